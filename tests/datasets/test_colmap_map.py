@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,15 +37,21 @@ def own(colmap_room: Path, tmp_path: Path) -> Path:
 
 
 def import_colmap(source: ColmapFolders, output: Path) -> dict[str, float]:
+    output.mkdir(exist_ok=True)
     return ColmapReconstruction.read(source).write_map(output)
 
 
 def imported(source: ColmapFolders, output: Path) -> tuple[KaptureFolder, dict[str, float]]:
-    output.mkdir()
     counts = import_colmap(source, output)
     folder = KaptureFolder(output)
     folder.validate()
     return folder, counts
+
+
+def execute(own: Path, statement: str, *values: Any) -> None:
+    with sqlite3.connect(own / "database.db") as connection:
+        connection.execute(statement, values)
+    connection.close()
 
 
 # a camera of every model that kapture has
@@ -94,48 +101,30 @@ def test_poses_rigs_and_projections_are_colmap_s(tmp_path: Path, form: str) -> N
     seen = folder.observations()["sift"]
     points = np.array([point.xyz for _, point in sorted(truth.points3D.items())])
     np.testing.assert_allclose(xyz, points, rtol=0, atol=1e-9)
+    order = {point_id: row for row, point_id in enumerate(sorted(truth.points3D))}
     assert theirs.rigs is not None and len({rig for rig, _ in theirs.rigs.key_pairs()}) == 5
     for image in truth.images.values():
         moment, sensor = data.record_of(image.name)
+        assert moment == image.frame_id
         # kapture's own reading: the pose of the camera, and the same through the rig
-        pose = theirs.trajectories[moment, sensor]
-        expected = image.cam_from_world()
+        pose, expected = theirs.trajectories[moment, sensor], image.cam_from_world()
         np.testing.assert_allclose(pose.r_raw, np.roll(expected.rotation.quat, 1), atol=1e-9)
         np.testing.assert_allclose(pose.t_raw, expected.translation, rtol=0, atol=1e-9)
         rig = theirs.rigs[f"rig{image.frame.rig_id}", sensor]
-        rig_from_world = image.frame.rig_from_world
         through = pycolmap.Rigid3d(pycolmap.Rotation3d(np.roll(rig.r_raw, -1)), np.ravel(rig.t_raw))
-        np.testing.assert_allclose(
-            (through * rig_from_world).matrix(), expected.matrix(), rtol=0, atol=1e-9
-        )
-        assert moment == image.frame_id
+        through = through * image.frame.rig_from_world
+        np.testing.assert_allclose(through.matrix(), expected.matrix(), rtol=0, atol=1e-9)
         # what the map observes, projected by our camera, against COLMAP's projection
         rows = seen.image_ids == seen.image_names.index(image.name)
         observed = xyz[seen.point_ids[rows]]
         ours = project(data.camera_of(image.name), data.poses()[image.name], observed)
-        in_cam = expected * observed
-        camera = truth.cameras[image.camera_id]
-        np.testing.assert_allclose(ours, camera.img_from_cam(in_cam), rtol=0, atol=1e-6)
+        at = truth.cameras[image.camera_id].img_from_cam(expected * observed)
+        np.testing.assert_allclose(ours, at, rtol=0, atol=1e-6)
         stored = folder.keypoints("sift").read(image.name)
         np.testing.assert_allclose(stored, [p.xy for p in image.points2D], rtol=0, atol=1e-3)
-        ids = {(p, k) for p, k in zip(seen.point_ids[rows], seen.keypoint_ids[rows], strict=True)}
-        order = {point_id: row for row, point_id in enumerate(sorted(truth.points3D))}
-        assert ids == {
-            (order[p.point3D_id], k) for k, p in enumerate(image.points2D) if p.has_point3D()
-        }
-
-
-def errors(found: Any, scene: Path) -> list[tuple[float, float]]:
-    """Metres and degrees from the truth, of each query."""
-    truth = KaptureFolder(scene / "query_gt").read().poses()
-    told = []
-    for name, pose in found:
-        assert pose, (name, pose)
-        off = pose.cam_from_world @ truth[name].inverse()
-        centre = pose.cam_from_world.center() - truth[name].center()
-        angle_deg = 2 * np.degrees(np.arccos(min(1.0, abs(off.quat_wxyz[0]))))
-        told.append((float(np.linalg.norm(centre)), float(angle_deg)))
-    return told
+        ids = set(zip(seen.point_ids[rows], seen.keypoint_ids[rows], strict=True))
+        tracks = ((p.point3D_id, k) for k, p in enumerate(image.points2D) if p.has_point3D())
+        assert ids == {(order[point_id], k) for point_id, k in tracks}
 
 
 @pytest.mark.parametrize("with_database", [True, False])
@@ -145,7 +134,7 @@ def test_queries_are_localized(
     """With the database's features, or with SIFT extracted again, once."""
     found = find_colmap(colmap_room)
     assert found.database == colmap_room / "database.db"
-    source = found if with_database else ColmapFolders(found.model, found.images, None)
+    source = found if with_database else replace(found, database=None)
     folder, counts = imported(source, tmp_path / "map")
     read = pycolmap.Reconstruction(colmap_room / "sparse" / "0")
     assert counts["points"] == len(read.points3D)
@@ -162,21 +151,23 @@ def test_queries_are_localized(
     assert os.readlink(link) == str((colmap_room / "images").resolve())
     opened = KaptureMap.open(tmp_path / "map")
     assert opened.fault() is None and opened.pixel_origin.intrinsics == "corner"
-    localizer = Localizer(opened)
-    off = np.array(errors(localizer.localize_kapture(scene / "query"), scene))
-    assert off[:, 0].max() < 0.01 and off[:, 1].max() < 0.05
+    truth = KaptureFolder(scene / "query_gt").read().poses()
+    for name, pose in Localizer(opened).localize_kapture(scene / "query"):
+        assert pose, (name, pose)
+        off = pose.cam_from_world @ truth[name].inverse()
+        assert np.linalg.norm(pose.cam_from_world.center() - truth[name].center()) < 0.01
+        assert 2 * np.degrees(np.arccos(min(1.0, abs(off.quat_wxyz[0])))) < 0.05
 
 
-def write_type(database: Path, kind: int, size: int) -> None:
+def write_type(own: Path, kind: int, size: int) -> None:
     """Give all descriptors another type and size."""
-    with sqlite3.connect(database) as connection:
-        for image_id, rows in connection.execute("SELECT image_id, rows FROM keypoints").fetchall():
-            content = np.full((rows, size // 4), 0.25, "<f4").tobytes()
-            connection.execute(
-                "UPDATE descriptors SET type = ?, cols = ?, data = ? WHERE image_id = ?",
-                (kind, size, content, image_id),
-            )
+    with sqlite3.connect(own / "database.db") as connection:
+        images = connection.execute("SELECT image_id, rows FROM keypoints").fetchall()
     connection.close()
+    for image_id, rows in images:
+        content = np.full((rows, size // 4), 0.25, "<f4").tobytes()
+        change = "UPDATE descriptors SET type = ?, cols = ?, data = ? WHERE image_id = ?"
+        execute(own, change, kind, size, content, image_id)
 
 
 @pytest.mark.parametrize(
@@ -193,7 +184,7 @@ def write_type(database: Path, kind: int, size: int) -> None:
 def test_types_of_features(
     own: Path, tmp_path: Path, kind: Any, local_type: str, dtype: Any, size: int, extractor: Any
 ) -> None:
-    write_type(own / "database.db", int(kind), 512)
+    write_type(own, int(kind), 512)
     folder, _ = imported(find_colmap(own), tmp_path / "map")
     config = folder.descriptors(local_type).config
     assert (config.dtype, config.dsize, config.keypoints_type) == (dtype, size, local_type)
@@ -203,20 +194,19 @@ def test_types_of_features(
         assert plugin.options == {"weights": local_type}
 
 
-def test_several_types_of_features_are_refused(own: Path, tmp_path: Path) -> None:
-    with sqlite3.connect(own / "database.db") as connection:
-        connection.execute("UPDATE descriptors SET type = 1 WHERE image_id = 1")
-    connection.close()
-    with pytest.raises(DataError, match=r"database.db: .*several types: aliked-n16rot, sift"):
-        import_colmap(find_colmap(own), tmp_path)
-
-
-def test_an_image_without_descriptors_is_named(own: Path, tmp_path: Path) -> None:
-    with sqlite3.connect(own / "database.db") as connection:
-        connection.execute("DELETE FROM descriptors WHERE image_id = 1")
-    connection.close()
-    with pytest.raises(DataError, match=r"database.db: image '0\d*.jpg' has no descriptors"):
-        import_colmap(find_colmap(own), tmp_path)
+@pytest.mark.parametrize(
+    ("statement", "match"),
+    [
+        ("UPDATE descriptors SET type = 1", "database.db: .*several types: aliked-n16rot, sift"),
+        ("DELETE FROM descriptors", r"database.db: image '0\d*.jpg' has no descriptors"),
+    ],
+)
+def test_descriptors_of_several_types_or_not_of_all_images_are_refused(
+    own: Path, tmp_path: Path, statement: str, match: str
+) -> None:
+    execute(own, f"{statement} WHERE image_id = 1")
+    with pytest.raises(DataError, match=match):
+        import_colmap(find_colmap(own), tmp_path / "map")
 
 
 def test_the_database_of_an_older_version(colmap_room: Path, own: Path, tmp_path: Path) -> None:
@@ -231,18 +221,18 @@ def test_the_database_of_an_older_version(colmap_room: Path, own: Path, tmp_path
             database.add_camera(*row[1:4], np.frombuffer(row[4]), camera_id=row[0])
         for image_id, name, camera_id in newer.execute("SELECT * FROM images").fetchall():
             database.add_image(name, camera_id, image_id=image_id)
-            for table, dtype, add in (
-                ("keypoints", np.float32, database.add_keypoints),
-                ("descriptors", np.uint8, database.add_descriptors),
-            ):
+            for table, dtype in (("keypoints", np.float32), ("descriptors", np.uint8)):
                 query = f"SELECT rows, cols, data FROM {table} WHERE image_id = {image_id}"
                 rows, columns, content = newer.execute(query).fetchone()
-                add(image_id, np.frombuffer(content, dtype).reshape(rows, columns))
+                values = np.frombuffer(content, dtype).reshape(rows, columns)
+                getattr(database, f"add_{table}")(image_id, values)
     newer.close()
     database.commit()
     database.close()
     new, _ = imported(find_colmap(colmap_room), tmp_path / "new")
-    old, _ = imported(find_colmap(own), tmp_path / "old")
+    # that the images are not here changes nothing of it
+    old, _ = imported(replace(find_colmap(own), images=None), tmp_path / "old")
+    assert not KaptureMap.open(old.root).has_images()
     assert old.read().poses() == new.read().poses()
     for image in new.read().image_names():
         for kind in ("keypoints", "descriptors"):
@@ -250,21 +240,16 @@ def test_the_database_of_an_older_version(colmap_room: Path, own: Path, tmp_path
             assert np.array_equal(a, b)
 
 
-# -------------------------------------------------------------------------------- names
-
-
 def rename(own: Path, names: dict[str, str]) -> None:
     """Give images of a workspace other names, in all of its parts."""
     model = pycolmap.Reconstruction(own / "sparse" / "0")
-    with sqlite3.connect(own / "database.db") as connection:
-        for image in model.images.values():
-            if image.name in names:
-                new = names[image.name]
-                (own / "images" / new).parent.mkdir(exist_ok=True)
-                (own / "images" / image.name).rename(own / "images" / new)
-                connection.execute("UPDATE images SET name = ? WHERE name = ?", (new, image.name))
-                image.name = new
-    connection.close()
+    for image in model.images.values():
+        if image.name in names:
+            new = names[image.name]
+            (own / "images" / new).parent.mkdir(exist_ok=True)
+            (own / "images" / image.name).rename(own / "images" / new)
+            execute(own, "UPDATE images SET name = ? WHERE name = ?", new, image.name)
+            image.name = new
     model.write_binary(own / "sparse" / "0")
 
 
@@ -273,7 +258,7 @@ def test_names_that_kapture_cannot_hold(own: Path, tmp_path: Path, with_database
     names = {"0000.jpg": "my photos/a, b.jpg", "0002.jpg": "#c d.jpg", "0003.jpg": " e.jpg"}
     rename(own, names)
     found = find_colmap(own)
-    source = found if with_database else ColmapFolders(found.model, found.images, None)
+    source = found if with_database else replace(found, database=None)
     folder, _ = imported(source, tmp_path / "map")
     written = {"my photos/a_ b.jpg": names["0000.jpg"], "_c d.jpg": "#c d.jpg", "_e.jpg": " e.jpg"}
     theirs = kapture.io.csv.kapture_from_dir(str(tmp_path / "map"))
@@ -287,81 +272,61 @@ def test_names_that_kapture_cannot_hold(own: Path, tmp_path: Path, with_database
 def test_two_images_of_one_name_are_refused(own: Path, tmp_path: Path) -> None:
     rename(own, {"0000.jpg": "a,b.jpg", "0002.jpg": "a_b.jpg"})
     with pytest.raises(DataError, match=r"'a,b.jpg' and 'a_b.jpg' would both be 'a_b.jpg'"):
-        import_colmap(find_colmap(own), tmp_path)
+        import_colmap(find_colmap(own), tmp_path / "map")
 
 
-# -------------------------------------------------------------------------------- folders
-
-
-def test_the_parts_are_found(own: Path) -> None:
-    found = ColmapFolders(own / "sparse" / "0", own / "images", own / "database.db")
-    for path in (own, own / "sparse", own / "sparse" / "0"):
+def test_the_parts_are_found(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = own / "sparse" / "0"
+    found = ColmapFolders(model, own / "images", own / "database.db")
+    for path in (own, own / "sparse", model):
         assert is_colmap(path) and find_colmap(path) == found
     assert not is_colmap(own / "images") and not is_colmap(own / "none")
     # given ones come first
     (own / "other").mkdir()
-    given = find_colmap(own, images=own / "other")
-    assert given == ColmapFolders(found.model, own / "other", found.database)
+    assert find_colmap(own, images=own / "other") == replace(found, images=own / "other")
     # as image_undistorter has it
     (own / "dense").mkdir()
-    (own / "dense" / "sparse").symlink_to(own / "sparse" / "0")
+    (own / "dense" / "sparse").symlink_to(model)
     assert find_colmap(own / "dense") == ColmapFolders(own / "dense" / "sparse", None, None)
-    shutil.copytree(own / "sparse" / "0", own / "sparse" / "1")
-    with pytest.raises(DataError, match="several models, give one of them: sparse/0, sparse/1"):
-        find_colmap(own)
-    with pytest.raises(DataError, match="images: no COLMAP model: neither images.bin nor"):
-        find_colmap(own / "images")
-    with pytest.raises(DataError, match="none: no such folder of images"):
-        find_colmap(own / "sparse" / "0", images=own / "none")
-    with pytest.raises(DataError, match="images: no such database"):
-        find_colmap(own / "sparse" / "0", database=own / "images")
-
-
-def test_relative_paths_are_found_too(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(model, own / "sparse" / "1")
+    for path, given, message in (
+        (own, {}, "several models, give one of them: sparse/0, sparse/1"),
+        (own / "images", {}, "images: no COLMAP model: neither images.bin nor"),
+        (model, {"images": own / "none"}, "none: no such folder of images"),
+        (model, {"database": own / "images"}, "images: no such database"),
+    ):
+        with pytest.raises(DataError, match=message):
+            find_colmap(path, **given)
     monkeypatch.chdir(own / "sparse")
-    found = find_colmap(Path("0"))
-    assert found.images is not None and found.images.samefile(own / "images")
-    assert found.database is not None and found.database.samefile(own / "database.db")
+    relative = find_colmap(Path("0"))
+    assert relative.images is not None and relative.images.samefile(own / "images")
+    assert relative.database is not None and relative.database.samefile(own / "database.db")
 
 
 def test_what_is_missing_is_said_before_the_work(own: Path, tmp_path: Path) -> None:
-    found = find_colmap(own)
-    output = tmp_path / "map"
-    output.mkdir()
+    found, output = find_colmap(own), tmp_path / "map"
     with pytest.raises(DataError, match="no descriptors .*--database.* or the images .*--images"):
         import_colmap(ColmapFolders(found.model, None, None), output)
-    (own / "images" / "0003.jpg").unlink()
-    with pytest.raises(DataError, match="images: 1 of the model's 7 images are not here, .* 0003"):
-        import_colmap(found, output)
-    (own / "sparse" / "0" / "cameras.bin").unlink()
-    with pytest.raises(DataError, match=r"cameras.bin: file is missing"):
-        import_colmap(found, output)
+    for gone, message in (
+        (own / "images" / "0003.jpg", "images: 1 of the model's 7 images are not here, .* 0003"),
+        (own / "sparse" / "0" / "cameras.bin", r"cameras.bin: file is missing"),
+    ):
+        gone.unlink()
+        with pytest.raises(DataError, match=message):
+            import_colmap(found, output)
     assert list(output.iterdir()) == []
 
 
-def test_a_map_without_images(colmap_room: Path, tmp_path: Path) -> None:
-    found = find_colmap(colmap_room)
-    folder, _ = imported(ColmapFolders(found.model, None, found.database), tmp_path / "map")
-    assert not KaptureMap.open(folder.root).has_images()
-
-
-def test_a_model_of_other_features_is_refused(own: Path, tmp_path: Path) -> None:
-    """Points that are nowhere near SIFT's keypoints."""
+def test_models_of_other_features_or_without_points_are_refused(own: Path, tmp_path: Path) -> None:
     found = find_colmap(own)
     model = pycolmap.Reconstruction(found.model)
     for image in model.images.values():
         for point in image.points2D:
-            point.xy = point.xy + [5.3, 2.6]
+            point.xy = point.xy + [5.3, 2.6]  # nowhere near SIFT's keypoints
     model.write_binary(found.model)
     with pytest.raises(OtherFeaturesError, match="sparse/0: the model has no descriptors"):
-        import_colmap(ColmapFolders(found.model, found.images, None), tmp_path)
-
-
-def test_a_model_without_points_is_refused(own: Path, tmp_path: Path) -> None:
-    model = pycolmap.Reconstruction(own / "sparse" / "0")
+        import_colmap(replace(found, database=None), tmp_path / "map")
     model.delete_all_points2D_and_points3D()
-    model.write_text(own / "sparse" / "0")
-    for path in (own / "sparse" / "0").glob("*.bin"):
-        path.unlink()
+    model.write_binary(found.model)
     with pytest.raises(OtherFeaturesError, match="sparse/0: the model has no points"):
-        import_colmap(find_colmap(own), tmp_path)
+        import_colmap(find_colmap(own), tmp_path / "none")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,25 +16,7 @@ from megloc_kapture.datasets.kapture_folders import (
     prefixed,
 )
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.dataset_tables import (
-    ImageGroup,
-    Protocol,
-    RelocalizationPair,
-    SimilarityTransform,
-    World,
-    read_groups,
-    read_names,
-    read_priors,
-    read_protocol,
-    read_relocalization,
-    read_world,
-    write_groups,
-    write_names,
-    write_priors,
-    write_protocol,
-    write_relocalization,
-    write_world,
-)
+from megloc_kapture.io import dataset_tables as tables
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
@@ -44,19 +27,15 @@ CAMERA = Camera("SIMPLE_PINHOLE", 8, 6, (10.0, 4.0, 3.0))
 def write_part(
     root: Path, part: str, names: Sequence[str], *, poses: bool, images: bool = True
 ) -> None:
-    keys = [(timestamp, "cam") for timestamp in range(len(names))]
-    data = KaptureData(
-        sensors={"cam": Sensor.from_camera(CAMERA)},
-        rigs={},
-        trajectories={key: RigidTransform.identity() for key in keys} if poses else {},
-        records_camera=dict(zip(keys, names, strict=True)),
-        records_depth={},
-    )
+    data = KaptureData(sensors={"cam": Sensor.from_camera(CAMERA)})
+    for timestamp, name in enumerate(names):
+        data.records_camera[timestamp, "cam"] = name
+        if poses:
+            data.trajectories[timestamp, "cam"] = RigidTransform.identity()
+        if images:
+            path = root / part / "sensors" / "records_data" / name
+            write_image(path, np.full((6, 8, 3), 99, np.uint8))
     write_sensors(root / part, data)
-    for name in names if images else ():
-        write_image(
-            root / part / "sensors" / "records_data" / name, np.full((6, 8, 3), 99, np.uint8)
-        )
 
 
 @pytest.fixture
@@ -71,86 +50,83 @@ def root(tmp_path: Path) -> Path:
 
 def test_what_is_imported(root: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    counts = import_kapture_folders(root, out)
-    assert counts == {
-        "map_images": 2,
-        "map_images_with_pose": 2,
-        "queries": 2,
-        "queries_with_truth": 2,
-    }
+    counts = {"map_images": 2, "map_images_with_pose": 2, "queries": 2, "queries_with_truth": 2}
+    assert import_kapture_folders(root, out) == counts
     mapping, query = KaptureFolder(out / "mapping"), KaptureFolder(out / "query")
     assert mapping.read().poses().keys() == {"a.png", "b/c.png"}
     assert query.read().image_names() == ["b/q.png", "r.png"]
     # the queries' poses are nobody's business but the evaluation's
     assert query.read().poses() == {}
     assert len(KaptureFolder(out / "query_gt").read().poses()) == 2
-    assert (out / "mapping/sensors/records_data").readlink() == (
-        root / "mapping/sensors/records_data"
-    )
+    images = root / "mapping/sensors/records_data"
+    assert (out / "mapping/sensors/records_data").readlink() == images
     assert query.image_path("b/q.png").is_file()
-    assert read_protocol(out / "megloc") == Protocol()
+    assert tables.read_protocol(out / "megloc") == tables.Protocol()
     assert sorted(path.name for path in (out / "megloc").iterdir()) == ["protocol.json"]
+    (root / "query_gt/sensors/sensors.txt").unlink()
+    assert import_kapture_folders(root, tmp_path / "b") == counts | {"queries_with_truth": 0}
+    assert not (tmp_path / "b" / "query_gt").exists()
 
 
 @pytest.mark.parametrize("prefix", ["", "q"])
-def test_queries_keep_their_depth(root: Path, tmp_path: Path, prefix: str) -> None:
+def test_queries_keep_their_depth_and_masks(root: Path, tmp_path: Path, prefix: str) -> None:
     data = KaptureFolder(root / "query").read()
     data.sensors["depth"] = Sensor.from_camera(CAMERA, sensor_type="depth")
     data.rigs["rig"] = {name: RigidTransform.identity() for name in ("cam", "depth")}
     data.records_depth[0, "depth"] = "b/q.depth"
     write_sensors(root / "query", data)
-    depth = root / "query/sensors/records_data/b/q.depth"
+    sensors = root / "query/sensors"
+    depth, mask = sensors / "records_data/b/q.depth", sensors / "masks/r.png.png"
     before = set(input_files(root))
     depth.write_bytes(np.ones((6, 8), np.float32).tobytes())
+    write_image(mask, np.zeros((6, 8), np.uint8))
     # another depth map is another data set
-    assert set(input_files(root)) - before == {depth}
+    assert set(input_files(root)) - before == {depth, mask}
     import_kapture_folders(root, tmp_path / "out", query_prefix=prefix)
     query = KaptureFolder(tmp_path / "out" / "query")
     (name,) = query.read().records_depth.values()
     assert query.depth_path(name).read_bytes() == depth.read_bytes()
+    there = query.root / "sensors" / "masks" / prefix / "r.png.png"
+    assert there.read_bytes() == mask.read_bytes()
     assert query.read().poses() == {}
     assert KaptureFolder(tmp_path / "out" / "query_gt").read().records_depth == {}
 
 
-def test_without_truth(root: Path, tmp_path: Path) -> None:
-    (root / "query_gt/sensors/sensors.txt").unlink()
-    assert import_kapture_folders(root, tmp_path / "out")["queries_with_truth"] == 0
-    assert not (tmp_path / "out" / "query_gt").exists()
-
-
 def test_side_tables_come_along(root: Path, tmp_path: Path) -> None:
-    tables = root / "megloc"
-    groups = {"a.png": ImageGroup(frame="f"), "r.png": ImageGroup(condition="night", scored=False)}
-    world = World(official_from_local=SimilarityTransform(translation=(1.0, 2.0, 3.0)))
-    write_groups(tables, groups)
-    write_priors(tables, {"r.png": ["a.png"]})
-    write_names(tables, {"r.png": "R"})
-    write_relocalization(tables, [RelocalizationPair("x.txt", "a.png", "r.png")])
-    write_world(tables, world)
-    write_protocol(tables, Protocol(dataset="mine", thresholds=((1.0, 2.0),)))
-    out = tmp_path / "out"
+    given, out = root / "megloc", tmp_path / "out" / "megloc"
+    of_map = tables.ImageGroup(frame="f")
+    of_query = tables.ImageGroup(condition="night", scored=False)
+    moved = tables.SimilarityTransform(translation=(1.0, 2.0, 3.0))
+    world = tables.World(official_from_local=moved)
+    tables.write_groups(given, {"a.png": of_map, "r.png": of_query})
+    tables.write_priors(given, {"r.png": ["a.png"]})
+    tables.write_names(given, {"r.png": "R"})
+    tables.write_relocalization(given, [tables.RelocalizationPair("x.txt", "a.png", "r.png")])
+    tables.write_world(given, world)
+    protocol = tables.Protocol(dataset="mine", thresholds=((1.0, 2.0),))
+    tables.write_protocol(given, protocol)
+    change = {"conditions": ("night",)}
     import_kapture_folders(
         root,
-        out,
+        tmp_path / "out",
         query_prefix="q",
-        protocol_change=lambda given: given.model_copy(update={"conditions": ("night",)}),
+        protocol_change=lambda given: given.model_copy(update=change),
     )
-    assert read_groups(out / "megloc") == {"a.png": groups["a.png"], "q/r.png": groups["r.png"]}
-    assert read_priors(out / "megloc") == {"q/r.png": ("a.png",)}
-    assert read_names(out / "megloc") == {"q/r.png": "R"}
-    pairs = read_relocalization(out / "megloc")
-    assert pairs == [RelocalizationPair("x.txt", "a.png", "q/r.png")]
-    assert read_world(out / "megloc") == world
-    assert read_protocol(out / "megloc") == Protocol(
-        dataset="mine", thresholds=((1.0, 2.0),), conditions=("night",)
-    )
+    assert tables.read_groups(out) == {"a.png": of_map, "q/r.png": of_query}
+    assert tables.read_priors(out) == {"q/r.png": ("a.png",)}
+    assert tables.read_names(out) == {"q/r.png": "R"}
+    assert tables.read_relocalization(out) == [
+        tables.RelocalizationPair("x.txt", "a.png", "q/r.png")
+    ]
+    assert tables.read_world(out) == world
+    assert tables.read_protocol(out) == protocol.model_copy(update=change)
 
 
 def test_equal_names_are_refused_or_prefixed(root: Path, tmp_path: Path) -> None:
     write_part(root, "query", ["a.png", "r.png"], poses=False)
     write_part(root, "query_gt", ["a.png", "r.png"], poses=True, images=False)
-    night = ImageGroup(condition="night")
-    write_groups(root / "megloc", {"a.png": night})
+    night = tables.ImageGroup(condition="night")
+    tables.write_groups(root / "megloc", {"a.png": night})
     out = tmp_path / "out"
     with pytest.raises(DataError, match=r"root: 1 images .* the first is a\.png; .*--query-prefix"):
         import_kapture_folders(root, out)
@@ -161,15 +137,7 @@ def test_equal_names_are_refused_or_prefixed(root: Path, tmp_path: Path) -> None
     truth = KaptureFolder(out / "query_gt").read()
     assert truth.poses().keys() == {"some/where/a.png", "some/where/r.png"}
     # the table cannot tell which of the two it means
-    assert read_groups(out / "megloc") == {"a.png": night, "some/where/a.png": night}
-
-
-def test_masks_are_linked_under_the_prefix_too(root: Path, tmp_path: Path) -> None:
-    mask = root / "query" / "sensors" / "masks" / "r.png.png"
-    write_image(mask, np.zeros((6, 8), np.uint8))
-    import_kapture_folders(root, tmp_path / "out", query_prefix="q")
-    there = tmp_path / "out" / "query" / "sensors" / "masks" / "q" / "r.png.png"
-    assert there.read_bytes() == mask.read_bytes()
+    assert tables.read_groups(out / "megloc") == {"a.png": night, "some/where/a.png": night}
 
 
 @pytest.mark.parametrize("prefix", ["..", "/q", "a/../b", "a//b", "a\\b"])
@@ -179,18 +147,17 @@ def test_a_prefix_is_a_plain_relative_path(prefix: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("part", "names", "poses", "message"),
+    ("part", "names", "message"),
     [
-        ("mapping", ["a.png"], False, r"root/mapping: no mapping image has a pose"),
-        ("query", [], False, r"root/query: there are no query images"),
+        ("mapping", ["a.png"], r"root/mapping: no mapping image has a pose"),
+        ("query", [], r"root/query: there are no query images"),
     ],
 )
 def test_too_little_is_refused(
-    root: Path, tmp_path: Path, part: str, names: list[str], poses: bool, message: str
+    root: Path, tmp_path: Path, part: str, names: list[str], message: str
 ) -> None:
-    for file in (root / part / "sensors").glob("*.txt"):
-        file.unlink()
-    write_part(root, part, names, poses=poses)
+    shutil.rmtree(root / part)
+    write_part(root, part, names, poses=False)
     with pytest.raises(DataError, match=message):
         import_kapture_folders(root, tmp_path / "out")
 
@@ -207,15 +174,8 @@ def test_a_root_has_both_parts(root: Path, part: str) -> None:
 
 def test_every_file_an_import_reads_counts(root: Path) -> None:
     write_image(root / "query/sensors/masks/r.png.png", np.zeros((6, 8), np.uint8))
-    write_priors(root / "megloc", {"r.png": ["a.png"]})
+    tables.write_priors(root / "megloc", {"r.png": ["a.png"]})
+    read = {path for path in root.rglob("*") if path.is_file()}
     (root / "notes.txt").write_text("no input")
-    found = sorted(str(path.relative_to(root)) for path in input_files(root))
-    tables = ["records_camera.txt", "sensors.txt", "trajectories.txt"]
-    assert found == sorted(
-        [
-            *(f"{part}/sensors/{t}" for part in ("mapping", "query", "query_gt") for t in tables),
-            *("mapping/sensors/records_data/a.png", "mapping/sensors/records_data/b/c.png"),
-            *("query/sensors/records_data/b/q.png", "query/sensors/records_data/r.png"),
-            *("query/sensors/masks/r.png.png", "megloc/priors.csv"),
-        ]
-    )
+    found = list(input_files(root))
+    assert set(found) == read and len(found) == len(read)

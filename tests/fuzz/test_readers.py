@@ -11,6 +11,7 @@ import sys
 import tarfile
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -20,7 +21,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from hostile import NUMBERS
+from hostile import EDITS, NUMBERS, TOKENS, Edit, changed
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from onnx import helper, numpy_helper
@@ -28,13 +29,7 @@ from safetensors.torch import save
 from scipy.io import savemat
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.dataset_tables import (
-    read_groups,
-    read_names,
-    read_priors,
-    read_protocol,
-    read_world,
-)
+from megloc_kapture.io import dataset_tables, tables
 from megloc_kapture.io.images import image_size, read_image_rgb
 from megloc_kapture.io.kapture import read_pairs, read_point_covariances, write_pairs
 from megloc_kapture.io.kapture.blobs import TarBlobs
@@ -43,17 +38,10 @@ from megloc_kapture.io.kapture.observations import Observations, read_observatio
 from megloc_kapture.io.kapture.points import read_points3d
 from megloc_kapture.io.kapture.sensors import read_kapture_data
 from megloc_kapture.io.mat_file import read_mat, read_mat_array
-from megloc_kapture.io.tables import (
-    read_clusters,
-    read_consistency,
-    read_mask_counts,
-    read_match_counts,
-    read_refinement,
-    read_status,
-)
 from megloc_kapture.io.weights.containers import read_checkpoint
 
 BUNDLE = Path(__file__).parent.parent / "io/weights/data/tensor_bundle/graph.ckpt-7"
+PARTS = (".index", ".data-00000-of-00001")
 VERSION = "# kapture format: 1.1\n"
 POSE = "0.5, 0.5, 0.5, 0.5, 1.0, -2.0, 3.0"
 CELL = "1.0 0.0 0.0 0.0 1.0 -2.0 3.0"
@@ -150,6 +138,11 @@ def read_tar(path: Path) -> None:
         blobs.read(name)
 
 
+def beside(read: Callable[[Path], object]) -> Callable[[Path], object]:
+    """A reader that is given the file's folder."""
+    return lambda path: read(path.parent)
+
+
 def read_mats(path: Path) -> None:
     content = path.read_bytes()
     with suppress(DataError):
@@ -158,9 +151,13 @@ def read_mats(path: Path) -> None:
     assert found.dtype == np.float64 and found.size * 8 <= len(content) * 1032
 
 
+def part(ending: str) -> bytes:
+    """A file of TensorFlow's checkpoint."""
+    return BUNDLE.with_name(BUNDLE.name + ending).read_bytes()
+
+
 def read_weights(path: Path) -> None:
-    data = BUNDLE.with_name(f"{BUNDLE.name}.data-00000-of-00001").read_bytes()
-    read_checkpoint(path.read_bytes(), str(path), lambda _: data)
+    read_checkpoint(path.read_bytes(), str(path), lambda _: part(PARTS[1]))
 
 
 def read_pairs_again(path: Path) -> None:
@@ -175,9 +172,7 @@ def rows(observations: dict[str, Observations]) -> dict[str, list[tuple[int, str
         kind: [
             (point, found.image_names[image], keypoint)
             for point, image, keypoint in zip(
-                found.point_ids.tolist(),
-                found.image_ids.tolist(),
-                found.keypoint_ids.tolist(),
+                *(a.tolist() for a in (found.point_ids, found.image_ids, found.keypoint_ids)),
                 strict=True,
             )
         ]
@@ -193,24 +188,15 @@ def outcome(read: Callable[..., Any], path: Path, **options: int) -> Any:
         return None
 
 
-def read_observations_twice(path: Path) -> None:
+def read_twice(
+    read: Callable[..., Any], comparable: Callable[[Any], Any], path: Path, **options: int
+) -> None:
     """By both readers, the compiled one in chunks of a few lines: they agree on anything."""
-    plain = outcome(read_observations, path, large_bytes=PLAIN)
-    compiled = outcome(read_observations, path, large_bytes=LARGE, chunk_bytes=50)
+    plain = outcome(read, path, large_bytes=PLAIN)
+    compiled = outcome(read, path, large_bytes=LARGE, **options)
     assert (plain is None) == (compiled is None)
-    if plain is not None:
-        assert rows(plain) == rows(compiled)
-    read_observations(path)
-
-
-def read_points_twice(path: Path) -> None:
-    """By both readers: they agree on anything."""
-    plain = outcome(read_points3d, path, large_bytes=PLAIN)
-    pandas = outcome(read_points3d, path, large_bytes=LARGE)
-    assert (plain is None) == (pandas is None)
-    if plain is not None:
-        assert np.array_equal(plain.view(np.uint64), pandas.view(np.uint64))
-    read_points3d(path)
+    assert plain is None or comparable(plain) == comparable(compiled)
+    read(path)
 
 
 TENSORS = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.count": torch.tensor(7)}
@@ -228,9 +214,15 @@ READERS = {
         for name, content in SENSORS.items()
     },
     "observations": Reader(
-        "observations.txt", b"0, t, a b.jpg, 1, c, 2\n# c\n5, u, c, 07\n", read_observations_twice
+        "observations.txt",
+        b"0, t, a b.jpg, 1, c, 2\n# c\n5, u, c, 07\n",
+        partial(read_twice, read_observations, rows, chunk_bytes=50),
     ),
-    "points": Reader("points3d.txt", b"# X, Y, Z\n1.5,-2e3,.5\n1,2,3\n", read_points_twice),
+    "points": Reader(
+        "points3d.txt",
+        b"# X, Y, Z\n1.5,-2e3,.5\n1,2,3\n",
+        partial(read_twice, read_points3d, lambda points: points.view(np.uint64).tolist()),
+    ),
     "covariances": Reader(
         "reconstruction/point_covariances.npy",
         saved_array(),
@@ -252,54 +244,54 @@ READERS = {
         "status.csv",
         b"image,status,reason,num_matches,num_inliers,cluster,fallback,candidates,refinement,"
         b'remarks\na,localized,,9,8,0,none,"b,c",,\nd,failed,why,0,0,,rig,,,\n',
-        read_status,
+        tables.read_status,
     ),
     "clusters": Reader(
         "clusters.csv",
         b"image,cluster,chosen,num_matches,num_inliers,score,reason,images,cam_from_world\n"
         + f'a,0,yes,4,3,1.5,,"b,c",{CELL}\n'.encode(),
-        read_clusters,
+        tables.read_clusters,
     ),
     "refinement": Reader(
         "refinement.csv",
         b"image,method,accepted,reason,moved_m,turned_deg,measures,before\n"
         + f"a,icp,yes,,0.1,0.2,m=1;n=2,{CELL}\n".encode(),
-        read_refinement,
+        tables.read_refinement,
     ),
     "consistency": Reader(
         "map_consistency.csv",
         b"frame,method,images,contradicting,moved_m,turned_deg,moved_px,claimed_m,claimed_deg,"
         b"squared_distance,reason\n,icp,3,0,0.1,,1,2,3,4,\n",
-        read_consistency,
+        tables.read_consistency,
     ),
     "match counts": Reader(
         "local_features/t/match_counts.csv",
         b"image,other,matches,verified\na,b,3,2\n",
-        lambda path: read_match_counts(path.parent.parent.parent, "t"),
+        lambda path: tables.read_match_counts(path.parent.parent.parent, "t"),
     ),
     "mask counts": Reader(
         "local_features/t/masked.csv",
         b"image,num_masked\na,3\n",
-        lambda path: read_mask_counts(path.parent.parent.parent, "t"),
+        lambda path: tables.read_mask_counts(path.parent.parent.parent, "t"),
     ),
     "groups": Reader(
         "groups.csv",
         b"image,condition,frame,location,scored\na,day,,,1\n",
-        lambda path: read_groups(path.parent),
+        beside(dataset_tables.read_groups),
     ),
     "priors": Reader(
-        "priors.csv", b"query,permitted\na,b\na,c\n", lambda path: read_priors(path.parent)
+        "priors.csv", b"query,permitted\na,b\na,c\n", beside(dataset_tables.read_priors)
     ),
-    "names": Reader("names.csv", b"image,name\na,b\n", lambda path: read_names(path.parent)),
+    "names": Reader("names.csv", b"image,name\na,b\n", beside(dataset_tables.read_names)),
     "world": Reader(
         "world.json",
         b'{"official_from_local": {"quat_wxyz": [0.6, 0, 0.8, 0], "scale": 2}, "unit": "m"}',
-        lambda path: read_world(path.parent),
+        beside(dataset_tables.read_world),
     ),
     "protocol": Reader(
         "protocol.json",
         b'{"dataset": "x", "thresholds": [[0.25, 2.0], [5, null]], "pools": {"a": ["b"]}}',
-        lambda path: read_protocol(path.parent),
+        beside(dataset_tables.read_protocol),
     ),
     "mat": Reader("x.mat", saved_mat(compressed=False), read_mats),
     "mat, packed": Reader("x.mat", saved_mat(compressed=True), read_mats),
@@ -312,64 +304,11 @@ READERS = {
     "npz": Reader("x.npz", saved_npz(), read_weights),
     "onnx": Reader("x.onnx", saved_onnx(), read_weights),
     "NetVLAD": Reader("x.mat", saved_mat(compressed=True), read_weights),
-    "TensorFlow": Reader(
-        "x.index", BUNDLE.with_name("graph.ckpt-7.index").read_bytes(), read_weights
-    ),
+    "TensorFlow": Reader("x.index", part(".index"), read_weights),
     "TensorFlow in a tar": Reader(
-        "x.tar",
-        saved_tar(
-            {
-                f"g{ending}": BUNDLE.with_name(BUNDLE.name + ending).read_bytes()
-                for ending in (".index", ".data-00000-of-00001")
-            }
-        ),
-        read_weights,
+        "x.tar", saved_tar({f"g{e}": part(e) for e in PARTS}), read_weights
     ),
 }
-
-TOKENS = st.sampled_from(
-    [
-        b",",
-        b", ",
-        b"\n",
-        b"\r\n",
-        b"\r",
-        b"#",
-        b" ",
-        b"\0",
-        b"\xff",
-        b'"',
-        b"-",
-        b"..",
-        b"/",
-        b"nan",
-    ]
-    + [b"1e999", b"1e", b"-1", b"0", b"9" * 19, b"cam", b"rig", b"\xc3\xa9", b"\xc2\xa0", b"\x85"]
-    + [
-        b"\xe2\x80\x83",
-        b"\\",
-        b"{",
-        b"[",
-        b"\x7f\xff\xff\xff",
-        b"\xff\xff\xff\x7f",
-        VERSION.encode(),
-    ]
-)
-# (what part of the file before it, in thousandths; bytes taken away there; bytes put there)
-EDITS = st.lists(
-    st.tuples(st.integers(0, 1000), st.integers(0, 6), st.binary(max_size=6) | TOKENS),
-    min_size=1,
-    max_size=6,
-)
-CUTS = st.just(1000) | st.integers(0, 1000)
-
-
-def mutated(whole: bytes, edits: list[tuple[int, int, bytes]], cut: int) -> bytes:
-    content = bytearray(whole)
-    for at, taken, put in edits:
-        begin = at * len(content) // 1000
-        content[begin : begin + taken] = put
-    return bytes(content[: cut * len(content) // 1000])
 
 
 def placed(reader: Reader, folder: Path, content: bytes) -> Path:
@@ -414,22 +353,18 @@ def test_whole_files_are_read(name: str, tmp_path: Path) -> None:
 
 
 @EACH
-@given(EDITS, CUTS)
+@given(edits=EDITS)
 @ANY
-def test_mutations(
-    name: str, tmp_path: Path, edits: list[tuple[int, int, bytes]], cut: int
-) -> None:
-    survives(READERS[name], tmp_path, mutated(READERS[name].whole, edits, cut))
+def test_mutations(name: str, tmp_path: Path, edits: list[Edit]) -> None:
+    survives(READERS[name], tmp_path, changed(READERS[name].whole, edits))
 
 
 @pytest.mark.fuzz
 @EACH
-@given(EDITS, CUTS)
+@given(edits=EDITS)
 @MANY
-def test_many_mutations(
-    name: str, tmp_path: Path, edits: list[tuple[int, int, bytes]], cut: int
-) -> None:
-    survives(READERS[name], tmp_path, mutated(READERS[name].whole, edits, cut))
+def test_many_mutations(name: str, tmp_path: Path, edits: list[Edit]) -> None:
+    survives(READERS[name], tmp_path, changed(READERS[name].whole, edits))
 
 
 @pytest.mark.fuzz
@@ -439,8 +374,6 @@ def test_many_mutations(
 def test_random_bytes(name: str, tmp_path: Path, content: bytes, ended: bool) -> None:
     survives(READERS[name], tmp_path, READERS[name].whole * ended + content)
 
-
-# ------------------------------------- files nearly right, to reach deep into both readers
 
 FIELDS = st.sampled_from(
     ["0", "1", "17", " 5 ", "007", "-1", "x", "", "t", "u u", "a.jpg", "b/c d.jpg", "é", "..", "#"]

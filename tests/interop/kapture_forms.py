@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import kapture
+import numpy as np
 from kapture.converter.colmap.import_colmap import import_colmap
 from kapture.io.csv import kapture_from_dir, kapture_to_dir
 from kapture.io.records import TransferAction
@@ -12,9 +13,10 @@ from tools.kapture_import_4seasons import import_4seasons_sequence
 from tools.kapture_import_image_list import import_image_list
 from tools.kapture_import_RobotCar_Seasons import import_robotcar_seasons
 
-import megloc_kapture  # noqa: F401  before pycolmap, see megloc_kapture/io/colmap.py
+from megloc_kapture.datasets.official import OfficialDataset, write_official
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 
-import pycolmap  # isort: skip
+import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
 
 def aachen_with_kapture(official: Path, place: Path) -> Path:
@@ -66,3 +68,53 @@ def fourseasons_with_kapture(official: Path, place: Path) -> Path:
             False,
         )
     return place
+
+
+def without_images(folder: Path, gone: str) -> None:
+    """Take the images that have some text in their names out of a kapture folder's records."""
+    data = kapture_from_dir(str(folder))
+    for time, sensor, name in list(kapture.flatten(data.records_camera)):
+        if gone in name:
+            del data.records_camera[time][sensor]
+    kapture_to_dir(str(folder), data)
+
+
+def assert_same_images(found: KaptureData, expected: KaptureData, *, atol: float = 0.0) -> None:
+    """The same images in the same order, with the same cameras and poses.
+
+    Ids of sensors are each form's own.
+    """
+    assert list(found.records_camera.values()) == list(expected.records_camera.values())
+    for name in expected.records_camera.values():
+        assert found.camera_of(name) == expected.camera_of(name)
+        pose, own = expected.cam_from_world(name), found.cam_from_world(name)
+        assert (own is None) == (pose is None), name
+        if own is not None and pose is not None:
+            np.testing.assert_allclose(own.matrix(), pose.matrix(), rtol=0, atol=atol)
+
+
+def assert_same_dataset(
+    found: OfficialDataset, expected: OfficialDataset, *, atol: float = 0.0
+) -> None:
+    """The same images and tables, the order of names and lines of the summary included."""
+    assert_same_images(found.mapping, expected.mapping, atol=atol)
+    assert_same_images(found.query, expected.query, atol=atol)
+    assert (found.query_gt is None) == (expected.query_gt is None)
+    if found.query_gt is not None and expected.query_gt is not None:
+        assert_same_images(found.query_gt, expected.query_gt, atol=atol)
+    for table in ("groups", "priors", "protocol", "world", "names"):
+        assert getattr(found, table) == getattr(expected, table), table
+    assert list(found.names) == list(expected.names)
+    assert list(map(str, found.summary)) == list(map(str, expected.summary))
+
+
+def assert_linked(dataset: OfficialDataset, output: Path, images: Path) -> None:
+    """What is written has links to the dataset's images, each in its own part, and no others."""
+    write_official(dataset, output)
+    for part in ("mapping", "query"):
+        folder = KaptureFolder(output / part)
+        records = folder.root / "sensors" / "records_data"
+        names = folder.read().image_names()
+        files = [path for path in records.rglob("*") if not path.is_dir()]
+        assert sorted(str(path.relative_to(records)) for path in files) == names
+        assert all((records / name).samefile(images / name) for name in names)

@@ -18,11 +18,9 @@ pytestmark = pytest.mark.slow
 def read_pose_file(path: Path) -> dict[str, np.ndarray]:
     """``name qw qx qy qz tx ty tz`` per line; quaternions with w not negative."""
     poses = {}
-    for line in path.read_text().splitlines():
-        name, *numbers = line.split()
-        pose = np.array(numbers, dtype=np.float64)
-        pose[:4] *= math.copysign(1.0, pose[0])
-        poses[name] = pose
+    for name, *numbers in map(str.split, path.read_text().splitlines()):
+        poses[name] = np.array(numbers, dtype=np.float64)
+        poses[name][:4] *= math.copysign(1.0, poses[name][0])
     return poses
 
 
@@ -44,11 +42,8 @@ def test_its_colmap_export_reads_our_map(fountain_workspace: Path, tmp_path: Pat
     kapture_tool(
         "kapture_export_colmap", "-i", ours, "-db", database, "-txt", model, "-kpt", "rootsift"
     )
-    rows = [
-        line.split()
-        for line in (model / "points3D.txt").read_text().splitlines()
-        if not line.startswith("#")
-    ]
+    lines = (model / "points3D.txt").read_text().splitlines()
+    rows = [line.split() for line in lines if not line.startswith("#")]
     points = KaptureFolder(ours).points3d()
     assert len(rows) == len(points) > 500
     exported = np.array([row[1:4] for row in rows], dtype=np.float64)

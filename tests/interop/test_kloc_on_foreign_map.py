@@ -1,4 +1,4 @@
-"""kapture-localization's tools through our adapter, on data that they made themselves."""
+"""kapture-localization's tools through our adapter, on data that they made, and ours on it."""
 
 from __future__ import annotations
 
@@ -7,10 +7,17 @@ from pathlib import Path
 import pytest
 from kloc import kloc, merged, needs_kapture_localization, pose_errors
 
-pytestmark = pytest.mark.slow
+from megloc_kapture.io.kapture import KaptureFolder, read_pairs
+from megloc_kapture.io.kapture.vectors import KaptureVectors
+from megloc_kapture.retrieval.search import rank_by_similarity
+from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
+from megloc_kapture.stages.image_pairs import pair_queries
+
+pytestmark = [needs_kapture_localization, pytest.mark.slow]
+
+TYPE = "AP-GeM-LM18"
 
 
-@needs_kapture_localization
 def test_kapture_localization_localizes_in_its_own_map(shared_data: Path, tmp_path: Path) -> None:
     scene = shared_data / "foreign_maps" / "virtual_gallery"
     pairs, result = tmp_path / "pairs.txt", tmp_path / "localized"
@@ -27,3 +34,28 @@ def test_kapture_localization_localizes_in_its_own_map(shared_data: Path, tmp_pa
     assert len(errors) == 4
     # 0.023 m and 0.35 deg at worst with the environment it was written for
     assert all(metres < 0.03 and degrees < 0.5 for metres, degrees in errors.values()), errors
+
+
+@pytest.mark.parametrize("top_k", [3, 50])
+def test_ap_gem_gives_the_pairs_and_scores_of_kapture_localization(
+    shared_data: Path, tmp_path: Path, top_k: int
+) -> None:
+    scene = shared_data / "foreign_maps" / "virtual_gallery"
+    both = ["--mapping", scene / "map", "--query", scene / "query"]
+    path = tmp_path / "pairs.txt"
+    kloc("kapture_compute_image_pairs", *both, "-gfeat", TYPE, "--topk", str(top_k), "-o", path)
+    theirs = read_pairs(path)
+    mapping, query = KaptureFolder(scene / "map"), KaptureFolder(scene / "query")
+    options = QueryPairsOptions(top_k=top_k)
+    ours = pair_queries(mapping, query, options, retrieval=Retrieval((TYPE,)))
+    assert len(theirs) >= 12
+    assert [(p.query, p.map) for p in ours] == [(p.query, p.map) for p in theirs]
+    assert [p.score for p in ours] == pytest.approx([p.score for p in theirs], rel=0, abs=1e-6)
+
+    images, queries = sorted(mapping.read().poses()), query.read().image_names()
+    vectors = KaptureVectors(query.global_features(TYPE), queries).read(0, len(queries))
+    database = KaptureVectors(mapping.global_features(TYPE), images)
+    indices, scores = rank_by_similarity(vectors, database, top_k)
+    assert [images[k] for k in indices.ravel()] == [p.map for p in theirs]
+    expected = pytest.approx([p.score for p in theirs], rel=0, abs=1e-6)
+    assert scores.ravel().tolist() == expected

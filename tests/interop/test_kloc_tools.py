@@ -2,38 +2,31 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
+from contextlib import suppress
 from types import ModuleType
 
 import kloc_tools
 import numpy as np
 import pycolmap
 import pytest
+from kloc import needs_kapture_localization
 from kloc_tools import run_tool, shims, tool_scripts
 
 from megloc_kapture.errors import OptionError
 
-needs_kapture_localization = pytest.mark.skipif(
-    importlib.util.find_spec("kapture_localization") is None,
-    reason="kapture-localization is not installed",
-)
 
-
-def test_shims_add_names_and_take_them_away() -> None:
+@pytest.mark.parametrize("error", [False, True])
+def test_shims_add_names_and_take_them_away(error: bool) -> None:
     assert not hasattr(np, "float")
-    with shims(pycolmap):
+    with suppress(RuntimeError), shims(pycolmap):
         assert np.float is float
         assert callable(pycolmap.absolute_pose_estimation)
+        if error:
+            raise RuntimeError
     assert not hasattr(np, "float")
     assert not hasattr(pycolmap, "absolute_pose_estimation")
-
-
-def test_shims_are_taken_away_after_an_error() -> None:
-    with pytest.raises(RuntimeError), shims(pycolmap):
-        raise RuntimeError
-    assert not hasattr(np, "float")
 
 
 def test_shims_leave_an_old_pycolmap_alone() -> None:
@@ -69,10 +62,6 @@ def test_tools_are_found_where_pip_put_them() -> None:
     scripts = tool_scripts()
     assert scripts["kapture_compute_matches"].is_file()
     assert scripts["kapture_pycolmap_localize"].suffix == ".py"
-
-
-@needs_kapture_localization
-def test_unknown_tool_is_refused_with_the_known_ones() -> None:
     with pytest.raises(OptionError, match="no tool 'kapture_nothing'.*kapture_compute_matches"):
         run_tool("kapture_nothing", [], pycolmap)
 

@@ -45,11 +45,6 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return checkpoint(tmp_path_factory.mktemp("weights") / "mobilenet.pth")
 
 
-@pytest.fixture(scope="module")
-def photograph() -> np.ndarray:
-    return smooth_noise()
-
-
 def deeplab(weights: Path, **options: object) -> DeepLab:
     return DeepLab(DeepLabOptions(weights=str(weights), device="cpu", **options))
 
@@ -67,15 +62,18 @@ def test_labels_are_the_published_networks_at_the_images_size(tmp_path: Path) ->
     assert (labels != reference["mobilenet/classes"]).mean() < 1e-3  # but for ties
 
 
-def test_the_backbone_is_read_from_the_checkpoint(tmp_path: Path, photograph: np.ndarray) -> None:
+def test_the_backbone_is_read_from_the_checkpoint(tmp_path: Path) -> None:
     resnet = checkpoint(tmp_path / "any-name.pth", "resnet101")
-    labels = deeplab(resnet).segment(photograph[:64, :80])
+    labels = deeplab(resnet).segment(smooth_noise()[:64, :80])
     assert labels.shape == (64, 80) and labels.max() < 19
+    path = tmp_path / "other.pth"
+    torch.save({"model_state": {"conv1a.weight": torch.zeros(64, 1, 3, 3)}}, path)
+    with pytest.raises(DataError, match=r"other\.pth: no DeepLabV3\+"):
+        deeplab(path).segment(smooth_noise())
 
 
-def test_a_larger_image_is_made_smaller_and_its_labels_are_not(
-    weights: Path, photograph: np.ndarray
-) -> None:
+def test_a_larger_image_is_made_smaller_and_its_labels_are_not(weights: Path) -> None:
+    photograph = smooth_noise()
     large = cv2.resize(photograph, (342, 246), interpolation=cv2.INTER_NEAREST)
     labels = deeplab(weights, max_size_px=171).segment(large)
     assert labels.shape == (246, 342)
@@ -96,19 +94,10 @@ def test_people_and_vehicles_move() -> None:
     }
 
 
-def test_it_travels_light_and_names_its_weights(weights: Path, photograph: np.ndarray) -> None:
-    segmenter = deeplab(weights)
-    expected = segmenter.segment(photograph)
+def test_it_travels_light_and_names_its_weights(weights: Path) -> None:
+    segmenter, image = deeplab(weights), smooth_noise()
     packed = pickle.dumps(segmenter)
     assert len(packed) < 10_000
-    assert np.array_equal(pickle.loads(packed).segment(photograph), expected)
-    assert segmenter.weights() == {
-        "mobilenet.pth": hashlib.sha256(weights.read_bytes()).hexdigest()
-    }
-
-
-def test_a_checkpoint_of_something_else_is_refused(tmp_path: Path, photograph: np.ndarray) -> None:
-    path = tmp_path / "other.pth"
-    torch.save({"model_state": {"conv1a.weight": torch.zeros(64, 1, 3, 3)}}, path)
-    with pytest.raises(DataError, match=r"other\.pth: no DeepLabV3\+"):
-        deeplab(path).segment(photograph)
+    assert np.array_equal(pickle.loads(packed).segment(image), segmenter.segment(image))
+    checksum = hashlib.sha256(weights.read_bytes()).hexdigest()
+    assert segmenter.weights() == {"mobilenet.pth": checksum}

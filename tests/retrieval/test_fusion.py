@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections import defaultdict
-from collections.abc import Callable
+from functools import partial
 from itertools import combinations
 from typing import Any
 
@@ -25,7 +25,7 @@ from megloc_kapture.retrieval.fusion import (
     fuse_rankings,
     greedy_coverage,
 )
-from megloc_kapture.retrieval.search import Found, FusedSearch, rank_by_similarity
+from megloc_kapture.retrieval.search import FusedSearch, rank_by_similarity
 from megloc_kapture.retrieval.vectors import ConcatenatedBlocks
 
 needs_kapture_localization = pytest.mark.skipif(
@@ -33,14 +33,6 @@ needs_kapture_localization = pytest.mark.skipif(
     reason="kapture-localization is not installed (make test installs it)",
 )
 Matrices = list[NDArray[np.float64]]
-
-
-def rank_fused(
-    queries: Any, database: Any, top_k: int, *, fusion: FusionOptions, weights: Any = None,
-    permitted: Any = None,
-) -> Found:  # fmt: skip
-    search = FusedSearch(top_k, fusion, weights)
-    return search.ranking([search.lists(queries, database, permitted)])
 
 
 def theirs(matrices: Matrices, method: str, **parameters: Any) -> NDArray[np.float64]:
@@ -62,27 +54,25 @@ def random_similarities(
 
 # ours, theirs, its parameters beside the weights, and the least similarity it is right for
 OPERATORS: list[tuple[FusionOptions, str, dict[str, Any], float]] = [
-    (FusionOptions(method="mean"), "mean", {}, -1.0),
-    (FusionOptions(method="power"), "power", {}, 0.0),
-    (FusionOptions(method="maximum"), "maximum", {}, -1.0),
-    (FusionOptions(method="minimum"), "minimum", {}, -1.0),
-    (FusionOptions(method="mean_and_power"), "mean_and_power", {"gamma": 0.5}, 0.0),
-    (FusionOptions(method="mean_and_power", gamma=0.2), "mean_and_power", {"gamma": 0.2}, 0.0),
-    (FusionOptions(method="min_and_max"), "min_and_max", {"min_weight": 2, "max_weight": 2}, -1.0),
-    (
-        FusionOptions(method="min_and_max", alpha=0.75),
-        "min_and_max",
-        {"min_weight": 3, "max_weight": 1},
-        -1.0,
-    ),
-    (FusionOptions(method="villena_roman"), "villena_roman", {"alpha": 0.5}, 0.01),
-    (FusionOptions(method="villena_roman", alpha=0.9), "villena_roman", {"alpha": 0.9}, 0.01),
-    (FusionOptions(method="mean_and_min"), "mean_and_min", {"gamma": 0.5}, -1.0),
-    (FusionOptions(method="mean_and_min", gamma=0.8), "mean_and_min", {"gamma": 0.8}, -1.0),
-    (FusionOptions(method="harmonic_mean"), "harmonic_mean", {}, 0.01),
-    (FusionOptions(method="ghm"), "generalized_harmonic_mean", {"gamma": 0.5}, -0.45),
-    (FusionOptions(method="ghm", gamma=2.0), "generalized_harmonic_mean", {"gamma": 2.0}, -1.0),
-    (FusionOptions(method="ghm", gamma=0.0), "generalized_harmonic_mean", {"gamma": 0.0}, 0.01),
+    (FusionOptions(method=ours, **given), theirs or ours, parameters, least)
+    for ours, given, theirs, parameters, least in (
+        ("mean", {}, "", {}, -1.0),
+        ("power", {}, "", {}, 0.0),
+        ("maximum", {}, "", {}, -1.0),
+        ("minimum", {}, "", {}, -1.0),
+        ("mean_and_power", {}, "", {"gamma": 0.5}, 0.0),
+        ("mean_and_power", {"gamma": 0.2}, "", {"gamma": 0.2}, 0.0),
+        ("min_and_max", {}, "", {"min_weight": 2, "max_weight": 2}, -1.0),
+        ("min_and_max", {"alpha": 0.75}, "", {"min_weight": 3, "max_weight": 1}, -1.0),
+        ("villena_roman", {}, "", {"alpha": 0.5}, 0.01),
+        ("villena_roman", {"alpha": 0.9}, "", {"alpha": 0.9}, 0.01),
+        ("mean_and_min", {}, "", {"gamma": 0.5}, -1.0),
+        ("mean_and_min", {"gamma": 0.8}, "", {"gamma": 0.8}, -1.0),
+        ("harmonic_mean", {}, "", {}, 0.01),
+        ("ghm", {}, "generalized_harmonic_mean", {"gamma": 0.5}, -0.45),
+        ("ghm", {"gamma": 2.0}, "generalized_harmonic_mean", {"gamma": 2.0}, -1.0),
+        ("ghm", {"gamma": 0.0}, "generalized_harmonic_mean", {"gamma": 0.0}, 0.01),
+    )
 ]
 
 
@@ -111,59 +101,35 @@ def test_the_default_is_the_generalized_harmonic_mean() -> None:
     np.testing.assert_allclose(fuse([a, b], FusionOptions(), [3, 1]), expected, rtol=1e-12)
 
 
-# ---------------------------------------------------------------------------- the listed quirks
-
-
 @needs_kapture_localization
-def test_power_of_a_negative_similarity_is_zero_not_nan() -> None:
-    matrices = [np.array([[-0.1, 0.5]]), np.array([[0.4, 0.5]])]
-    assert np.isnan(theirs(matrices, "power", weights=None)[0, 0])
-    fused = fuse(matrices, FusionOptions(method="power"))
-    np.testing.assert_allclose(fused, [[0, 0.5]])
-    both = fuse(matrices, FusionOptions(method="mean_and_power", gamma=0.5))
-    np.testing.assert_allclose(both, [[0.5 * 0.15, 0.5]])
-
-
-@needs_kapture_localization
-def test_harmonic_means_have_no_pole() -> None:
-    matrices = [np.array([[-0.30, -0.3001, 0.3, 0.0]]), np.array([[0.30, 0.3000, 0.3, 0.3]])]
-    # reciprocals of opposite signs cancel: theirs is far beyond any similarity
-    assert abs(theirs(matrices, "harmonic_mean", weights=None)[0, 1]) > 100
-    fused = fuse(matrices, FusionOptions(method="harmonic_mean"))
-    np.testing.assert_allclose(fused, [[0, 0, 0.15, 0]])
+@pytest.mark.parametrize(
+    ("method", "first", "second", "expected"),
+    [
+        ("power", [-0.1, 0.5], [0.4, 0.5], [0, 0.5]),
+        # reciprocals of opposite signs cancel
+        ("harmonic_mean", [-0.3, -0.3001, 0.3, 0], [0.3, 0.3, 0.3, 0.3], [0, 0, 0.15, 0]),
+        ("villena_roman", [-0.3, 0, -0.5], [0.3001, 0, -0.2], [0.15005, 0, 0]),
+    ],
+)
+def test_where_theirs_is_no_number_or_no_similarity(
+    method: Any, first: list[float], second: list[float], expected: list[float]
+) -> None:
+    matrices = [np.array([first]), np.array([second])]
+    parameters = {"alpha": 0.5} if method == "villena_roman" else {"weights": None}
+    assert not np.abs(theirs(matrices, method, **parameters)).max() < 100
+    np.testing.assert_allclose(fuse(matrices, FusionOptions(method=method)), [expected])
 
 
 @needs_kapture_localization
 def test_the_generalized_harmonic_mean_ends_at_minus_gamma() -> None:
-    options = FusionOptions(method="ghm", gamma=0.2)
-    first = np.array([[-1.0, -0.41, -0.4, -0.3999]])
-    matrices = [first, np.full((1, 4), 0.5)]
+    matrices = [np.array([[-1.0, -0.41, -0.4, -0.3999]]), np.full((1, 4), 0.5)]
     expected = theirs(matrices, "generalized_harmonic_mean", weights=None, gamma=0.2)
     assert expected[0, 1] < -0.2  # below the pole theirs falls as similarity grows
-    fused = fuse(matrices, options)
+    fused = fuse(matrices, FusionOptions(method="ghm", gamma=0.2))
     np.testing.assert_allclose(fused[0, :3], -0.2, atol=1e-12)
     np.testing.assert_allclose(fused[0, 3], expected[0, 3], atol=1e-9)
     # and it is continuous there
     assert -0.2 < fused[0, 3] < -0.1995
-
-
-@needs_kapture_localization
-def test_villena_roman_follows_the_code_not_the_help() -> None:
-    least, largest = np.array([[0.2]]), np.array([[0.6]])
-    options = FusionOptions(method="villena_roman", alpha=0.25)
-    joint = 0.2**2 / (0.2 + 0.6)
-    fused = fuse([least, largest], options)
-    np.testing.assert_allclose(fused, 0.75 * 0.6 + 0.25 * joint)
-    np.testing.assert_allclose(fused, theirs([least, largest], "villena_roman", alpha=0.25))
-    assert abs(float(fused[0, 0]) - (0.75 * 0.2 + 0.25 * joint)) > 0.1  # what the help says
-
-
-@needs_kapture_localization
-def test_villena_roman_has_no_pole() -> None:
-    matrices = [np.array([[-0.3, 0.0, -0.5]]), np.array([[0.3001, 0.0, -0.2]])]
-    assert not np.abs(theirs(matrices, "villena_roman", alpha=0.5)).max() < 100
-    fused = fuse(matrices, FusionOptions(method="villena_roman"))
-    np.testing.assert_allclose(fused, [[0.15005, 0, 0]])
 
 
 @needs_kapture_localization
@@ -189,25 +155,11 @@ def test_round_robin_is_kapture_localization_s(top_k: int) -> None:
     assert {q: images[row].tolist() for q, row in zip(queries, order, strict=True)} == expected
 
 
-@needs_kapture_localization
 def test_a_zero_descriptor_is_similar_to_nothing() -> None:
-    from kapture_localization.image_retrieval import pairing
-
-    class Config:
-        dsize, dtype = 2, np.float64
-
-    zero = np.zeros((1, 2))
-    with pytest.MonkeyPatch.context() as patch, np.errstate(invalid="ignore"):
-        patch.setattr(pairing, "image_global_features_from_file", lambda *_: zero)
-        stacked = pairing.stack_global_features(Config(), [("a", "a")])
-    assert np.isnan(stacked.stacked_features).all()
-    # with the zero row that ours has, its similarity is 0, and every operator takes it
+    # theirs divides by its length, which is none
     for options, *_ in OPERATORS:
         fused = fuse([np.array([[0.0, 0.0]]), np.array([[0.0, 0.9]])], options)
         assert np.isfinite(fused).all() and fused[0, 0] <= fused[0, 1]
-
-
-# ------------------------------------------------------------------------------- what must hold
 
 
 ALL = [options for options, *_ in OPERATORS if options.method != "villena_roman"]
@@ -227,48 +179,51 @@ def test_features_have_no_order_and_every_value_is_finite(
     seed: int, options: FusionOptions
 ) -> None:
     rng = np.random.default_rng(seed)
-    matrices = [rng.uniform(-1, 1, (2, 8)).round(1) for _ in range(3)]
+    matrices: Any = [rng.uniform(-1, 1, (2, 8)).round(1) for _ in range(3)]
     weights = rng.uniform(0.1, 3, 3).tolist()
     fused = fuse(matrices, options, weights)
     assert np.isfinite(fused).all()
     np.testing.assert_allclose(fuse(matrices[::-1], options, weights[::-1]), fused, atol=1e-12)
-
-
-@pytest.mark.parametrize("options", [options for options, *_ in OPERATORS])
-def test_float32_stays_float32_and_nothing_is_changed(options: FusionOptions) -> None:
-    matrices: Any = [matrix.astype(np.float32) for matrix in random_similarities(-1)]
-    before = [matrix.copy() for matrix in matrices]
-    assert fuse(matrices, options).dtype == np.float32
-    np.testing.assert_array_equal(matrices, before)
+    # float32 stays float32, and nothing is changed
+    single = [matrix.astype(np.float32) for matrix in matrices]
+    assert fuse(single, options).dtype == np.float32
+    np.testing.assert_array_equal(single, np.float32(matrices))
 
 
 def test_ranks_as_scores() -> None:
     a, b = np.array([[0.9, 0.5, 0.1]]), np.array([[0.2, 0.8, 0.2]])  # b ties: database order
-    order: Callable[[str], list[int]] = lambda method: np.argsort(  # noqa: E731
-        -fuse([a, b], FusionOptions.model_validate({"method": method})), kind="stable"
-    )[0].tolist()
-    assert order("round_robin") == [0, 1, 2]
+    turns = fuse([a, b], FusionOptions(method="round_robin"))
+    assert np.argsort(-turns, kind="stable").tolist() == [[0, 1, 2]]
     reciprocal = fuse([a, b], FusionOptions(method="reciprocal_rank"))
     expected = [1 / 61 + 1 / 62, 1 / 62 + 1 / 61, 1 / 63 + 1 / 63]
     np.testing.assert_allclose(reciprocal, np.array([expected]) / 2)
-    np.testing.assert_allclose(
-        fuse([a, b], FusionOptions(method="borda"), [3, 1]), [[2.75, 2.25, 1]]
-    )
-
-
-@pytest.mark.parametrize("weights", [[1.0], [1.0, 0.0], [1.0, -1.0], [1.0, np.nan], [[1.0, 1.0]]])
-def test_weights_that_cannot_be_used_are_refused(weights: Any) -> None:
-    with pytest.raises(OptionError, match="weights"):
-        fuse(random_similarities(0, 2), FusionOptions(), weights)
+    borda = fuse([a, b], FusionOptions(method="borda"), [3, 1])
+    np.testing.assert_allclose(borda, [[2.75, 2.25, 1]])
 
 
 def test_what_cannot_be_fused_is_refused() -> None:
-    with pytest.raises(OptionError, match="0 global features"):
-        fuse([], FusionOptions())
+    same, more = [np.zeros((2, 4), np.float32)] * 2, np.zeros((3, 4))
+    for weights in ([1.0], [1.0, 0.0], [1.0, -1.0], [1.0, np.nan], [[1.0, 1.0]]):
+        for weighted in (partial(fuse, same, FusionOptions()), partial(ConcatenatedBlocks, same)):
+            with pytest.raises(OptionError, match="weights"):
+                weighted(weights)
+    for function in (partial(fuse, [], FusionOptions()), partial(concatenate, [])):
+        with pytest.raises(OptionError, match="0 global features"):
+            function()
     with pytest.raises(DataError, match="different shapes"):
-        fuse([np.zeros((1, 2)), np.zeros((2, 1))], FusionOptions())
+        fuse([*same, more], FusionOptions())
+    with pytest.raises(DataError, match="2, 3 images"):
+        concatenate([same[0], more])
+    with pytest.raises(DataError, match=r"\[2, 3\] rows"):
+        ConcatenatedBlocks([same[0], more])
     with pytest.raises(ValidationError, match="gamma is a share"):
         FusionOptions(method="mean_and_min", gamma=1.5)
+    for method in ("round_robin", "borda", "reciprocal_rank"):
+        options = FusionOptions.model_validate({"method": method})
+        with pytest.raises(OptionError):
+            fuse_rankings([], 3, options)
+        with pytest.raises(DataError, match="shapes"):
+            fuse_rankings([ids(0, 1)[None], np.zeros((2, 2), np.int64)], 3, options)
 
 
 def unit(seed: int, count: int, dimension: int) -> NDArray[np.float32]:
@@ -295,26 +250,14 @@ def test_a_feature_of_zeros_takes_its_share_away() -> None:
 
 
 def test_blocks_of_several_features_rank_as_the_mean_does() -> None:
-    queries = [unit(1, 20, 16), unit(2, 20, 8)]
-    database = [unit(3, 300, 16), unit(4, 300, 8)]
+    queries, database = [unit(1, 20, 16), unit(2, 20, 8)], [unit(3, 300, 16), unit(4, 300, 8)]
     blocks = ConcatenatedBlocks(database, [2, 1])
     assert len(blocks) == 300 and blocks.dimension == 24
     early = rank_by_similarity(concatenate(queries, [2, 1]), blocks, 10)
-    mean = FusionOptions(method="mean")
-    late = rank_fused(queries, database, 10, fusion=mean, weights=[2, 1])
+    search = FusedSearch(10, FusionOptions(method="mean"), [2, 1])
+    late = search.ranking([search.lists(queries, database)])
     np.testing.assert_array_equal(early[0], late[0])
     np.testing.assert_allclose(early[1], late[1], atol=1e-6)
-
-
-def test_what_cannot_be_concatenated_is_refused() -> None:
-    with pytest.raises(DataError, match="2, 3 images"):
-        concatenate([unit(0, 2, 4), unit(0, 3, 4)])
-    with pytest.raises(DataError, match=r"\[2, 3\] rows"):
-        ConcatenatedBlocks([unit(0, 2, 4), unit(0, 3, 4)])
-    with pytest.raises(OptionError, match="weights"):
-        ConcatenatedBlocks([unit(0, 2, 4), unit(0, 2, 4)], [1.0, 0.0])
-    with pytest.raises(OptionError):
-        concatenate([])
 
 
 @st.composite
@@ -374,27 +317,12 @@ def test_points_add_up(lists: list[NDArray[np.int64]], top_k: int, reciprocal: b
 
 def test_equal_sums_keep_the_order_of_the_images() -> None:
     lists = [np.array([[5, 3, 9]]), np.array([[3, 5, 7]])]
-    for options in (FusionOptions(method="reciprocal_rank"), FusionOptions(method="borda")):
+    reciprocal = FusionOptions(method="reciprocal_rank")
+    for options in (reciprocal, FusionOptions(method="borda")):
         assert fuse_rankings(lists, 4, options)[0].tolist() == [[3, 5, 7, 9]]
-
-
-def test_the_papers_constant_is_the_default() -> None:
-    options = FusionOptions(method="reciprocal_rank")
-    _, scores = fuse_rankings([np.array([[4]]), np.array([[4]])], 1, options)
+    # the paper's constant is the default
+    _, scores = fuse_rankings([np.array([[4]]), np.array([[4]])], 1, reciprocal)
     np.testing.assert_allclose(scores, 1 / 61, rtol=1e-6)
-
-
-@pytest.mark.parametrize("method", ["round_robin", "borda", "reciprocal_rank"])
-def test_lists_that_cannot_be_fused_are_refused(method: Any) -> None:
-    one, other = np.zeros((1, 2), dtype=np.int64), np.zeros((2, 2), dtype=np.int64)
-    options = FusionOptions(method=method)
-    with pytest.raises(OptionError):
-        fuse_rankings([], 3, options)
-    with pytest.raises(DataError, match="shapes"):
-        fuse_rankings([one, other], 3, options)
-
-
-AHEAD = np.array([0.0, 0.0, 1.0])
 
 
 def ids(*values: int) -> np.ndarray:
@@ -424,51 +352,42 @@ def test_it_is_never_far_from_the_best(sets: list[set[int]], keep: int) -> None:
     assert sorted(added, reverse=True) == added
 
 
-def ahead(count: int) -> np.ndarray:
-    return np.tile(AHEAD, (count, 1))
-
-
-def test_near_duplicates_make_way_for_other_places() -> None:
-    centers = np.array([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [9, 0, 0], [9.1, 0, 0]], float)
-    options = DiversityOptions(max_per_place=2, radius=1.0)
-    found = diversify(np.arange(5), centers, ahead(5), 4, options)
-    assert found.tolist() == [0, 1, 3, 4]
-    assert diversify(np.arange(5), centers, ahead(5), 3, options).tolist() == [0, 1, 3]
-
-
-def test_what_was_passed_over_fills_the_rest() -> None:
-    centers = np.zeros((4, 3))
-    options = DiversityOptions(max_per_place=1, radius=1.0)
-    assert diversify(np.arange(4), centers, ahead(4), 3, options).tolist() == [0, 1, 2]
-
-
-def test_images_that_look_elsewhere_are_another_place() -> None:
-    directions = np.array([AHEAD, AHEAD, [1.0, 0.0, 0.0]])
-    options = DiversityOptions(max_per_place=1, radius=1.0, angle_deg=45)
-    found = diversify(np.array([0, 1, 2]), np.zeros((3, 3)), directions, 2, options)
-    assert found.tolist() == [0, 2]
+@pytest.mark.parametrize(
+    ("places", "turned", "most", "top_k", "expected"),
+    [
+        ([0, 0.1, 0.2, 9, 9.1], [], 2, 4, [0, 1, 3, 4]),
+        ([0, 0.1, 0.2, 9, 9.1], [], 2, 3, [0, 1, 3]),
+        ([0, 0, 0, 0], [], 1, 3, [0, 1, 2]),  # what was passed over fills the rest
+        ([0, 0, 0], [2], 1, 2, [0, 2]),  # who looks elsewhere is in another place
+    ],
+)
+def test_near_duplicates_make_way_for_other_places(
+    places: list[float], turned: list[int], most: int, top_k: int, expected: list[int]
+) -> None:
+    centers = np.multiply.outer(places, [1.0, 0.0, 0.0])
+    directions = np.tile([0.0, 0.0, 1.0], (len(places), 1))
+    directions[turned] = [1.0, 0.0, 0.0]
+    options = DiversityOptions(max_per_place=most, radius=1.0, angle_deg=45)
+    found = diversify(np.arange(len(places)), centers, directions, top_k, options)
+    assert found.tolist() == expected
 
 
 @settings(deadline=None, max_examples=50)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 12), st.integers(1, 3), st.floats(0.1, 3))
-def test_against_its_definition(seed: int, top_k: int, most: int, radius: float) -> None:
+def test_diversity_against_its_definition(seed: int, top_k: int, most: int, radius: float) -> None:
     rng = np.random.default_rng(seed)
     count = int(rng.integers(1, 15))
-    centers = rng.uniform(0, 4, (count, 3))
+    centers, ranking = rng.uniform(0, 4, (count, 3)), rng.permutation(count)
     directions = rng.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    ranking = rng.permutation(count)
     options = DiversityOptions(max_per_place=most, radius=radius, angle_deg=60)
     found = diversify(ranking, centers, directions, top_k, options).tolist()
-
-    def near(a: int, b: int) -> bool:
-        angle = np.rad2deg(np.arccos(np.clip(directions[a] @ directions[b], -1, 1)))
-        return bool(np.linalg.norm(centers[a] - centers[b]) <= radius and angle <= 60)
-
+    distances = np.linalg.norm(centers[ranking, None] - centers[ranking], axis=2)
+    angles = np.rad2deg(np.arccos(np.clip(directions @ directions.T, -1, 1)))
+    near = (distances <= radius) & (angles[np.ix_(ranking, ranking)] <= 60)
     kept: list[int] = []
     for position in range(count):
-        others = [k for k in kept if near(ranking[k], ranking[position])]
-        if len(kept) < top_k and len(others) < most:
+        if len(kept) < top_k and near[position, kept].sum() < most:
             kept.append(position)
     rest = [position for position in range(count) if position not in kept]
     assert found == (kept + rest)[:top_k]

@@ -58,13 +58,8 @@ def problems(draw: st.DrawFn) -> tuple[NDArray[np.float64], NDArray[np.float64],
     size = draw(st.integers(1, 3))
     queries = rng.integers(-2, 3, (draw(st.integers(1, 12)), size)).astype(np.float64)
     database = rng.integers(-2, 3, (draw(st.integers(1, 40)), size)).astype(np.float64)
-    return (
-        queries,
-        database,
-        draw(st.integers(1, 45)),
-        draw(st.integers(1, 60)),
-        draw(st.booleans()),
-    )
+    top_k, block = draw(st.integers(1, 45)), draw(st.integers(1, 60))
+    return queries, database, top_k, block, draw(st.booleans())
 
 
 @given(problems())
@@ -86,39 +81,28 @@ def test_equal_to_a_full_stable_sort_whatever_the_blocks(
     assert indices.dtype == np.int64 and scores.dtype == np.float32
 
 
-def test_more_queries_than_one_block() -> None:
-    rng = np.random.default_rng(0)
-    queries, database = rng.integers(-3, 4, (600, 4)), rng.integers(-3, 4, (50, 4))
-    indices, scores = rank_by_similarity(queries.astype(float), database.astype(float), 7)
-    expected = np.argsort(-(queries @ database.T), axis=1, kind="stable")[:, :7]
-    np.testing.assert_array_equal(indices, expected)
-    np.testing.assert_array_equal(
-        scores, np.take_along_axis(queries @ database.T, expected, axis=1)
-    )
-
-
 def test_real_vectors_agree_with_the_full_sort() -> None:
     rng = np.random.default_rng(1)
-    queries, database = rng.normal(size=(20, 64)), rng.normal(size=(300, 64))
+    queries, database = rng.normal(size=(600, 64)), rng.normal(size=(300, 64))
     indices, scores = rank_by_similarity(queries, database, 10)
     products = queries @ database.T
-    np.testing.assert_array_equal(indices, np.argsort(-products, axis=1)[:, :10])
-    np.testing.assert_allclose(scores, -np.sort(-products, axis=1)[:, :10], rtol=1e-4, atol=1e-4)
+    order = np.argsort(-products, axis=1)[:, :10]
+    best = np.take_along_axis(products, order, axis=1)
+    np.testing.assert_allclose(scores, best, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(np.take_along_axis(products, indices, axis=1), best, atol=1e-4)
+    # one feature is not fused
+    for found, same in zip(
+        rank_fused([queries], [database], 10, fusion=FusionOptions()),
+        (indices, scores),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(found, same)
 
 
-def test_rows_that_are_not_permitted_never_appear() -> None:
-    database = np.array([[3.0], [2.0], [1.0]])
-    permitted = np.array([[False, True, True], [False, False, False]])
-    indices, scores = rank_by_similarity(np.ones((2, 1)), database, 3, permitted=permitted)
-    assert indices.tolist() == [[1, 2, -1], [-1, -1, -1]]
-    assert scores.tolist() == [[2.0, 1.0, -np.inf], [-np.inf] * 3]
-
-
-def test_nothing_to_search() -> None:
-    indices, scores = rank_by_similarity(np.zeros((2, 4)), np.zeros((0, 4)), 5)
-    assert indices.shape == (2, 0) and scores.shape == (2, 0)
-    indices, scores = rank_by_similarity(np.zeros((0, 4)), np.zeros((3, 4)), 5)
-    assert indices.shape == (0, 3) and scores.shape == (0, 3)
+@pytest.mark.parametrize(("queries", "rows"), [(2, 0), (0, 3)])
+def test_nothing_to_search(queries: int, rows: int) -> None:
+    indices, scores = rank_by_similarity(np.zeros((queries, 4)), np.zeros((rows, 4)), 5)
+    assert indices.shape == scores.shape == (queries, rows)
 
 
 class Blocks:
@@ -162,18 +146,10 @@ def test_permission_may_come_block_by_block() -> None:
     expected = rank_by_similarity(queries, database, 20, permitted=permitted)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(search, "_MOST_ROWS", 16)
-        found = rank_by_similarity(
-            queries, database, 20, permitted=lambda start, stop: permitted[:, start:stop]
-        )
-    np.testing.assert_array_equal(found[0], expected[0])
-    np.testing.assert_allclose(found[1], expected[1], rtol=1e-6)
-
-
-def test_a_zero_row_is_similar_to_nothing() -> None:
-    database = np.array([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
-    indices, scores = rank_by_similarity(np.array([[1.0, 0.0], [0.0, 0.0]]), database, 3)
-    assert indices.tolist() == [[2, 1, 0], [0, 1, 2]]
-    assert scores.tolist() == [[1, 0, -1], [0, 0, 0]]
+        for given_so in (permitted, lambda start, stop: permitted[:, start:stop]):
+            found = rank_by_similarity(queries, database, 20, permitted=given_so)
+            np.testing.assert_array_equal(found[0], expected[0])
+            np.testing.assert_allclose(found[1], expected[1], rtol=1e-6)
 
 
 METHODS = [
@@ -216,16 +192,6 @@ def test_fused_ranking_is_that_of_the_whole_matrices(method: str, masked: bool) 
             assert indices[row].tolist() == expected.tolist()
 
 
-def test_one_feature_is_not_fused() -> None:
-    rng = np.random.default_rng(5)
-    queries, database = rng.normal(size=(5, 4)), rng.normal(size=(40, 4))
-    expected = rank_by_similarity(queries, database, 6)
-    for found, same in zip(
-        rank_fused([queries], [database], 6, fusion=FusionOptions()), expected, strict=True
-    ):
-        np.testing.assert_array_equal(found, same)
-
-
 def test_features_that_do_not_fit_are_refused() -> None:
     one, more = np.zeros((2, 4)), np.zeros((3, 4))
     for queries, database, match in [
@@ -240,21 +206,20 @@ def test_features_that_do_not_fit_are_refused() -> None:
         rank_fused([one, one], [one, one], 1, fusion=FusionOptions(), weights=[1.0, 0.0])
 
 
-def test_different_dimensions_are_refused() -> None:
-    with pytest.raises(DataError, match="different dimensions"):
-        rank_by_similarity(np.zeros((2, 4)), np.zeros((3, 5)), 1)
-    with pytest.raises(DataError, match="different dimensions"):
-        rank_by_similarity(np.zeros(4), np.zeros((3, 4)), 1)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_values_that_are_not_finite_are_refused(value: float) -> None:
-    bad = np.zeros((3, 4))
-    bad[1, 2] = value
-    with pytest.raises(DataError, match="not finite"):
-        rank_by_similarity(bad, np.zeros((3, 4)), 1)
-    with pytest.raises(DataError, match="not finite"):
-        rank_by_similarity(np.zeros((3, 4)), bad, 1)
+@pytest.mark.parametrize(
+    ("queries", "database", "match"),
+    [
+        (np.zeros((2, 4)), np.zeros((3, 5)), "different dimensions"),
+        (np.zeros(4), np.zeros((3, 4)), "different dimensions"),
+        (np.full((2, 4), np.nan), np.zeros((3, 4)), "not finite"),
+        (np.full((2, 4), np.inf), np.zeros((3, 4)), "not finite"),
+        (np.zeros((2, 4)), np.diag([0, np.nan, 0, 0]), "not finite, the first in row 1"),
+        (np.zeros((2, 4)), np.diag([0, 0, np.inf, 0]), "not finite, the first in row 2"),
+    ],
+)
+def test_descriptors_that_are_none_are_refused(queries: Any, database: Any, match: str) -> None:
+    with pytest.raises(DataError, match=match):
+        rank_by_similarity(queries, database, 1)
 
 
 @given(
@@ -288,14 +253,6 @@ def test_equal_to_a_stable_sort(
     there = np.full((queries, top_k), -1)
     there[:, : order.shape[1]] = order
     np.testing.assert_array_equal(indices, np.where(expected == -np.inf, -1, there))
-
-
-def test_queries_come_in_parts() -> None:
-    scores = np.random.default_rng(0).normal(size=(6, 50)).astype(np.float32)
-    best = BestRows(6, 3)
-    best.add(4, 10, scores[4:])
-    best.add(0, 10, scores[:4])
-    np.testing.assert_array_equal(best.result()[0], np.argsort(-scores, axis=1)[:, :3] + 10)
 
 
 TOP = 10

@@ -3,74 +3,34 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-import kapture
 import numpy as np
 import pytest
-from kapture.io.csv import kapture_from_dir, kapture_to_dir
-from kapture_forms import aachen_with_kapture
+from aachen_files import MODEL, write_v1_0, write_v1_1
+from kapture import flatten
+from kapture.io.csv import kapture_from_dir
+from kapture_forms import (
+    aachen_with_kapture,
+    assert_linked,
+    assert_same_dataset,
+    without_images,
+)
 from kloc import kapture_tool
+from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.datasets import choose_dataset
-
-import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
 PARTS = ("query_day", "query_night")
 
 
-# shared cameras, ids without order, decimals that need all digits
-CAMERAS = """9 SIMPLE_RADIAL 8 6 12.1 4.25 3 -0.0353019
-2 SIMPLE_RADIAL 6 8 11 3 4 0.123456789012345
-"""
-IMAGES = """4 0.5 -0.5 0.5 0.5 -652.833568325199 84.70595670766824 5.1 9 db/7.jpg
-
-30 0.0 0.6 0.0 0.8 1.3 2.1 -3.7 2 db/3.jpg
-
-11 1 0 0 0 0.1 0.2 0.3 9 sequences/nexus4_sequences/sequence_1/b.jpg
-
-10 1 0 0 0 0 0 2 9 sequences/gopro3_undistorted/a.jpg
-
-"""
-DAY = (
-    "query/day/nexus4/IMG_2.jpg",
-    "query/day/milestone/m_1.jpg",
-    "query/day/nexus4/IMG_1.jpg",
-)
-NIGHT = (
-    "query/night/nexus5x_additional_night/IMG_8.jpg",
-    "query/night/nexus5x/IMG_9.jpg",
-    "query/night/nexus5x_additional_night/IMG_7.jpg",
-    "query/night/nexus5x/IMG_5.jpg",
-)
-
-
 @pytest.fixture(scope="module")
 def official(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("official") / "Aachen"
-    model = root / "3D-models" / "aachen_v_1_1"
-    for folder in (model, root / "queries", root / "text"):
-        folder.mkdir(parents=True)
-    for name, text in (("cameras", CAMERAS), ("images", IMAGES), ("points3D", "")):
-        (root / "text" / f"{name}.txt").write_text(text)
-    pycolmap.Reconstruction(root / "text").write_binary(model)
-    for when, names in (("day", DAY), ("night", NIGHT)):
-        lines = (
-            f"{name} SIMPLE_RADIAL 8 6 7.{number} 4 3 -0.0353019"
-            for number, name in enumerate(names)
-        )
-        (root / f"queries/{when}_time_queries_with_intrinsics.txt").write_text("\n".join(lines))
-    mapped = [line.split()[-1] for line in IMAGES.splitlines() if line]
-    for name in (*mapped, *DAY, *NIGHT):
-        shape = (8, 6, 3) if name == "db/3.jpg" else (6, 8, 3)
-        write_image(root / "images_upright" / name, np.full(shape, 99, np.uint8))
-    return root
+    return write_v1_1(write_v1_0(tmp_path_factory.mktemp("official") / "Aachen"))
 
 
 @pytest.fixture(scope="module")
@@ -79,90 +39,54 @@ def downloaded(official: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     return aachen_with_kapture(official, tmp_path_factory.mktemp("kapture") / "Aachen-Day-Night")
 
 
-@pytest.fixture
-def root(downloaded: Path, tmp_path: Path) -> Path:
-    """A copy to be changed."""
-    return Path(shutil.copytree(downloaded, tmp_path / "root", symlinks=True))
-
-
 def read(root: Path, **options: object) -> OfficialDataset:
     return Aachen(AachenOptions(**options)).read(root)  # type: ignore[arg-type]
 
 
-def views(dataset: OfficialDataset) -> Iterator[tuple[str, object]]:
-    """What an image is, by its name; ids of sensors are each form's own."""
-    for data in (dataset.mapping, dataset.query):
-        for name in data.records_camera.values():
-            camera = data.camera_of(name)
-            yield name, (camera, data.cam_from_world(name), dataset.groups.get(name))
-
-
-def assert_same(found: OfficialDataset, expected: OfficialDataset) -> None:
-    assert list(views(found)) == list(views(expected))  # in the same order, to the last bit
-    assert found.names == expected.names and list(found.names) == list(expected.names)
-    assert found.protocol == expected.protocol
-    assert (found.priors, found.world) == (expected.priors, expected.world)
-    assert [str(count) for count in found.summary] == [str(count) for count in expected.summary]
-
-
-def test_the_same_dataset_in_both_forms(official: Path, downloaded: Path) -> None:
-    expected = read(official)
-    assert len(expected.names) == 7 and expected.protocol.pose_file_stem == "Aachen_v1_1"
-    assert_same(read(downloaded), expected)
+def test_the_same_dataset_in_both_forms(official: Path, downloaded: Path, tmp_path: Path) -> None:
+    expected, found = read(official), read(downloaded)
+    assert len(expected.names) == 5 and expected.protocol.pose_file_stem == "Aachen_v1_1"
+    assert_same_dataset(found, expected)
+    assert_linked(found, tmp_path / "out", official / "images_upright")
+    assert kapture_from_dir(str(tmp_path / "out" / "query")).trajectories is None
 
 
 def test_rows_of_tables_have_no_order(official: Path, root: Path) -> None:
     for table in root.glob("*/sensors/*.txt"):
         lines = table.read_text().splitlines()
         table.write_text("\n".join([*lines[:2], *reversed(lines[2:])]) + "\n")
-    assert_same(read(root), read(official))
+    assert_same_dataset(read(root), read(official))
 
 
 def test_queries_that_kapture_merged(official: Path, downloaded: Path, root: Path) -> None:
     parts = [downloaded / part for part in PARTS]
     images = ["--image_transfer", "link_absolute"]
     kapture_tool("kapture_merge", "-i", *parts, "-o", root / "query", *images)
-    assert_same(read(root), read(official))  # as kapture's scripts leave it
+    assert_same_dataset(read(root), read(official))  # as kapture's scripts leave it
     for part in PARTS:
         shutil.rmtree(root / part)
-    assert_same(read(root), read(official))
+    assert_same_dataset(read(root), read(official))
 
 
-def test_kapture_folders_in_a_folder_of_their_own(official: Path, downloaded: Path) -> None:
-    place = downloaded.parent / "aachenv11"
-    if not place.exists():
-        place.mkdir()
-        (place / "kapture").symlink_to(downloaded)
-    assert_same(read(place), read(official))
-
-
-def test_the_official_files_come_first(official: Path, root: Path, tmp_path: Path) -> None:
-    both = Path(shutil.copytree(official, tmp_path / "both"))
-    (both / "kapture").symlink_to(root)
-    assert read(both).links == {"": both / "images_upright"}
-
-
-def test_what_is_written(downloaded: Path, official: Path, tmp_path: Path) -> None:
-    write_official(read(downloaded), tmp_path / "out")
-    for part in ("mapping", "query"):
-        folder = KaptureFolder(tmp_path / "out" / part)
-        for name in folder.read().image_names():
-            link = folder.image_path(name)
-            assert link.is_symlink()
-            assert link.samefile(official / "images_upright" / name)
-        assert not (folder.root / "sensors/records_data/db").exists() or part == "mapping"
-    found = kapture_from_dir(str(tmp_path / "out" / "query"))
-    assert found.trajectories is None
+def test_kapture_folders_in_a_folder_of_their_own(
+    official: Path, downloaded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "Aachen-Day-Night-v1.1"  # what kapture unpacks to
+    place.mkdir()
+    (place / "kapture").symlink_to(downloaded)
+    assert_same_dataset(read(place), read(official))
+    monkeypatch.setenv("MEGLOC_DATA", str(tmp_path))
+    choice = choose_dataset("aachen", None)
+    choice.check()
+    assert choice.root == place
+    # the official files come first
+    shutil.copytree(official, place, dirs_exist_ok=True)
+    assert read(place).links == {"": place / "images_upright"}
 
 
 def test_the_pose_file_of_v1_0(downloaded: Path, root: Path) -> None:
     for part, gone in (("mapping", "sequences/"), ("query_night", "_additional_night/")):
-        data = kapture_from_dir(str(root / part))
-        for time, sensor, name in list(kapture.flatten(data.records_camera)):
-            if gone in name:
-                del data.records_camera[time][sensor]
-        shutil.rmtree(root / part / "sensors" / "records_data" / gone, ignore_errors=True)
-        kapture_to_dir(str(root / part), data)
+        without_images(root / part, gone)
     assert read(root).protocol.pose_file_stem == "Aachen"
     # the added queries alone are v1.1's, and so is the folder's name
     shutil.rmtree(root / "query_night")
@@ -174,32 +98,26 @@ def test_the_pose_file_of_v1_0(downloaded: Path, root: Path) -> None:
     assert read(named).protocol.pose_file_stem == "Aachen_v1_1"
 
 
-def test_v1_1_is_not_taken_for_v1_0(downloaded: Path) -> None:
+def test_what_kapture_folders_do_not_have(downloaded: Path) -> None:
     with pytest.raises(OptionError, match=r"is v1\.1, whose poses are others"):
         read(downloaded, version="1.0")
-
-
-def test_its_own_model_is_not_there(downloaded: Path) -> None:
     with pytest.raises(OptionError, match="kapture folders"):
         Aachen(AachenOptions(reference_model=True)).check(downloaded)
 
 
-def test_a_download_without_the_night(root: Path, tmp_path: Path) -> None:
+def test_a_partial_download(root: Path, tmp_path: Path) -> None:
     shutil.rmtree(root / "query_night")
     dataset = read(root)
     with pytest.raises(DataError, match="query_night/sensors/sensors.txt; --allow-missing"):
         write_official(dataset, tmp_path / "out")
     write_official(dataset, tmp_path / "out", allow_missing=True)
     assert len(dataset.names) == 3
-
-
-def test_images_that_are_not_there(root: Path, tmp_path: Path) -> None:
-    (name,) = read(root).query.image_names()[:1]
+    name = dataset.query.image_names()[0]
     (root / "query_day/sensors/records_data" / name).unlink()
     dataset = read(root)
-    assert name not in dataset.names
-    with pytest.raises(DataError, match="1 files are missing"):
-        write_official(dataset, tmp_path / "out")
+    assert len(dataset.names) == 2 and name not in dataset.names
+    with pytest.raises(DataError, match="2 files are missing"):
+        write_official(dataset, tmp_path / "again")
 
 
 def test_a_query_of_neither_day_nor_night(root: Path) -> None:
@@ -221,44 +139,52 @@ def test_an_image_of_another_size_than_its_camera(root: Path) -> None:
 def test_input_files_are_what_is_read(downloaded: Path) -> None:
     files = [str(path.relative_to(downloaded)) for path in Aachen().input_files(downloaded)]
     assert len(set(files)) == len(files)
-    tables = {
-        f"{part}/sensors/{name}.txt"
-        for part in ("mapping", *PARTS)
-        for name in ("sensors", "records_camera")
-    } | {"mapping/sensors/trajectories.txt"}
-    assert tables <= set(files)
+    for part in ("mapping", *PARTS):
+        assert f"{part}/sensors/sensors.txt" in files
+        assert f"{part}/sensors/records_camera.txt" in files
+    assert "mapping/sensors/trajectories.txt" in files
     images = {path.removeprefix("mapping/sensors/records_data/") for path in files}
     assert set(read(downloaded).mapping.image_names()) <= images
 
 
-def test_it_is_found_by_the_folder_kapture_unpacks_to(
-    downloaded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "Aachen-Day-Night-v1.1").symlink_to(downloaded)
-    monkeypatch.setenv("MEGLOC_DATA", str(tmp_path))
-    choice = choose_dataset("aachen", None)
-    choice.check()
-    assert choice.root == tmp_path / "Aachen-Day-Night-v1.1"
+def images_of(folder: Path) -> dict[str, tuple[list[float], Any]]:
+    """Cameras and poses by image, as kapture reads them; names of sensors are each tool's own."""
+    data = kapture_from_dir(str(folder))
+    poses = data.trajectories or {}
+    return {
+        name: (data.sensors[sensor].camera_params, poses.get(time, {}).get(sensor))
+        for time, sensor, name in flatten(data.records_camera)
+    }
 
 
-def test_kaptures_own_sample(shared_data: Path, tmp_path: Path) -> None:
-    sample = shared_data / "kapture_samples" / "Aachen-Day-Night"
-    if not sample.is_dir():
-        pytest.skip(f"no sample at {sample}")
-    for part, theirs in (("mapping", "training"), ("query", "query")):
-        shutil.copytree(sample / "kapture" / theirs / "sensors", tmp_path / part / "sensors")
-        (tmp_path / part / "sensors/records_data").symlink_to(sample / "images_upright")
-    found, expected = read(tmp_path), read(sample)
-    assert found.protocol == expected.protocol and found.protocol.pose_file_stem == "Aachen"
-    assert list(found.names.items()) == list(expected.names.items())
-    assert len(found.names) == 4
-    for data in ("mapping", "query"):
-        ours, theirs_ = getattr(expected, data), getattr(found, data)
-        assert ours.image_names() == theirs_.image_names()
-        for name in ours.image_names():
-            assert ours.camera_of(name) == theirs_.camera_of(name)
-    for name, pose in expected.mapping.poses().items():
-        # kapture turns the NVM's centres into translations by its own arithmetic
-        np.testing.assert_allclose(
-            found.mapping.poses()[name].translation, pose.translation, atol=1e-9
-        )
+def assert_same_kapture(ours: Path, theirs: Path) -> None:
+    found, expected = images_of(ours), images_of(theirs)
+    assert found.keys() == expected.keys() and len(found) > 2
+    for name, (params, pose) in expected.items():
+        own_params, own = found[name]
+        assert own_params == params and (own is None) == (pose is None)
+        if pose is not None:
+            np.testing.assert_allclose(own.t_raw, pose.t_raw, rtol=0, atol=1e-9)
+            turns = (Rotation.from_quat(one.r_raw, scalar_first=True) for one in (own, pose))
+            assert np.degrees((next(turns) * next(turns).inv()).magnitude()) < 1e-9
+
+
+@pytest.fixture
+def sample(shared_data: Path) -> Path:
+    folder = shared_data / "kapture_samples" / "Aachen-Day-Night"
+    if not folder.is_dir():
+        pytest.skip(f"no sample at {folder}")
+    return folder
+
+
+def test_the_sample_is_what_kapture_makes_of_it(sample: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write_official(read(sample), out, allow_missing=True)
+    assert_same_kapture(out / "mapping", sample / "kapture/training")
+    assert_same_kapture(out / "query", sample / "kapture/query")
+    kapture_tool(
+        "kapture_import_nvm",
+        *("-i", sample / MODEL, "-im", sample / "images_upright"),
+        *("-o", tmp_path / "theirs", "--image_transfer", "skip"),
+    )
+    assert_same_kapture(out / "mapping", tmp_path / "theirs")

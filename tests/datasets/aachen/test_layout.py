@@ -24,19 +24,9 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "list.txt"
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        f"{LINE}\n{OTHER}\n",
-        f"{LINE}\n{OTHER}",  # the published lists end so
-        f"{LINE}\r\n{OTHER}\r\n",
-        f"\ufeff{LINE}\n{OTHER}\n",
-        f"\n  \n{LINE}\n\n{OTHER}\n\n",
-        f" {LINE.replace(' ', '  ')}\t\n{OTHER.replace(' ', chr(9))} \n",
-    ],
-)
-def test_images_in_their_order(path: Path, text: str) -> None:
-    path.write_bytes(text.encode())
+def test_images_in_their_order(path: Path) -> None:
+    # the published lists end without a line end
+    path.write_text(f"\n  \n{LINE.replace(' ', '  ')}\n\n{OTHER.replace(' ', chr(9))}")
     cameras = read_query_list(path)
     assert list(cameras.items()) == [(LINE.split()[0], CAMERA), (OTHER.split()[0], OTHER_CAMERA)]
 
@@ -44,68 +34,25 @@ def test_images_in_their_order(path: Path, text: str) -> None:
 @pytest.mark.parametrize(
     ("line", "match"),
     [
-        ("a.jpg", "expected 'name MODEL WIDTH HEIGHT PARAMS...', got 1 fields"),
-        ("a.jpg SIMPLE_RADIAL 1600", "got 3 fields"),
+        ("a.jpg SIMPLE_RADIAL 1600", "'name MODEL WIDTH HEIGHT PARAMS...', got 3 fields"),
         ("a.jpg SIMPLE_RADIAL 1600 1200 1469.2 800 600", "takes 4 parameters, got 3"),
         ("a.jpg SIMPLE_RADIAL 1600 1200 1469.2 800 600 0 0", "takes 4 parameters, got 5"),
         ("a.jpg FISH 1600 1200 1469.2 800 600 0", "unknown camera model 'FISH'"),
-        (
-            "a.jpg SIMPLE_RADIAL 1600.5 1200 1469.2 800 600 0",
-            "'1600.5' is not a whole",
-        ),
-        ("a.jpg SIMPLE_RADIAL -1600 1200 1469.2 800 600 0", "is not a whole number"),
+        ("a.jpg SIMPLE_RADIAL 1600.5 1200 1469.2 800 600 0", "'1600.5' is not a whole number"),
         ("a.jpg SIMPLE_RADIAL 0 1200 1469.2 800 600 0", "not positive"),
-        (f"a.jpg SIMPLE_RADIAL {'9' * 5000} 1200 1469.2 800 600 0", "is not a whole number"),
-        (
-            "a.jpg SIMPLE_RADIAL 1600 1200 nan 800 600 0",
-            "parameter 'nan' is not a finite",
-        ),
-        ("a.jpg SIMPLE_RADIAL 1600 1200 1e999 800 600 0", "is not a finite number"),
-        ("a.jpg SIMPLE_RADIAL 1600 1200 1_469 800 600 0", "'1_469' is not a finite number"),
-        ("a.jpg SIMPLE_RADIAL 1600 1200 ١٤ 800 600 0", "is not a finite number"),
+        ("a.jpg SIMPLE_RADIAL 1600 1200 nan 800 600 0", "parameter 'nan' is not a finite number"),
         ("a.jpg SIMPLE_RADIAL 1600 1200 -5 800 600 0", "focal length -5.0 is not positive"),
         ("../a.jpg SIMPLE_RADIAL 1600 1200 1469.2 800 600 0", "leads out of its folder"),
-        ("/a.jpg SIMPLE_RADIAL 1600 1200 1469.2 800 600 0", "absolute path"),
         (LINE, "is listed twice"),
-        (
-            "b c.jpg SIMPLE_RADIAL 1600 1200 1469.2 800 600 0",
-            "'SIMPLE_RADIAL' is not a whole",
-        ),
+        ("b c.jpg SIMPLE_RADIAL 1600 1200 1469.2 800 600 0", "'SIMPLE_RADIAL' is not a whole"),
     ],
 )
 def test_bad_lines_name_file_and_line(path: Path, line: str, match: str) -> None:
     path.write_text(f"{LINE}\n\n{line}\n{OTHER}\n")
     with pytest.raises(DataError) as caught:
         read_query_list(path)
-    assert str(caught.value).startswith(f"{path}:3: ")
-    assert match in str(caught.value)
+    assert str(caught.value).startswith(f"{path}:3: ") and match in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("content", [b"", b"\n\r\n  \n", b"\xef\xbb\xbf"])
-def test_an_empty_list_is_refused(path: Path, content: bytes) -> None:
-    path.write_bytes(content)
-    with pytest.raises(DataError, match=r"list\.txt: no image in the list"):
-        read_query_list(path)
-
-
-def test_what_is_no_text_is_refused(path: Path) -> None:
-    path.write_bytes(f"{LINE}\n".encode() + b"\xff\xfe")
-    with pytest.raises(DataError, match=r"list\.txt:2: not a text file in UTF-8"):
-        read_query_list(path)
-    with pytest.raises(DataError, match="file is missing"):
-        read_query_list(path.parent / "absent.txt")
-    with pytest.raises(DataError, match="not a plain file"):
-        read_query_list(path.parent)
-
-
-def test_the_writer_leaves_out_the_last_line_end(path: Path) -> None:
-    write_query_list(path, {LINE.split()[0]: CAMERA}, last_line_ends=False)
-    assert path.read_bytes() == LINE.encode()
-    write_query_list(path, {LINE.split()[0]: CAMERA})
-    assert path.read_bytes() == f"{LINE}\n".encode()
-    with pytest.raises(DataError, match="cannot hold"):
-        write_query_list(path, {"a b.jpg": CAMERA})
 
 
 _NAMES = st.lists(
@@ -127,13 +74,19 @@ def _cameras(draw: st.DrawFn) -> Camera:
     return Camera(model, *size, (*focals[:1], 0.0, *rest) if one_focal else (*focals, *rest))
 
 
-@given(st.dictionaries(_NAMES.filter(lambda name: name.strip("./")), _cameras(), min_size=1))
+@given(
+    st.dictionaries(_NAMES.filter(lambda name: name.strip("./")), _cameras(), min_size=1),
+    st.booleans(),
+)
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_what_is_written_reads_back_the_same(path: Path, cameras: dict[str, Camera]) -> None:
+def test_what_is_written_reads_back_the_same(
+    path: Path, cameras: dict[str, Camera], ended: bool
+) -> None:
     try:
-        write_query_list(path, cameras)
+        write_query_list(path, cameras, last_line_ends=ended)
     except DataError:  # a name with ".." or an empty part in it
         return
+    assert path.read_bytes().endswith(b"\n") == ended
     read = read_query_list(path)
     assert read == cameras
     assert list(read) == list(cameras)

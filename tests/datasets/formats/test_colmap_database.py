@@ -17,6 +17,16 @@ from megloc_kapture.errors import DataError
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
 RNG = np.random.default_rng(0)
+
+
+def run(path: Path, *statements: str) -> None:
+    connection = sqlite3.connect(path)
+    for statement in statements:
+        connection.execute(statement)
+    connection.commit()
+    connection.close()
+
+
 KEYPOINTS = {"db/7.jpg": 5, "rear/8.png": 3, "c.jpg": 0}
 
 
@@ -85,12 +95,12 @@ def test_what_others_write_is_read(tmp_path: Path, write: Any) -> None:
 
 
 def test_a_database_without_features_has_images(tmp_path: Path) -> None:
-    connection = sqlite3.connect(tmp_path / "d.db")
-    connection.execute("CREATE TABLE cameras (camera_id, model, width, height, params)")
-    connection.execute("CREATE TABLE images (image_id, name, camera_id)")
-    connection.execute("INSERT INTO images VALUES (1, './db/7.jpg', 1)")
-    connection.commit()
-    connection.close()
+    run(
+        tmp_path / "d.db",
+        "CREATE TABLE cameras (camera_id, model, width, height, params)",
+        "CREATE TABLE images (image_id, name, camera_id)",
+        "INSERT INTO images VALUES (1, './db/7.jpg', 1)",
+    )
     with ColmapDatabase(tmp_path / "d.db") as database:
         assert list(database.images) == ["db/7.jpg"]
         assert database.keypoints("db/7.jpg").shape == (0, 2)
@@ -115,20 +125,17 @@ def test_a_database_that_is_still_being_written_is_refused(tmp_path: Path) -> No
     ("statement", "match"),
     [
         ("UPDATE descriptors SET data = 'text'", "expected 640 bytes of data, got no bytes"),
-        ("UPDATE descriptors SET cols = 2.5", "columns is 2.5"),
         ("UPDATE images SET name = x'ff' WHERE image_id = 1", "has no name or no camera"),
         ("UPDATE images SET name = '../a' WHERE image_id = 1", "leads out of its folder"),
         ("UPDATE images SET name = './c.jpg' WHERE image_id = 1", "'c.jpg' is listed twice"),
         ("UPDATE images SET name = CAST(x'ff' AS TEXT) WHERE image_id = 1", "UTF-8"),
         ("UPDATE keypoints SET rows = 4", "keypoints of .*: expected 96 bytes of data, got 120"),
         ("UPDATE keypoints SET rows = -1", "keypoints of .*: rows is -1"),
-        ("UPDATE keypoints SET rows = 1000000000000", "rows is 1000000000000"),
         ("UPDATE keypoints SET rows = 2147483647", "expected 51539607528 bytes of data, got 120"),
         ("UPDATE keypoints SET cols = 5", "have 5 columns, not 2, 4 or 6"),
         ("UPDATE keypoints SET data = zeroblob(119)", "expected 120 bytes of data, got 119"),
         ("UPDATE keypoints SET data = CAST(x'0000807f' || zeroblob(116) AS BLOB)", "not finite"),
         ("UPDATE descriptors SET cols = 127", "descriptors of .*: expected 635 bytes"),
-        ("UPDATE descriptors SET data = NULL", "expected 640 bytes of data, got 0 bytes"),
         ("ALTER TABLE descriptors ADD COLUMN type INTEGER DEFAULT 1", "are not SIFT"),
         ("ALTER TABLE descriptors DROP COLUMN data", "no readable COLMAP database: no such col"),
         ("DROP TABLE images", "it has no table 'images'"),
@@ -137,11 +144,7 @@ def test_a_database_that_is_still_being_written_is_refused(tmp_path: Path) -> No
 def test_what_does_not_fit_is_named(tmp_path: Path, statement: str, match: str) -> None:
     path = tmp_path / "d.db"
     write_with_kapture(path)
-    connection = sqlite3.connect(path)
-    connection.execute("PRAGMA foreign_keys = OFF")
-    connection.execute(statement)
-    connection.commit()
-    connection.close()
+    run(path, "PRAGMA foreign_keys = OFF", statement)
     with pytest.raises(DataError, match=match) as caught, ColmapDatabase(path) as database:
         database.keypoints("db/7.jpg")
         database.descriptors("db/7.jpg")
@@ -150,13 +153,11 @@ def test_what_does_not_fit_is_named(tmp_path: Path, statement: str, match: str) 
 
 
 def test_a_view_that_never_ends_is_not_looked_into(tmp_path: Path) -> None:
-    connection = sqlite3.connect(tmp_path / "d.db")
-    connection.execute(
+    run(
+        tmp_path / "d.db",
         "CREATE VIEW images AS WITH RECURSIVE r(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM r) "
-        "SELECT x AS image_id, 'a' || x AS name, 1 AS camera_id FROM r"
+        "SELECT x AS image_id, 'a' || x AS name, 1 AS camera_id FROM r",
     )
-    connection.commit()
-    connection.close()
     with pytest.raises(DataError, match="it has no table 'images'"):
         ColmapDatabase(tmp_path / "d.db")
 
@@ -164,21 +165,18 @@ def test_a_view_that_never_ends_is_not_looked_into(tmp_path: Path) -> None:
 def test_a_column_that_computes_more_than_the_file_holds_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "d.db"
     write_with_kapture(path)
-    connection = sqlite3.connect(path)
-    connection.execute("DROP TABLE keypoints")
-    connection.execute(
+    run(
+        path,
+        "DROP TABLE keypoints",
         "CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, "
-        "data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL)"
+        "data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL)",
+        "INSERT INTO keypoints VALUES (1, 37500000, 6)",
     )
-    connection.execute("INSERT INTO keypoints VALUES (1, 37500000, 6)")
-    connection.commit()
-    name = connection.execute("SELECT name FROM images WHERE image_id = 1").fetchone()[0]
-    connection.close()
     with (
         ColmapDatabase(path) as database,
         pytest.raises(DataError, match="d.db: no readable COLMAP database: .*too big"),
     ):
-        database.keypoints(name)
+        database.keypoints("db/7.jpg")  # the first that was written
 
 
 @pytest.mark.parametrize("content", [b"", b"SQLite format 3\0", b"no database at all" * 100])

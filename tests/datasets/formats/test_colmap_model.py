@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-import shutil
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,91 +23,13 @@ from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransfor
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
 WRITERS = pytest.mark.parametrize("write", [write_colmap_text, write_colmap_binary])
+EMPTY = ColmapModel({}, (), SparsePoints.none())
 
 
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let borders of blocks be everywhere."""
     monkeypatch.setitem(TextFile.__init__.__kwdefaults__, "block_bytes", 200)
-
-
-def synthetic_reconstruction() -> Any:
-    """COLMAP's own synthetic model: rigs of two cameras, ids in its own order."""
-    pycolmap.set_random_seed(3)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs = 2
-    options.num_cameras_per_rig = 2
-    options.num_frames_per_rig = 3
-    options.num_points3D = 80
-    options.track_length = 4
-    reconstruction = pycolmap.synthesize_dataset(options)
-    for image in reconstruction.images.values():
-        image.name = f"sub folder/{image.image_id % 2}/{image.name}".replace(" ", "_")
-    for point_id, point in reconstruction.points3D.items():
-        point.color = np.array([point_id % 256, 7, 255], dtype=np.uint8)
-    return reconstruction
-
-
-def check_same(model: ColmapModel, truth: Any) -> None:
-    """Every number of a model against a pycolmap.Reconstruction."""
-    assert list(model.cameras) == sorted(model.cameras)
-    assert set(model.cameras) == set(truth.cameras)
-    for camera_id, camera in model.cameras.items():
-        theirs = truth.cameras[camera_id]
-        assert camera.model == theirs.model.name
-        assert (camera.width, camera.height) == (theirs.width, theirs.height)
-        assert np.array_equal(camera.params, theirs.params)
-    ids = [image.image_id for image in model.images]
-    assert ids == sorted(truth.images)
-    for image in model.images:
-        theirs = truth.images[image.image_id]
-        assert (image.name, image.camera_id) == (theirs.name, theirs.camera_id)
-        pose = theirs.cam_from_world()
-        xyzw = np.roll(image.cam_from_world.quat_wxyz, -1)
-        assert np.allclose(xyzw, pose.rotation.quat, rtol=0, atol=1e-14)
-        assert np.allclose(image.cam_from_world.translation, pose.translation, rtol=0, atol=1e-14)
-    points = model.points
-    by_place = {tuple(point.xyz): point for point in truth.points3D.values()}
-    assert len(by_place) == len(points) == len(truth.points3D)
-    assert (np.diff(points.point_ids) >= 0).all()
-    for row, (xyz, rgb) in enumerate(zip(points.xyz.tolist(), points.rgb.tolist(), strict=True)):
-        theirs = by_place[tuple(xyz)]
-        assert rgb == theirs.color.tolist()
-        seen = np.flatnonzero(points.point_ids == row)
-        track = {
-            (ids[points.image_ids[k]], int(points.feature_ids[k])): points.xy_px[k] for k in seen
-        }
-        elements = {(e.image_id, e.point2D_idx) for e in theirs.track.elements}
-        assert set(track) == elements
-        for (image_id, feature), xy in track.items():
-            expected = truth.images[image_id].points2D[feature].xy
-            assert np.array_equal(xy, expected.astype(np.float32))
-    dtypes = [points.xyz, points.rgb, points.point_ids, points.image_ids, points.feature_ids]
-    assert [a.dtype for a in dtypes] == [np.float64, np.uint8, np.int64, np.int32, np.int32]
-
-
-@pytest.mark.parametrize("form", ["text", "binary"])
-@pytest.mark.usefixtures("small_blocks")
-def test_what_pycolmap_writes_is_read(tmp_path: Path, form: str) -> None:
-    truth = synthetic_reconstruction()
-    getattr(truth, f"write_{form}")(str(tmp_path))
-    # COLMAP 4 writes rigs and frames beside the three files of old
-    assert len(list(tmp_path.iterdir())) == 5
-    model = read_colmap_model(tmp_path)
-    check_same(model, truth)
-    poses = read_colmap_model(tmp_path, with_points=False)
-    assert poses.images == model.images
-    assert len(poses.points) == len(poses.points.point_ids) == 0
-
-
-@WRITERS
-def test_what_is_written_pycolmap_reads(tmp_path: Path, write: Callable[..., None]) -> None:
-    original = synthetic_reconstruction()
-    original.write_binary(str(tmp_path))
-    model = read_colmap_model(tmp_path)
-    write(tmp_path / "ours", model)
-    assert len(list((tmp_path / "ours").iterdir())) == 3
-    check_same(model, pycolmap.Reconstruction(str(tmp_path / "ours")))
 
 
 def small_model() -> ColmapModel:
@@ -152,75 +73,58 @@ def test_a_model_comes_back_exactly(tmp_path: Path, write: Callable[..., None]) 
     model = small_model()
     write(tmp_path, model)
     assert same(read_colmap_model(tmp_path), model)
+    theirs = pycolmap.Reconstruction(str(tmp_path))
+    assert set(theirs.cameras) == set(model.cameras)
+    for camera_id, camera in theirs.cameras.items():
+        ours = model.cameras[camera_id]
+        assert (camera.model.name, tuple(camera.params)) == (ours.model, ours.params)
+    colours = {tuple(point.xyz): point.color.tolist() for point in theirs.points3D.values()}
+    points = model.points
+    assert colours == dict(zip(map(tuple, points.xyz), points.rgb.tolist(), strict=True))
     content = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     write(tmp_path, model)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == content
-    empty = ColmapModel({}, (), SparsePoints.none())
-    write(tmp_path, empty)
-    assert same(read_colmap_model(tmp_path), empty)
-
-
-def test_the_camera_models_have_colmap_s_ids(tmp_path: Path) -> None:
-    write_colmap_binary(tmp_path, small_model())
-    read = pycolmap.Reconstruction(str(tmp_path))
-    for camera_id, camera in small_model().cameras.items():
-        assert read.cameras[camera_id].model.name == camera.model
+    # poses alone need no points
+    next(tmp_path.glob("points3D.*")).unlink()
+    poses = read_colmap_model(tmp_path, with_points=False)
+    assert poses.images == model.images and len(poses.points) == 0
+    with pytest.raises(DataError, match=r"points3D\.\w+: file is missing"):
+        read_colmap_model(tmp_path)
+    write(tmp_path, EMPTY)
+    assert same(read_colmap_model(tmp_path), EMPTY)
 
 
 def test_the_binary_files_count_where_there_are_both(tmp_path: Path) -> None:
-    model = small_model()
-    write_colmap_text(tmp_path, ColmapModel({}, (), SparsePoints.none()))
-    assert colmap_model_files(tmp_path) == tuple(
-        tmp_path / name for name in ("cameras.txt", "images.txt", "points3D.txt")
-    )
-    write_colmap_binary(tmp_path, model)
-    assert same(read_colmap_model(tmp_path), model)
-    assert colmap_model_files(tmp_path, with_points=False) == (
-        tmp_path / "cameras.bin",
-        tmp_path / "images.bin",
-    )
-
-
-@WRITERS
-def test_poses_alone_need_no_points(tmp_path: Path, write: Callable[..., None]) -> None:
-    model = small_model()
-    write(tmp_path, model)
-    (points,) = tmp_path.glob("points3D.*")
-    points.unlink()
-    assert read_colmap_model(tmp_path, with_points=False).images == model.images
-    with pytest.raises(DataError, match=r"points3D\.\w+: file is missing"):
-        read_colmap_model(tmp_path)
-
-
-def test_a_folder_without_a_model_is_named(tmp_path: Path) -> None:
     for read in (read_colmap_model, colmap_model_files):
         with pytest.raises(DataError, match="neither images.bin nor images.txt is here") as caught:
             read(tmp_path)
         assert str(caught.value).startswith(f"{tmp_path}: ")
+    write_colmap_text(tmp_path, EMPTY)
+    names = ("cameras.txt", "images.txt", "points3D.txt")
+    assert colmap_model_files(tmp_path) == tuple(tmp_path / name for name in names)
+    write_colmap_binary(tmp_path, small_model())
+    assert same(read_colmap_model(tmp_path), small_model())
+    names = ("cameras.bin", "images.bin")
+    assert colmap_model_files(tmp_path, with_points=False) == tuple(tmp_path / n for n in names)
 
 
-def test_models_that_colmap_cannot_hold_are_not_written(tmp_path: Path) -> None:
-    model = small_model()
+@WRITERS
+def test_models_that_colmap_cannot_hold_are_not_written(
+    tmp_path: Path, write: Callable[..., None]
+) -> None:
+    model, none = small_model(), SparsePoints.none()
     image, points = model.images[0], model.points
     twice = SparsePoints(*(np.repeat(getattr(points, name), 2, axis=0) for name in vars(points)))
-    wrong = [
-        ColmapModel({}, model.images, points),
-        ColmapModel(model.cameras, (image, image), SparsePoints.none()),
-        ColmapModel(model.cameras, model.images[:2], points),
-        ColmapModel(model.cameras, model.images, twice),
-        ColmapModel(
-            model.cameras,
-            (ColmapImage(1, "a b.jpg", 1, image.cam_from_world),),
-            SparsePoints.none(),
-        ),
-    ]
-    for write in (write_colmap_text, write_colmap_binary):
-        for bad in wrong:
-            with pytest.raises(ValueError):
-                write(tmp_path / "m", bad)
+    for wrong in (
+        replace(model, cameras={}),
+        replace(model, images=(image, image), points=none),
+        replace(model, images=model.images[:2]),
+        replace(model, points=twice),
+        replace(model, images=(replace(image, name="a b.jpg"),), points=none),
+    ):
+        with pytest.raises(ValueError):
+            write(tmp_path / "m", wrong)
 
-
-# ------------------------------------------------------------------------------------ text
 
 CAMERAS = "# comment\n\n 1 SIMPLE_RADIAL 1600 1067 1084.6 800 533.5 -0.0811 \n"
 IMAGES = "7 1 0 0 0 0.5 0 2 1 db/7.jpg\n1 2 4 3.5 4 -1 5 6 9\n8 1 0 0 0 0 0 0 1 db/8.jpg\n"
@@ -251,6 +155,8 @@ def test_text_by_hand(tmp_path: Path, end: str) -> None:
     assert points.image_ids.tolist() == [0, 0, 1, 0]
     assert points.feature_ids.tolist() == [0, 2, 0, 1]
     assert points.xy_px.tolist() == [[1, 2], [5, 6], [0, 1], [3.5, 4]]
+    dtypes = [points.xyz, points.rgb, points.point_ids, points.image_ids, points.feature_ids]
+    assert [a.dtype for a in dtypes] == [np.float64, np.uint8, np.int64, np.int32, np.int32]
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -279,26 +185,20 @@ def test_an_empty_line_of_features_is_consumed(tmp_path: Path) -> None:
     ("name", "text", "match"),
     [
         ("cameras", "1 PINHOLE 5 5\n", "cameras.txt:1: expected a camera .* got 4"),
-        ("cameras", "1 PINHOLE 5 5 1 1 1\n", "cameras.txt:1: .* takes 4 parameters, got 3"),
         ("cameras", "\n1 NEW 5 5 1\n", "cameras.txt:2: unknown camera model 'NEW'"),
         ("cameras", CAMERAS + CAMERAS, "cameras.txt:6: camera 1 is listed twice"),
-        ("cameras", "1 PINHOLE 5.0 5 1 1 1 1\n", "cameras.txt:1: width '5.0'"),
         ("cameras", "1 PINHOLE 5 5 1 1 1 nan\n", "cameras.txt:1: camera parameter 'nan'"),
         ("cameras", "1 PINHOLE 0 5 1 1 1 1\n", "cameras.txt:1: image size 0x5"),
         ("cameras", "", "images.txt:1: image .* unknown camera 1"),
-        ("cameras", "\udcff PINHOLE 0 5 1 1 1 1\n", "cameras.txt:1: not a text file"),
         ("images", "7 1 0 0 0 0 0 0 1\n\n", "images.txt:1: expected an image .* got 9"),
         ("images", "7 2 0 0 0 0 0 0 1 a\n\n", "images.txt:1: .* unit quaternion"),
         ("images", "7 1 0 0 0 0 inf 0 1 a\n\n", "images.txt:1: pose 'inf'"),
-        ("images", "x 1 0 0 0 0 0 0 1 a\n\n", "images.txt:1: image id 'x'"),
         ("images", "2147483647 1 0 0 0 0 0 0 1 a\n\n", "images.txt:1: image id .* out of range"),
         ("images", "7 1 0 0 0 0 0 0 1 ../a\n\n", "images.txt:1: .* leads out"),
-        ("images", "7 1 0 0 0 0 0 0 1 \x1c\n\n", "images.txt:1: .* control character"),
         ("images", IMAGES + "0 1 9\n" + IMAGES, "images.txt:5: image id 7 is listed twice"),
         ("images", IMAGES.replace("8.jpg", "7.jpg"), "images.txt:3: image 'db/7.jpg' is listed"),
         ("images", IMAGES + "0 1\n", "images.txt:4: expected features .* got 2 fields"),
         ("images", IMAGES + "0 1 1.5\n", "images.txt:4: point id '1.5'"),
-        ("images", IMAGES + "0 1 -2\n", "images.txt:4: point id '-2'"),
         ("images", IMAGES + "0 nan 1\n", "images.txt:4: image coordinate 'nan'"),
         ("images", IMAGES + "0 1e300 1\n", "images.txt:4: image coordinate '1e300'"),
         ("images", IMAGES + "\n", "images.txt:4: .* names feature 0 of image 8, which has 0"),
@@ -306,7 +206,6 @@ def test_an_empty_line_of_features_is_consumed(tmp_path: Path) -> None:
         ("images", IMAGES[:49], "points3D.txt: a track names image 8, which is not there"),
         ("points3D", "1 1 1 1 1 1 1\n", "points3D.txt:1: expected a point .* got 7"),
         ("points3D", POINTS + "1 1 1 1 1 1 1 1 7\n", "points3D.txt:5: .* got 9"),
-        ("points3D", POINTS + "-1 1 1 1 1 1 1 1\n", "points3D.txt:5: point id '-1'"),
         ("points3D", POINTS + "1 1 nan 1 1 1 1 1\n", "points3D.txt:5: coordinate 'nan'"),
         ("points3D", POINTS + "1 1 1 1 1 1 256 1\n", "points3D.txt:5: a colour"),
         ("points3D", POINTS + "1 1 1 1 1 1 1 x\n", "points3D.txt:5: reprojection error 'x'"),
@@ -321,27 +220,15 @@ def test_bad_text_is_named(tmp_path: Path, name: str, text: str, match: str) -> 
         read_colmap_model(write_files(tmp_path, **{name: text}))
 
 
-def test_files_that_are_none_are_named(tmp_path: Path) -> None:
-    for name in ("cameras", "images", "points3D"):
-        write_files(tmp_path)
-        (tmp_path / f"{name}.txt").unlink()
-        os.mkfifo(tmp_path / f"{name}.txt")
-        with pytest.raises(DataError, match=rf"{name}\.txt: not a plain file"):
-            read_colmap_model(tmp_path)
-        (tmp_path / f"{name}.txt").unlink()
-    write_colmap_binary(tmp_path, small_model())
-    for name in ("cameras", "points3D"):
-        path = tmp_path / f"{name}.bin"
-        content = path.read_bytes()
-        path.unlink()
-        os.mkfifo(path)
-        with pytest.raises(DataError, match=rf"{name}\.bin: not a plain file"):
-            read_colmap_model(tmp_path)
-        path.unlink()
-        path.write_bytes(content)
-
-
-# ---------------------------------------------------------------------------------- binary
+@pytest.mark.parametrize("form", ["txt", "bin"])
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_files_that_are_none_are_named(tmp_path: Path, name: str, form: str) -> None:
+    (write_colmap_text if form == "txt" else write_colmap_binary)(tmp_path, small_model())
+    path = tmp_path / f"{name}.{form}"
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(DataError, match=rf"{name}\.{form}: not a plain file"):
+        read_colmap_model(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
@@ -358,13 +245,13 @@ def test_every_truncation_is_named(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-@pytest.mark.parametrize("count", [2**64 - 1, 2**63, 2**40, 10**6])
-def test_counts_are_checked_before_memory_is_taken(tmp_path: Path, name: str, count: int) -> None:
+def test_counts_are_checked_before_memory_is_taken(tmp_path: Path, name: str) -> None:
     write_colmap_binary(tmp_path, small_model())
     content = (tmp_path / name).read_bytes()
-    (tmp_path / name).write_bytes(struct.pack("<Q", count) + content[8:])
-    with pytest.raises(DataError, match=rf"{name}: {count} \w+ do not fit into the file"):
-        read_colmap_model(tmp_path)
+    for count in (2**64 - 1, 2**63, 2**40, 10**6):
+        (tmp_path / name).write_bytes(struct.pack("<Q", count) + content[8:])
+        with pytest.raises(DataError, match=rf"{name}: {count} \w+ do not fit into the file"):
+            read_colmap_model(tmp_path)
 
 
 # offsets of the first record's fields, from the published layouts
@@ -374,7 +261,6 @@ def test_counts_are_checked_before_memory_is_taken(tmp_path: Path, name: str, co
         ("cameras.bin", 12, struct.pack("<i", 18), "unknown camera model 18"),
         ("cameras.bin", 12, struct.pack("<i", 16), "the model EUCM .*image_undistorter"),
         ("cameras.bin", 12, struct.pack("<i", 17), "the model EQUIRECTANGULAR .*panorama_sfm"),
-        ("cameras.bin", 12, struct.pack("<i", -1), "unknown camera model -1"),
         ("cameras.bin", 16, struct.pack("<Q", 0), "image size 0x480"),
         ("cameras.bin", 16, struct.pack("<Q", 2**63), "is out of range"),
         ("cameras.bin", 32, struct.pack("<d", np.nan), "must be finite"),
@@ -384,8 +270,8 @@ def test_counts_are_checked_before_memory_is_taken(tmp_path: Path, name: str, co
         ("images.bin", 68, struct.pack("<I", 77), "unknown camera 77"),
         ("images.bin", 8, struct.pack("<I", 2**32 - 1), "image id 4294967295 is out of range"),
         ("images.bin", 8, struct.pack("<I", 5), "image id 5 is listed twice"),
-        ("images.bin", 72, b"\xff", "name is not UTF-8"),
         ("images.bin", 72, b"/", "absolute path"),
+        ("images.bin", 72, b"x" * 10_000, r"name does not end \(byte 72"),
         ("images.bin", 81, struct.pack("<Q", 2**61), "features do not fit into the file"),
         ("images.bin", 89, struct.pack("<d", np.nan), "a feature of image 2 is not finite"),
         ("images.bin", 89, struct.pack("<d", 1e300), "a feature of image 2 is not finite"),
@@ -404,14 +290,6 @@ def test_bad_binary_values_are_named(
     content = path.read_bytes()
     path.write_bytes(content[:offset] + value + content[offset + len(value) :])
     with pytest.raises(DataError, match=match):
-        read_colmap_model(tmp_path)
-
-
-def test_an_endless_name_is_refused(tmp_path: Path) -> None:
-    write_colmap_binary(tmp_path, small_model())
-    path = tmp_path / "images.bin"
-    path.write_bytes(path.read_bytes()[:72] + b"x" * 10_000)
-    with pytest.raises(DataError, match=r"images\.bin: an image's name does not end \(byte 72"):
         read_colmap_model(tmp_path)
 
 
@@ -438,14 +316,3 @@ def test_later_camera_models(tmp_path: Path, form: str) -> None:
         else:
             with pytest.raises(DataError, match=f"cameras.* the model {model} .*undistorter"):
                 read_colmap_model(tmp_path)
-
-
-def test_both_forms_read_the_same(tmp_path: Path) -> None:
-    truth = synthetic_reconstruction()
-    for form in ("text", "binary"):
-        (tmp_path / form).mkdir()
-        getattr(truth, f"write_{form}")(str(tmp_path / form))
-    text, binary = read_colmap_model(tmp_path / "text"), read_colmap_model(tmp_path / "binary")
-    assert text.cameras == binary.cameras
-    assert [i.name for i in text.images] == [i.name for i in binary.images]
-    shutil.rmtree(tmp_path / "text")

@@ -1,36 +1,28 @@
-"""Valid files of every format changed at random: a value or one clear error, and nothing else."""
+"""Valid files of every format, and changed at random: a value or one clear error."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hostile import EDITS, Edit, changed
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from kapture.converter.colmap.database import COLMAPDatabase
-from megloc_twins.model_files import write_colmap_binary, write_colmap_text, write_nvm
 
 from megloc_kapture.datasets.aachen.layout import read_query_list
 from megloc_kapture.datasets.formats import fourseasons_files
 from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
-from megloc_kapture.datasets.formats.colmap_model import (
-    BINARY_FILES,
-    TEXT_FILES,
-    ColmapImage,
-    ColmapModel,
-)
 from megloc_kapture.datasets.formats.colmap_reading import read_colmap_model, read_colmap_rigs
-from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm
-from megloc_kapture.datasets.formats.sparse_points import SparsePoints
+from megloc_kapture.datasets.formats.nvm import read_nvm
 from megloc_kapture.datasets.formats.text_lines import TextFile, read_rigid_matrix
 from megloc_kapture.datasets.inloc.layout import read_transformation, read_wrong_scans
 from megloc_kapture.datasets.robotcar import layout as robotcar_layout
 from megloc_kapture.errors import DataError
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import RigidTransform
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
@@ -61,74 +53,20 @@ TEXTS: dict[Callable[[Path], Any], str] = {
     read_wrong_scans: "known wrong:\n\n008\nDUC_scan_12.ptx 31\r\n2017\n",
 }
 
-POINTS = SparsePoints(
-    np.array([[1.5, -2.0, 30.0], [4.0, 5.0, 6.0], [-7.0, 8.0, 9.0]]),
-    np.array([[255, 0, 7], [1, 2, 3], [0, 0, 0]], dtype=np.uint8),
-    np.array([0, 0, 0, 1]),
-    np.array([0, 1, 0, 1], dtype=np.int32),
-    np.array([2, 3, 0, 1], dtype=np.int32),
-    np.array([[10.5, 20.25], [30, 40], [11, 21], [100, 0.5]], dtype=np.float32),
-)
-NVM = NvmModel(
-    ("db/7.jpg", "db/8.jpg"),
-    np.array([1000.0, 900.5]),
-    np.array([[1.0, 0, 0, 0], [0.5, -0.5, 0.5, 0.5]]),
-    np.array([[2.0, 0, -5], [1, 2, 3]]),
-    np.array([-0.08, 0.25]),
-    POINTS,
-)
-COLMAP = ColmapModel(
-    {1: Camera("SIMPLE_RADIAL", 640, 480, (500, 320, 240, 0.1))},
-    (
-        ColmapImage(1, "db/7.jpg", 1, RigidTransform((1.0, 0.0, 0.0, 0.0), (0.5, 0.0, 2.0))),
-        ColmapImage(4, "db/8.jpg", 1, RigidTransform((0.5, 0.5, 0.5, 0.5), (0.5, 0.0, 2.0))),
-    ),
-    POINTS,
-)
+NVM = b"""NVM_V3
 
-# what parsers of numbers trip over
-TOKENS = st.sampled_from(
-    [b"nan", b"-inf", b"1e999", b"-1", b"0", b"1", b"2", b"99999999999", b"18446744073709551616"]
-    + [b"1_0", b"0x1", b".5", b"5.", b"-.5e-3", b"+7", b"1e", b"#", b"\xff", b"\0", b"\n", b"\r\n"]
-    + [b" ", b"\t", b"\x0b", b"\x1c", b"\xc2\xa0", b"\xd9\xa1", b"../x", b"256", b"2147483648"]
-    + [b"179769313486231570000e290", b"8.5070591730234615e37", b"1.7014118346046923e38", b"-0.0"]
-    + [b"9" * 400, b",", b"\xef\xbb\xbf", b"\n\n\n"]
-)
-OFFSETS = st.integers(0, 1 << 16)
-EDITS = st.lists(
-    st.one_of(
-        st.tuples(st.just("insert"), OFFSETS, TOKENS | st.binary(max_size=30)),
-        st.tuples(st.just("token"), OFFSETS, TOKENS),
-        st.tuples(st.just("delete"), OFFSETS, st.integers(1, 40)),
-        st.tuples(st.just("double"), OFFSETS, st.integers(1, 80)),
-        st.tuples(st.just("byte"), OFFSETS, st.integers(0, 255)),
-        st.tuples(st.just("cut"), OFFSETS, st.none()),
-    ),
-    min_size=1,
-    max_size=4,
-)
+2
+db/7.jpg 1000 1 0 0 0 2 0 -5 0.08 0
+db/8.jpg 900.5 0.5 -0.5 0.5 0.5 1 2 3 -0.25 0
+
+3
+1.5 -2 30 255 0 7 3 0 2 10.5 20.25 1 3 30 40 0 0 11 21
+4 5 6 1 2 3 1 1 1 100 0.5
+-7 8 9 0 0 0 0
+
+0
+"""
 MANY = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-
-
-def changed(content: bytes, edits: list[tuple[str, int, Any]]) -> bytes:
-    """Apply edits; offsets wrap around the length."""
-    for kind, offset, value in edits:
-        k = offset % (len(content) + 1)
-        if kind == "insert":
-            content = content[:k] + value + content[k:]
-        elif kind == "token":  # instead of a field
-            end = min((e for e in (content.find(c, k) for c in b" \n") if e >= 0), default=k)
-            begin = max(content.rfind(b" ", 0, end), content.rfind(b"\n", 0, end)) + 1
-            content = content[:begin] + value + content[end:]
-        elif kind == "delete":
-            content = content[:k] + content[k + value :]
-        elif kind == "double":
-            content = content[: k + value] + content[k:]
-        elif kind == "byte":
-            content = content[:k] + bytes([value]) + content[k + 1 :]
-        else:
-            content = content[:k]
-    return content
 
 
 def outcome(read: Callable[[], Any], path: Path) -> Any:
@@ -152,12 +90,50 @@ def block_bytes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(TextFile.__init__.__kwdefaults__, "block_bytes", request.param)
 
 
-@pytest.mark.parametrize("reader", TEXTS, ids=lambda reader: reader.__name__)
+READERS = pytest.mark.parametrize("reader", TEXTS, ids=lambda reader: reader.__name__)
+
+
+@READERS
+def test_line_ends_and_blanks_do_not_matter(tmp_path: Path, reader: Callable[[Path], Any]) -> None:
+    text, path = TEXTS[reader].replace("\r\n", "\n"), tmp_path / "file.txt"
+    path.write_bytes(text.encode())
+    expected = repr(reader(path))
+    for other in (
+        text.replace("\n", "\r\n"),
+        text.rstrip("\n"),
+        text + "\n \r\n",
+        "\ufeff" + text,
+        "".join(f" {line}\t\n" for line in text.split("\n")),
+    ):
+        path.write_bytes(other.encode())
+        assert repr(reader(path)) == expected, other
+
+
+@READERS
+def test_what_is_no_such_file(tmp_path: Path, reader: Callable[[Path], Any]) -> None:
+    path = tmp_path / "file.txt"
+    for content in (b"", b"\n\r\n  \n", b"\xef\xbb\xbf"):
+        path.write_bytes(content)
+        if reader in (fourseasons_files.read_keyframe_accuracy, read_wrong_scans):
+            assert not reader(path)
+        else:
+            with pytest.raises(DataError, match=r"file\.txt\b"):
+                reader(path)
+    path.write_bytes(b"1\n2 \xff")
+    with pytest.raises(DataError, match=r"file\.txt:2: not a text file in UTF-8"):
+        reader(path)
+    path.unlink()
+    with pytest.raises(DataError, match=r"file\.txt: file is missing"):
+        reader(path)
+    path.mkdir()
+    with pytest.raises(DataError, match=r"file\.txt: not a plain file"):
+        reader(path)
+
+
+@READERS
 @given(edits=EDITS)
 @MANY
-def test_texts(
-    tmp_path: Path, reader: Callable[[Path], Any], edits: list[tuple[str, int, Any]]
-) -> None:
+def test_texts(tmp_path: Path, reader: Callable[[Path], Any], edits: list[Edit]) -> None:
     path = tmp_path / "file.txt"
     path.write_bytes(changed(TEXTS[reader].encode(), edits))
     outcome(lambda: reader(path), path)
@@ -166,52 +142,46 @@ def test_texts(
 @given(EDITS)
 @MANY
 @pytest.mark.usefixtures("block_bytes")
-def test_nvm(tmp_path: Path, edits: list[tuple[str, int, Any]]) -> None:
+def test_nvm(tmp_path: Path, edits: list[Edit]) -> None:
     path = tmp_path / "m.nvm"
-    write_nvm(path, NVM)
-    path.write_bytes(changed(path.read_bytes(), edits))
+    path.write_bytes(changed(NVM, edits))
     found = outcome(lambda: read_nvm(path), path)
     poses = outcome(lambda: read_nvm(path, with_points=False), path)
     if not isinstance(found, str):
         assert [model.names for model in found] == [model.names for model in poses]
 
 
-@given(st.sampled_from([*TEXT_FILES, *BINARY_FILES]), EDITS)
-@MANY
-@pytest.mark.usefixtures("block_bytes")
-def test_colmap_models(tmp_path: Path, name: str, edits: list[tuple[str, int, Any]]) -> None:
-    folder = tmp_path / name
-    (write_colmap_text if name in TEXT_FILES else write_colmap_binary)(folder, COLMAP)
-    (folder / name).write_bytes(changed((folder / name).read_bytes(), edits))
-    found = outcome(lambda: read_colmap_model(folder), folder)
-    poses = outcome(lambda: read_colmap_model(folder, with_points=False), folder)
-    if not isinstance(found, str):
-        assert poses.images == found.images
-
-
 @pytest.fixture(scope="module")
-def rigs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def model(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """A model with rigs of three cameras as COLMAP writes it, in both forms."""
     pycolmap.set_random_seed(3)
     options = pycolmap.SyntheticDatasetOptions()
     options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 3, 2, 10
     made = pycolmap.synthesize_dataset(options)
-    folder = tmp_path_factory.mktemp("rigs")
+    folder = tmp_path_factory.mktemp("model")
     made.write_text(folder)
     made.write_binary(folder)
-    return folder
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@given(st.sampled_from(["rigs.txt", "frames.txt", "rigs.bin", "frames.bin"]), EDITS)
+@pytest.mark.parametrize("form", ["txt", "bin"])
+@given(st.sampled_from(["cameras", "images", "points3D", "rigs", "frames"]), EDITS)
 @MANY
-def test_colmap_rigs(
-    tmp_path: Path, rigs: Path, name: str, edits: list[tuple[str, int, Any]]
+@pytest.mark.usefixtures("block_bytes")
+def test_colmap_models(
+    tmp_path: Path, model: dict[str, bytes], form: str, name: str, edits: list[Edit]
 ) -> None:
-    folder = tmp_path / name
-    shutil.copytree(rigs, folder, dirs_exist_ok=True)
-    (folder / name).write_bytes(changed((rigs / name).read_bytes(), edits))
-    found = outcome(lambda: read_colmap_rigs(folder, binary=name.endswith(".bin")), folder)
+    for file, content in model.items():
+        if file.endswith(form):
+            edited = changed(content, edits) if file == f"{name}.{form}" else content
+            (tmp_path / file).write_bytes(edited)
+    found = outcome(lambda: read_colmap_model(tmp_path), tmp_path)
+    poses = outcome(lambda: read_colmap_model(tmp_path, with_points=False), tmp_path)
     if not isinstance(found, str):
-        for cams_from_rig in found.cams_from_rig.values():
+        assert poses.images == found.images
+    rigs = outcome(lambda: read_colmap_rigs(tmp_path, binary=form == "bin"), tmp_path)
+    if not isinstance(rigs, str):
+        for cams_from_rig in rigs.cams_from_rig.values():
             for pose in cams_from_rig.values():
                 assert np.isfinite([*pose.quat_wxyz, *pose.translation]).all()
 
@@ -233,10 +203,9 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @given(EDITS)
 @MANY
-def test_colmap_database(tmp_path: Path, database: Path, edits: list[tuple[str, int, Any]]) -> None:
+def test_colmap_database(tmp_path: Path, database: Path, edits: list[Edit]) -> None:
     path = tmp_path / "d.db"
-    shutil.copy(database, path)
-    path.write_bytes(changed(path.read_bytes(), edits))
+    path.write_bytes(changed(database.read_bytes(), edits))
 
     def read() -> Any:
         with ColmapDatabase(path) as opened:

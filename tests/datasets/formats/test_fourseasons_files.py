@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -23,12 +22,11 @@ from megloc_kapture.datasets.formats.fourseasons_files import (
     read_times,
     read_transformations,
 )
-from megloc_kapture.datasets.formats.text_lines import read_rigid_matrix
 from megloc_kapture.errors import DataError
+from megloc_kapture.values import Camera, RigidTransform
 
 TIME, LATER = 1602074877390449152, 1610028237003433729
 PINHOLE = "Pinhole 501.5 502.5 421.8 167.7 0.0 0.0 0.0 0.0\n800 400\ncrop\n800 400\n"
-STEREO = "1.0 0.0 0.0 -0.3\n0.0 1.0 0.0 0.0\n0.0 0.0 1.0 0.0\n0.0 0.0 0.0 1.0\n"
 HEADER = "# timestamp_ns, tran_x, tran_y, tran_z, quat_x, quat_y, quat_z, quat_w, scale, q, v3\n"
 ROW = f"{TIME},-0.06,0.05,-0.15,-0.015376,0.724499,-0.689104,-0.000977,0.9624,2"
 PLAIN = f"{TIME} -0.06 0.05 -0.15 -0.015376 0.724499 -0.689104 -0.000977"
@@ -80,32 +78,21 @@ def sample(shared_data: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    "text",
-    [
-        PINHOLE,
-        PINHOLE.rstrip(),
-        PINHOLE.replace("\n", "\r\n"),
-        "\ufeff" + PINHOLE,
-        PINHOLE.replace(" 0.0 0.0 0.0 0.0", ""),
-        PINHOLE.replace("crop\n800 400\n", ""),
-        PINHOLE.replace(" ", "  "),
-    ],
+    ("old", "new"),
+    [("", ""), (" 0.0 0.0 0.0 0.0", ""), ("crop\n800 400\n", ""), (" ", "  ")],
 )
-def test_pinhole(write: Callable[[str], Path], text: str) -> None:
-    camera = read_pinhole(write(text))
-    assert (camera.model, camera.width, camera.height) == ("PINHOLE", 800, 400)
-    assert camera.params == (501.5, 502.5, 421.8, 167.7)
+def test_pinhole(write: Callable[[str], Path], old: str, new: str) -> None:
+    camera = read_pinhole(write(PINHOLE.replace(old, new) if old else PINHOLE))
+    assert camera == Camera("PINHOLE", 800, 400, (501.5, 502.5, 421.8, 167.7))
 
 
 @pytest.mark.parametrize(
     ("text", "scale", "quality"),
     [
-        (HEADER + ROW + "\n", 0.9624, 2.0),
         (HEADER + ROW, 0.9624, 2.0),
-        ((HEADER + ROW + "\n").replace("\n", "\r\n"), 0.9624, 2.0),
         (HEADER + ROW + ",0.5\n", 0.9624, 2.0),
-        (HEADER + ROW.removesuffix(",2") + "\n", 0.9624, None),
-        (HEADER + ROW.removesuffix(",0.9624,2") + "\n\n", None, None),
+        (HEADER + ROW.removesuffix(",2"), 0.9624, None),
+        (HEADER + ROW.removesuffix(",0.9624,2"), None, None),
         (ROW.replace(",", ", "), 0.9624, 2.0),
         (ROW.replace(",", " "), 0.9624, 2.0),
     ],
@@ -118,65 +105,36 @@ def test_gnss_poses(
     row = rows[TIME]
     assert (row.scale, row.fusion_quality) == (scale, quality)
     assert row.slam_from_cam.translation == (-0.06, 0.05, -0.15)
-    rotation = Rotation.from_quat([-0.015376, 0.724499, -0.689104, -0.000977])
-    np.testing.assert_allclose(
-        row.slam_from_cam.rotation_matrix(), rotation.as_matrix(), atol=1e-14
-    )
-
-
-@pytest.mark.parametrize(
-    "text",
-    [PLAIN, f"# ts tx ty tz qx qy qz qw\n{PLAIN}\n", PLAIN.replace(" ", ","), PLAIN + "\r\n\r\n"],
-)
-def test_poses(write: Callable[[str], Path], text: str) -> None:
-    poses = read_poses(write(text))
-    assert list(poses) == [TIME]
-    assert poses[TIME].translation == (-0.06, 0.05, -0.15)
-    assert poses[TIME].quat_wxyz[0] == pytest.approx(-0.000977, abs=1e-7)
+    rotation = Rotation.from_quat([-0.015376, 0.724499, -0.689104, -0.000977]).as_matrix()
+    np.testing.assert_allclose(row.slam_from_cam.rotation_matrix(), rotation, atol=1e-14)
+    assert read_poses(write(f"# ts\n{PLAIN}\n")) == {TIME: row.slam_from_cam}
 
 
 def test_keyframe_accuracy(write: Callable[[str], Path]) -> None:
     path = write(f"# better than 0.05 m\n{TIME}\n{TIME + 1} 0.03\n")
     assert read_keyframe_accuracy(path) == {TIME, TIME + 1}
-    with pytest.raises(DataError, match=r"file\.txt:1: 'x' is not a timestamp"):
-        read_keyframe_accuracy(write("x\n"))
 
 
-@pytest.mark.parametrize("between", ["\n", "", "\n\n"])
+@pytest.mark.parametrize("between", ["\n", ""])
 @pytest.mark.parametrize("order", [1, -1])
 def test_transformations(write: Callable[[str], Path], between: str, order: int) -> None:
     found = read_transformations(write(between.join(BLOCKS[::order])))
     assert found.s_from_as.translation == (1.0, 2.0, 3.0)
-    assert found.w_from_gpsw.translation == (4.0, 5.0, 6.0)
-    assert found.w_from_gpsw.quat_wxyz == (0.8, 0.0, 0.0, 0.6)
-    assert found.e_from_gpsw.translation == (4e6, 8e5, 4.7e6)
-    assert found.e_from_gpsw.quat_wxyz == (0.8, 0.6, 0.0, 0.0)
+    assert found.w_from_gpsw == RigidTransform((0.8, 0.0, 0.0, 0.6), (4.0, 5.0, 6.0))
+    assert found.e_from_gpsw == RigidTransform((0.8, 0.6, 0.0, 0.0), (4e6, 8e5, 4.7e6))
     assert found.gnss_scale == 0.9624
-
-
-def test_transformations_without_scale(write: Callable[[str], Path]) -> None:
     assert read_transformations(write("".join(BLOCKS[:5]))).gnss_scale is None
 
 
 @pytest.mark.parametrize(
-    "text",
-    [
-        KEYFRAME,
-        KEYFRAME.rstrip(),
-        KEYFRAME + "\n\n",
-        KEYFRAME.replace("\n", "\r\n"),
-        KEYFRAME.replace("\n\n", "\n"),
-        KEYFRAME.replace("36,\n", "36\n"),
-        KEYFRAME + "\n# something new\n1,2,3\n",
-    ],
+    ("old", "new"), [("\n\n", "\n"), ("36,\n", "36\n"), ("\n31,", "\n31, "), ("# Poi", "#Poi")]
 )
-def test_a_keyframe(write: Callable[[str], Path], text: str) -> None:
-    keyframe = read_keyframe(write(text))
-    assert keyframe.timestamp == 1602074877390449152
-    assert (keyframe.camera.width, keyframe.camera.height) == (800, 400)
-    assert keyframe.camera.params == (501.5, 502.5, 421.8, 167.7)
-    assert keyframe.world_from_cam.quat_wxyz == (0.8, 0.0, 0.0, 0.6)
-    assert keyframe.world_from_cam.translation == (1.0, 2.0, 3.0)
+def test_a_keyframe(write: Callable[[str], Path], old: str, new: str) -> None:
+    assert old in KEYFRAME
+    keyframe = read_keyframe(write(KEYFRAME.replace(old, new) + "\n# something new\n1,2,3\n"))
+    assert keyframe.timestamp == TIME
+    assert keyframe.camera == Camera("PINHOLE", 800, 400, (501.5, 502.5, 421.8, 167.7))
+    assert keyframe.world_from_cam == RigidTransform((0.8, 0.0, 0.0, 0.6), (1.0, 2.0, 3.0))
     np.testing.assert_array_equal(keyframe.points, [[394, 5, 0.047381], [529.5, 6, 0.055165]])
 
 
@@ -189,22 +147,10 @@ def test_a_keyframe_without_points(write: Callable[[str], Path], end: str) -> No
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        (
-            "relocalizationFile_recording_2020-03-24_17-45-31_easy.txt",
-            (None, "recording_2020-03-24_17-45-31"),
-        ),
-        (
-            "relocalizationFile_recording_2020-03-24_17-36-22.txt",
-            (None, "recording_2020-03-24_17-36-22"),
-        ),
-        (
-            "relocalizationFile_recording_2020-10-08_09-57-28_to_recording_2021-01-07_14-03-57.txt",
-            ("recording_2020-10-08_09-57-28", "recording_2021-01-07_14-03-57"),
-        ),
-        (
-            "reloc_city_loop_2_train_to_city_loop_2_test.txt",
-            ("city_loop_2_train", "city_loop_2_test"),
-        ),
+        ("relocalizationFile_rec_2020-03-24_easy.txt", (None, "rec_2020-03-24")),
+        ("relocalizationFile_rec_2020-03-24.txt", (None, "rec_2020-03-24")),
+        ("relocalizationFile_rec_2020_to_rec_2021.txt", ("rec_2020", "rec_2021")),
+        ("reloc_loop_2_train_to_loop_2_test.txt", ("loop_2_train", "loop_2_test")),
         ("reloc_city_loop.txt", None),
         ("relocalizationFile_.txt", None),
         ("relocalizationFile_a.csv", None),
@@ -215,17 +161,10 @@ def test_names(name: str, expected: tuple[str | None, str] | None) -> None:
     assert parse_relocalization_name(name) == expected
 
 
-@pytest.mark.parametrize(
-    "text",
-    [f"{TIME} {LATER}\n{LATER} {TIME}", f"# pairs\r\n{TIME},{LATER}\r\n\r\n{LATER} {TIME}\r\n"],
-)
-def test_pairs(write: Callable[[str], Path], text: str) -> None:
-    rows = read_relocalization(write(text))
+def test_pairs(write: Callable[[str], Path]) -> None:
+    rows = read_relocalization(write(f"# pairs\n{TIME},{LATER}\n\n{LATER} {TIME}\n"))
     assert [(row.reference, row.query) for row in rows] == [(TIME, LATER), (LATER, TIME)]
     assert all(row.query_from_reference is None for row in rows)
-
-
-def test_pairs_with_poses(write: Callable[[str], Path]) -> None:
     row = read_relocalization(write(f"{TIME} {LATER} 1 2 3 0 0 0.6 0.8\n"))[0]
     assert row.query_from_reference is not None
     point = row.query_from_reference.apply(np.array([[1.0, 0.0, 0.0]]))[0]
@@ -235,14 +174,12 @@ def test_pairs_with_poses(write: Callable[[str], Path]) -> None:
 def test_times_keep_every_digit(write: Callable[[str], Path]) -> None:
     text = f"{TIME} 1602074877.3904490471 0.25\n{LATER} 1610028237.0034337044\n"
     assert read_times(write(text)) == [TIME, LATER]
-    assert read_times(write(text.replace("\n", "\r\n").rstrip())) == [TIME, LATER]
 
 
 GNSS, TRANSFORMATIONS = HEADER + ROW, "".join(BLOCKS)
 PAIR, FRAME = f"{TIME} {LATER} 1 2 3 0 0 0.6 0.8", f"{TIME} 1602074877.39 0.25"
 TEXTS: dict[Callable[[Path], Any], str] = {
     read_pinhole: PINHOLE,
-    read_rigid_matrix: STEREO,
     read_keyframe: KEYFRAME,
     read_transformations: TRANSFORMATIONS,
     read_gnss_poses: GNSS,
@@ -260,27 +197,15 @@ TEXTS: dict[Callable[[Path], Any], str] = {
         (read_pinhole, "167.7 0.0", "167.7", 1, "expected 'Pinhole"),
         (read_pinhole, "0.0 0.0\n", "0.0 0.1\n", 1, "cannot have distortion"),
         (read_pinhole, "501.5", "nan", 1, "'nan' is not a finite number"),
-        (read_pinhole, "501.5", "5_01.5", 1, "is not a finite number"),
         (read_pinhole, "501.5", "-501.5", 1, "focal length -501.5 is not positive"),
         (read_pinhole, "p\n800", "p\n640", 4, r"is \(800, 400\) first and \(640, 400\) then"),
         (read_pinhole, "800 400\ncrop", "800x400\ncrop", 2, "expected 2 fields .width height"),
-        (read_pinhole, "800 400\ncrop", "0 400\ncrop", 4, "first and"),
         (read_pinhole, "800 400\ncrop", "99999 400\ncrop", 2, "takes images of 99999x400"),
         (read_pinhole, "crop\n800 400\n", "crop\n", 3, "expected the lines .*, got 3"),
-        (read_pinhole, PINHOLE, "", 1, "expected the lines .*, got 0"),
-        (read_rigid_matrix, "1.0\n", "1.0 0\n", 4, "four lines of four numbers, got line 4 with 5"),
-        (read_rigid_matrix, "0.0 0.0 0.0 1.0\n", "", 4, "four lines of four numbers, got 3"),
-        (read_rigid_matrix, "0.0 0.0 0.0 1.0", "0.0 0.0 0.0 1.0\n0 0 0 1", 5, "got line 5"),
-        (read_rigid_matrix, "0.0 0.0 0.0 1.0", "0.0 0.0 0.1 1.0", 4, "last row is 0 0 0.1 1"),
-        (read_rigid_matrix, "0.0 0.0 1.0 0.0", "0.0 0.0 -1.0 0.0", 4, "no rotation matrix"),
-        (read_rigid_matrix, "0.0 0.0 1.0 0.0", "0.0 0.0 1e300 0.0", 4, "no rotation matrix"),
-        (read_rigid_matrix, "-0.3", "-3e99", 4, "nowhere on earth"),
-        (read_rigid_matrix, "-0.3", "inf", 1, "'inf' is not a finite number"),
         (read_keyframe, "400,2\n", "400,3\n", 19, "2 points, 3 are announced"),
         (read_keyframe, "400,2\n", f"400,{'9' * 18}\n", 19, "2 points, 9{18} are announced"),
         (read_keyframe, "800,400,2", "800,400", 5, "expected 7 fields .fx, .* got 6"),
         (read_keyframe, "400,2\n", "400.5,2\n", 5, "'400.5' is not a whole number"),
-        (read_keyframe, "800,400,2", "-800,400,2", 5, "'-800' is not a whole number"),
         (read_keyframe, f"{TIME}\n", "1602074877.39\n", 2, "is not a timestamp"),
         (read_keyframe, "# timestamp\n", "", 18, "no line '# timestamp'"),
         (read_keyframe, "# camToWorld", "# worldToCam", 19, "no line '# camToWorld'"),
@@ -290,9 +215,7 @@ TEXTS: dict[Callable[[Path], Any], str] = {
         (read_keyframe, "31,28,17,27,19,14,18,20,", "31,28,17,", 19, "expected 8 colours"),
         (read_keyframe, "31,28,17,27,19,14,18,20,\n", "", 19, "expected 8 colours"),
         (read_keyframe, KEYFRAME[KEYFRAME.index("# Poi") :], "", 12, "no line '# Point Cloud'"),
-        (read_keyframe, KEYFRAME, "", 1, "no line '# timestamp'"),
         (read_transformations, "".join(BLOCKS[4:]), "", 8, "there is no transform_e_gpsw"),
-        (read_transformations, TRANSFORMATIONS, "", 1, "no transform_S_AS, transform_w_gpsw, "),
         (read_transformations, BLOCKS[0], "1,2,3,0,0,0,1\n", 1, "numbers without a line"),
         (read_transformations, "1,2,3,0,0,0,1\n", "", 11, "there is no transform_S_AS"),
         (read_transformations, "4,5,6,", "4,5,", 6, "expected 7 fields .*, got 6"),
@@ -304,32 +227,23 @@ TEXTS: dict[Callable[[Path], Any], str] = {
             "'transform_S_AS' is given twice",
         ),
         (read_transformations, "0.9624", "0.9,0.8", 12, "expected 1 fields .one scale., got 2"),
-        (read_transformations, "0.9624", "x", 12, "scale 'x' is not a finite number"),
+        (read_transformations, "0.9624", "-1", 12, "scale -1 is no factor"),
         (read_gnss_poses, ",-0.000977,0.9624,2", "", 2, "expected 8 or .* 11 fields .*, got 7"),
         (read_gnss_poses, "0.9624,2", "0.9624,2,1,2", 2, "got 12"),
-        (read_gnss_poses, str(TIME), "1602074877.39", 2, "'1602074877.39' is not a timestamp"),
         (read_gnss_poses, str(TIME), "1602074877390449152000", 2, "is not a timestamp"),
         (read_gnss_poses, str(TIME), "-5", 2, "'-5' is not a timestamp"),
-        (read_gnss_poses, str(TIME), "1_6", 2, "'1_6' is not a timestamp"),
         (read_gnss_poses, "0.05", "nan", 2, "translation 'nan' is not a finite number"),
         (read_gnss_poses, "0.05", "5e9", 2, "leads beyond the earth"),
-        (read_gnss_poses, "0.05", "", 2, "translation '' is not a finite number"),
         (read_gnss_poses, "0.724499", "0.7", 2, "not a unit quaternion"),
-        (read_gnss_poses, "0.724499", "1e300", 2, "not a unit quaternion"),
         (read_gnss_poses, "0.9624", "0", 2, "scale 0 is no factor"),
-        (read_gnss_poses, "0.9624", "-1", 2, "scale -1 is no factor"),
         (read_gnss_poses, "24,2", "24,good", 2, "fusion_quality 'good' is not a finite number"),
         (read_gnss_poses, ROW, f"{ROW}\n{ROW}", 3, f"timestamp {TIME} is given twice"),
         (read_poses, PLAIN, PLAIN + " 0", 1, "expected 7 fields .*, got 8"),
-        (read_poses, PLAIN, f"{PLAIN}\n{PLAIN}", 2, f"timestamp {TIME} is given twice"),
         (read_keyframe_accuracy, str(TIME), "x", 1, "'x' is not a timestamp"),
-        (read_relocalization, PAIR, f"{TIME}\n", 1, "expected 2 or 9 fields .reference .* got 1"),
         (read_relocalization, PAIR, f"{TIME} {LATER}\n{TIME} {LATER} 1 2 3\n", 2, "got 5"),
         (read_relocalization, "0.8", "0.7", 1, "not a unit quaternion"),
-        (read_relocalization, PAIR, f"{TIME} b\n", 1, "'b' is not a timestamp"),
         (read_relocalization, PAIR, f"{TIME} {LATER}.0\n", 1, "is not a timestamp"),
         (read_times, FRAME, f"{TIME}\n", 1, "expected 2 or 3 fields .timestamp .*, got 1"),
-        (read_times, FRAME, f"{FRAME}\n{FRAME}\n", 2, "is given twice"),
         (read_times, "1602074877.39", "soon", 1, "'soon' is not a finite number"),
         (read_times, str(TIME), "1.5e18", 1, "is not a timestamp"),
     ],
@@ -350,55 +264,10 @@ def test_a_broken_file_is_refused_with_its_line(
     assert str(caught.value).startswith(f"{path}:{line}: ")
 
 
-@pytest.mark.parametrize("reader", [read_poses, read_gnss_poses, read_relocalization, read_times])
-@pytest.mark.parametrize("text", ["", "\n\n", HEADER])
-def test_an_empty_file_is_refused(
-    write: Callable[[str], Path], reader: Callable[[Path], Any], text: str
-) -> None:
-    with pytest.raises(DataError, match=r"file\.txt: no (pose|pair|frame) in the file"):
-        reader(write(text))
-
-
-def test_missing_file(tmp_path: Path) -> None:
+def test_the_second_camera_may_not_lack(tmp_path: Path) -> None:
     (tmp_path / "undistorted_calib_0.txt").write_text(PINHOLE)
     with pytest.raises(DataError, match=r"undistorted_calib_1\.txt: file is missing"):
         read_calibration(tmp_path)
-
-
-def test_the_published_calibration(sample: Path) -> None:
-    """A point 0.3 m to the right and 5 m ahead lies straight ahead of the right camera."""
-    folder = sample / "calibration"
-    calibration = read_calibration(folder)
-    matrix = np.loadtxt(folder / "undistorted_calib_stereo.txt")
-    np.testing.assert_array_equal(calibration.cam1_from_cam0.rotation_matrix(), matrix[:3, :3])
-    np.testing.assert_array_equal(calibration.cam1_from_cam0.translation, matrix[:3, 3])
-    point = calibration.cam1_from_cam0.apply(np.array([[0.3, 0.0, 5.0]]))[0]
-    np.testing.assert_allclose(point, [0.0, 0.0, 5.0], atol=1e-3)
-    camera = calibration.cam1
-    theirs = pycolmap.Camera(
-        model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
-    )
-    assert theirs.img_from_cam(point[None])[0, 0] == pytest.approx(421.7953735163109, abs=0.06)
-
-
-def test_the_published_files_as_kapture_reads_them(sample: Path) -> None:
-    from tools.kapture_import_4seasons import load_transformations_file
-
-    folder = next(sample.glob("recording_*"))
-    theirs, scale = load_transformations_file(str(folder / "Transformations.txt"))
-    ours = read_transformations(folder / "Transformations.txt")
-    assert ours.gnss_scale == scale == 0.962356
-    for name, transform in (
-        ("transform_S_AS", ours.s_from_as),
-        ("transform_w_gpsw", ours.w_from_gpsw),
-        ("transform_e_gpsw", ours.e_from_gpsw),
-    ):
-        np.testing.assert_allclose(transform.quat_wxyz, theirs[name].r_raw, atol=1e-6)
-        np.testing.assert_array_equal(transform.translation, theirs[name].t_raw)
-    rows = read_gnss_poses(folder / "GNSSPoses.txt")
-    assert len(rows) == 2874
-    assert {row.scale for row in rows.values()} == {0.962356}
-    assert next(iter(rows)) == TIME
 
 
 def test_the_published_clouds_as_kapture_reads_them(sample: Path) -> None:
@@ -425,7 +294,5 @@ def test_the_published_clouds_as_kapture_reads_them(sample: Path) -> None:
 def test_the_published_times(sample: Path) -> None:
     folder = next(sample.glob("recording_*"))
     times = read_times(folder / "times.txt")
-    assert len(times) == 10030
     images = {int(p.stem) for p in (folder / "undistorted_images/cam0").iterdir()}
-    assert len(images) == 4
-    assert images <= set(times)
+    assert (len(times), len(images)) == (10030, 4) and images <= set(times)

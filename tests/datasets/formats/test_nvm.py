@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,13 @@ import numpy as np
 import pytest
 from kapture.io.records import TransferAction
 from megloc_twins.model_files import write_nvm
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.formats.text_lines import TextFile
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.images import write_image
 
 SAMPLE = "kapture_samples/Aachen-Day-Night"
 
@@ -42,14 +43,6 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 def file(path: Path, lines: list[str], end: str = "\n") -> Path:
     path.write_bytes(end.join(["NVM_V3", "", *lines]).encode())
     return path
-
-
-def equal_points(first: SparsePoints, second: SparsePoints) -> bool:
-    return all(
-        getattr(first, name).dtype == getattr(second, name).dtype
-        and np.array_equal(getattr(first, name), getattr(second, name))
-        for name in ARRAYS
-    )
 
 
 def check_model(model: NvmModel) -> None:
@@ -77,60 +70,34 @@ def check_model(model: NvmModel) -> None:
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 @pytest.mark.usefixtures("small_blocks")
 def test_the_plain_form(tmp_path: Path, end: str) -> None:
-    for tail in ([], [""], ["0"], ["", "0", "", "some PLY stuff", "\udcff"[:0]]):
-        path = file(tmp_path / "m.nvm", MODEL + tail, end)
-        [model] = read_nvm(path)
+    for tail in ([], [""], ["0"], ["", "0", "", "some PLY stuff"]):
+        [model] = read_nvm(file(tmp_path / "m.nvm", MODEL + tail, end))
         check_model(model)
+    # a file of cameras alone is a model too
+    [model] = read_nvm(file(tmp_path / "m.nvm", ["1", CAMERA, "0", "0"], end))
+    assert model.names == ("db/7.jpg",) and len(model.points) == 0
 
 
 @pytest.mark.usefixtures("small_blocks")
 def test_all_known_variants_of_the_layout(tmp_path: Path) -> None:
-    text = "\n".join(
-        [
-            "\ufeffNVM_V3 FixedK 1000 512 1000.5 384 ",
-            " ",
-            "\t",
-            " 2  ",
-            "./db/7.jpg\t1000.0 1 0 0 0  2.0 0.0 -5.0 0.08 0 ",
-            "",
-            TURNED.replace(" ", "\t"),
-            "",
-            "",
-            "3 ",
-            *(f"  {point} \n" for point in POINTS),
-            "1",
-            "db/9.jpg 5 1 0 0 0 0 0 0 0 0",
-            "1",
-            "1 2 3 64.0 5 6 1 0 0 1 2",
-            "2",
-            "unregistered/1.jpg 0 0 0 0 0 0 0 0 0 0",
-            "unregistered/2.jpg 0 0 0 0 0 0 0 0 0 0",
-            "0",
-            "0",
-            "# what follows is not looked at: 1 2 three",
-        ]
-    )
+    lines = ["\ufeffNVM_V3 FixedK 1000 512 1000.5 384 ", " ", "\t", " 2  "]
+    lines += ["./db/7.jpg\t1000.0 1 0 0 0  2.0 0.0 -5.0 0.08 0 ", "", TURNED.replace(" ", "\t")]
+    lines += ["", "", "3 ", *(f"  {point} \n" for point in POINTS)]
+    lines += ["1", "db/9.jpg 5 1 0 0 0 0 0 0 0 0", "1", "1 2 3 64.0 5 6 1 0 0 1 2"]
+    unregistered = [f"unregistered/{k}.jpg 0 0 0 0 0 0 0 0 0 0" for k in (1, 2)]
+    lines += ["2", *unregistered, "0", "0", "# what follows is not looked at: 1 2 three"]
     path = tmp_path / "m.nvm"
-    path.write_bytes(text.encode() + b"\n\xff\x00\xfe")
+    path.write_bytes("\n".join(lines).encode() + b"\n\xff\x00\xfe")
     first, second = read_nvm(path)
     check_model(first)
     assert second.names == ("db/9.jpg",)
     assert second.points.rgb.tolist() == [[64, 5, 6]]
     assert second.points.point_ids.tolist() == [0]
-    # no minus zero
-    assert np.signbit(second.k_colmap).tolist() == [False]
-
+    assert np.signbit(second.k_colmap).tolist() == [False]  # no minus zero
     models = read_nvm(path, with_points=False)
     assert [model.names for model in models] == [first.names, second.names]
     assert all(len(model.points) == 0 for model in models)
     assert np.array_equal(models[0].centers, first.centers)
-
-
-def test_a_file_of_cameras_alone_is_a_model(tmp_path: Path) -> None:
-    path = file(tmp_path / "m.nvm", ["1", CAMERA, "0", "0"])
-    [model] = read_nvm(path)
-    assert model.names == ("db/7.jpg",)
-    assert len(model.points) == 0
 
 
 def test_quaternions_are_normalised_or_refused(tmp_path: Path) -> None:
@@ -143,9 +110,6 @@ def test_quaternions_are_normalised_or_refused(tmp_path: Path) -> None:
     path = file(tmp_path / "m.nvm", ["2", camera.replace("0.5003", "0.503"), CAMERA, "0"])
     with pytest.raises(DataError, match=r"m\.nvm:4: .*not a unit quaternion"):
         read_nvm(path)
-
-
-# ------------------------------------------------------------------------------- against kapture
 
 
 def import_with_kapture(nvm: Path, images: Path, output: Path) -> kapture.Kapture:
@@ -168,22 +132,20 @@ def observed(data: kapture.Kapture, folder: Path) -> list[tuple[int, str, float,
 
 def check_against_kapture(models: list[NvmModel], data: kapture.Kapture, folder: Path) -> None:
     """Poses, distortion, points and observations; kapture merges the models of a file."""
+    merged = np.concatenate([np.hstack([m.points.xyz, m.points.rgb]) for m in models])
+    assert np.allclose(merged, data.points3d.as_array(), atol=1e-9)
+    first = 0
+    rows: set[tuple[Any, ...]] = set()
     sensors = {name: (time, sensor) for time, sensor, name in kapture.flatten(data.records_camera)}
     for model in models:
         for index, name in enumerate(model.names):
             camera = data.sensors[sensors[name][1]]
             assert camera.camera_params[2] == model.focal_px[index]
             assert camera.camera_params[5] == model.k_colmap[index]
-            theirs = data.trajectories[sensors[name]]
-            ours = model.cam_from_world(index)
+            theirs, ours = data.trajectories[sensors[name]], model.cam_from_world(index)
             # kapture keeps the length of the quaternion, which has six digits here
             assert np.allclose(ours.quat_wxyz, theirs.r_raw, atol=1e-6)
             assert np.allclose(ours.translation, theirs.t_raw, atol=1e-9)
-    merged = np.concatenate([np.hstack([m.points.xyz, m.points.rgb]) for m in models])
-    assert np.allclose(merged, data.points3d.as_array(), atol=1e-9)
-    first = 0
-    rows: set[tuple[Any, ...]] = set()
-    for model in models:
         points = model.points
         for point, image, (x, y) in zip(
             points.point_ids, points.image_ids, points.xy_px.tolist(), strict=True
@@ -202,20 +164,6 @@ def test_the_published_sample_reads_as_kapture_reads_it(
     assert len(models) == (2 if "two_parts" in name else 1)
     data = import_with_kapture(nvm, shared_data / SAMPLE / "images_upright", tmp_path)
     check_against_kapture(models, data, tmp_path)
-
-
-def test_the_sample_has_the_poses_of_its_published_kapture(shared_data: Path) -> None:
-    [model] = read_nvm(shared_data / SAMPLE / "3D-models/aachen_cvpr2018_db.nvm")
-    twin = kapture.io.csv.kapture_from_dir(str(shared_data / SAMPLE / "kapture/training"))
-    by_name = {name: key for *key, name in kapture.flatten(twin.records_camera)}
-    assert model.k_colmap[0] == -0.0810989
-    assert set(by_name) == set(model.names)
-    for index, name in enumerate(model.names):
-        time, sensor = by_name[name]
-        pose = twin.trajectories[time, sensor]
-        assert np.allclose(model.cam_from_world(index).quat_wxyz, pose.r_raw, atol=1e-6)
-        assert np.allclose(model.cam_from_world(index).translation, pose.t_raw, atol=1e-9)
-        assert twin.sensors[sensor].camera_params[5] == model.k_colmap[index]
 
 
 def random_model(seed: int, num_images: int = 7, num_points: int = 60) -> NvmModel:
@@ -245,44 +193,32 @@ def random_model(seed: int, num_images: int = 7, num_points: int = 60) -> NvmMod
 
 
 @pytest.mark.usefixtures("small_blocks")
-def test_a_model_comes_back_exactly(tmp_path: Path) -> None:
-    written = random_model(1)
-    write_nvm(tmp_path / "m.nvm", written)
-    [read] = read_nvm(tmp_path / "m.nvm")
-    assert read.names == written.names
+def test_what_is_written_comes_back_exactly_and_kapture_reads_it(tmp_path: Path) -> None:
+    model, path = random_model(2), tmp_path / "m.nvm"
+    write_nvm(path, model)
+    [read] = read_nvm(path)
+    assert read.names == model.names
     for name in ("focal_px", "centers", "k_colmap"):
-        assert np.array_equal(getattr(read, name), getattr(written, name))
-    assert np.allclose(read.quat_wxyz, written.quat_wxyz, rtol=0, atol=1e-15)
-    assert equal_points(read.points, written.points)
-
-
-def test_what_we_write_kapture_reads(tmp_path: Path) -> None:
-    model = random_model(2)
-    write_nvm(tmp_path / "m.nvm", model)
+        assert np.array_equal(getattr(read, name), getattr(model, name))
+    assert np.allclose(read.quat_wxyz, model.quat_wxyz, rtol=0, atol=1e-15)
+    for name in ARRAYS:
+        ours, theirs = getattr(read.points, name), getattr(model.points, name)
+        assert ours.dtype == theirs.dtype and np.array_equal(ours, theirs)
     # COLMAP's exporter leaves blanks in blank lines, which kapture does not take for blank
-    text = (tmp_path / "m.nvm").read_text()
+    text = path.read_text()
     assert text.startswith("NVM_V3 \n \n7  \n")
-    (tmp_path / "m.nvm").write_text(text.replace("\n \n", "\n\n"))
+    path.write_text(text.replace("\n \n", "\n\n"))
     for name in model.names:
-        image = tmp_path / "images" / name
-        image.parent.mkdir(parents=True, exist_ok=True)
-        Image.new("L", (64, 48)).save(image)
-    data = import_with_kapture(tmp_path / "m.nvm", tmp_path / "images", tmp_path / "kapture")
+        write_image(tmp_path / "images" / name, np.zeros((48, 64, 3), np.uint8))
+    data = import_with_kapture(path, tmp_path / "images", tmp_path / "kapture")
     check_against_kapture([model], data, tmp_path / "kapture")
 
 
 def test_names_with_blanks_cannot_be_written(tmp_path: Path) -> None:
-    model = random_model(3, 1, 1)
     for name in ("a b.jpg", "a\tb", "", "a\n"):
-        wrong = NvmModel(
-            (name,), model.focal_px, model.quat_wxyz, model.centers, model.k_colmap, model.points
-        )
         with pytest.raises(ValueError, match="blanks"):
-            write_nvm(tmp_path / "m.nvm", wrong)
+            write_nvm(tmp_path / "m.nvm", replace(random_model(3, 1, 1), names=(name,)))
     assert list(tmp_path.iterdir()) == []
-
-
-# ------------------------------------------------------------------------------------ bad input
 
 
 @pytest.mark.parametrize(
@@ -294,9 +230,7 @@ def test_names_with_blanks_cannot_be_written(tmp_path: Path) -> None:
         ("1 2 3 4 5 6 999999999999 0 0 1 2", "expected 4000000000003 fields"),
         ("1 2 3 4 5 6 -1", "'-1' is not a whole number"),
         ("nan 2 3 4 5 6 0", "coordinate 'nan' is not a finite number"),
-        ("1e999 2 3 4 5 6 0", "coordinate '1e999' is not a finite number"),
-        ("1 0x2 3 4 5 6 0", "coordinate '0x2' is not a finite number"),
-        ("1 2,5 3 4 5 6 0", "coordinate '2,5' is not a finite number"),
+        ("1 2 3\0 4 5 6 0", "is not a finite number"),
         ("1 2 3 256 5 6 0", "a colour is not made of whole numbers"),
         ("1 2 3 4 -5 6 0", "a colour is not made of whole numbers"),
         ("1 2 3 4 5 6.5 0", "a colour is not made of whole numbers"),
@@ -304,11 +238,8 @@ def test_names_with_blanks_cannot_be_written(tmp_path: Path) -> None:
         ("1 2 3 4 5 6 1 -1 0 1 2", "image index '-1' is not a whole number"),
         ("1 2 3 4 5 6 1 0 2147483648 1 2", "feature index 2147483648 is out of range"),
         ("1 2 3 4 5 6 1 0 1.5 1 2", "feature index '1.5' is not a whole number"),
-        ("1 2 3 4 5 6 1 0 0 1_0 2", "image coordinate '1_0' is not a finite number"),
         ("1 2 3 4 5 6 1 0 0 inf 2", "image coordinate 'inf' is not a finite number"),
         ("1 2 3 4 5 6 1 0 0 2e38 2", "image coordinate '2e38' is out of range"),
-        ("1 2 3 4 5 6 \u0661", "is not a whole number"),
-        ("1 2 3\0 4 5 6 0", "is not a finite number"),
     ],
 )
 @pytest.mark.usefixtures("small_blocks")
@@ -324,24 +255,21 @@ def test_bad_points_name_file_and_line(tmp_path: Path, line: str, match: str) ->
 @pytest.mark.parametrize(
     ("lines", "match"),
     [
-        ([], r"m\.nvm: holds no model"),
         (["0"], r"m\.nvm: holds no model"),
         (["x"], r"m\.nvm:3: the number of cameras 'x' is not a whole number"),
-        (["-2"], r"m\.nvm:3: the number of cameras '-2' is not"),
         (["2 2"], r"m\.nvm:3: expected 1 fields \(the number of cameras"),
         (["2", CAMERA], r"m\.nvm:4: the file ends after 1 of 2 cameras"),
         (["99999999999999999", CAMERA], r"ends after 1 of 99999999999999999 cameras"),
         (["1", CAMERA], r"m\.nvm:4: the file ends where the number of points was expected"),
-        (["1", CAMERA, "2"], r"m\.nvm:5: the file ends after 0 of 2 points"),
-        (["1", CAMERA, "99999999999999999"], "ends after 0 of 99999999999999999 points"),
+        (
+            ["1", CAMERA, "99999999999999999"],
+            "5: the file ends after 0 of 99999999999999999 points",
+        ),
         (["1", CAMERA, "x"], r"m\.nvm:5: the number of points 'x'"),
         (["1", CAMERA, "1", "1 2 3 4 5 6 0", "1 2 3"], r"m\.nvm:7: expected 1 fields"),
         (["1", CAMERA + " 7", "0"], r"m\.nvm:4: expected 11 fields .*, got 12"),
-        (["1", CAMERA.replace("1000.0", "f"), "0"], r"m\.nvm:4: camera parameter 'f'"),
         (["1", CAMERA.replace("1000.0", "NaN"), "0"], r"m\.nvm:4: camera parameter 'NaN'"),
         (["1", "../" + CAMERA, "0"], r"m\.nvm:4: .* leads out of its folder"),
-        (["1", "/" + CAMERA, "0"], r"m\.nvm:4: .* absolute path"),
-        (["1", "a\\b" + CAMERA, "0"], r"m\.nvm:4: .* backslash"),
         (["2", CAMERA, "./" + CAMERA, "0"], r"m\.nvm:5: image 'db/7.jpg' is listed twice, .* 4"),
     ],
 )
@@ -359,11 +287,11 @@ def test_bad_structure_is_named(tmp_path: Path, lines: list[str], match: str) ->
         (b"\n\n", "the first line must begin with NVM_V3"),
         (b"NVM_V3_R9T\n1\n", "the first line must begin with NVM_V3"),
         (b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 40, "the first line must begin with NVM_V3"),
+        (b"NVM_V3\n\n", "holds no model"),
         (b"NVM_V3 FixedK 1 2 3\n", "expected 6 fields"),
         (b"NVM_V3 FixedX 1 2 3 4\n", "only FixedK"),
         (b"NVM_V3 FixedK 1 2 3 x\n", "calibration 'x'"),
         (b"NVM_V3\n1\n\xff.jpg 1 1 0 0 0 0 0 0 0 0\n0\n", "name is not UTF-8"),
-        (b"NVM_V3\n1\na\x01 1 1 0 0 0 0 0 0 0 0\n0\n", "control character"),
     ],
 )
 def test_bad_content_is_named(tmp_path: Path, content: bytes, match: str) -> None:
@@ -378,10 +306,9 @@ def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"m\.nvm: file is missing"):
         read_nvm(tmp_path / "m.nvm")
     os.mkfifo(tmp_path / "m.nvm")
-    with pytest.raises(DataError, match=r"m\.nvm: not a plain file"):
-        read_nvm(tmp_path / "m.nvm")
-    with pytest.raises(DataError, match="not a plain file"):
-        read_nvm(tmp_path)
+    for path in (tmp_path / "m.nvm", tmp_path):
+        with pytest.raises(DataError, match="not a plain file"):
+            read_nvm(path)
 
 
 @pytest.mark.usefixtures("small_blocks")

@@ -42,11 +42,11 @@ def test_models_are_joined_behind_one_another() -> None:
 
 
 def test_sorting_by_point_keeps_the_order_of_equals() -> None:
-    mixed = points(3, [(2, 0, 1), (0, 1, 2), (2, 1, 3), (0, 0, 4)])
-    ordered = mixed.sorted_by_point()
+    ordered = points(3, [(2, 0, 1), (0, 1, 2), (2, 1, 3), (0, 0, 4)]).sorted_by_point()
     assert ordered.point_ids.tolist() == [0, 0, 2, 2]
-    assert ordered.feature_ids.tolist() == [2, 4, 1, 3]
     assert ordered.xy_px.tolist() == [[1, 2], [0, 4], [0, 1], [1, 3]]
+    for ids, column in ((ordered.image_ids, 0), (ordered.feature_ids, 1)):
+        assert ids.tolist() == ordered.xy_px[:, column].tolist()
     assert ordered.sorted_by_point() is ordered
     for bad in (3, -1):
         with pytest.raises(ValueError, match="point_ids are out of range"):

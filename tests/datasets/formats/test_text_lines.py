@@ -49,9 +49,36 @@ def test_long_texts_are_cut_in_errors(path: Path) -> None:
         line.expect(["a"], (2, 3), "a b c")
 
 
-@pytest.mark.parametrize("name", ["./a/b.jpg", "a/b.jpg"])
-def test_image_names_lose_the_dot_before_them(name: str) -> None:
-    assert image_name(name) == "a/b.jpg"
+def test_counts(path: Path) -> None:
+    line = Line(path, 1, "")
+    assert line.count_of("007", "size") == 7
+    for text in ("1_0", "-1", "5.0", "\u0661", "9" * 5000):
+        with pytest.raises(DataError, match="is not a whole number"):
+            line.count_of(text, "size", 99)
+    with pytest.raises(DataError, match="3 is out of range, there are 3"):
+        line.count_of("3", "size", 3)
+
+
+@pytest.mark.parametrize(
+    "text", ["nan", "inf", "1e999", "1_0", "0x2", "2,5", "\u0661", "3\0", "", "x"]
+)
+def test_what_is_no_finite_number(path: Path, text: str) -> None:
+    assert Line(path, 1, "").number_of("-.5e1", "width") == -5
+    with pytest.raises(DataError, match="is not a finite number"):
+        Line(path, 1, "").number_of(text, "width")
+
+
+def test_image_names_are_plain_paths() -> None:
+    assert image_name("./a/b.jpg") == image_name("a/b.jpg") == "a/b.jpg"
+    for name, match in (
+        ("../a.jpg", "leads out of its folder"),
+        ("/a.jpg", "absolute path"),
+        ("a\\b.jpg", "backslash"),
+        ("a\x1c", "control character"),
+        ("\udcff.jpg", "not UTF-8"),
+    ):
+        with pytest.raises(DataError, match=match):
+            image_name(name)
 
 
 def test_the_file_and_its_blocks_pass_over_the_same_lines(path: Path) -> None:
@@ -84,27 +111,19 @@ def test_a_file_without_line_breaks_does_not_fill_the_memory(
 ) -> None:
     monkeypatch.setattr(text_lines, "_MAX_LINE_BYTES", 100)
     path.write_text("1\n" + "2" * 300)
-    for block_bytes in (10, 250):
-        with TextFile(path, block_bytes=block_bytes) as file:
-            file.line()
-            if block_bytes < 100:
-                with pytest.raises(DataError, match=r"file\.txt:2: a line of more than 100 bytes"):
-                    file.block(5)
+    with TextFile(path, block_bytes=10) as file:
+        file.line()
+        with pytest.raises(DataError, match=r"file\.txt:2: a line of more than 100 bytes"):
+            file.block(5)
 
 
 def numbers_of(content: bytes) -> list[list[float]] | None:
     rows = Block(Path("f"), 1, content).numbers()
     if rows is None:
         return None
-    assert rows.heads(1)[:, 0].tolist() == [rows.values[start] for start in rows.starts]
-    ends = np.cumsum(rows.lengths - 1)
-    tails = np.split(rows.tails(1), ends[:-1]) if len(ends) else []
-    return [
-        [head, *tail]
-        for head, tail in zip(
-            rows.heads(1)[:, 0].tolist(), [t.tolist() for t in tails], strict=True
-        )
-    ]
+    heads = rows.heads(1)[:, 0].tolist()
+    tails = np.split(rows.tails(1), np.cumsum(rows.lengths - 1)[:-1]) if heads else []
+    return [[head, *tail.tolist()] for head, tail in zip(heads, tails, strict=True)]
 
 
 def test_rows_of_numbers_are_told_apart() -> None:
@@ -130,14 +149,36 @@ def test_comments_become_blank_lines() -> None:
     assert [line.number for line in block.rows()] == [6, 8]
 
 
+MATRIX = "0 -1 0 5\n1 0 0 2\n0 0 1 -1\n0 0 0 1"
+
+
 @pytest.mark.parametrize("separator", [",", " ", " , "])
 def test_a_rigid_matrix(path: Path, separator: str) -> None:
-    rows = [
-        ["0", "-1", "0", "5"],
-        ["1", "0", "0", "2"],
-        ["0", "0", "1", "-1"],
-        ["0", "0", "0", "1"],
-    ]
-    path.write_text("\n".join(separator.join(row) for row in rows))
+    path.write_text(MATRIX.replace(" ", separator))
     transform = read_rigid_matrix(path)
     np.testing.assert_allclose(transform.apply(np.array([[1.0, 0, 0]])), [[5, 3, -1]], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "match"),
+    [
+        (" 5\n", " 5 0\n", 1, "four lines of four numbers, got line 1 with 5"),
+        ("\n0 0 0 1", "", 4, "four lines of four numbers, got 3"),
+        ("0 0 0 1", "0 0 0 1\n0 0 0 1", 5, "got line 5"),
+        ("0 0 0 1", "0 0 0.1 1", 4, "last row is 0 0 0.1 1"),
+        ("0 0 1 -1", "0 0 0.9 -1", 4, "no rotation matrix"),
+        ("0 0 1 -1", "0 0 -1 -1", 4, "no rotation matrix"),
+        ("0 0 1 -1", "0 0 1e300 -1", 4, "no rotation matrix"),
+        ("-1\n", "-3e99\n", 4, "nowhere on earth"),
+        ("-1\n", "inf\n", 3, "'inf' is not a finite number"),
+        ("-1\n", "1e999\n", 3, "'1e999' is not a finite number"),
+    ],
+)
+def test_a_broken_matrix_is_refused_with_its_line(
+    path: Path, old: str, new: str, line: int, match: str
+) -> None:
+    assert old in MATRIX
+    path.write_text(MATRIX.replace(old, new))
+    with pytest.raises(DataError, match=match) as caught:
+        read_rigid_matrix(path)
+    assert str(caught.value).startswith(f"{path}:{line}: ")

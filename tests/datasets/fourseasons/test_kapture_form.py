@@ -7,16 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fourseasons_files import DAY, SNOW, read, write, write_calibration, write_recording
 from kapture_forms import fourseasons_with_kapture
 
-from megloc_kapture.datasets.fourseasons.adapter import FourSeasons, FourSeasonsOptions
+from megloc_kapture.datasets.fourseasons.adapter import FourSeasons
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
 
-DAY, SNOW = "recording_2020-05-01_10-00-00", "recording_2021-01-02_10-00-00"
 RELOCALIZATION = f"relocalizationFile_{DAY}_to_{SNOW}.txt"
 # kapture's importer reads them as floats, which hold whole seconds to the nanosecond
 MAP_TIMES = tuple(10**9 * (1_600_000_000 + number) for number in range(4))
@@ -32,55 +31,31 @@ TRANSFORMATIONS = """# transform_S_AS: translation vector, rotation quaternion
 """
 
 
-def write_recording(folder: Path, times: tuple[int, ...]) -> None:
-    folder.mkdir(parents=True)
-    (folder / "Transformations.txt").write_text(TRANSFORMATIONS)
-    rows = [
-        f"{time},{2 * i},{0.5 * i},{-0.1 * i},0,{0.6 if i % 2 else -0.6},0,0.8,0.96,2"
-        for i, time in enumerate(times)
-    ]
-    (folder / "GNSSPoses.txt").write_text("# timestamp_ns, ...\n" + "\n".join(rows) + "\n")
-    lines = [f"{time} {time // 10**9}.0 0.25\n" for time in times]
-    (folder / "times.txt").write_text("".join(lines))
-    for camera in ("cam0", "cam1"):
-        for time in times:
-            image = folder / "undistorted_images" / camera / f"{time}.png"
-            write_image(image, np.full((4, 8, 3), 9, np.uint8))
-
-
 @pytest.fixture(scope="module")
 def official(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("official") / "4Seasons"
-    write_recording(root / DAY, MAP_TIMES)
-    write_recording(root / SNOW, QUERY_TIMES)
-    calibration = root / "calibration"
-    calibration.mkdir()
-    for number in (0, 1):
-        text = f"Pinhole 5.1 5.2 4.25 1.7{number} 0.0 0.0 0.0 0.0\n8 4\ncrop\n8 4\n"
-        (calibration / f"undistorted_calib_{number}.txt").write_text(text)
-    stereo = "1.0 0.0 0.0 -0.3\n0.0 1.0 0.0 0.0\n0.0 0.0 1.0 0.0\n0.0 0.0 0.0 1.0\n"
-    (calibration / "undistorted_calib_stereo.txt").write_text(stereo)
+    for name, times in ((DAY, MAP_TIMES), (SNOW, QUERY_TIMES)):
+        rows = [
+            f"{time},{2 * i},{0.5 * i},{-0.1 * i},0,{0.6 if i % 2 else -0.6},0,0.8,0.96,2"
+            for i, time in enumerate(times)
+        ]
+        folder = write_recording(root, name, times, rows)
+        write(folder / "Transformations.txt", TRANSFORMATIONS)
+        write(folder / "times.txt", "".join(f"{t} {t // 10**9}.0 0.25\n" for t in times))
+    write_calibration(root / "calibration")
+    pinhole = "Pinhole 5.1 5.2 4.25 1.71 0.0 0.0 0.0 0.0\n8 4\ncrop\n8 4\n"
+    write(root / "calibration/undistorted_calib_1.txt", pinhole)
     pairs = [(MAP_TIMES[1], QUERY_TIMES[2]), (MAP_TIMES[3], QUERY_TIMES[0])]
-    (root / RELOCALIZATION).write_text("".join(f"{a} {b}\n" for a, b in pairs))
+    write(root / RELOCALIZATION, "".join(f"{a} {b}\n" for a, b in pairs))
     return root
 
 
 @pytest.fixture(scope="module")
-def converted(official: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def downloaded(official: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("kapture") / "4seasons"
     fourseasons_with_kapture(official, root)
     shutil.copyfile(official / RELOCALIZATION, root / RELOCALIZATION)
     return root
-
-
-@pytest.fixture
-def root(converted: Path, tmp_path: Path) -> Path:
-    """A copy to be changed."""
-    return Path(shutil.copytree(converted, tmp_path / "root", symlinks=True))
-
-
-def read(root: Path, **options: object) -> OfficialDataset:
-    return FourSeasons(FourSeasonsOptions.model_validate(options)).read(root)
 
 
 def on_earth(dataset: OfficialDataset) -> dict[str, RigidTransform]:
@@ -90,17 +65,15 @@ def on_earth(dataset: OfficialDataset) -> dict[str, RigidTransform]:
 
 
 def assert_same(found: OfficialDataset, expected: OfficialDataset) -> None:
+    """Each has a local frame of its own."""
     for part in ("mapping", "query"):
         ours, theirs = getattr(found, part), getattr(expected, part)
-        assert ours.records_camera == theirs.records_camera
-        assert ours.sensors == theirs.sensors
+        assert ours.records_camera == theirs.records_camera and ours.sensors == theirs.sensors
         for camera, pose in theirs.rigs["car"].items():
-            np.testing.assert_allclose(
-                ours.rigs["car"][camera].translation, pose.translation, atol=1e-12
-            )
-    assert found.groups == expected.groups and found.priors == expected.priors
-    assert list(found.relocalization) == list(expected.relocalization)
-    assert found.protocol == expected.protocol
+            own = ours.rigs["car"][camera]
+            np.testing.assert_allclose(own.translation, pose.translation, atol=1e-12)
+    for table in ("groups", "priors", "relocalization", "protocol"):
+        assert getattr(found, table) == getattr(expected, table), table
     poses, others = on_earth(found), on_earth(expected)
     assert poses.keys() == others.keys() and len(poses) == 2 * (len(MAP_TIMES) + 2)
     for name, pose in others.items():
@@ -109,8 +82,8 @@ def assert_same(found: OfficialDataset, expected: OfficialDataset) -> None:
         np.testing.assert_allclose(mine.center(), pose.center(), rtol=0, atol=1e-6)
 
 
-def test_the_same_dataset_in_both_forms(official: Path, converted: Path) -> None:
-    found = read(converted)
+def test_the_same_dataset_in_both_forms(official: Path, downloaded: Path, tmp_path: Path) -> None:
+    found = read(downloaded)
     assert_same(found, read(official))
     assert len(found.relocalization) == 2
     # small numbers in a frame whose z is up
@@ -119,37 +92,35 @@ def test_the_same_dataset_in_both_forms(official: Path, converted: Path) -> None
     up = np.array(found.world.pose_in_official(RigidTransform.identity()).rotation_matrix())[2]
     earth = next(iter(on_earth(found).values())).center()
     assert up @ earth / np.linalg.norm(earth) > 0.9999
-
-
-def test_recordings_in_the_root(official: Path, converted: Path, tmp_path: Path) -> None:
-    for name in (DAY, SNOW):
-        shutil.copytree(converted / "records" / name, tmp_path / name, symlinks=True)
-    shutil.copyfile(official / RELOCALIZATION, tmp_path / DAY / RELOCALIZATION)
-    assert_same(read(tmp_path), read(official))
-
-
-def test_images_are_linked(converted: Path, official: Path, tmp_path: Path) -> None:
-    write_official(read(converted), tmp_path / "out")
+    write_official(found, tmp_path / "out")
     for part in ("mapping", "query"):
         folder = KaptureFolder(tmp_path / "out" / part)
         for name in folder.read().image_names():
             assert folder.image_path(name).samefile(official / name)
 
 
-def test_input_files_are_what_is_read(converted: Path) -> None:
-    files = list(FourSeasons().input_files(converted))
+def test_recordings_in_the_root(official: Path, downloaded: Path, tmp_path: Path) -> None:
+    for name in (DAY, SNOW):
+        shutil.copytree(downloaded / "records" / name, tmp_path / name, symlinks=True)
+    shutil.copyfile(official / RELOCALIZATION, tmp_path / DAY / RELOCALIZATION)
+    assert_same(read(tmp_path), read(official))
+
+
+def test_input_files_are_what_is_read(downloaded: Path) -> None:
+    files = list(FourSeasons().input_files(downloaded))
     assert all(path.is_file() for path in files) and len(set(files)) == len(files)
-    names = {str(path.relative_to(converted)) for path in files}
-    assert {RELOCALIZATION, f"records/{DAY}/sensors/trajectories.txt"} <= names
-    assert f"records/{SNOW}/sensors/records_data/undistorted_images/cam1/{QUERY_TIMES[0]}.png" in (
-        names
-    )
+    names = {str(path.relative_to(downloaded)) for path in files}
+    sensors = f"records/{SNOW}/sensors"
+    assert f"{sensors}/records_data/undistorted_images/cam1/{QUERY_TIMES[0]}.png" in names
+    assert {RELOCALIZATION, f"{sensors}/trajectories.txt"} <= names
 
 
 def test_a_recording_without_poses_is_a_query(root: Path) -> None:
     (root / "records" / SNOW / "sensors/trajectories.txt").unlink()
     dataset = read(root)
     assert dataset.query_gt is None and len(dataset.relocalization) == 2
+    with pytest.raises(DataError, match=r"depth needs the scale .* GNSSPoses\.txt"):
+        read(root, depth=True)
 
 
 def test_poses_that_are_nowhere_on_earth(root: Path) -> None:
@@ -161,19 +132,11 @@ def test_poses_that_are_nowhere_on_earth(root: Path) -> None:
     assert str(table) in str(caught.value)
 
 
-@pytest.mark.parametrize("table", ["rigs.txt", "sensors.txt"])
-def test_a_car_of_other_cameras(root: Path, table: str) -> None:
-    path = root / "records" / DAY / "sensors" / table
-    lines = path.read_text().splitlines(keepends=True)
-    path.write_text("".join(line for line in lines if "cam1" not in line))
-    if table == "sensors.txt":
-        for other in ("rigs.txt", "records_camera.txt"):
-            there = path.with_name(other).read_text().splitlines(keepends=True)
-            path.with_name(other).write_text("".join(x for x in there if "cam1" not in x))
+@pytest.mark.parametrize("tables", [["rigs"], ["sensors", "rigs", "records_camera"]])
+def test_a_car_of_other_cameras(root: Path, tables: list[str]) -> None:
+    for table in tables:
+        path = root / "records" / DAY / f"sensors/{table}.txt"
+        lines = path.read_text().splitlines(keepends=True)
+        path.write_text("".join(line for line in lines if "cam1" not in line))
     with pytest.raises(DataError, match="no cameras cam0 and cam1 on one rig"):
         FourSeasons().check(root)
-
-
-def test_depth_is_read_from_the_official_layout(converted: Path) -> None:
-    with pytest.raises(DataError, match=r"depth needs the scale .* GNSSPoses\.txt"):
-        read(converted, depth=True)

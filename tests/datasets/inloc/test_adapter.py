@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
+import kapture
 import numpy as np
 import pytest
 import scipy.io
 from inloc_files import CENTRES, HEIGHT, SCANS, VIEWS, WIDTH, Floats, scanned, write_download
+from kapture.io.csv import kapture_from_dir
 from PIL import Image
 
-import megloc_kapture  # noqa: F401  before kapture
-from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions, depth_camera
+from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import read_groups, read_names, read_protocol
@@ -21,16 +23,12 @@ from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import DATASETS
 from megloc_kapture.values import Camera
 
+import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
+
 
 @pytest.fixture(scope="module")
-def download(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def downloaded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_download(tmp_path_factory.mktemp("data") / "InLoc")
-
-
-@pytest.fixture
-def root(download: Path, tmp_path: Path) -> Path:
-    """A copy to be changed."""
-    return Path(shutil.copytree(download, tmp_path / "InLoc"))
 
 
 def imported(root: Path, output: Path, *, allow_missing: bool = False, **options: object) -> Path:
@@ -43,36 +41,31 @@ def read(root: Path, *, allow_missing: bool = False, **options: object) -> Offic
     return InLoc(InLocOptions.model_validate(options)).read(root, allow_missing=allow_missing)
 
 
-def in_cutouts(mapping: Path, sensor_type: str) -> dict[str, tuple[Floats, object]]:
+def in_cutouts(mapping: Path, sensor_type: str) -> dict[str, tuple[Floats, Any]]:
     """By record: what its scan measured, in the sensor's frame, and COLMAP's camera, after kapture.
 
     The poses are composed by kapture from what it reads.
     """
-    import kapture
-    import pycolmap
-    from kapture.io.csv import kapture_from_dir
-
     theirs = kapture_from_dir(str(mapping))
     poses = kapture.rigs_remove(theirs.trajectories, theirs.rigs) if theirs.rigs else None
     records = theirs.records_camera if sensor_type == "camera" else theirs.records_depth
     found = {}
     for timestamp, sensor_id, name in kapture.flatten(records):
         model, width, height, *params = theirs.sensors[sensor_id].sensor_params
-        camera = pycolmap.Camera(
-            model=model, width=int(width), height=int(height), params=list(map(float, params))
-        )
+        numbers = {"width": int(width), "height": int(height), "params": list(map(float, params))}
         *_, floor, _, file = name.split("/")
         yaw, pitch = (int(part) for part in file.split(".")[0].split("_")[-2:])
         rotation, translation = SCANS[floor]
         in_floor = scanned(yaw, pitch).reshape(-1, 3) @ rotation.T + translation
-        pose = (poses or theirs.trajectories)[timestamp, sensor_id]
-        found[name] = pose.transform_points(in_floor).reshape(HEIGHT, WIDTH, 3), camera
+        in_camera = (poses or theirs.trajectories)[timestamp, sensor_id].transform_points(in_floor)
+        camera = pycolmap.Camera(model=model, **numbers)
+        found[name] = in_camera.reshape(HEIGHT, WIDTH, 3), camera
     return found
 
 
 @pytest.mark.parametrize("depth", [True, False])
-def test_points_are_seen_in_their_pixels(download: Path, tmp_path: Path, depth: bool) -> None:
-    output = imported(download, tmp_path / "out", depth=depth)
+def test_points_are_seen_in_their_pixels(downloaded: Path, tmp_path: Path, depth: bool) -> None:
+    output = imported(downloaded, tmp_path / "out", depth=depth)
     found = in_cutouts(output / "mapping", "camera")
     assert sorted(found) == sorted(
         f"database/cutouts/{floor}/024/DUC_cutout_024_{yaw}_{pitch}.jpg"
@@ -83,56 +76,48 @@ def test_points_are_seen_in_their_pixels(download: Path, tmp_path: Path, depth: 
         seen = np.isfinite(points).all(axis=2)
         assert seen.sum() == WIDTH * HEIGHT - 2
         assert (points[seen][:, 2] > 0.5).all()
-        pixels = camera.img_from_cam(points[seen])  # type: ignore[attr-defined]
-        np.testing.assert_allclose(pixels, CENTRES[seen], atol=1e-6)
+        np.testing.assert_allclose(camera.img_from_cam(points[seen]), CENTRES[seen], atol=1e-6)
 
 
 @pytest.mark.parametrize("step", [1, 3, 64])
-def test_depth_maps_hold_the_measured_points(download: Path, tmp_path: Path, step: int) -> None:
-    output = imported(download, tmp_path / "out", depth_step=step)
+def test_depth_maps_hold_the_measured_points(downloaded: Path, tmp_path: Path, step: int) -> None:
+    output = imported(downloaded, tmp_path / "out", depth_step=step)
     found = in_cutouts(output / "mapping", "depth")
     assert len(found) == 72
     for name, (points, camera) in found.items():
         kept = points[::step, ::step]
         path = output / "mapping" / "sensors" / "records_data" / name
         depth = np.frombuffer(path.read_bytes(), "<f4").reshape(kept.shape[:2])
-        assert (camera.width, camera.height) == depth.shape[::-1]  # type: ignore[attr-defined]
+        assert (camera.width, camera.height) == depth.shape[::-1]
         known = np.isfinite(kept).all(axis=2)
         assert (depth[~known] == 0).all() and (~known).any()
         np.testing.assert_allclose(depth[known], kept[known][:, 2], rtol=1e-6)
         rows, columns = np.nonzero(known)
         pixels = np.column_stack([columns, rows]) + 0.5
-        rays = np.column_stack([camera.cam_from_img(pixels), np.ones(len(rows))])  # type: ignore[attr-defined]
+        rays = np.column_stack([camera.cam_from_img(pixels), np.ones(len(rows))])
         np.testing.assert_allclose(rays * depth[known][:, None], kept[known], atol=1e-5)
 
 
-def test_depth_cameras_count_the_centres_of_pixels() -> None:
-    camera = Camera("SIMPLE_PINHOLE", 1600, 1200, (1385.6406460551, 800.0, 600.0))
-    assert depth_camera(camera, 1) == camera
-    small = depth_camera(camera, 4)
-    assert (small.width, small.height) == (400, 300)
-    assert small.params == (1385.6406460551 / 4, 799.5 / 4 + 0.5, 599.5 / 4 + 0.5)
-    assert depth_camera(camera, 7).width == 229
-
-
 def test_cameras_are_those_of_the_paper(root: Path) -> None:
-    for name, size in (("IMG_0801.JPG", (4032, 3024)), ("IMG_0803.JPG", (3024, 4032))):
-        Image.new("L", size).save(root / "query" / "iphone7" / name, format="JPEG")
-    data = read(root).query
-    landscape = data.camera_of("query/iphone7/IMG_0801.JPG")
+    name = "database/cutouts/DUC1/024/DUC_cutout_024_0_0.jpg"
+    for file, size in (
+        ("query/iphone7/IMG_0801.JPG", (4032, 3024)),
+        ("query/iphone7/IMG_0803.JPG", (3024, 4032)),
+        (name, (1600, 1200)),
+    ):
+        Image.new("L", size).save(root / file, format="JPEG")
+    data = read(root)
+    landscape, upright = (data.query.camera_of(f"query/iphone7/IMG_080{n}.JPG") for n in (1, 3))
     assert landscape == Camera("SIMPLE_PINHOLE", 4032, 3024, (3136.0, 2016.0, 1512.0))
-    upright = data.camera_of("query/iphone7/IMG_0803.JPG")
     assert upright == Camera("SIMPLE_PINHOLE", 3024, 4032, (3136.0, 1512.0, 2016.0))
-    cutout = root / "database/cutouts/DUC1/024/DUC_cutout_024_0_0.jpg"
-    Image.new("L", (1600, 1200)).save(cutout)
-    camera = read(root).mapping.camera_of("database/cutouts/DUC1/024/DUC_cutout_024_0_0.jpg")
-    assert (camera.width, camera.height) == (1600, 1200)
-    np.testing.assert_allclose(camera.params, (1385.6406460551, 800, 600), rtol=1e-13)
+    params = data.mapping.camera_of(name).params
+    np.testing.assert_allclose(params, (1385.6406460551, 800, 600), rtol=1e-13)
 
 
-def test_queries_as_they_are_stored(download: Path, tmp_path: Path) -> None:
-    output = imported(download, tmp_path / "out")
-    query = KaptureFolder(output / "query")
+def test_queries_as_they_are_stored(downloaded: Path, tmp_path: Path) -> None:
+    dataset = read(downloaded)
+    write_official(dataset, tmp_path / "out")
+    query = KaptureFolder(tmp_path / "out" / "query")
     query.validate(deep=True)
     names = [f"query/iphone7/{n}" for n in ("IMG_0801.JPG", "IMG_0802.jpg", "IMG_0803.JPG")]
     assert query.read().image_names() == names
@@ -140,71 +125,61 @@ def test_queries_as_they_are_stored(download: Path, tmp_path: Path) -> None:
     turned = query.read().camera_of(names[1])
     assert (turned.width, turned.height) == (64, 48)
     assert len(query.read().sensors) == 2
-    dataset = read(download)
     assert any("1 queries have an EXIF orientation" in remark for remark in dataset.remarks)
-    assert list(read_names(output / "megloc").items()) == [
-        (name, name.split("/")[-1]) for name in names
-    ]
+    listed = list(read_names(tmp_path / "out" / "megloc").items())
+    assert listed == [(name, name.split("/")[-1]) for name in names]
     for name in names:
-        link = output / "query" / "sensors" / "records_data" / name
-        assert link.resolve() == download / name
-        assert link.parent.is_symlink()
+        link = query.root / "sensors" / "records_data" / name
+        assert link.resolve() == downloaded / name and link.parent.is_symlink()
 
 
-def test_floors_are_frames_of_their_own(download: Path, tmp_path: Path) -> None:
-    output = imported(download, tmp_path / "out")
-    mapping = KaptureFolder(output / "mapping")
+def test_floors_are_frames_of_their_own(downloaded: Path, tmp_path: Path) -> None:
+    output = imported(downloaded, tmp_path / "out")
+    mapping, groups = KaptureFolder(output / "mapping"), read_groups(output / "megloc")
     mapping.validate(deep=True)
-    groups = read_groups(output / "megloc")
     for image in mapping.read().image_names():
         floor = image.split("/")[2]
         assert (groups[image].frame, groups[image].location) == (floor, f"{floor}/024")
     assert {groups[i].frame for i in KaptureFolder(output / "query").read().image_names()} == {""}
     protocol = read_protocol(output / "megloc")
-    assert protocol.dataset == "inloc"
+    assert (protocol.dataset, protocol.conditions) == ("inloc", ("DUC1", "DUC2"))
     assert protocol.thresholds == ((0.25, 10), (0.5, 10), (1, 10))
-    assert protocol.conditions == ("DUC1", "DUC2")
     assert not (output / "query_gt").exists()
 
 
-def test_depth_sensors_stand_where_the_cameras_are(download: Path) -> None:
-    data = read(download).mapping
+def test_depth_sensors_are_on_a_rig_where_they_are_wanted(downloaded: Path) -> None:
+    data = read(downloaded).mapping
     assert list(data.rigs) == ["cutout_40x30_rig"]
     assert {device for _, device in data.trajectories} == {"cutout_40x30_rig"}
-    for (timestamp, sensor), _ in data.records_camera.items():
-        assert data.records_depth[timestamp, f"{sensor}_depth"].endswith(".depth")
-        assert data.device_from_world(timestamp, f"{sensor}_depth") == data.device_from_world(
-            timestamp, sensor
-        )
     assert len({timestamp for timestamp, _ in data.records_camera}) == 72
-    assert not read(download, depth=False).mapping.rigs
-    assert not read(download, depth=False).mapping.records_depth
+    adapter = load_plugin(DATASETS, "inloc", {"depth": False})
+    assert isinstance(adapter, InLoc)
+    without = adapter.read(downloaded).mapping
+    assert not without.rigs and not without.records_depth
 
 
-def test_the_summary_compares_with_what_is_published(download: Path) -> None:
-    lines = [str(count) for count in read(download).summary]
-    text = "\n".join(lines)
-    assert "72  published: 4680, -4608" in text
-    assert "3  published: 356, -353" in text
+def test_the_summary_compares_with_what_is_published(downloaded: Path) -> None:
+    text = "\n".join(map(str, read(downloaded).summary))
+    assert "72  published: 4680, -4608" in text and "3  published: 356, -353" in text
     assert "scans of DUC1" in text and "1  published: 50, -49" in text
-    with_all = "\n".join(map(str, read(download, distractor_floors=True).summary))
+    with_all = "\n".join(map(str, read(downloaded, distractor_floors=True).summary))
     assert "published: 9972" in with_all
 
 
 def test_distractor_floors_are_imported_when_asked_for(root: Path) -> None:
-    cutouts, alignments = (root / "database" / part for part in ("cutouts", "alignments"))
-    shutil.copytree(cutouts / "DUC1", cutouts / "CSE3")
-    shutil.copytree(alignments / "DUC1", alignments / "CSE3")
-    for folder in (cutouts / "CSE3", alignments / "CSE3"):
+    for part in ("cutouts", "alignments"):
+        folder = Path(
+            shutil.copytree(root / f"database/{part}/DUC1", root / f"database/{part}/CSE3")
+        )
         for path in sorted(folder.rglob("DUC_*")):
             path.rename(path.with_name(path.name.replace("DUC_", "cse_")))
     assert len(read(root).mapping.records_camera) == 72
     dataset = read(root, distractor_floors=True, allow_missing=True)
     assert len(dataset.mapping.records_camera) == 108
-    name = "database/cutouts/CSE3/024/cse_cutout_024_30_-30.jpg"
-    assert dataset.groups[name].frame == "CSE3"
+    assert dataset.groups["database/cutouts/CSE3/024/cse_cutout_024_30_-30.jpg"].frame == "CSE3"
+    cutouts = root / "database" / "cutouts"
     assert dataset.missing is not None
-    assert {file.name for file in dataset.missing.files} == {"CSE4", "CSE5"}
+    assert dataset.missing.files == [cutouts / "CSE4", cutouts / "CSE5"]
 
 
 def test_scans_known_to_be_wrong_are_left_out(root: Path) -> None:
@@ -228,41 +203,28 @@ def test_redistributions_lie_otherwise(
     for old, new in moves.items():
         (root / new).parent.mkdir(exist_ok=True)
         (root / old).rename(root / new)
-    output = imported(root, tmp_path / "out")
-    mapping = KaptureFolder(output / "mapping")
-    name = "database/cutouts/DUC2/024/DUC_cutout_024_30_-30.jpg"
-    assert name in mapping.read().image_names()
-    assert mapping.image_path(name).resolve() == root / place / "/".join(name.split("/")[2:])
+    mapping = KaptureFolder(imported(root, tmp_path / "out") / "mapping")
     mapping.validate(deep=True)
+    name = "DUC2/024/DUC_cutout_024_30_-30.jpg"
+    assert mapping.image_path(f"database/cutouts/{name}").resolve() == root / place / name
 
 
-def test_what_is_missing_is_listed_and_refused(root: Path, tmp_path: Path) -> None:
-    cutouts = root / "database" / "cutouts"
-    (cutouts / "DUC1/024/DUC_cutout_024_0_0.jpg.mat").unlink()
-    (cutouts / "DUC1/024/DUC_cutout_024_30_0.jpg").unlink()
-    (root / "database/alignments/DUC2/transformations/DUC_trans_024.txt").unlink()
-    with pytest.raises(DataError, match="3 files are missing: .*--allow-missing") as caught:
-        imported(root, tmp_path / "refused")
-    assert "DUC_trans_024.txt" in str(caught.value)
-    missing = read(root).missing
-    assert missing is not None and {file.name for file in missing.files} == {
-        "DUC_cutout_024_0_0.jpg.mat",
-        "DUC_cutout_024_30_0.jpg",
-        "DUC_trans_024.txt",
-    }
-    assert not (tmp_path / "refused").exists()
-    output = imported(root, tmp_path / "out", allow_missing=True)
-    data = KaptureFolder(output / "mapping").read()
+def test_what_is_missing_is_listed_and_refused(root: Path) -> None:
+    cutouts, alignments = root / "database/cutouts", root / "database/alignments"
+    gone = {cutouts / f"DUC1/024/DUC_cutout_024_{name}" for name in ("0_0.jpg.mat", "30_0.jpg")}
+    gone.add(alignments / "DUC2/transformations/DUC_trans_024.txt")
+    for path in gone:
+        path.unlink()
+    dataset = read(root, allow_missing=True)
+    assert dataset.missing is not None and set(dataset.missing.files) == gone
+    with pytest.raises(DataError, match="3 files are missing: .*DUC_trans_024.*--allow-missing"):
+        dataset.missing.refuse()
+    data = dataset.mapping
     assert {name.split("/")[2] for name in data.image_names()} == {"DUC1"}
     assert (len(data.records_camera), len(data.records_depth)) == (35, 34)
-    KaptureFolder(output / "mapping").validate(deep=True)
-
-
-def test_a_floor_that_is_missing(root: Path) -> None:
-    shutil.rmtree(root / "database" / "cutouts" / "DUC2")
-    dataset = read(root)
-    assert dataset.missing is not None
-    assert dataset.missing.files == [root / "database" / "cutouts" / "DUC2"]
+    shutil.rmtree(cutouts / "DUC2")
+    missing = read(root).missing
+    assert missing is not None and cutouts / "DUC2" in missing.files
 
 
 def test_the_download_without_points(root: Path, tmp_path: Path) -> None:
@@ -292,26 +254,28 @@ def test_broken_points_name_their_file(root: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "match"),
+    ("name", "match"),
     [
-        ("DUC_cutout_024_0_0.jpg", "DUC_cutout_024_0.jpg", "is not named <BUILDING>_cutout"),
-        (
-            "DUC_cutout_024_0_0.jpg",
-            "DUC_cutout_025_0_0.jpg",
-            "scan 025, but lies in DUC1, scan 024",
-        ),
-        ("DUC_cutout_024_0_0.jpg", "cse_cutout_024_0_0.jpg", "cutout of cse, scan 024, but lies"),
+        ("DUC_cutout_024_0.jpg", "is not named <BUILDING>_cutout"),
+        ("DUC_cutout_025_0_0.jpg", "scan 025, but lies in DUC1, scan 024"),
+        ("cse_cutout_024_0_0.jpg", "cutout of cse, scan 024, but lies"),
     ],
 )
-def test_images_that_lie_elsewhere_are_refused(root: Path, old: str, new: str, match: str) -> None:
+def test_images_that_lie_elsewhere_are_refused(root: Path, name: str, match: str) -> None:
     folder = root / "database/cutouts/DUC1/024"
-    (folder / old).rename(folder / new)
+    (folder / "DUC_cutout_024_0_0.jpg").rename(folder / name)
     with pytest.raises(DataError, match=match) as caught:
         read(root)
-    assert str(caught.value).startswith(str(folder / new))
+    assert str(caught.value).startswith(str(folder / name))
 
 
-def test_broken_images_and_names_are_refused(root: Path) -> None:
+def test_broken_files_are_refused(root: Path) -> None:
+    path = root / "database/alignments/DUC1/transformations/DUC_trans_024.txt"
+    text = path.read_text()
+    path.write_text(text.replace("0 0 0 1\n\nAfter", "0 0 0 1\nAfter") + "0\n")
+    with pytest.raises(DataError, match=r"DUC_trans_024\.txt:10: the matrix' last row is"):
+        read(root)
+    path.write_text(text)
     query = root / "query" / "iphone7" / "IMG_0804.JPG"
     query.write_bytes(b"\xff\xd8 no image")
     with pytest.raises(DataError, match=r"IMG_0804\.JPG: not an image"):
@@ -321,58 +285,41 @@ def test_broken_images_and_names_are_refused(root: Path) -> None:
         read(root)
 
 
-def test_a_broken_transformation_names_file_and_line(root: Path) -> None:
-    path = root / "database/alignments/DUC1/transformations/DUC_trans_024.txt"
-    path.write_text(path.read_text().replace("0 0 0 1\n\nAfter", "0 0 0 1\nAfter") + "0\n")
-    with pytest.raises(DataError, match=r"DUC_trans_024\.txt:10: the matrix' last row is"):
-        read(root)
-
-
 def test_what_is_no_inloc_is_refused_quickly(tmp_path: Path, root: Path) -> None:
-    adapter = InLoc()
-    with pytest.raises(DataError, match="no such folder"):
-        adapter.check(tmp_path / "absent")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match="database/cutouts/ is missing; InLoc lies as database"):
-        adapter.check(tmp_path / "empty")
-    adapter.check(root)
-    (root / "query").rename(root / "queries_elsewhere")
-    with pytest.raises(DataError, match="query/iphone7/ is missing"):
-        adapter.check(root)
-    shutil.rmtree(root / "database" / "alignments")
-    with pytest.raises(DataError, match="database/alignments/ is missing"):
-        adapter.check(root)
-    for floor in SCANS:
-        (root / "database/alignments").mkdir(exist_ok=True)
-        (root / "query/iphone7").mkdir(exist_ok=True, parents=True)
-        shutil.rmtree(root / "database/cutouts" / floor)
-    with pytest.raises(DataError, match="none of DUC1, DUC2 is there"):
-        adapter.check(root)
+    layout = "is missing; InLoc lies as database"
+    InLoc().check(root)
+    for place, gone, message in (
+        (tmp_path / "absent", (), "no such folder"),
+        (tmp_path / "empty", (), f"database/cutouts/ {layout}"),
+        (root, [f"database/cutouts/{floor}" for floor in SCANS], "none of DUC1, DUC2 is there"),
+        (root, ["query"], f"query/iphone7/ {layout}"),
+        (root, ["database/alignments"], f"database/alignments/ {layout}"),
+    ):
+        for folder in gone:
+            shutil.rmtree(root / folder)
+        with pytest.raises(DataError, match=message):
+            InLoc().check(place)
 
 
 def test_input_files_are_all_that_is_read(root: Path) -> None:
-    files = {path.relative_to(root).as_posix() for path in InLoc().input_files(root)}
-    assert len(files) == 2 * 72 + 2 + 3
-    assert "query/iphone7/IMG_0802.jpg" in files
-    without = set(InLoc(InLocOptions(depth=False)).input_files(root))
-    assert len(without) == 72 + 2 + 3
-    (root / "database/alignments/DUC1/know_incorrect.txt").write_text("024\n")
-    truth = root / "ground_truth" / "megloc"
-    truth.mkdir(parents=True)
-    (truth / "groups.csv").write_text("image, condition, frame, location, scored\n")
-    names = {path.name for path in InLoc().input_files(root)}
-    assert {"know_incorrect.txt", "groups.csv"} <= names
+    read_so = {path for path in root.rglob("*") if path.is_file()}
+    read_so -= {root / "query/iphone7" / name for name in ("._IMG_0801.JPG", "readme.txt")}
+    assert set(InLoc().input_files(root)) == read_so and len(read_so) == 2 * 72 + 2 + 3
+    without = {path for path in read_so if path.suffix != ".mat"}
+    assert set(InLoc(InLocOptions(depth=False)).input_files(root)) == without
+    more = [
+        root / "database/alignments/DUC1/know_incorrect.txt",
+        root / "ground_truth/megloc/groups.csv",
+    ]
+    more[1].parent.mkdir(parents=True)
+    for path in more:
+        path.write_text("image, condition, frame, location, scored\n")
+    assert set(InLoc().input_files(root)) == {*read_so, *more}
 
 
-def test_it_is_registered(root: Path) -> None:
-    adapter = load_plugin(DATASETS, "inloc", {"depth": False})
-    assert isinstance(adapter, InLoc)
-    assert adapter.name == "inloc" and not adapter.options.depth
-    assert not adapter.read(root).mapping.records_depth
-
-
-def test_large_depth_maps_are_announced(download: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert not any("depth maps take" in remark for remark in read(download).remarks)
+def test_large_depth_maps_are_announced(downloaded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not any("depth maps take" in remark for remark in read(downloaded).remarks)
     monkeypatch.setattr("megloc_kapture.datasets.inloc.adapter._MANY_GIGABYTES", 1e-9)
-    assert any("depth_step = 8" in remark for remark in read(download, depth_step=2).remarks)
-    assert not any("depth maps take" in remark for remark in read(download, depth=False).remarks)
+    assert any("depth_step = 8" in remark for remark in read(downloaded, depth_step=2).remarks)
+    assert not any("depth maps take" in remark for remark in read(downloaded, depth=False).remarks)

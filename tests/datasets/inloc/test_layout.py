@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
-from megloc_twins.model_files import write_transformation
-from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.inloc.layout import (
     Cutout,
@@ -18,7 +16,6 @@ from megloc_kapture.datasets.inloc.layout import (
     read_wrong_scans,
 )
 from megloc_kapture.errors import DataError
-from megloc_kapture.values import RigidTransform
 
 TRANSFORMATION = """Before general icp:
 1 0 0 0
@@ -50,20 +47,10 @@ def test_names_say_what_they_show() -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        "DUC_cutout_24_0_0.jpg",
-        "DUC_cutout_024_0.jpg",
-        "DUC_cutout_024_360_0.jpg",
-        "DUC_cutout_024_0_91.jpg",
-        "DUC_cutout_024_0_0.png",
-        "DUC_cutout_024_0_0.jpg.mat",
-        "DUC_cutout_024_-30_0.jpg",
-        "DUC_cutout_024_030_0.jpg",
-        "DUC_cutout_024_0_-0.jpg",
-        "DUC_cutout_٠٢٤_0_0.jpg",
-        "DUC_scan_024_0_0.jpg",
-        "a/DUC_cutout_024_0_0.jpg",
-        "DUC_cutout_024_0_0.jpg\n",
-        "",
+        *(f"DUC_cutout_{n}.jpg" for n in ("24_0_0", "024_0", "024_360_0", "024_0_91", "024_-30_0")),
+        *(f"DUC_cutout_{n}.jpg" for n in ("024_030_0", "024_0_-0", "٠٢٤_0_0")),
+        *("DUC_cutout_024_0_0.png", "DUC_cutout_024_0_0.jpg.mat", "DUC_cutout_024_0_0.jpg\n"),
+        *("DUC_scan_024_0_0.jpg", "a/DUC_cutout_024_0_0.jpg", ""),
     ],
 )
 def test_other_names_are_refused(name: str) -> None:
@@ -71,53 +58,11 @@ def test_other_names_are_refused(name: str) -> None:
         parse_cutout_name(name)
 
 
-@pytest.mark.parametrize(
-    ("yaw", "pitch", "forward", "right"),
-    [
-        (0, 0, (-1, 0, 0), (0, 1, 0)),
-        (90, 0, (0, 1, 0), (1, 0, 0)),
-        (180, 0, (1, 0, 0), (0, -1, 0)),
-        (270, 0, (0, -1, 0), (-1, 0, 0)),
-        (0, 30, (-np.cos(np.pi / 6), 0, 0.5), (0, 1, 0)),
-        (90, -30, (0, np.cos(np.pi / 6), -0.5), (1, 0, 0)),
-    ],
-)
-def test_where_cutouts_look(
-    yaw: int, pitch: int, forward: tuple[float, ...], right: tuple[float, ...]
-) -> None:
-    pose = Cutout("DUC", "000", yaw, pitch).cam_from_scan()
-    rotation = pose.rotation_matrix()
-    np.testing.assert_allclose(rotation @ forward, (0, 0, 1), atol=1e-12)
-    np.testing.assert_allclose(rotation @ right, (1, 0, 0), atol=1e-12)
-    assert pose.translation == (0, 0, 0)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        TRANSFORMATION,
-        TRANSFORMATION.rstrip("\n"),
-        TRANSFORMATION.replace("\n", "\r\n"),
-        TRANSFORMATION.replace(" ", "\t"),
-        TRANSFORMATION.replace("After general icp:", "whatever it says"),
-        TRANSFORMATION + "\nfitness 0.1\n",
-    ],
-)
-def test_the_second_matrix_counts(path: Path, text: str) -> None:
-    path.write_bytes(text.encode())
-    pose = read_transformation(path)
-    np.testing.assert_allclose(pose.apply(np.array([[1.0, 0, 0]])), [[5, 3, -0.1]], atol=1e-12)
-
-
-def test_what_is_written_reads_back(path: Path) -> None:
-    rotation = Rotation.from_euler("xyz", [0.02, -0.01, 2.1]).as_matrix()
-    after = RigidTransform.from_matrix(rotation, np.array([12.345678901, -3.0, 0.25]))
-    write_transformation(path, RigidTransform.identity(), after)
-    lines = path.read_text().splitlines()
-    assert [len(line.split()) for line in lines[7:11]] == [4] * 4  # where others look for it
-    read = read_transformation(path)
-    np.testing.assert_allclose(read.rotation_matrix(), rotation, atol=2e-9)
-    np.testing.assert_allclose(read.translation, after.translation, atol=1e-9)
+def test_the_second_matrix_counts(path: Path) -> None:
+    for text in (TRANSFORMATION, f"what it says:{TRANSFORMATION}\nfitness 0.1\n"):
+        path.write_text(text)
+        pose = read_transformation(path)
+        np.testing.assert_allclose(pose.apply(np.array([[1.0, 0, 0]])), [[5, 3, -0.1]], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -128,12 +73,8 @@ def test_what_is_written_reads_back(path: Path) -> None:
         ("  0  0  0  1\n", "  0  0  0  1\n1 0 0 0\n", "9 rows of four numbers"),
         ("  0  0  0  1\n", "  0  0  0  2\n", ":11: the matrix. last row is 0 0 0 2"),
         ("  1  0  0  2.0", "  1.1  0  0  2.0", ":11: .* no rotation matrix"),
-        ("  1  0  0  2.0", "  -1  0  0  2.0", ":11: .* no rotation matrix"),
-        ("  1  0  0  2.0", "  1e300 1e300 0 2.0", ":11: .* no rotation matrix"),
         ("5.0", "nan", "7 rows of four numbers"),
         ("5.0", "1e999", "not a finite number"),
-        ("5.0", "5_0", "7 rows of four numbers"),
-        (TRANSFORMATION, "", "0 rows of four numbers"),
         (TRANSFORMATION, TRANSFORMATION[:75], "4 rows of four numbers"),
     ],
 )
@@ -145,24 +86,15 @@ def test_broken_transformations_name_the_line(path: Path, old: str, new: str, ma
     assert str(caught.value).startswith(str(path))
 
 
-def test_what_is_no_text_is_refused(path: Path) -> None:
-    path.write_bytes(TRANSFORMATION.encode() + b"\xff")
-    with pytest.raises(DataError, match=r"024\.txt:12: not a text file in UTF-8"):
-        read_transformation(path)
+def test_a_file_too_large_for_a_few_lines_is_refused(path: Path) -> None:
     path.write_bytes(b"0 " * 600_000)
     with pytest.raises(DataError, match="too many for a few lines"):
         read_transformation(path)
-    with pytest.raises(DataError, match="missing"):
-        read_transformation(path.with_name("absent"))
-    with pytest.raises(DataError, match="not a plain file"):
-        read_transformation(path.parent)
 
 
 def test_lists_of_wrong_scans(path: Path) -> None:
     path.write_text("known wrong:\n\n008\nDUC_scan_12.ptx 31\r\n2017\n")
     assert read_wrong_scans(path) == {"008", "012", "031"}
-    path.write_bytes(b"")
-    assert read_wrong_scans(path) == frozenset()
 
 
 def test_points_of_another_size_are_refused(path: Path) -> None:
@@ -171,6 +103,3 @@ def test_points_of_another_size_are_refused(path: Path) -> None:
     for width, height in ((3, 4), (4, 4)):
         with pytest.raises(DataError, match=f"3x4x3, expected {height}x{width}x3"):
             read_cutout_points(path, width, height)
-    scipy.io.savemat(path, {"XYZcut": np.zeros((3, 4))}, appendmat=False)
-    with pytest.raises(DataError, match="XYZcut is 3x4, expected 3x4x3"):
-        read_cutout_points(path, 4, 3)

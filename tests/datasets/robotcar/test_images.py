@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.robotcar.images import middle_transform, rig_of_model
@@ -41,15 +42,15 @@ def apart(a: RigidTransform, b: RigidTransform) -> tuple[float, float]:
     return float(angle), float(np.linalg.norm(between.translation))
 
 
-def test_exact_poses_give_the_rig_exactly() -> None:
-    found = rig_of_model(poses(12, noise=0.0))
+@pytest.mark.parametrize(
+    ("moments", "noise", "wrong", "error"), [(12, 0.0, 0, 1e-9), (400, 0.01, 60, 0.003)]
+)
+def test_noise_averages_out_and_wrong_poses_have_no_say(
+    moments: int, noise: float, wrong: int, error: float
+) -> None:
+    found = rig_of_model(poses(moments, noise=noise, wrong=wrong))
     assert set(found) == set(RIG)
-    assert max(max(apart(found[camera], RIG[camera])) for camera in RIG) < 1e-9
-
-
-def test_noise_averages_out_and_wrong_poses_have_no_say() -> None:
-    found = rig_of_model(poses(400, noise=0.01, wrong=60))
-    assert max(max(apart(found[camera], RIG[camera])) for camera in RIG) < 0.003
+    assert max(max(apart(found[camera], RIG[camera])) for camera in RIG) < error
 
 
 def test_too_few_moments_say_nothing() -> None:
