@@ -157,8 +157,8 @@ def test_the_best_keypoints_are_those_that_the_mask_allows() -> None:
     assert selected(None, 10) == ([2, 1, 0, 3], 0)
     assert selected(None, 2) == ([2, 1], 0)
     mask = np.ones(SIZE, bool)
-    mask[0, 2] = mask[1, 0] = False
-    assert selected(mask, 1) == ([0], 2)
+    mask[0, 2] = mask[1, 0] = mask[2, 1] = False
+    assert selected(mask, 2) == ([0], 3)
     none = np.zeros((0, 2), np.float32)
     rows, num_masked = select_keypoints(none, SCORES[:0], size=SIZE, mask=mask, max_keypoints=9)
     assert len(rows) == 0 and num_masked == 0
