@@ -30,6 +30,12 @@ def built(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> megloc.Map:
     return megloc.build_map(scene / "mapping", set=SMALL, workspace=workspace)
 
 
+@pytest.fixture(scope="module")
+def results(built: megloc.Map, scene: Path) -> megloc.Results:
+    """Of the queries, localized when they are asked for."""
+    return built.localize(scene / "query")
+
+
 def errors(scene: Path, name: str, pose: megloc.RigidTransform) -> tuple[float, float]:
     """Metres and degrees from the true pose."""
     truth = KaptureFolder(scene / "query_gt").read().poses()[name]
@@ -39,22 +45,17 @@ def errors(scene: Path, name: str, pose: megloc.RigidTransform) -> tuple[float, 
     return float(np.linalg.norm(centers)), float(angle)
 
 
-def test_a_map_of_images_with_poses(built: megloc.Map, scene: Path) -> None:
-    folder = KaptureFolder(scene / "query")
-    data = folder.read()
-    name = data.image_names()[0]
-    camera = data.camera_of(name)
-    for image in (folder.image_path(name), read_image_rgb(folder.image_path(name))):
-        found = built.localize(image, camera)
-        assert found, found
-        assert np.less(errors(scene, name, found.cam_from_world), (0.05, 0.5)).all()
-        assert found.covariance is not None and found.covariance.shape == (6, 6)
+def reprojection_px(pose: megloc.Pose, camera: megloc.Camera) -> float:
+    """The largest distance of an inlier from where its point is seen."""
+    assert pose.inlier_points_px is not None and pose.inlier_points_world is not None
+    in_camera = pose.inlier_points_world @ pose.matrix[:3, :3].T + pose.matrix[:3, 3]
+    projected = in_camera[:, :2] / in_camera[:, 2:] * camera.params[:2] + camera.params[2:]
+    return float(np.linalg.norm(projected - pose.inlier_points_px, axis=1).max())
 
 
 def test_a_folder_is_localized_when_it_is_asked_for(
-    built: megloc.Map, scene: Path, tmp_path: Path
+    results: megloc.Results, scene: Path, tmp_path: Path
 ) -> None:
-    results = built.localize(scene / "query")
     names = KaptureFolder(scene / "query").read().image_names()
     assert list(results) == names and len(results) == len(names)
     last = results[names[-1]]
@@ -76,8 +77,9 @@ def test_a_folder_is_localized_when_it_is_asked_for(
         results.save(tmp_path / "mine")
 
 
-def test_results_are_evaluated_as_they_are(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
-    results = built.localize(scene / "query")
+def test_results_are_evaluated_as_they_are(
+    results: megloc.Results, scene: Path, tmp_path: Path
+) -> None:
     found = megloc.evaluate(results, truth=scene / "query_gt")
     assert "recall (%)" in str(found) and found.row().recall[0].recall == 1.0
     results.save(tmp_path / "saved")
@@ -148,26 +150,25 @@ def test_a_pose_says_what_it_rests_on(built: megloc.Map, scene: Path) -> None:
     folder = KaptureFolder(scene / "query")
     name = folder.read().image_names()[0]
     camera = folder.read().camera_of(name)
-    found = built.localize(folder.image_path(name), camera)
-    assert found and found.camera is None and found.name == str(folder.image_path(name))
-    assert found.inlier_points_px is not None and found.inlier_points_world is not None
+    found, read = (
+        built.localize(image, camera)
+        for image in (folder.image_path(name), read_image_rgb(folder.image_path(name)))
+    )
+    for pose in (found, read):
+        assert pose and np.less(errors(scene, name, pose.cam_from_world), (0.05, 0.5)).all()
+        assert pose.covariance is not None and pose.covariance.shape == (6, 6)
+    assert found.camera is None and found.name == str(folder.image_path(name))
+    assert reprojection_px(found, camera) <= 12
     assert len(found.inlier_points_px) == len(found.inlier_points_world) == found.num_inliers
-    in_camera = found.inlier_points_world @ found.matrix[:3, :3].T + found.matrix[:3, 3]
-    projected = in_camera[:, :2] / in_camera[:, 2:] * camera.params[:2] + camera.params[2:]
-    assert np.linalg.norm(projected - found.inlier_points_px, axis=1).max() <= 12
     assert {"extraction", "retrieval", "matching", "estimation"} <= found.seconds.keys()
     # in pixels of the image as it was given, whatever was made of it
     options = {**SMALL, "preprocessing.max_size_px": 320}
     smaller = megloc.open_map(built.kapture_map.folder.root, set=options)
     other = smaller.localize(folder.image_path(name), camera)
-    assert other and other.inlier_points_px is not None and other.inlier_points_world is not None
-    in_camera = other.inlier_points_world @ other.matrix[:3, :3].T + other.matrix[:3, 3]
-    projected = in_camera[:, :2] / in_camera[:, 2:] * camera.params[:2] + camera.params[2:]
-    assert np.linalg.norm(projected - other.inlier_points_px, axis=1).max() <= 15.1
+    assert other and reprojection_px(other, camera) <= 15.1
 
 
-def test_results_travel(built: megloc.Map, scene: Path) -> None:
-    results = built.localize(scene / "query")
+def test_results_travel(built: megloc.Map, results: megloc.Results) -> None:
     there = pickle.loads(pickle.dumps(results))
     assert list(there) == list(results)
     for name, pose in results.items():
@@ -257,9 +258,11 @@ def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
 
 
 def test_importing_the_package_loads_no_network_and_no_solver() -> None:
+    slow = {"torch", "scipy", "pandas", "numba", "cv2", "pycolmap"}
+    # nor does the command line wait for figures
     code = (
-        "import sys, megloc_kapture\n"
-        "print(sorted({'torch', 'scipy', 'pandas', 'numba', 'cv2', 'pycolmap'} & set(sys.modules)))"
+        f"import sys, megloc_kapture\nprint(sorted({slow} & set(sys.modules)))\n"
+        "import megloc_kapture.cli.main\nprint('matplotlib' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "[]\n"
+    assert done.stdout == "[]\nFalse\n"

@@ -37,15 +37,12 @@ MODULE = """
             ones = np.ones((len(xy), 4), np.float32)
             return LocalFeatures(xy, ones[:, 0], ones)
 
-    class Plain:
-        name = "plain"
-
-        def extract(self, image, mask=None):
-            raise NotImplementedError
-
     class Nameless:
         def extract(self, image, mask=None):
             raise NotImplementedError
+
+    class Plain(Nameless):
+        name = "plain"
 
     class Deaf:
         name = "deaf"
@@ -55,25 +52,14 @@ MODULE = """
 
     instance = Plain()
 
-    class Moody:
-        name = "moody"
-
+    class Moody(Plain):
         def __init__(self):
             raise ValueError("not today")
-
-        def extract(self, image, mask=None):
-            raise NotImplementedError
 """
-ENTRY_POINTS = """
+NAMES = ("Grid", "Plain", "Nameless", "Deaf", "function", "instance", "Moody", "Absent")
+ENTRY_POINTS = f"""
     [megloc_kapture.local_features]
-    grid = outside_plugin:Grid
-    plain = outside_plugin:Plain
-    nameless = outside_plugin:Nameless
-    deaf = outside_plugin:Deaf
-    function = outside_plugin:function
-    instance = outside_plugin:instance
-    moody = outside_plugin:Moody
-    absent = outside_plugin:Absent
+    {"".join(f"{name.lower()} = outside_plugin:{name}{chr(10)}    " for name in NAMES)}
     no-module = outside_plugin_that_is_not_there:Grid
     broken = outside_plugin_broken:Grid
 """
@@ -119,9 +105,7 @@ def test_a_plugin_of_another_package_is_found_and_works(outside: Path) -> None:
     features = grid.extract(np.zeros((40, 60, 3), np.uint8))
     assert isinstance(features, LocalFeatures)
     assert len(features.keypoints_px) == 6
-
-
-def test_a_plugin_needs_no_options(outside: Path) -> None:
+    # it needs no options
     assert load_plugin(LOCAL_FEATURES, "plain").name == "plain"
     assert load_plugin(LOCAL_FEATURES, "plain", {}).name == "plain"
 
@@ -169,31 +153,31 @@ def test_wrong_options_are_refused(
         load_plugin(LOCAL_FEATURES, name, options)
 
 
-def test_two_packages_with_one_name_are_refused(
-    outside: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("group", "name", "value", "message"),
+    [
+        # of two packages
+        (LOCAL_FEATURES, "grid", "rival:Grid", "registered twice.*outside_plugin:Grid.*rival:Grid"),
+        (
+            MATCHERS,
+            "crossed",
+            "megloc_kapture.features.rootsift:RootSift",
+            "does not fulfil Matcher: it lacks match",
+        ),
+    ],
+    ids=["the same name", "no matcher"],
+)
+def test_a_second_package_may_not_mix_up_names_and_groups(
+    outside: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+    group: str,
+    name: str,
+    value: str,
+    message: str,
 ) -> None:
     rival = tmp_path_factory.mktemp("rival")
-    install(
-        rival,
-        "rival_plugin",
-        {"rival_plugin": MODULE},
-        "[megloc_kapture.local_features]\ngrid = rival_plugin:Grid\n",
-    )
+    install(rival, "rival", {"rival": MODULE}, f"[{group}]\n{name} = {value}\n")
     monkeypatch.syspath_prepend(rival)
-    with pytest.raises(PluginError, match="registered twice.*outside_plugin:Grid.*rival_plugin"):
-        load_plugin(LOCAL_FEATURES, "grid")
-
-
-def test_a_matcher_is_no_extractor(
-    outside: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    crossed = tmp_path_factory.mktemp("crossed")
-    install(
-        crossed,
-        "crossed_plugin",
-        {},
-        "[megloc_kapture.matchers]\ncrossed = megloc_kapture.features.rootsift:RootSift\n",
-    )
-    monkeypatch.syspath_prepend(crossed)
-    with pytest.raises(PluginError, match="does not fulfil Matcher: it lacks match"):
-        load_plugin(MATCHERS, "crossed")
+    with pytest.raises(PluginError, match=message):
+        load_plugin(group, name)

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from images import Image
 from numpy.typing import NDArray
 
 from megloc_kapture.features.image_bound import (
@@ -23,8 +24,8 @@ from megloc_kapture.plugins import LOCAL_FEATURES
 from megloc_kapture.values import LocalFeatures
 
 
-def blobs(width: int, height: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """An image of discs on a grid, and their centres (the first pixel's centre is (0.5, 0.5))."""
+def discs(width: int, height: int) -> tuple[Image, NDArray[np.float64]]:
+    """Discs on a grid, and their centres (the first pixel's centre is (0.5, 0.5))."""
     image = np.full((height, width, 3), 60, np.uint8)
     step = width // 8
     rows, columns = range(step, height - step // 2, step), range(step, width - step // 2, step)
@@ -44,25 +45,22 @@ def test_sizes_up_to_the_bound_are_left_alone() -> None:
 
 
 def test_keypoints_of_a_reduced_image_are_where_they_were() -> None:
-    image, centres = blobs(1601, 1203)
+    image, centres = discs(1601, 1203)
     whole = RootSift().extract(image)
-    found = extract_bounded(RootSift(RootSiftOptions(max_megapixels=0.5)), [(image, None)])[0]
+    half, same = (RootSift(RootSiftOptions(max_megapixels=most)) for most in (0.5, 2.0))
+    found = extract_bounded(half, [(image, None)])[0]
     assert len(found.keypoints_px) > len(centres)
     for features in (whole, found):
         near = np.linalg.norm(centres[:, None] - features.keypoints_px[None, :, :2], axis=2)
         assert near.min(axis=1).max() < 1.0
-    same = extract_bounded(RootSift(RootSiftOptions(max_megapixels=2.0)), [(image, None)])[0]
-    np.testing.assert_array_equal(same.keypoints_px, whole.keypoints_px)
-    np.testing.assert_array_equal(same.descriptors, whole.descriptors)
-
-
-def test_the_mask_is_reduced_with_the_image() -> None:
-    image, _ = blobs(1601, 1203)
-    mask = np.zeros(image.shape[:2], bool)
-    mask[:, 801:] = True
-    found = extract_bounded(RootSift(RootSiftOptions(max_megapixels=0.5)), [(image, mask)])[0]
-    assert len(found.keypoints_px) > 10
-    assert found.num_masked > 10
+    unchanged = extract_bounded(same, [(image, None)])[0]
+    np.testing.assert_array_equal(unchanged.keypoints_px, whole.keypoints_px)
+    np.testing.assert_array_equal(unchanged.descriptors, whole.descriptors)
+    # the mask is reduced with the image
+    mask = np.ones(image.shape[:2], bool)
+    mask[:, :801] = False
+    found = extract_bounded(half, [(image, mask)])[0]
+    assert len(found.keypoints_px) > 10 and found.num_masked > 10
     assert found.keypoints_px[:, 0].min() >= 801
 
 

@@ -65,10 +65,12 @@ def test_the_vector_is_the_formulas(assignment: str, intra: bool, power: float) 
     options = VladOptions.model_validate(
         {"assignment": assignment, "alpha": 4.0, "intra_normalization": intra, "power": power}
     )
-    vector = aggregate(data, Vocabulary(centres[None]), options)
-    assert vector.dtype == np.float32 and vector.shape == (40,)
-    np.testing.assert_allclose(vector, vlad_by_loops(data, centres, options), atol=2e-6)
-    np.testing.assert_allclose(np.linalg.norm(vector), 1.0, atol=1e-6)
+    bytes_ = rng.integers(0, 256, (60, 8), dtype=np.uint8)
+    for descriptors, words in ((data, centres), (bytes_, 255 * np.abs(centres))):
+        vector = aggregate(descriptors, Vocabulary(words[None]), options)
+        assert vector.dtype == np.float32 and vector.shape == (40,)
+        expected = vlad_by_loops(descriptors.astype(np.float32), words, options)
+        np.testing.assert_allclose(vector, expected, atol=2e-6)
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.1, 200.0))
@@ -81,52 +83,9 @@ def test_soft_weights_are_equation_one(seed: int, alpha: float) -> None:
     np.testing.assert_allclose(
         soft_assignment(data, centres, alpha), powers / powers.sum(axis=1, keepdims=True), atol=1e-9
     )
-
-
-def test_soft_weights_do_not_overflow_far_from_every_centre() -> None:
-    weights = soft_assignment(np.array([[1e4, 0.0]]), np.array([[1.0, 0.0], [0.0, 1.0]]), 1e3)
-    np.testing.assert_array_equal(weights, [[1.0, 0.0]])
-
-
-def test_sharp_soft_assignment_is_hard_assignment() -> None:
-    rng = np.random.default_rng(2)
-    data, centres = unit_rows(rng, 80, 8), unit_rows(rng, 4, 8)
-    vocabulary = Vocabulary(centres[None])
-    hard = aggregate(data, vocabulary, VladOptions(assignment="hard"))
-    distances = [
-        float(
-            np.abs(
-                aggregate(data, vocabulary, VladOptions(assignment="soft", alpha=alpha)) - hard
-            ).max()
-        )
-        for alpha in (1.0, 30.0, 1e6)
-    ]
-    assert distances[0] > 0.05  # blunt: something else
-    assert distances[0] > distances[1] > distances[2]
-    assert distances[2] < 1e-5
-
-
-def test_intra_normalisation_gives_every_met_cluster_the_same_weight() -> None:
-    rng = np.random.default_rng(3)
-    centres = np.eye(3, 6, dtype=np.float32)
-    # a burst: a hundred near copies at the first centre, one descriptor at the second
-    burst = np.repeat(centres[:1], 100, axis=0) + np.float32(0.05) * unit_rows(rng, 1, 6)
-    single = centres[1:2] + np.float32(0.05) * unit_rows(rng, 1, 6)
-    data = np.concatenate([burst, single])
-    blocks = aggregate(data, Vocabulary(centres[None]), VladOptions()).reshape(3, 6)
-    np.testing.assert_allclose(np.linalg.norm(blocks, axis=1), [0.5**0.5, 0.5**0.5, 0], atol=1e-5)
-    raw = aggregate(data, Vocabulary(centres[None]), VladOptions(intra_normalization=False))
-    lengths = np.linalg.norm(raw.reshape(3, 6), axis=1)
-    assert lengths[0] > 50 * lengths[1] > 0
-
-
-def test_uint8_descriptors_count_as_numbers() -> None:
-    rng = np.random.default_rng(4)
-    data = rng.integers(0, 256, (50, 8), dtype=np.uint8)
-    centres = rng.uniform(0, 255, (4, 8)).astype(np.float32)
-    vector = aggregate(data, Vocabulary(centres[None]), VladOptions())
-    expected = vlad_by_loops(data.astype(np.float32), centres, VladOptions())
-    np.testing.assert_allclose(vector, expected, atol=1e-5)
+    # far from every centre nothing overflows
+    far = soft_assignment(np.array([[1e4, 0.0]]), np.array([[1.0, 0.0], [0.0, 1.0]]), 5 * alpha)
+    np.testing.assert_array_equal(far, [[1.0, 0.0]])
 
 
 def test_more_descriptors_than_one_chunk(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,22 +100,16 @@ def test_more_descriptors_than_one_chunk(monkeypatch: pytest.MonkeyPatch) -> Non
         np.testing.assert_allclose(parts, whole, atol=1e-6)
 
 
-@pytest.mark.parametrize("assignment", ["hard", "soft"])
-def test_an_image_without_descriptors_is_similar_to_nothing(assignment: str) -> None:
-    vocabulary = Vocabulary(np.eye(3, 8, dtype=np.float32)[None])
-    options = VladOptions.model_validate({"assignment": assignment})
-    vector = aggregate(np.zeros((0, 8), np.float32), vocabulary, options)
-    assert vector.shape == (24,) and vector.dtype == np.float32 and not vector.any()
-
-
-def test_descriptors_on_their_centres_leave_no_residual_and_no_nan() -> None:
+def test_what_leaves_no_residual_is_the_zero_vector() -> None:
     centres = np.eye(3, 8, dtype=np.float32)
-    assert not aggregate(centres, Vocabulary(centres[None]), VladOptions()).any()
-
-
-def test_another_size_of_descriptors_is_refused() -> None:
+    vocabulary = Vocabulary(centres[None])
+    for assignment in ("hard", "soft"):
+        options = VladOptions.model_validate({"assignment": assignment})
+        vector = aggregate(np.zeros((0, 8), np.float32), vocabulary, options)
+        assert vector.shape == (24,) and vector.dtype == np.float32 and not vector.any()
+    assert not aggregate(centres, vocabulary, VladOptions()).any()
     with pytest.raises(DataError, match="descriptors have 4 dimensions, the vocabulary 8"):
-        aggregate(np.zeros((5, 4), np.float32), Vocabulary(np.zeros((1, 3, 8), np.float32)))
+        aggregate(np.zeros((5, 4), np.float32), vocabulary)
 
 
 def clusters(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
@@ -184,6 +137,22 @@ def test_the_vocabulary_is_a_fixed_point_of_lloyd() -> None:
     np.testing.assert_allclose(centres, means, atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("num_clusters", "rows", "message"),
+    [
+        (10, np.eye(9, 8), "10 clusters .* has 9"),
+        (10, np.repeat(np.eye(3, 8), 20, axis=0), "fewer than 10 distinct"),
+        (4, np.where(np.eye(20, 8) > 0, np.nan, 1.0), "not finite"),
+    ],
+    ids=["few", "copies", "NaN"],
+)
+def test_descriptors_that_make_no_vocabulary(
+    num_clusters: int, rows: NDArray[np.float64], message: str
+) -> None:
+    with pytest.raises(DataError, match=message):
+        train_vocabulary(rows, VladOptions(num_clusters=num_clusters))
+
+
 def test_training_depends_on_the_seed_only() -> None:
     data = unit_rows(np.random.default_rng(8), 500, 8)
     first = train_vocabulary(data, VladOptions(num_clusters=10, seed=1)).centres
@@ -191,6 +160,9 @@ def test_training_depends_on_the_seed_only() -> None:
     other = train_vocabulary(data, VladOptions(num_clusters=10, seed=2)).centres
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
+    # the first of several is the one that is trained alone
+    several = train_vocabulary(data, VladOptions(num_clusters=10, seed=1, vocabularies=2)).centres
+    np.testing.assert_array_equal(first[0], several[0])
 
 
 def test_a_large_training_set_starts_from_a_sample() -> None:
@@ -201,23 +173,6 @@ def test_a_large_training_set_starts_from_a_sample() -> None:
     distance = np.linalg.norm(centres[:, None] - truth, axis=2)
     assert sorted(distance.argmin(axis=1).tolist()) == [0, 1, 2]
     assert distance.min(axis=1).max() < 0.1
-
-
-def test_too_few_descriptors_are_refused() -> None:
-    data = unit_rows(np.random.default_rng(0), 9, 8)
-    with pytest.raises(DataError, match="10 clusters .* has 9"):
-        train_vocabulary(data, VladOptions(num_clusters=10))
-    copies = np.repeat(data[:3], 20, axis=0)
-    with pytest.raises(DataError, match="fewer than 10 distinct"):
-        train_vocabulary(copies, VladOptions(num_clusters=10))
-    assert train_vocabulary(copies, VladOptions(num_clusters=3)).centres.shape == (1, 3, 8)
-
-
-def test_training_refuses_values_that_are_not_finite() -> None:
-    data = unit_rows(np.random.default_rng(0), 20, 8)
-    data[3, 2] = np.nan
-    with pytest.raises(DataError, match="not finite"):
-        train_vocabulary(data, VladOptions(num_clusters=4))
 
 
 @given(st.lists(st.integers(0, 300), max_size=20), st.integers(1, 500), st.integers(0, 2**32 - 1))
@@ -246,13 +201,6 @@ def test_vocabularies_stand_side_by_side_with_equal_weight() -> None:
     np.testing.assert_allclose(
         aggregate(image, vocabulary, options), np.concatenate(alone) / np.sqrt(3), atol=2e-6
     )
-
-
-def test_the_first_of_several_vocabularies_is_the_one_trained_alone() -> None:
-    data = unit_rows(np.random.default_rng(12), 300, 8)
-    one = train_vocabulary(data, VladOptions(num_clusters=4, seed=7))
-    several = train_vocabulary(data, VladOptions(num_clusters=4, seed=7, vocabularies=2))
-    np.testing.assert_array_equal(one.centres[0], several.centres[0])
 
 
 def images_of(rng: np.random.Generator, count: int) -> dict[str, NDArray[np.float32]]:
@@ -288,30 +236,28 @@ def test_training_whole_is_training_vocabularies_and_then_whitening() -> None:
             aggregate(images[name], vocabulary, WHITENED), expected.apply(vector)
         )
     assert not aggregate(images["empty"], vocabulary, WHITENED).any()
+    none = train(images, WHITENED.model_copy(update={"dimensions": None}))
+    assert none.whitening is None and none.size == 64
 
 
-def test_the_power_of_whitening_is_an_option() -> None:
-    images = images_of(np.random.default_rng(18), 12)
+# fewer than images, and no more than wanted
+@pytest.mark.parametrize(("count", "size"), [(2, 1), (5, 4), (30, 10)])
+def test_dimensions_and_the_power_of_whitening(count: int, size: int) -> None:
+    images = images_of(np.random.default_rng(14), count)
     half, whole = (
         train(images, WHITENED.model_copy(update={"whitening_power": power})).whitening
         for power in (0.5, 1.0)
     )
-    assert half is not None and whole is not None
-    assert not np.allclose(half.projection, whole.projection)
+    assert half is not None and whole is not None and len(half.projection) == size
+    # of two images there is one direction, of deviation 1
+    assert np.allclose(half.projection, whole.projection) == (count == 2)
 
 
-@pytest.mark.parametrize(("count", "size"), [(2, 1), (5, 4), (30, 10)])
-def test_whitening_has_fewer_dimensions_than_images_and_no_more_than_wanted(
-    count: int, size: int
-) -> None:
-    images = images_of(np.random.default_rng(14), count)
-    assert train(images, WHITENED).size == size
-
-
-def test_training_without_whitening_has_none() -> None:
-    images = images_of(np.random.default_rng(15), 5)
-    vocabulary = train(images, WHITENED.model_copy(update={"dimensions": None}))
-    assert vocabulary.whitening is None and vocabulary.size == 64
+def test_images_that_cannot_be_trained_on() -> None:
+    with pytest.raises(DataError, match="no descriptors"):
+        train({"empty": np.zeros((0, 8), np.float32)}, WHITENED)
+    with pytest.raises(DataError, match="cannot be learnt from 1 images"):
+        train(images_of(np.random.default_rng(17), 1), WHITENED)
 
 
 def test_whitening_is_learnt_from_a_bounded_number_of_images(
@@ -333,16 +279,6 @@ def test_whitening_is_learnt_from_a_bounded_number_of_images(
     assert described == ["000", "008", "016", "023", "031", "039"]
 
 
-def test_a_map_without_any_descriptor_is_refused() -> None:
-    with pytest.raises(DataError, match="no descriptors"):
-        train({"empty": np.zeros((0, 8), np.float32)}, WHITENED)
-
-
-def test_whitening_of_one_image_is_refused() -> None:
-    with pytest.raises(DataError, match="cannot be learnt from 1 images"):
-        train(images_of(np.random.default_rng(17), 1), WHITENED)
-
-
 def vectors_of(rng: np.random.Generator, count: int, size: int) -> NDArray[np.float32]:
     """Around a mean far from zero, each axis of another deviation."""
     turn = scipy.linalg.qr(rng.normal(size=(size, size)))[0]
@@ -359,6 +295,10 @@ def test_the_projection_is_the_eigenvectors_over_powers_of_the_deviations(
     covariance = np.cov(data.astype(np.float64).T, bias=True)
     variances, axes = scipy.linalg.eigh(covariance)
     whitening = learn_whitening(data.copy(), 5, power)
+    again = learn_whitening(data.copy(), 5, power)
+    assert whitening.projection.tobytes() == again.projection.tobytes()
+    mirrored = learn_whitening(-data, 5, power).projection
+    np.testing.assert_allclose(whitening.projection, mirrored, atol=1e-5)
     np.testing.assert_allclose(whitening.mean, data.mean(axis=0), atol=1e-5)
     assert whitening.projection.shape == (5, size)
     for row, variance, axis in zip(
@@ -367,32 +307,6 @@ def test_the_projection_is_the_eigenvectors_over_powers_of_the_deviations(
         expected = axis / np.sqrt(variance) ** power
         expected *= np.sign(expected[np.abs(expected).argmax()])
         np.testing.assert_allclose(row, expected, atol=5e-4)
-
-
-@pytest.mark.slow
-def test_many_vectors_are_white_afterwards() -> None:
-    data = vectors_of(np.random.default_rng(4), 4000, 6)
-    whitening = learn_whitening(data.copy(), 6)
-    white = (data - whitening.mean) @ whitening.projection.T
-    np.testing.assert_allclose(white.mean(axis=0), 0, atol=1e-3)
-    np.testing.assert_allclose(np.cov(white.T), np.eye(6), atol=0.02)
-
-
-def test_of_few_vectors_the_power_keeps_their_likeness() -> None:
-    rng = np.random.default_rng(5)
-    groups = np.repeat(rng.normal(size=(4, 300)), 3, axis=0)
-    data = (groups + 0.5 * rng.normal(size=groups.shape)).astype(np.float32)
-    same = np.kron(np.eye(4), np.ones((3, 3))) - np.eye(12) > 0
-    other = ~same & ~np.eye(12, dtype=bool)
-    alike = []
-    for power in (0.5, 1.0):
-        whitening = learn_whitening(data.copy(), 300, power)
-        assert len(whitening.projection) == 11
-        white = np.stack([whitening.apply(row) for row in data])
-        alike.append(white @ white.T)
-    assert alike[0][same].min() > 0.1 + alike[0][other].max()
-    # as many dimensions as can be, each of the same deviation: the corners of a simplex
-    np.testing.assert_allclose(alike[1][same | other], -1 / 11, atol=1e-4)
 
 
 def test_vectors_are_of_unit_length_and_nothing_stays_nothing() -> None:
@@ -404,13 +318,13 @@ def test_vectors_are_of_unit_length_and_nothing_stays_nothing() -> None:
     nothing = whitening.apply(np.zeros(10, np.float32))
     assert nothing.shape == (4,) and not nothing.any()
     assert not whitening.apply(whitening.mean).any()
-
-
-def test_no_dimension_without_variance() -> None:
+    # no dimension without variance
     rng = np.random.default_rng(7)
     flat = (rng.normal(size=(30, 3)) @ rng.normal(size=(3, 20))).astype(np.float32)
     assert len(learn_whitening(flat, 20).projection) == 3
-    assert len(learn_whitening(vectors_of(rng, 6, 20), 20).projection) == 5
+    for count in (1, 4):
+        with pytest.raises(DataError, match=f"from {count} images that do not differ"):
+            learn_whitening(np.ones((count, 8), np.float32), 3)
 
 
 def test_parts_of_the_dimensions_are_taken_one_after_another(
@@ -421,18 +335,6 @@ def test_parts_of_the_dimensions_are_taken_one_after_another(
     monkeypatch.setattr("megloc_kapture.features.vlad._COLUMNS", 4)
     parts = learn_whitening(data.copy(), 6)
     np.testing.assert_allclose(parts.projection, whole.projection, atol=1e-5)
-
-
-def test_learning_again_gives_the_same_bytes() -> None:
-    data = vectors_of(np.random.default_rng(9), 15, 25)
-    first, again = learn_whitening(data.copy(), 6), learn_whitening(data.copy(), 6)
-    assert first.projection.tobytes() == again.projection.tobytes()
-
-
-def test_the_sign_of_the_data_does_not_turn_the_axes() -> None:
-    data = vectors_of(np.random.default_rng(10), 15, 25)
-    first, mirrored = learn_whitening(data.copy(), 6), learn_whitening(-data, 6)
-    np.testing.assert_allclose(first.projection, mirrored.projection, atol=1e-6)
 
 
 @given(arrays(np.float32, (6, 5), elements=st.floats(-10, 10, width=16)))
@@ -447,9 +349,3 @@ def test_whatever_is_learnt_is_finite(data: NDArray[np.float32]) -> None:
     for row in data:
         length = np.linalg.norm(whitening.apply(row))
         assert length == 0 or abs(length - 1) < 1e-5
-
-
-@pytest.mark.parametrize("count", [1, 4])
-def test_vectors_that_do_not_differ_are_refused(count: int) -> None:
-    with pytest.raises(DataError, match=f"from {count} images that do not differ"):
-        learn_whitening(np.ones((count, 8), np.float32), 3)

@@ -1,12 +1,84 @@
-"""Keys and shapes of the published checkpoints, as the files in ``keys`` have them."""
+"""Keys and shapes of the published checkpoints, and random weights of networks."""
 
 from __future__ import annotations
 
+import math
+import zlib
 from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+Net = TypeVar("Net", bound=nn.Module)
+Tensors = dict[str, torch.Tensor]
+Shapes = dict[str, tuple[int, ...]]
+FOLDER = Path(__file__).parent
 
 
-def published_shapes(name: str) -> dict[str, tuple[int, ...]]:
-    """Key -> shape."""
-    rows = (Path(__file__).parent / "keys" / f"{name}.txt").read_text(encoding="utf-8").splitlines()
-    pairs = (row.split() for row in rows)
+def published_shapes(name: str) -> Shapes:
+    """Key -> shape, as the files in ``keys`` have them."""
+    return _read(FOLDER / "keys" / f"{name}.txt")
+
+
+def delg_shapes(kind: str) -> Shapes:
+    """Name -> shape of the variables, as TensorFlow wrote them."""
+    return _read(FOLDER / "data" / "delg" / f"{kind}.txt")
+
+
+def _read(path: Path) -> Shapes:
+    pairs = (row.split() for row in path.read_text(encoding="utf-8").splitlines())
     return {key: () if s == "scalar" else tuple(map(int, s.split("x"))) for key, s in pairs}
+
+
+def delg_variables(kind: str) -> dict[str, NDArray[np.float32]]:
+    """As data/delg/make_reference.py has them."""
+    drawn = {}
+    words = ("kernel", "bias", "gamma", "beta", "moving_mean", "moving_variance")
+    for name, shape in delg_shapes(kind).items():
+        random = np.random.RandomState(zlib.crc32(name.encode()))
+        word = name.removesuffix("/.ATTRIBUTES/VARIABLE_VALUE").rpartition("/")[2]
+        word = words[int(word) % 6] if word.isdigit() else word
+        low, high = {"moving_variance": (0.5, 2.0), "gamma": (0.3, 0.7)}.get(word, (-0.2, 0.2))
+        if len(shape) > 1:
+            values = random.standard_normal(shape) * np.sqrt(2 / np.prod(shape[:-1]))
+        else:
+            values = random.uniform(low, high, shape)
+        drawn[name] = np.asarray(values, np.float32)
+    return drawn
+
+
+def shapes_of(module: nn.Module) -> Shapes:
+    return {key: tuple(value.shape) for key, value in module.state_dict().items()}
+
+
+def random_tensors(name: str, seed: int = 0) -> Tensors:
+    """Under the published keys; activations neither vanish nor grow with the depth."""
+    generator = torch.Generator().manual_seed(seed)
+    tensors = {}
+    for key, shape in published_shapes(name).items():
+        values = torch.randn(shape, generator=generator)
+        if len(shape) > 1:
+            values *= (2 / math.prod(shape[1:])) ** 0.5
+        elif key.endswith(("running_var", "weight")):  # of a normalisation
+            values = values.abs() + 0.5
+        tensors[key] = torch.tensor(3) if key.endswith("num_batches_tracked") else values
+        if key.endswith(("bias", "running_mean")):
+            values *= 0.3
+    return tensors
+
+
+def randomised(module: Net, seed: int = 0) -> Net:
+    """Weights whose activations stay near 1, statistics of no layer trivial."""
+    torch.manual_seed(seed)
+    for part in module.modules():
+        if isinstance(part, nn.Conv2d):
+            nn.init.kaiming_normal_(part.weight, mode="fan_in")
+        if isinstance(part, nn.BatchNorm2d):
+            nn.init.uniform_(part.weight, 0.3, 0.7)
+            nn.init.uniform_(part.bias, -0.3, 0.3)
+            part.running_mean.uniform_(-0.2, 0.2)
+            part.running_var.uniform_(0.5, 2.0)
+    return module.eval().requires_grad_(False)

@@ -8,12 +8,11 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
-torch = pytest.importorskip("torch")
-
-from megloc_kapture.nets.gaussians import Gaussians  # noqa: E402
-from megloc_kapture.nets.radiance import Rays, nerf_w_loss  # noqa: E402
+from megloc_kapture.nets.gaussians import Gaussians
+from megloc_kapture.nets.radiance import Rays, nerf_w_loss
 
 
 def drawn(count: int, seed: int = 0) -> Gaussians:
@@ -65,20 +64,6 @@ def test_one_gaussian_is_closed_form() -> None:
     assert (behind.opacity == 0).all() and (behind.rgb == 0).all() and (behind.depth == 0).all()
 
 
-def test_the_nearer_hides_the_farther() -> None:
-    field = Gaussians(1, count=2)
-    with torch.no_grad():
-        field.means[:, 2] = torch.tensor([2.0, 1.0])
-        field.log_scales.fill_(math.log(0.1))
-        field.opacity_logits.fill_(math.log(4.0))  # 0.8
-        field.colour_logits[:] = torch.tensor([[9.0, -9.0, -9.0], [-9.0, 9.0, -9.0]])
-    found = field.render(Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]), 0.1, 5.0))
-    expected = torch.tensor([[0.2 * 0.8, 0.8, 0.0]])
-    torch.testing.assert_close(found.rgb, expected, atol=5e-4, rtol=0)
-    assert found.opacity.item() == pytest.approx(0.96, abs=1e-5)
-    assert found.depth.item() == pytest.approx((0.8 * 1 + 0.16 * 2) / 0.96, abs=1e-4)
-
-
 @pytest.mark.parametrize("table", [1 << 18, 900])
 def test_tables_miss_no_gaussian(table: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("megloc_kapture.nets.gaussians._TABLE_OF_CACHE", table)
@@ -101,41 +86,23 @@ def test_tables_miss_no_gaussian(table: int, monkeypatch: pytest.MonkeyPatch) ->
         torch.testing.assert_close(found[row], seen.detach(), atol=2e-3, rtol=0)
 
 
-def test_gradients_are_those_of_differences() -> None:
+def test_gradients_are_those_of_differences(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Gaussians, "forward", Gaussians.render)
     field, rays = drawn(20).double(), towards(6)
-    rays = Rays(
-        rays.origins.double(),
-        rays.directions.double(),
-        rays.near,
-        rays.far,
-        field.appearance.weight[[0, 1, 2, 0, 1, 2]].detach(),
-        field.transient.weight[[0, 1, 2, 0, 1, 2]].detach(),
-    )
+    rows = [0, 1, 2, 0, 1, 2]
+    light, moving = (part.weight[rows].detach() for part in (field.appearance, field.transient))
+    origins, directions = rays.origins.double(), rays.directions.double()
+    rays = Rays(origins, directions, rays.near, rays.far, light, moving)
     names = ["means", "log_scales", "quats_wxyz", "opacity_logits", "colour_logits", "light"]
     seen = torch.rand(6, 3, dtype=torch.float64)
 
     def loss(*values: torch.Tensor) -> torch.Tensor:
         changed = dict(zip(names, values, strict=True))
-        found = torch.func.functional_call(_Rendering(field), _prefixed(changed), (rays,))
+        found = torch.func.functional_call(field, changed, (rays,))
         return nerf_w_loss(found, seen) + found.depth.sum()
 
     values = [getattr(field, name).detach().clone().requires_grad_() for name in names]
     assert torch.autograd.gradcheck(loss, values, eps=1e-7, atol=1e-4)
-
-
-class _Rendering(torch.nn.Module):
-    """``render`` as what a module is called for."""
-
-    def __init__(self, field: Gaussians) -> None:
-        super().__init__()
-        self.field = field
-
-    def forward(self, rays: Rays) -> object:
-        return self.field.render(rays)
-
-
-def _prefixed(values: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    return {f"field.{name}": value for name, value in values.items()}
 
 
 def test_what_is_transient_stands_before_all() -> None:

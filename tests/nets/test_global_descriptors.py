@@ -1,18 +1,15 @@
-"""NetVLAD, AP-GeM and EigenPlaces: keys, layers against equations, weights that do not fit."""
+"""NetVLAD, AP-GeM and EigenPlaces: layers against equations, weights that do not fit."""
 
 from __future__ import annotations
 
-import copy
 import itertools
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from published import published_shapes
-from torch import nn
+from published import Tensors, published_shapes, randomised
 from torch.nn import functional as F
-from transformers import ResNetConfig, ResNetModel
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.weights.authors import AVERAGE_IMAGE
@@ -21,8 +18,6 @@ from megloc_kapture.nets.global_descriptors import (
     EigenPlacesNet,
     NetVladLayer,
     Order,
-    VggNetVlad,
-    Whitening,
     apgem_from,
     eigenplaces_from,
     netvlad,
@@ -33,7 +28,6 @@ from megloc_kapture.nets.trunks import Depth, ResNet
 
 CLUSTERS, OUTPUT = 3, 10
 MEAN = (123.0, 116.5, 104.25)
-Tensors = dict[str, torch.Tensor]
 # place in the published sequence -> torchvision's name
 NAMES = {"0": "conv1", "1": "bn1", "4": "layer1", "5": "layer2", "6": "layer3", "7": "layer4"}
 
@@ -72,49 +66,8 @@ def test_the_layer_is_the_papers_equation(seed: int) -> None:
             np.testing.assert_allclose(layer(features)[row].numpy(), vector, atol=2e-6)
 
 
-def test_the_two_orders_hold_the_same_numbers() -> None:
-    features = torch.randn(1, 5, 6, 2, generator=torch.Generator().manual_seed(4))
-    dk = random_layer("dk")(features)[0]
-    kd = random_layer("kd")(features)[0]
-    assert (dk - kd).abs().max() > 0.1
-    torch.testing.assert_close(dk, kd.reshape(4, 5).T.reshape(-1), rtol=0, atol=1e-7)
-
-
-def test_one_feature_and_two_clusters_in_closed_form() -> None:
-    layer = random_layer("dk", clusters=2, size=2)
-    layer.conv.weight.copy_(torch.tensor([[[[np.log(3.0)]], [[0.0]]], [[[0.0]], [[0.0]]]]))
-    layer.centroids.copy_(torch.tensor([[0.0, -1.0], [1.0, 2.0]]))
-    # (1, 0) belongs to the first by 3 / 4, to the second by 1 / 4, which no unit length shows:
-    # the differences are (1, 1) and (0, -2)
-    found = layer(torch.tensor([[[[7.0]], [[0.0]]]]))[0]
-    half = np.sqrt(0.5)
-    np.testing.assert_allclose(found.numpy(), np.array([half, 0, half, -1]) / np.sqrt(2), atol=1e-6)
-
-
-def test_places_of_features_do_not_matter_and_doubling_them_neither() -> None:
-    features = torch.randn(1, 5, 4, 6, generator=torch.Generator().manual_seed(5))
-    layer = random_layer("kd")
-    expected = layer(features)
-    order = torch.randperm(24, generator=torch.Generator().manual_seed(6))
-    shuffled = features.flatten(2)[:, :, order].reshape(1, 5, 8, 3)
-    torch.testing.assert_close(layer(shuffled), expected, rtol=0, atol=1e-6)
-    torch.testing.assert_close(layer(torch.cat([features, 2 * features], 3)), expected)
-
-
-def test_keys_shapes_and_number_of_parameters_are_the_published_ones() -> None:
-    with torch.device("meta"):
-        net = VggNetVlad(order="kd", mean_rgb=MEAN)
-    assert {key: tuple(v.shape) for key, v in net.state_dict().items()} == published_shapes(
-        "openibl"
-    )
-    assert sum(parameter.numel() for parameter in net.parameters()) == 149_002_048
-    image = torch.empty(2, 3, 480, 640, device="meta")
-    assert net.features(image).shape == (2, 512, 30, 40)
-    assert net(image).shape == (2, 4096)
-
-
 @pytest.fixture(scope="module")
-def weights() -> dict[str, torch.Tensor]:
+def weights() -> Tensors:
     """Of a network with few clusters and a short vector; the trunk is the whole one."""
     generator = torch.Generator().manual_seed(0)
     small = {64: CLUSTERS, 32768: CLUSTERS * 512, 4096: OUTPUT}
@@ -134,9 +87,7 @@ def image() -> torch.Tensor:
 
 
 @pytest.mark.parametrize("official", [True, False], ids=["netvlad", "openibl"])
-def test_the_whole_network_restated(
-    weights: dict[str, torch.Tensor], image: torch.Tensor, official: bool
-) -> None:
+def test_the_whole_network_restated(weights: Tensors, image: torch.Tensor, official: bool) -> None:
     if official:
         net = netvlad(weights | {AVERAGE_IMAGE: torch.tensor(MEAN)}, "w.mat")
         assert net.mean_rgb == MEAN and net.net_vlad.order == "dk"
@@ -169,72 +120,31 @@ def test_the_whole_network_restated(
     np.testing.assert_allclose(found.norm(dim=1).numpy(), 1, atol=1e-6)
 
 
-def test_weights_go_in_whole_or_not_at_all(weights: dict[str, torch.Tensor]) -> None:
+def test_weights_of_netvlad_that_do_not_fit(weights: Tensors) -> None:
     net = openibl(weights, "w.pth")
-    for key, value in net.state_dict().items():
-        assert torch.equal(value, weights[key]), key
-    less = copy.copy(weights)
-    lost = less.pop("net_vlad.centroids")
-    with pytest.raises(DataError, match=r"^w\.pth: .*missing keys: net_vlad\.centroids"):
-        openibl(less, "w.pth")
-    with pytest.raises(DataError, match=r"unexpected keys: net_vlad\.centres"):
-        openibl(weights | {"net_vlad.centres": lost}, "w.pth")
-    with pytest.raises(DataError, match=r"net_vlad\.conv\.weight is \(3, 512, 1, 1\), not \(4, 5"):
-        openibl(weights | {"net_vlad.centroids": torch.zeros(4, 512)}, "w.pth")
-    with pytest.raises(DataError, match=r"pca_layer\.bias is \(\), not \(4096,\)"):
-        openibl(weights | {"pca_layer.bias": torch.tensor(1.0)}, "w.pth")
+    assert all(torch.equal(value, weights[key]) for key, value in net.state_dict().items())
+    for change, message in (
+        (
+            {"net_vlad.centroids": torch.zeros(4, 512)},
+            r"conv\.weight is \(3, 512, 1, 1\), not \(4, 5",
+        ),
+        ({"pca_layer.bias": torch.tensor(1.0)}, r"pca_layer\.bias is \(\), not \(4096,\)"),
+        ({AVERAGE_IMAGE: torch.zeros(3)}, "weights of NetVLAD's .*plugin netvlad"),
+    ):
+        with pytest.raises(DataError, match=rf"^w\.pth: .*{message}"):
+            openibl(weights | change, "w.pth")
+    with pytest.raises(DataError, match=r"^w\.mat: .*no average_image .*plugin openibl"):
+        netvlad(weights, "w.mat")
     with pytest.raises(DataError, match=r"^w\.mat: average_image is \(1, 3\), not \(3,\)"):
         netvlad(weights | {AVERAGE_IMAGE: torch.zeros(1, 3)}, "w.mat")
-
-
-def test_one_plugins_weights_are_not_the_others(weights: dict[str, torch.Tensor]) -> None:
-    with pytest.raises(DataError, match=r"^w\.pth: .*no average_image .*plugin openibl"):
-        netvlad(weights, "w.pth")
-    with pytest.raises(DataError, match=r"^w\.mat: weights of NetVLAD's .*plugin netvlad"):
-        openibl(weights | {AVERAGE_IMAGE: torch.zeros(3)}, "w.mat")
 
 
 @pytest.fixture(scope="module")
 def apgem_tensors() -> Tensors:
     """Weights of depth 50 whose activations stay near 1."""
-    torch.manual_seed(0)
-    net = ApGemNet(50)
-    for part in net.modules():
-        if isinstance(part, nn.Conv2d):
-            nn.init.kaiming_normal_(part.weight, mode="fan_in")
-        if isinstance(part, nn.BatchNorm2d):
-            nn.init.uniform_(part.weight, 0.3, 0.7)
-            nn.init.uniform_(part.bias, -0.3, 0.3)
-    with torch.no_grad():
-        net.adpool.p.fill_(2.6)
-    return {key: value.detach().clone() for key, value in net.state_dict().items()}
-
-
-def trunk_of_transformers(tensors: Tensors) -> ResNetModel:
-    kind = {"c": "convolution", "b": "normalization"}
-    renamed = {}
-    for key, value in tensors.items():
-        parts = key.split(".")
-        if parts[0] in ("conv1", "bn1"):
-            renamed[f"embedder.embedder.{kind[parts[0][0]]}.{parts[-1]}"] = value
-        elif parts[0].startswith("layer"):
-            place = f"encoder.stages.{int(parts[0][-1]) - 1}.layers.{parts[1]}"
-            if parts[2] == "downsample":
-                part = f"shortcut.{'convolution' if parts[3] == '0' else 'normalization'}"
-            else:
-                part = f"layer.{int(parts[2][-1]) - 1}.{kind[parts[2][0]]}"
-            renamed[f"{place}.{part}.{parts[-1]}"] = value
-    model = ResNetModel(ResNetConfig(depths=[3, 4, 6, 3], layer_type="bottleneck"))
-    model.load_state_dict(renamed, strict=True)
-    return model.eval()
-
-
-def test_apgems_keys_and_shapes_are_the_published_ones() -> None:
-    with torch.device("meta"):
-        net = ApGemNet(101)
-    found = {key: tuple(value.shape) for key, value in net.state_dict().items()}
-    assert found == published_shapes("apgem-resnet101")
-    assert sum(p.numel() for p in net.parameters()) == 46_696_513
+    net = randomised(ApGemNet(50))
+    net.adpool.p.fill_(2.6)
+    return dict(net.state_dict())
 
 
 @pytest.mark.parametrize("normalised", [False, True])
@@ -251,8 +161,9 @@ def test_apgem_is_its_steps_one_by_one(apgem_tensors: Tensors, normalised: bool)
     seen = (image.numpy() - mean[:, None, None]) / deviation[:, None, None]
     with torch.inference_mode():
         found = net.describe(image).numpy()
-        trunk = trunk_of_transformers(tensors)
-        features = trunk(torch.from_numpy(seen.astype(np.float32))).last_hidden_state.numpy()
+        trunk = ResNet(50).eval()  # compared with transformers' in test_trunks.py
+        trunk.load_state_dict(tensors, strict=False)
+        features = trunk(torch.from_numpy(seen.astype(np.float32)))[-1].numpy()
     assert features.shape == (2, 2048, 3, 4) and features.std() > 0.1
     power = float(tensors["adpool.p"])
     pooled = (np.maximum(features.astype(float), 1e-6) ** power).mean(axis=(2, 3)) ** (1 / power)
@@ -265,27 +176,17 @@ def test_apgem_is_its_steps_one_by_one(apgem_tensors: Tensors, normalised: bool)
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-6)
 
 
-def test_without_statistics_of_its_own_it_is_imagenets(apgem_tensors: Tensors) -> None:
-    tensors = apgem_tensors
-    net = apgem_from(tensors, "w.pt")
+def test_checkpoints_of_apgem(apgem_tensors: Tensors) -> None:
+    net = apgem_from(apgem_tensors, "w.pt")
+    # without statistics of its own they are ImageNet's
     assert net.mean.flatten().tolist() == pytest.approx([0.485, 0.456, 0.406])
     assert net.deviation.flatten().tolist() == pytest.approx([0.229, 0.224, 0.225])
     assert not net.training and not net.normalised_features
-
-
-def test_checkpoints_that_do_not_fit(apgem_tensors: Tensors) -> None:
-    tensors = apgem_tensors
-    no_counters = {k: v for k, v in tensors.items() if not k.endswith("num_batches_tracked")}
-    assert len(no_counters) < len(tensors)
-    apgem_from(no_counters, "w.pt")
+    without = {key: value for key, value in apgem_tensors.items() if key != "adpool.p"}
     with pytest.raises(DataError, match=r"^w\.pt: no AP-GeM: keys layer3.*adpool\.p expected"):
-        apgem_from({k: v for k, v in tensors.items() if k != "adpool.p"}, "w.pt")
-    with pytest.raises(DataError, match=r"1 missing keys: fc\.bias"):
-        apgem_from({k: v for k, v in tensors.items() if k != "fc.bias"}, "w.pt")
-    with pytest.raises(DataError, match=r"fc\.weight is \(512, 2048\), not \(2048, 2048\)"):
-        apgem_from(tensors | {"fc.weight": torch.zeros(512, 2048)}, "w.pt")
+        apgem_from(without, "w.pt")
     with pytest.raises(DataError, match=r"preprocess\.mean has 1 values"):
-        apgem_from(tensors | {"preprocess.mean": torch.zeros(1)}, "w.pt")
+        apgem_from(apgem_tensors | {"preprocess.mean": torch.zeros(1)}, "w.pt")
 
 
 def pca(name: str = "Landmarks_clean", *, whiten: bool = True, size: int = 2048) -> Tensors:
@@ -312,61 +213,34 @@ def test_whitening_is_the_authors_formula(whiten: bool, power: float) -> None:
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-6)
 
 
-def test_power_one_half_makes_equal_variances() -> None:
-    """What whitening means, before the vectors are scaled to unit length."""
-    rng = np.random.default_rng(0)
-    samples = rng.normal(size=(500, 6)) * [5, 3, 2, 1, 0.5, 0.1] @ rng.normal(size=(6, 6))
-    variance, directions = np.linalg.eigh(np.cov(samples.T))
-    whitening = Whitening(
-        *(torch.from_numpy(a) for a in (samples.mean(axis=0), directions.T, variance)), power=0.5
-    )
-    white = (samples - whitening.mean.double().numpy()) @ whitening.weight.double().numpy().T
-    np.testing.assert_allclose(np.cov(white.T), np.eye(6), atol=1e-4)
+PCA = "Landmarks_clean"
 
 
-def test_whitenings_that_are_not_there_or_not_whole() -> None:
-    parts = pca() | pca("other")
-    with pytest.raises(OptionError, match="no whitening 'mine' in it; there is Landmarks_clean, o"):
-        whitening_from(parts, "mine", "w.pt", power=0.25)
-    with pytest.raises(OptionError, match=r"w\.pt: no whitening .*there is none .an empty name"):
-        whitening_from({}, "Landmarks_clean", "w.pt", power=0.25)
-    del parts["pca.other.explained_variance"]
-    with pytest.raises(DataError, match="the whitening other lacks explained_variance"):
-        whitening_from(parts, "other", "w.pt", power=0.25)
-    with pytest.raises(DataError, match=r"of shapes \(\(64,\), \(40, 64\), \(40,\)\)"):
-        whitening_from(pca(size=64), "Landmarks_clean", "w.pt", power=0.25)
-    zero = pca() | {"pca.Landmarks_clean.explained_variance": torch.zeros(40)}
-    with pytest.raises(DataError, match="variances that are not positive"):
-        whitening_from(zero, "Landmarks_clean", "w.pt", power=0.25)
+@pytest.mark.parametrize(
+    ("parts", "name", "message"),
+    [
+        (
+            pca() | pca("other"),
+            "mine",
+            "no whitening 'mine' in it; there is Landmarks_clean, other",
+        ),
+        ({}, PCA, "no whitening .*there is none .an empty name"),
+        (pca(size=64), PCA, r"of shapes \(\(64,\), \(40, 64\), \(40,\)\)"),
+        (pca() | {f"pca.{PCA}.explained_variance": torch.zeros(40)}, PCA, "are not positive"),
+        ({f"pca.{PCA}.mean": torch.zeros(2048)}, PCA, "lacks components, explained_variance, wh"),
+    ],
+    ids=["other name", "none", "other size", "no variance", "incomplete"],
+)
+def test_whitenings_that_are_not_there_or_not_whole(
+    parts: Tensors, name: str, message: str
+) -> None:
+    with pytest.raises(OptionError if "no whitening" in message else DataError, match=message):
+        whitening_from(parts, name, "w.pt", power=0.25)
 
 
-@pytest.fixture(scope="module")
-def eigenplaces() -> EigenPlacesNet:
-    """Random weights of ResNet-50, no statistics trivial."""
-    torch.manual_seed(0)
-    net = EigenPlacesNet(50, 12)
-    with torch.no_grad():
-        for part in net.modules():
-            if isinstance(part, nn.BatchNorm2d):
-                part.weight.uniform_(0.3, 0.7)
-                part.bias.uniform_(-0.3, 0.3)
-                part.running_mean.uniform_(-0.2, 0.2)
-                part.running_var.uniform_(0.5, 2.0)
-        net.aggregation["1"].p.fill_(2.6)
-    return net.eval()
-
-
-def test_eigenplaces_keys_and_shapes_are_the_published_ones() -> None:
-    with torch.device("meta"):
-        network = EigenPlacesNet()
-    found = {key: tuple(value.shape) for key, value in network.state_dict().items()}
-    assert found == published_shapes("eigenplaces")
-    # torchvision's ResNet-50 without its classifier, the power, the linear layer
-    assert sum(p.numel() for p in network.parameters()) == 23_508_032 + 1 + 2048 * 2049
-
-
-def test_eigenplaces_vector_is_the_papers(eigenplaces: EigenPlacesNet) -> None:
-    network = eigenplaces
+def test_eigenplaces_vector_is_the_papers() -> None:
+    network = randomised(EigenPlacesNet(50, 12))
+    network.aggregation["1"].p.fill_(2.6)
     trunk = ResNet(50).eval()
     trunk.load_state_dict(
         {
@@ -397,26 +271,12 @@ def test_depth_and_size_follow_from_the_file(depth: Depth, size: int) -> None:
     # numbers do not matter, and are many: one is seen as all of them
     with torch.device("meta"):
         shapes = EigenPlacesNet(depth, size).state_dict()
-    tensors = {
-        key: torch.zeros(()).expand(value.shape)
-        for key, value in shapes.items()
-        if not key.endswith("num_batches_tracked")  # torch before 0.4.1 wrote none
-    }
+    tensors = {key: torch.zeros(()).expand(value.shape) for key, value in shapes.items()}
     found = eigenplaces_from(tensors, "w.pth")
     assert not found.training
     assert {k: v.shape for k, v in found.state_dict().items()} == {
         k: v.shape for k, v in shapes.items()
     }
-
-
-def test_other_networks_are_refused(eigenplaces: EigenPlacesNet) -> None:
-    network = eigenplaces
+    del tensors["aggregation.3.weight"]
     with pytest.raises(DataError, match=r"w\.pth: no EigenPlaces: .*aggregation\.3\.weight"):
-        eigenplaces_from({"conv1.weight": torch.zeros(1)}, "w.pth")
-    tensors = dict(network.state_dict())
-    tensors["backbone.0.weight"] = torch.zeros(64, 3, 3, 3)  # as VGG-16 begins
-    with pytest.raises(DataError, match=r"backbone\.0\.weight is \(64, 3, 3, 3\)"):
-        eigenplaces_from(tensors, "w.pth")
-    del tensors["backbone.4.0.conv3.weight"]  # blocks of ResNet-18 have none
-    with pytest.raises(DataError, match=r"missing keys: backbone\.4\.0\.conv3\.weight"):
         eigenplaces_from(tensors, "w.pth")

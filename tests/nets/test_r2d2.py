@@ -1,69 +1,13 @@
-"""R2D2's network: keys, sizes, and a second implementation written down as the paper's layers."""
+"""R2D2's network against the paper's layers written down, and the levels of its pyramid."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
-from published import published_shapes
+from published import random_tensors
 from torch.nn import functional
 
-from megloc_kapture.errors import DataError
-from megloc_kapture.io.weights import find_weights, read_weights
-from megloc_kapture.nets.r2d2 import R2D2Network, load_r2d2, pyramid_levels
-
-FILES = {"r2d2_WAF_N16": 32, "r2d2_WASF_N16": 32, "r2d2_WASF_N8_big": 48}
-
-
-def random_tensors(name: str = "r2d2_WASF_N16", seed: int = 0) -> dict[str, torch.Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    tensors = {}
-    for key, shape in published_shapes(name).items():
-        fan_in = max(1, int(torch.tensor(shape[1:]).prod())) if len(shape) == 4 else 4
-        tensors[key] = torch.randn(shape, generator=generator) / fan_in**0.5
-        if key.endswith("running_var"):
-            tensors[key] = tensors[key].abs() + 0.5
-        elif key.endswith("num_batches_tracked"):
-            tensors[key] = torch.tensor(3)
-    return tensors
-
-
-def published(shared_data: Path, name: str) -> dict[str, torch.Tensor]:
-    return read_weights(find_weights(str(shared_data / "weights" / "r2d2" / f"{name}.pt")))
-
-
-@pytest.mark.parametrize(
-    ("name", "stored"), [("r2d2_WASF_N16", 485_803), ("r2d2_WASF_N8_big", 1_041_019)]
-)
-def test_keys_and_shapes_are_the_published_ones(name: str, stored: int) -> None:
-    state = R2D2Network(FILES[name]).state_dict()
-    assert {key: tuple(value.shape) for key, value in state.items()} == published_shapes(name)
-    assert sum(value.numel() for value in state.values()) == stored
-
-
-@pytest.mark.parametrize("name", list(FILES))
-def test_the_published_files_load_strictly(shared_data: Path, name: str) -> None:
-    tensors = published(shared_data, name)
-    network = load_r2d2(tensors, name)
-    assert not network.training
-    assert network.ops[0].out_channels == FILES[name]
-    state = network.state_dict()
-    assert state.keys() == tensors.keys()
-    assert all(torch.equal(state[key], tensors[key]) for key in tensors)
-
-
-def test_what_does_not_fit_is_named() -> None:
-    tensors = random_tensors()
-    with pytest.raises(DataError, match=r"r\.pt: .*ops\.0\.weight"):
-        load_r2d2({}, "r.pt")
-    lost = tensors.pop("ops.12.bias")
-    with pytest.raises(DataError, match=r"r\.pt: .*missing keys: ops\.12\.bias"):
-        load_r2d2(tensors, "r.pt")
-    with pytest.raises(DataError, match=r"unexpected keys: extra"):
-        load_r2d2(tensors | {"ops.12.bias": lost, "extra": lost}, "r.pt")
-    with pytest.raises(DataError, match=r"ops\.12\.bias is \(64,\), not \(128,\)"):
-        load_r2d2(tensors | {"ops.12.bias": lost[:64]}, "r.pt")
+from megloc_kapture.nets.r2d2 import load_r2d2, pyramid_levels
 
 
 def by_hand(
@@ -74,15 +18,8 @@ def by_hand(
         torch.tensor([0.229, 0.224, 0.225]).view(3, 1, 1)
     )
     table = [
-        (0, 1, 1, True),
-        (3, 1, 1, True),
-        (6, 1, 1, True),
-        (9, 2, 2, True),
-        (12, 2, 2, True),
-        (15, 4, 4, True),
-        (18, 2, 4, False),
-        (20, 4, 8, False),
-        (22, 8, 16, None),
+        *((0, 1, 1, True), (3, 1, 1, True), (6, 1, 1, True), (9, 2, 2, True), (12, 2, 2, True)),
+        *((15, 4, 4, True), (18, 2, 4, False), (20, 4, 8, False), (22, 8, 16, None)),
     ]
     for index, padding, dilation, relu in table:
         weight, bias = tensors[f"ops.{index}.weight"], tensors[f"ops.{index}.bias"]
@@ -101,7 +38,7 @@ def by_hand(
 
 @pytest.mark.parametrize("size", [(40, 56), (33, 47)])
 def test_the_maps_are_those_of_the_layers_written_down(size: tuple[int, int]) -> None:
-    tensors = random_tensors(seed=1)
+    tensors = random_tensors("r2d2_WASF_N16", 1)
     image = torch.rand(1, 3, *size, generator=torch.Generator().manual_seed(2))
     with torch.inference_mode():
         found = load_r2d2(tensors, "r")(image)
@@ -113,7 +50,7 @@ def test_the_maps_are_those_of_the_layers_written_down(size: tuple[int, int]) ->
 
 def test_a_pixel_sees_its_surroundings_evenly() -> None:
     # the kernels of 2 by 2 have no middle: a shift of theirs would move every keypoint
-    network = load_r2d2(random_tensors(seed=3), "r").double()
+    network = load_r2d2(random_tensors("r2d2_WASF_N16", 3), "r").double()
     image = torch.rand(1, 3, 121, 121, dtype=torch.float64).requires_grad_()
     network(image).repeatability[0, 0, 60, 60].backward()
     assert image.grad is not None
@@ -128,30 +65,20 @@ def sizes(height: int, width: int, smallest: int, largest: int) -> list[tuple[in
 
 
 def test_four_levels_an_octave_between_two_sizes() -> None:
-    assert sizes(480, 640, 256, 1024) == [
-        (640, 480),
-        (538, 404),
-        (453, 339),
-        (381, 285),
-        (320, 240),
-        (269, 202),
-    ]
+    found = sizes(480, 640, 256, 1024)
+    assert found == [(640, 480), (538, 404), (453, 339), (381, 285), (320, 240), (269, 202)]
     # levels that are too large are made, but not given
     assert sizes(1080, 1920, 600, 1024) == [(960, 540), (807, 454), (679, 382)]
+    # an image that is smaller than the smallest level is taken as it is
+    assert sizes(60, 80, 256, 1024) == [(80, 60)]
+    # a strip ends before it vanishes
+    assert sizes(1, 400, 1, 1024)[-1][1] == 1
 
 
 @pytest.mark.parametrize(("side", "count"), [(1024, 9), (1025, 9), (256, 1)])
 def test_the_last_level_may_be_rounded_down(side: int, count: int) -> None:
     found = sizes(16, side, 256, 1024)
     assert len(found) == count and 255 <= found[-1][0] <= 257
-
-
-def test_an_image_smaller_than_the_smallest_level_is_taken_as_it_is() -> None:
-    assert sizes(60, 80, 256, 1024) == [(80, 60)]
-
-
-def test_a_strip_ends_before_it_vanishes() -> None:
-    assert sizes(1, 400, 1, 1024)[-1][1] == 1
 
 
 def test_a_ramp_stays_in_its_place() -> None:

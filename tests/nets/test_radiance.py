@@ -6,14 +6,14 @@ import math
 from dataclasses import replace
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from megloc_kapture.nets.radiance import (  # noqa: E402
-    NerfW,  # noqa: E402
+from megloc_kapture.nets.radiance import (
+    NerfW,
     Rays,
     Samples,
-    TriPlane,  # noqa: E402
+    TriPlane,
+    _contracted,
     about_depth,
     composite,
     frequencies,
@@ -72,12 +72,9 @@ def test_without_what_is_transient_it_is_nerf_a() -> None:
     samples = random_samples((5, 12), torch.float64)
     t = torch.linspace(1, 2, 12, dtype=torch.float64).expand(5, -1)
     deltas = torch.full_like(t, 0.1)
-    assert samples.transient_sigma is not None
     off = replace(samples, transient_sigma=torch.zeros_like(samples.transient_sigma))
-    with_none, with_zero = (
-        composite(t, deltas, Samples(samples.sigma, samples.rgb)),
-        composite(t, deltas, off),
-    )
+    with_none = composite(t, deltas, Samples(samples.sigma, samples.rgb))
+    with_zero = composite(t, deltas, off)
     for name in ("rgb", "depth", "opacity", "beta", "weights"):
         torch.testing.assert_close(getattr(with_none, name), getattr(with_zero, name))
     seen = torch.rand(5, 3, dtype=torch.float64)
@@ -91,17 +88,7 @@ def test_gradients_are_those_of_differences() -> None:
     t = torch.sort(torch.rand(3, 7, dtype=torch.float64) + 1, dim=1).values
     deltas = torch.full_like(t, 0.2)
     seen = torch.rand(3, 3, dtype=torch.float64)
-    values = [
-        value.clone().requires_grad_()
-        for value in (
-            samples.sigma,
-            samples.rgb,
-            samples.transient_sigma,
-            samples.transient_rgb,
-            samples.transient_beta,
-        )
-        if value is not None
-    ]
+    values = [value.clone().requires_grad_() for value in vars(samples).values()]
 
     def loss(*parts: torch.Tensor) -> torch.Tensor:
         return nerf_w_loss(composite(t, deltas, Samples(*parts)), seen)
@@ -183,8 +170,6 @@ def test_a_field_renders_rays(kind: type[NerfW] | type[TriPlane]) -> None:
 
 
 def test_space_beyond_the_planes_is_contracted_without_a_seam() -> None:
-    from megloc_kapture.nets.radiance import _contracted
-
     points = torch.tensor([0.0, 0.5, 1.0, 1.0 + 1e-6, 3.0, 1e6, -3.0], dtype=torch.float64)
     found = _contracted(points)
     torch.testing.assert_close(found[:3], points[:3])

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+
+import cv2
 import numpy as np
 import pytest
 from corner import CAMERA, depth_m, pose_at
@@ -25,6 +28,7 @@ from megloc_kapture.training.labels import (
 from megloc_kapture.values import Camera, RigidTransform
 
 IDENTITY = RigidTransform.identity()
+WITHOUT_DEPTH = -3
 DISTORTED = Camera("OPENCV", 400, 300, (300.0, 302.0, 198.0, 151.0, -0.12, 0.03, 1e-3, -2e-3))
 
 
@@ -59,67 +63,24 @@ def twin() -> tuple[PosedView, PosedView]:
     return views[other], views[query]
 
 
-def surface(view: PosedView, px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """World points at pixels: depth of the four around, or of the nearest that has some."""
-    points, depth_m = np.full((len(px), 3), np.nan), view.depth.depth_m.astype(np.float64)
-    height, width = depth_m.shape
-    for row, (x, y) in enumerate(px):
-        if not (0 <= x <= width and 0 <= y <= height):
-            continue
-        left, top = int(np.floor(x - 0.5)), int(np.floor(y - 0.5))
-        u, v = x - 0.5 - left, y - 0.5 - top
-        corners = []
-        for i, j, weight in (
-            (top, left, (1 - u) * (1 - v)),
-            (top, left + 1, u * (1 - v)),
-            (top + 1, left, (1 - u) * v),
-            (top + 1, left + 1, u * v),
-        ):
-            z = depth_m[min(max(i, 0), height - 1), min(max(j, 0), width - 1)]
-            corners.append((z if z > 0 else np.nan, weight))
-        known = [(weight, z) for z, weight in corners if z > 0]
-        depths = [z for _, z in known]
-        if not known or max(depths) - min(depths) > 0.1 * min(depths):
-            continue
-        z = sum(w * z for w, z in known) if len(known) == 4 else max(known)[1]
-        ray = bearing_rays(view.camera, px[row : row + 1])[0]
-        points[row] = view.cam_from_world.inverse().apply((ray * z)[None])[0]
-    return points
-
-
 def brute_force(
     px_a: NDArray[np.float64], px_b: NDArray[np.float64], a: PosedView, b: PosedView
 ) -> list[int]:
-    """Labels of a's keypoints with depth, one by one; None's stand-in is -3 (without depth)."""
+    """Labels of a's keypoints with depth, one by one; WITHOUT_DEPTH of the others."""
     options = LabelOptions()
-
-    def there(px: NDArray[np.float64], one: PosedView, other: PosedView):  # type: ignore[no-untyped-def]
-        points = surface(one, px)
-        seen = project(other.camera, other.cam_from_world, points)
-        z = other.cam_from_world.apply(points)[:, 2]
-        behind = surface(other, np.nan_to_num(seen, nan=-9.0))
-        measured = other.cam_from_world.apply(behind)[:, 2]
-        inside = ((seen >= 0) & (seen <= (other.camera.width, other.camera.height))).all(axis=1)
-        return points, seen, inside & (np.abs(measured - z) <= options.max_depth_error * z)
-
-    points_a, a_in_b, visible_a = there(px_a, a, b)
-    _, b_in_a, visible_b = there(px_b, b, a)
+    a_in_b, known_a, visible_a = reproject(px_a, a, b)
+    b_in_a, _, visible_b = reproject(px_b, b, a)
     distance = np.full((len(px_a), len(px_b)), np.inf)
-    for i in range(len(px_a)):
-        for j in range(len(px_b)):
-            if visible_a[i] and visible_b[j]:
-                distance[i, j] = max(
-                    np.hypot(*(a_in_b[i] - px_b[j])), np.hypot(*(b_in_a[j] - px_a[i]))
-                )
+    for i, j in itertools.product(np.flatnonzero(visible_a), np.flatnonzero(visible_b)):
+        distance[i, j] = max(np.hypot(*(a_in_b[i] - px_b[j])), np.hypot(*(b_in_a[j] - px_a[i])))
     found = []
-    for i in range(len(px_a)):
-        if np.isnan(points_a[i]).any():
-            found.append(-3)
-            continue
+    for i, known in enumerate(known_a):
         j = int(distance[i].argmin())
         mutual = int(distance[:, j].argmin()) == i
         away = np.nan_to_num(np.hypot(*(a_in_b[i] - px_b).T), nan=np.inf).min()
-        if mutual and distance[i, j] < options.positive_px:
+        if not known:
+            found.append(WITHOUT_DEPTH)
+        elif mutual and distance[i, j] < options.positive_px:
             found.append(j)
         else:
             found.append(UNMATCHED if away > options.negative_px else IGNORED)
@@ -148,7 +109,7 @@ def test_labels_are_those_of_brute_force_on_an_exact_twin(
         (px_b, px_a, b, a, found.partner_b),
     ):
         expected = np.array(brute_force(px, other_px, view, other))
-        told = expected != -3
+        told = expected != WITHOUT_DEPTH
         assert told.sum() > 150
         np.testing.assert_array_equal(partner[told], expected[told])
         assert (expected >= 0).sum() > 40
@@ -201,11 +162,7 @@ def test_depth_beside_the_camera_and_distortion() -> None:
     px_a = np.random.default_rng(2).uniform((60, 60), (340, 240), (150, 2))
     rays = bearing_rays(DISTORTED, px_a)
     # the wall before both cameras is the plane z = 6 of the room
-    in_room = pose_a.inverse()
-    origin, along = (
-        in_room.center() * 0 + np.array(in_room.translation),
-        rays @ in_room.rotation_matrix().T,
-    )
+    origin, along = pose_a.center(), rays @ pose_a.rotation_matrix()
     points = origin + along * ((6.0 - origin[2]) / along[:, 2])[:, None]
     on_wall = points[:, 0] < 1.5
     expected = project(DISTORTED, pose_b, points)
@@ -222,27 +179,13 @@ def test_a_homography_is_a_plane() -> None:
     )
     there, _, visible = reproject(grid, a, b)
     grid, there = grid[visible], there[visible]
-    rows = np.zeros((2 * len(grid), 9))
-    ones = np.column_stack([grid, np.ones(len(grid))])
-    rows[::2, :3], rows[::2, 6:] = ones, -there[:, :1] * ones
-    rows[1::2, 3:6], rows[1::2, 6:] = ones, -there[:, 1:] * ones
-    b_from_a = np.linalg.svd(rows)[2][-1].reshape(3, 3)
-    b_from_a /= b_from_a[2, 2]
+    b_from_a = cv2.findHomography(grid, there)[0]
     rng = np.random.default_rng(3)
     px_b = np.concatenate([there + rng.normal(0, 2.5, there.shape), rng.uniform(0, 300, (40, 2))])
     by_depth = labels_of_views(grid, px_b, a, b)
     by_plane = labels_of_homography(grid, px_b, b_from_a, (400, 300), (400, 300))
     np.testing.assert_array_equal(by_depth.partner_a, by_plane.partner_a)
     assert len(by_plane.matches()) > 50 and (by_plane.partner_a == IGNORED).any()
-
-
-def test_no_keypoints_no_labels() -> None:
-    view = corner_view(pose_at((0, 0, 0), 0, 0))
-    none, some = np.zeros((0, 2)), np.array([[10.0, 10.0]])
-    for px_a, px_b in ((none, some), (some, none), (none, none)):
-        labels = labels_of_views(px_a, px_b, view, view)
-        assert labels.partner_a.tolist() == [IGNORED] * len(px_a)
-        assert len(labels.matches()) == 0
 
 
 def test_overlap_is_of_the_view_that_shows_more() -> None:
@@ -255,6 +198,12 @@ def test_overlap_is_of_the_view_that_shows_more() -> None:
     assert overlap(far, away) == 0.0
 
 
-def test_options_are_ordered() -> None:
+def test_no_keypoints_no_labels_and_options_in_order() -> None:
+    view = corner_view(pose_at((0, 0, 0), 0, 0))
+    none, some = np.zeros((0, 2)), np.array([[10.0, 10.0]])
+    for px_a, px_b in ((none, some), (some, none), (none, none)):
+        labels = labels_of_views(px_a, px_b, view, view)
+        assert labels.partner_a.tolist() == [IGNORED] * len(px_a)
+        assert len(labels.matches()) == 0
     with pytest.raises(ValueError, match="smaller than positive_px"):
         LabelOptions(positive_px=6.0)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from corner import pose_at
+from images import texture
 from numpy.typing import NDArray
 from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
@@ -46,11 +47,11 @@ LABELS = Labels(
 )
 
 
-def texture(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
-    noise = np.random.default_rng(seed).uniform(0, 255, (height, width, 3)).astype(np.float32)
-    return cv2.normalize(
-        cv2.GaussianBlur(noise, (0, 0), 1.5), None, 0, 255, cv2.NORM_MINMAX
-    ).astype(np.uint8)
+def random_side(count: int, size: int, seed: int, dtype: torch.dtype = torch.float32):  # type: ignore[no-untyped-def]
+    draw = torch.Generator().manual_seed(seed)
+    own = nn.functional.normalize(torch.randn(count, size, generator=draw), dim=1)
+    at, scores = torch.rand(count, 2, generator=draw), torch.rand(count, generator=draw)
+    return ImageKeypoints(at.to(dtype), scores.to(dtype), own.to(dtype))
 
 
 def extractors(files: dict[str, str]) -> list[SuperPoint | XFeat]:
@@ -73,13 +74,7 @@ def test_a_describer_begins_as_its_extractor(files: dict[str, str]) -> None:
 
 
 def test_a_new_superglue_matches_as_its_descriptors_do() -> None:
-    draw = torch.Generator().manual_seed(0)
-    sides = []
-    for count in (7, 5):
-        own = nn.functional.normalize(torch.randn(count, 64, generator=draw), dim=1)
-        at = torch.rand(count, 2, generator=draw)
-        sides.append(ImageKeypoints(at, torch.rand(count, generator=draw), own))
-    pair = (sides[0], sides[1])
+    pair = random_side(7, 64, 0), random_side(5, 64, 1)
     net = SuperGlueNet(encoder_sizes(64), 4).train()
     (own,) = ProductHead()([pair], 20)
     assert not torch.allclose(net([pair], 20)[0], own, atol=0.1)
@@ -158,15 +153,7 @@ def test_frozen_features_are_the_best_and_kept(files: dict[str, str]) -> None:
 
 
 def test_products_match_as_nearest_neighbours() -> None:
-    generator = torch.Generator().manual_seed(0)
-    a, b = (
-        ImageKeypoints(
-            torch.zeros(n, 2),
-            torch.ones(n),
-            nn.functional.normalize(torch.randn(n, 16, generator=generator), dim=1),
-        )
-        for n in (30, 25)
-    )
+    a, b = random_side(30, 16, 0), random_side(25, 16, 1)
     log = ProductHead()([(a, b)], 50)[0]
     assert log.shape == (31, 26)
     torch.testing.assert_close(log.exp()[:, :-1].sum(0), torch.ones(25))
@@ -197,9 +184,8 @@ def test_deep_supervision_is_the_mean_over_cross_attention(files: dict[str, str]
 
 def test_a_pair_without_keypoints_costs_nothing(files: dict[str, str]) -> None:
     blank = np.zeros((64, 64, 3), np.uint8)
-    frozen = FrozenFeatures(
-        SuperPoint(SuperPointOptions(weights=files["superpoint"], device="cpu", threshold=0.9)), 10
-    )
+    options = SuperPointOptions(weights=files["superpoint"], device="cpu", threshold=0.9)
+    frozen = FrozenFeatures(SuperPoint(options), 10)
     pair = frozen.prepare(TrainingPair((blank, blank), None, lambda a, b: NOTHING))
     model = PairModel(SuperGlueNet(encoder_sizes(256), 2), None, iterations=5)
     loss = model([pair])
@@ -226,9 +212,7 @@ def test_it_is_the_likelihood_of_the_labels() -> None:
     # what is ignored changes nothing
     log[2, :], log[:, 1] = 7.0, -3.0
     torch.testing.assert_close(transport_loss(log, LABELS), -(matched + unmatched) / 2)
-
-
-def test_nothing_labelled_is_no_loss() -> None:
+    # nothing labelled is no loss
     log = torch.zeros(4, 3, requires_grad=True)
     nothing = Labels(np.full(3, IGNORED), np.full(2, IGNORED))
     assert transport_loss(log, nothing).item() == 0
@@ -253,19 +237,11 @@ def test_gradients_through_the_transport(scale: float) -> None:
 def test_gradients_through_superglue_reach_its_inputs() -> None:
     torch.manual_seed(2)
     net = SuperGlueNet(encoder_sizes=(8, 8), num_layers=2).double()
-    generator = torch.Generator().manual_seed(3)
-
-    def side(num: int) -> ImageKeypoints:
-        xy = torch.rand(num, 2, generator=generator, dtype=torch.float64)
-        scores = torch.rand(num, generator=generator, dtype=torch.float64)
-        descriptors = torch.randn(num, 8, generator=generator, dtype=torch.float64)
-        return ImageKeypoints(xy, scores, descriptors)
-
-    a, b = side(5), side(4)
+    a, b = (random_side(count, 8, count, torch.float64) for count in (5, 4))
 
     def loss(first: torch.Tensor, second: torch.Tensor, bin_score: torch.Tensor) -> torch.Tensor:
         net.bin_score.data = bin_score.data
-        pair = (ImageKeypoints(a.xy, a.scores, first), ImageKeypoints(b.xy, b.scores, second))
+        pair = replace(a, descriptors=first), replace(b, descriptors=second)
         depths = net.assignments([pair], 10, [1, 2])
         return sum(transport_loss(depth[0], LABELS) for depth in depths)  # type: ignore[return-value]
 

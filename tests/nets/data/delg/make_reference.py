@@ -10,7 +10,7 @@ it is exported as the public exporter does. The TF-Slim one is resnet_v1_50 of t
 the same head; it is saved as a graph of TF1 is. ``keras.txt`` (exported model),
 ``keras-weights.txt`` (checkpoint of the training) and ``slim.txt`` hold the names and shapes of the
 variables as TensorFlow wrote them, ``reference.npz`` the vectors of one image at
-each scale. ``tests/nets/test_delg.py`` makes the same weights and the same image.
+each scale. ``tests/nets/published.py`` makes the same weights, ``test_delg.py`` the image.
 """
 
 import shutil

@@ -1,0 +1,62 @@
+"""Images, and weights of local features: random ones in files, published ones where there are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from images import Image
+from published import random_tensors
+from torch import nn
+
+from megloc_kapture.io.images import read_image_rgb
+from megloc_kapture.nets.superpoint import SuperPointNet
+
+
+def random_superpoint(seed: int) -> SuperPointNet:
+    torch.manual_seed(seed)
+    net = SuperPointNet()
+    for name, value in net.named_parameters():
+        if name.endswith("weight"):
+            nn.init.kaiming_normal_(value)
+    return net
+
+
+@pytest.fixture(scope="session")
+def superpoint_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("superpoint") / "superpoint_v1.pth"
+    torch.save(random_superpoint(0).state_dict(), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def other_superpoint() -> dict[str, torch.Tensor]:
+    return random_superpoint(1).state_dict()
+
+
+@pytest.fixture(scope="session")
+def aslfeat_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Random ones that answer to texture, under TensorFlow's names and in its layouts."""
+    arrays = {}
+    for name, values in random_tensors("aslfeat").items():
+        values = torch.randn(values.shape, generator=torch.Generator().manual_seed(len(arrays)))
+        if name.startswith("deform_param"):
+            values = values * 0.02
+        elif name.endswith("kernel"):
+            values = values * (2 / (9 * values.shape[2])) ** 0.5
+        elif name.endswith("moving_mean"):
+            values = values * 0.1
+        else:
+            values = values.abs() * 0.5 + (0.5 if values.ndim else 2)
+        arrays[name] = values.numpy()
+    path = tmp_path_factory.mktemp("aslfeat") / "aslfeat.npz"
+    np.savez(path, **arrays, global_step=np.array(380_000))
+    return path
+
+
+@pytest.fixture(scope="session")
+def photograph(shared_data: Path) -> Image:
+    folder = shared_data / "scenes" / "fountain_p11" / "mapping" / "sensors" / "records_data"
+    return read_image_rgb(folder / "0003.jpg")

@@ -1,0 +1,190 @@
+"""What all extractors of local features have in common: order, limits, masks, files."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from images import Image, texture
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.features.aliked import Aliked
+from megloc_kapture.features.aslfeat import AslFeat
+from megloc_kapture.features.colmap_sift import ColmapSift
+from megloc_kapture.features.r2d2 import R2D2
+from megloc_kapture.features.rootsift import RootSift
+from megloc_kapture.features.superpoint import SuperPoint
+from megloc_kapture.features.xfeat import XFeat
+from megloc_kapture.io.weights import MissingWeightsError
+from megloc_kapture.values import LocalFeatures
+
+Make = Callable[..., Any]
+ALL = 100_000
+KINDS: dict[str, Any] = {
+    **{"rootsift": RootSift, "sift": ColmapSift, "superpoint": SuperPoint, "aslfeat": AslFeat},
+    **{"aliked": Aliked, "xfeat": XFeat, "r2d2": R2D2},
+}
+# those with published weights see a part of a photograph, x, y, width and height
+PUBLISHED = {
+    "aliked": ("aliked/aliked-n16.pth", (400, 300, 320, 240)),
+    "xfeat": ("xfeat/xfeat.onnx", (0, 0, 320, 256)),
+    "r2d2": ("r2d2/r2d2_WASF_N16.pt", (600, 300, 240, 160)),
+}
+NETWORKS = [name for name in KINDS if "sift" not in name]
+DESCRIPTORS = {"superpoint": 256, "xfeat": 64}  # the others have 128
+# how far and how many keypoints are found again in half precision
+HALF = {
+    **{"superpoint": (8.0, 0.3), "aslfeat": (1.0, 0.7), "aliked": (1.0, 0.8)},
+    **{"xfeat": (0.01, 0.5), "r2d2": (1.5, 0.8)},
+}
+# height and width; where there are no features without texture
+FLAT = [(1, 1), (2, 5), (5, 5), (10, 40), (11, 11), (33, 31), (64, 48), (120, 160)]
+SMALL = {
+    **{"superpoint": [(7, 100), (8, 8)], "xfeat": [(20, 31), (33, 100)]},
+    **{"r2d2": [(9, 21), (40, 60)]},
+}
+REFUSALS = {
+    "superpoint": "23 missing keys",
+    "aslfeat": "missing keys",
+    "aliked": "no ALIKED",
+    "xfeat": "does not fit XFeatNetwork",
+    "r2d2": "does not fit R2D2Network",
+}
+
+
+@pytest.fixture(params=KINDS)
+def name(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture
+def weights(name: str, request: pytest.FixtureRequest) -> Path | None:
+    if name in PUBLISHED:
+        return request.getfixturevalue("shared_data") / "weights" / PUBLISHED[name][0]
+    return request.getfixturevalue(f"{name}_weights") if name in NETWORKS else None
+
+
+@pytest.fixture
+def make(name: str, weights: Path | None) -> Make:
+    """Makes the extractor; it takes its options."""
+
+    def made(**options: Any) -> Any:
+        if weights is not None:
+            options = {"weights": str(weights), "device": "cpu", **options}
+        if name == "r2d2":
+            options = {"min_size": 200, "max_size": 240, **options}
+        return KINDS[name](KINDS[name].Options.model_validate(options))
+
+    return made
+
+
+@pytest.fixture
+def image(name: str, request: pytest.FixtureRequest) -> Image:
+    if name not in PUBLISHED:
+        return texture(150, 203, sigma_px=1.5)
+    x, y, width, height = PUBLISHED[name][1]
+    whole = request.getfixturevalue("photograph")
+    return np.ascontiguousarray(whole[y : y + height, x : x + width])
+
+
+def assert_same(a: LocalFeatures, b: LocalFeatures, rows: Any = slice(None)) -> None:
+    np.testing.assert_array_equal(a.keypoints_px, b.keypoints_px[rows])
+    np.testing.assert_array_equal(a.scores, b.scores[rows])
+    np.testing.assert_allclose(a.descriptors, b.descriptors[rows], atol=1e-6)
+
+
+def assert_well_formed(found: LocalFeatures, name: str) -> None:
+    columns, count = 2 if "sift" in name else 3, len(found.scores)
+    assert found.keypoints_px.shape == (count, columns)
+    assert found.descriptors.shape == (count, DESCRIPTORS.get(name, 128))
+    assert found.keypoints_px.dtype == found.scores.dtype == np.float32
+    assert found.descriptors.dtype == np.dtype(KINDS[name].descriptor_dtype)
+    assert np.isfinite(found.keypoints_px).all() and np.isfinite(found.scores).all()
+    length = np.linalg.norm(found.descriptors.astype(np.float64), axis=1)
+    exact = {"rtol": 0.01} if name == "sift" else {"rtol": 0, "atol": 1e-5}
+    np.testing.assert_allclose(length, 512.0 if name == "sift" else 1.0, **exact)
+
+
+def test_the_best_come_first_and_are_kept(name: str, make: Make, image: Image) -> None:
+    every = make(max_keypoints=ALL).extract(image)
+    assert_well_formed(every, name)
+    assert len(every.scores) > 60 and every.num_masked == 0
+    assert (every.keypoints_px[:, :2] > 0).all()
+    assert (every.keypoints_px[:, :2] < image.shape[1::-1]).all()
+    assert (np.diff(every.scores) <= 0).all()
+    if name in NETWORKS and name != "r2d2":
+        np.testing.assert_array_equal(every.keypoints_px[:, 2], every.scores)
+    if name != "sift":  # keeps whole levels
+        assert_same(make(max_keypoints=40).extract(image), every, slice(40))
+
+
+def test_the_mask_comes_before_the_limit(name: str, make: Make, image: Image) -> None:
+    every = make(max_keypoints=ALL).extract(image)
+    mask = np.ones(image.shape[:2], bool)
+    assert_same(make(max_keypoints=ALL).extract(image, mask), every)
+    mask[:, 100:] = False
+    x, y = np.floor(every.keypoints_px[:, :2]).astype(int).T
+    allowed = mask[y, x]
+    assert 20 < allowed.sum() < len(allowed)
+    masked = make(max_keypoints=20).extract(image, mask)
+    assert_same(masked, every, np.flatnonzero(allowed)[:20])
+    assert masked.num_masked == (~allowed).sum()
+    nothing = make().extract(image, np.zeros_like(mask))
+    assert_well_formed(nothing, name)
+    assert len(nothing.scores) == 0 and nothing.num_masked == len(every.scores)
+
+
+def test_it_travels_and_names_its_weights(
+    name: str, make: Make, image: Image, weights: Path | None
+) -> None:
+    first = make()
+    expected = first.extract(image)
+    packed = pickle.dumps(first)
+    assert len(packed) < 10_000  # no network
+    found = pickle.loads(packed).extract(image.copy())
+    assert_same(found, expected)
+    assert found.descriptors.tobytes() == expected.descriptors.tobytes()
+    if weights is not None:
+        assert first.weights() == {weights.name: hashlib.sha256(weights.read_bytes()).hexdigest()}
+
+
+def test_small_and_flat_images(name: str, make: Make) -> None:
+    for size in SMALL.get(name, FLAT):
+        for image in (np.full((*size, 3), 90, np.uint8), texture(*size)):
+            found = make().extract(image)
+            assert_well_formed(found, name)
+            assert (found.keypoints_px[:, :2] < size[::-1]).all()
+            if name == "superpoint" or name not in SMALL and np.ptp(image) == 0:
+                assert len(found.scores) == 0
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_half_precision_finds_nearly_the_same(name: str, make: Make, image: Image) -> None:
+    full = make().extract(image).keypoints_px[:, None, :2]
+    half = make(half_precision=True).extract(image)
+    assert half.keypoints_px.dtype == half.descriptors.dtype == np.float32
+    px, share = HALF[name]
+    apart = np.linalg.norm(full - half.keypoints_px[:, :2], axis=2).min(axis=1)
+    assert (apart < px).mean() > share
+    if name in ("superpoint", "xfeat"):
+        np.testing.assert_array_equal(half.keypoints_px[:, :2] % 1, 0.5)
+    if name == "aliked":  # between pixels: not rounded to what bfloat16 can hold
+        assert (half.keypoints_px[:, :2] * 8 % 1 != 0).mean() > 0.9
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_weights_that_are_missing_or_of_another_network(
+    name: str, make: Make, tmp_path: Path
+) -> None:
+    with pytest.raises(MissingWeightsError, match=name):
+        KINDS[name]()
+    other = tmp_path / "other.pth"
+    torch.save({"conv1a.weight": torch.zeros(64, 1, 3, 3)}, other)
+    with pytest.raises(DataError, match=rf"other\.pth: .*{REFUSALS[name]}"):
+        make(weights=str(other)).extract(texture(40, 60))
