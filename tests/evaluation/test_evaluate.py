@@ -31,50 +31,24 @@ def result(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
 
 def test_it_prints_as_the_recall_table(world: Any, result: Path, tmp_path: Path) -> None:
     found = megloc.evaluate(result, truth=world.truth)
+    in_memory = evaluate(world.estimated, world.truth)
+    np.testing.assert_array_equal(in_memory.errors.position_m, found.errors.position_m)
     assert str(found) + "\n" == report_text(found)
     assert "95 % confidence intervals" in str(found) and str(result) in str(found)
     found.html(tmp_path / "report.html")
     assert "How large the errors are" in (tmp_path / "report.html").read_text()
 
 
-def test_poses_in_memory_are_those_on_disk(
-    world: Any, result: Path, tmp_path: Path, kaptures: Callable[..., Path]
-) -> None:
-    truth = kaptures(tmp_path / "query_gt", list(world.truth), world.truth)
-    on_disk = evaluate(result, truth)
-    in_memory = evaluate(world.estimated, world.truth)
-    np.testing.assert_array_equal(in_memory.errors.position_m, on_disk.errors.position_m)
-
-
 def test_what_localizing_gives_brings_reasons_and_inliers(world: Any) -> None:
     first, second, third, *_ = sorted(world.estimated)
     truth = {name: world.truth[name] for name in (first, second, third)}
-    found = evaluate(
-        {
-            first: Pose(world.estimated[first], 300, 120),
-            second: Failure("no matches", num_matches=7),
-        },
-        truth,
-        label="mine",
-    )
+    pose, failure = Pose(world.estimated[first], 300, 120), Failure("no matches", num_matches=7)
+    found = evaluate({first: pose, second: failure}, truth, label="mine")
     table = found.to_pandas()
     assert table.loc[first, "num_inliers"] == 120 and table.loc[first, "outcome"] == "localized"
     assert table.loc[second, "reason"] == "no matches" and table.loc[second, "num_matches"] == 7
     assert table.loc[third, "outcome"] == "missing" and table.loc[third, "num_inliers"] is pd.NA
     assert found.label == "mine"
-
-
-def test_a_table_of_the_queries(world: Any, result: Path) -> None:
-    found = evaluate(result, world.truth)
-    table = found.to_pandas()
-    assert list(table.index) == sorted(world.truth)
-    at = found.row().recall[1]
-    within = (table["position_error_m"] <= at.threshold.position_m) & (
-        table["angle_error_deg"] <= at.threshold.angle_deg
-    )
-    assert within.mean() == at.recall
-    assert table["position_error_m"].median() == found.row().median_position_m
-    assert set(table["outcome"]) == {"localized", "fallback", "missing"}
 
 
 def test_two_results_are_compared(world: Any, tmp_path: Path) -> None:
@@ -89,9 +63,7 @@ def test_two_results_are_compared(world: Any, tmp_path: Path) -> None:
     assert "Is the difference real?" in (tmp_path / "comparison.html").read_text()
     with pytest.raises(OptionError, match="two results are called 'all of them'"):
         all_of_them.compare(all_of_them)
-
-
-def test_results_without_a_label_are_told_apart(world: Any) -> None:
+    # those without a label are told apart
     first, second = evaluate_results([world.estimated, {}], world.truth, Benchmark())
     assert (first.label, second.label) == ("result 1", "result 2")
     assert "+-" in str(over_seeds([first, second]))
@@ -99,6 +71,13 @@ def test_results_without_a_label_are_told_apart(world: Any) -> None:
 
 def test_tables_in_python_are_those_of_the_files(world: Any, result: Path, tmp_path: Path) -> None:
     found = evaluate(result, world.truth)
+    table, at = found.to_pandas(), found.row().recall[1]
+    within = (table["position_error_m"] <= at.threshold.position_m) & (
+        table["angle_error_deg"] <= at.threshold.angle_deg
+    )
+    assert list(table.index) == sorted(world.truth) and within.mean() == at.recall
+    assert table["position_error_m"].median() == found.row().median_position_m
+    assert set(table["outcome"]) == {"localized", "fallback", "missing"}
     comparison = found.compare(evaluate({}, world.truth, label="nothing"))
     for number, reported in enumerate((found, comparison)):
         paths = write_report(tmp_path / str(number), reported)

@@ -37,6 +37,18 @@ from megloc_kapture.io.tables import write_status
 from megloc_kapture.values import Camera, RigidTransform
 
 
+@pytest.fixture
+def truth(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
+    return kaptures(tmp_path / "query_gt", list(world.truth), world.truth)
+
+
+@pytest.fixture
+def result(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
+    folder = kaptures(tmp_path / "localized", list(world.truth), world.estimated)
+    write_status(folder / "status.csv", world.statuses.values())
+    return folder
+
+
 @pytest.mark.parametrize(
     ("paths", "labels"),
     [
@@ -88,10 +100,9 @@ def test_workspaces_that_were_recentred_in_other_ways_are_brought_together(
             quat_wxyz=(0.8, 0.0, 0.6, 0.0), translation=(-7.0, 1.0, 0.0)
         )
     )
-    write_world(tmp_path / "one/megloc", truth_world)
-    write_protocol(tmp_path / "one/megloc", Protocol())
-    write_world(tmp_path / "two/megloc", other_world)
-    write_protocol(tmp_path / "two/megloc", Protocol())
+    for name, own in (("one", truth_world), ("two", other_world)):
+        write_world(tmp_path / name / "megloc", own)
+        write_protocol(tmp_path / name / "megloc", Protocol())
     names = list(world.truth)
     official = {n: truth_world.pose_in_official(p) for n, p in world.estimated.items()}
     moved = {n: other_world.pose_in_local(p) for n, p in official.items()}
@@ -102,37 +113,41 @@ def test_workspaces_that_were_recentred_in_other_ways_are_brought_together(
     found = evaluate_results(
         [here, there, tmp_path / "poses.txt"], truth, benchmark_of(tmp_path / "one/megloc")
     )
-    for other in found[1:]:
-        np.testing.assert_allclose(
-            other.errors.position_m, found[0].errors.position_m, rtol=0, atol=1e-9
-        )
+    first, *others = (one.errors.position_m for one in found)
+    for other in others:
+        np.testing.assert_allclose(other, first, rtol=0, atol=1e-9)
     # the guard: in its own frame it is metres off
     wrong = evaluate_results([kaptures(tmp_path / "lone", names, moved)], truth, Benchmark())
     assert np.median(wrong[0].errors.position_m) > 1.0
+    # and so is a file in the official frame, of another scale and far away
+    similarity = SimilarityTransform(
+        quat_wxyz=(0.8, 0.0, 0.6, 0.0), translation=(4.1e6, 8.6e5, 4.7e6), scale=2.0
+    )
+    official_world = World(official_from_local=similarity)
+    write_world(tmp_path, official_world)
+    poses = {name: official_world.pose_in_official(pose) for name, pose in world.truth.items()}
+    write_pose_file(tmp_path / "far.txt", poses)
+    near = evaluate(tmp_path / "far.txt", truth, side_tables=tmp_path)
+    assert near.errors.position_m.max() < 1e-6
+    assert evaluate(tmp_path / "far.txt", truth).errors.position_m.min() > 1e6
 
 
 def test_the_challenges_names_are_read_back(
-    world: Any, tmp_path: Path, kaptures: Callable[..., Path]
+    world: Any, truth: Path, result: Path, tmp_path: Path
 ) -> None:
     names = {name: f"rear/{number}.png" for number, name in enumerate(sorted(world.truth))}
     write_protocol(tmp_path / "megloc", protocol_of("robotcar"))
     write_names(tmp_path / "megloc", names)
     write_pose_file(tmp_path / "poses.txt", world.estimated, names=names)
-    truth = kaptures(tmp_path / "query_gt", list(world.truth), world.truth)
     rules = benchmark_of(tmp_path / "megloc")
     (found,) = evaluate_results([tmp_path / "poses.txt"], truth, rules)
     assert found.row().num_missing == 4 and found.without_truth == ()
     assert "RobotCar Seasons v2 publishes" in found.truth_known_by
-
-
-def test_a_result_knows_all_its_queries(
-    world: Any, tmp_path: Path, kaptures: Callable[..., Path]
-) -> None:
-    names = sorted(world.truth)
-    folder = kaptures(tmp_path / "localized", names, world.estimated)
-    found = read_result(folder, Benchmark(), label="x")
-    assert found.images == tuple(names)
-    assert len(found.poses) == 36 and found.statuses is None
+    # last parts of the path alone give the figures of the folder
+    write_pose_file(tmp_path / "poses.txt", world.estimated, names="basename")
+    from_file, from_folder = evaluate(tmp_path / "poses.txt", truth), evaluate(result, truth)
+    np.testing.assert_array_equal(from_file.errors.position_m, from_folder.errors.position_m)
+    assert from_file.without_truth == ()
 
 
 def test_what_lies_around(tmp_path: Path, kaptures: Callable[..., Path]) -> None:
@@ -156,35 +171,23 @@ def test_what_lies_around(tmp_path: Path, kaptures: Callable[..., Path]) -> None
     assert nothing.query_images() == [] and nothing.queries is None
 
 
-@pytest.fixture
-def truth(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
-    return kaptures(tmp_path / "query_gt", list(world.truth), world.truth)
-
-
-@pytest.fixture
-def result(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
-    folder = kaptures(tmp_path / "localized", list(world.truth), world.estimated)
-    write_status(folder / "status.csv", world.statuses.values())
-    return folder
-
-
 def test_statuses_and_side_tables_are_used(
     world: Any, result: Path, truth: Path, tmp_path: Path
 ) -> None:
+    alone = evaluate(result, truth)
+    assert [row.name for row in alone.rows] == ["all"] and len(alone.thresholds) == 4
+    found = read_result(result, Benchmark())
+    assert found.images == tuple(sorted(world.truth))
+    assert len(found.poses) == 36 and found.statuses == world.statuses
     unscored = sorted(world.truth)[0]
     groups = {
         name: ImageGroup(condition=condition, scored=name != unscored)
         for name, condition in world.conditions.items()
     }
     write_groups(tmp_path, groups)
-    write_protocol(
-        tmp_path,
-        Protocol(
-            thresholds=((0.1, None),),
-            conditions=("night", "day"),
-            pools={"any light": ("day", "night")},
-        ),
-    )
+    pools = {"any light": ("day", "night")}
+    rules = Protocol(thresholds=((0.1, None),), conditions=("night", "day"), pools=pools)
+    write_protocol(tmp_path, rules)
     evaluation = evaluate(result, truth, side_tables=tmp_path, label="x")
     assert [row.name for row in evaluation.rows] == ["night", "day", "any light", "all"]
     assert evaluation.thresholds == (Threshold(position_m=0.1),)
@@ -193,38 +196,6 @@ def test_statuses_and_side_tables_are_used(
     assert evaluation.row().num_fallback == 4
     other = evaluate(result, truth, side_tables=tmp_path, thresholds=[Threshold(position_m=1.0)])
     assert other.thresholds == (Threshold(position_m=1.0),)
-
-
-def test_without_side_tables(result: Path, truth: Path) -> None:
-    evaluation = evaluate(result, truth)
-    assert [row.name for row in evaluation.rows] == ["all"]
-    assert len(evaluation.thresholds) == 4
-
-
-def test_a_pose_file_gives_the_figures_of_its_folder(
-    world: Any, result: Path, truth: Path, tmp_path: Path
-) -> None:
-    pose_file = tmp_path / "poses.txt"
-    write_pose_file(pose_file, world.estimated, names="basename")
-    from_file, from_folder = evaluate(pose_file, truth), evaluate(result, truth)
-    np.testing.assert_array_equal(from_file.errors.position_m, from_folder.errors.position_m)
-    assert from_file.without_truth == ()
-
-
-def test_a_pose_file_in_the_official_frame_is_brought_back(
-    world: Any, truth: Path, tmp_path: Path
-) -> None:
-    similarity = SimilarityTransform(
-        quat_wxyz=(0.8, 0.0, 0.6, 0.0), translation=(4.1e6, 8.6e5, 4.7e6), scale=2.0
-    )
-    official = World(official_from_local=similarity)
-    write_world(tmp_path, official)
-    poses = {name: official.pose_in_official(pose) for name, pose in world.truth.items()}
-    write_pose_file(tmp_path / "poses.txt", poses)
-    evaluation = evaluate(tmp_path / "poses.txt", truth, side_tables=tmp_path)
-    assert evaluation.errors.position_m.max() < 1e-6
-    # the guard: left where it is, the file is thousands of kilometres off
-    assert evaluate(tmp_path / "poses.txt", truth).errors.position_m.min() > 1e6
 
 
 def test_rigs_are_resolved(tmp_path: Path, world: Any) -> None:
@@ -244,10 +215,9 @@ def test_rigs_are_resolved(tmp_path: Path, world: Any) -> None:
 
 
 def test_absent_results_are_named(truth: Path, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="nowhere"):
-        evaluate(tmp_path / "nowhere", truth)
-    with pytest.raises(DataError, match="nowhere"):
-        evaluate(truth, tmp_path / "nowhere")
+    for paths in ((tmp_path / "nowhere", truth), (truth, tmp_path / "nowhere")):
+        with pytest.raises(DataError, match="nowhere"):
+            evaluate(*paths)
 
 
 def test_lists_in_the_order_of_names_are_no_ranking() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import pytest
@@ -14,15 +14,11 @@ from megloc_kapture.io.dataset_tables import ImageGroup
 ROBOTCAR = {
     f"rear/{100 + i}.jpg": f"{c}/rear/{100 + i}.jpg" for i, c in enumerate(["dawn", "night"] * 3)
 }
-
-
 CAMERAS = [
     image.replace("/rear/", f"/{side}/")
     for image in ROBOTCAR.values()
     for side in ("left", "rear", "right")
 ]
-
-
 AACHEN = {f"IMG_{i}.jpg": f"query/day/nexus4/IMG_{i}.jpg" for i in range(5)}
 
 
@@ -62,23 +58,6 @@ def only(found: NamedRows) -> Finding:
     return finding
 
 
-def test_right_names() -> None:
-    found = match(list(AACHEN), AACHEN)
-    assert found.images == AACHEN and not found.findings
-
-
-def test_the_camera_forgotten_on_robotcar() -> None:
-    names = [name.removeprefix("rear/") for name in ROBOTCAR]
-    found = match(names, ROBOTCAR, queries=CAMERAS, dataset="robotcar")
-    finding = only(found)
-    assert (finding.severity, finding.kind) == ("error", "name-folder")
-    assert finding.message == (
-        "6 names without the folder before them: 100.jpg should be rear/100.jpg; the server finds "
-        "none of them, and every figure is zero"
-    )
-    assert list(found.images.values()) == list(ROBOTCAR.values())
-
-
 def test_all_three_cameras_of_robotcar() -> None:
     names = [image.split("/", 1)[1] for image in CAMERAS]
     finding = only(match(names, ROBOTCAR, queries=CAMERAS, dataset="robotcar"))
@@ -86,49 +65,56 @@ def test_all_three_cameras_of_robotcar() -> None:
     assert len(finding.names) == 12 and "left/100.jpg" in finding.message
 
 
+@pytest.mark.parametrize(
+    ("names", "expected", "kind", "words"),
+    [
+        (
+            [name.removeprefix("rear/") for name in ROBOTCAR],
+            ROBOTCAR,
+            "name-folder",
+            "6 names without the folder before them: 100.jpg should be rear/100.jpg; the server "
+            "finds none of them, and every figure is zero",
+        ),
+        (AACHEN.values(), AACHEN, "name-path", "query/day/nexus4/IMG_0.jpg should be IMG_0.jpg"),
+        ([f"./{name}" for name in AACHEN], AACHEN, "name-path", "./IMG_0.jpg should be IMG_0.jpg"),
+        ([f"/{name}" for name in AACHEN], AACHEN, "name-path", "/IMG_0.jpg should be IMG_0.jpg"),
+        (
+            [f"{image.removesuffix('.jpg')}.PNG" for image in AACHEN.values()],
+            AACHEN,
+            "name-path",
+            "more of the path than the list and ending in '.PNG' instead of '.jpg'",
+        ),
+        (
+            [name.replace(".jpg", ".JPG") for name in AACHEN],
+            AACHEN,
+            "name-letters",
+            "upper and lower case",
+        ),
+        (
+            [f"phones/{name}" for name in AACHEN],
+            {f"q/{name}": image for name, image in AACHEN.items()},
+            "name-folders",
+            "phones/IMG_0.jpg should be q/IMG_0.jpg",
+        ),
+    ],
+    ids=["no folder", "path", "./", "/", "path and ending", "letters", "other folder"],
+)
+def test_names_that_are_wrong_in_one_way(
+    names: Iterable[str], expected: Mapping[str, str], kind: str, words: str
+) -> None:
+    found = match(list(names), expected, queries=CAMERAS if expected is ROBOTCAR else ())
+    finding = only(found)
+    assert (finding.severity, finding.kind) == ("error", kind) and words in finding.message
+    assert list(found.images.values()) == list(expected.values())
+
+
 @pytest.mark.parametrize(("dataset", "severity"), [("robotcar", "warning"), ("aachen", "error")])
 def test_the_other_ending(dataset: str, severity: str) -> None:
     names = [name.replace(".jpg", ".png") for name in ROBOTCAR]
     finding = only(match(names, ROBOTCAR, queries=CAMERAS, dataset=dataset))
     assert (finding.severity, finding.kind) == (severity, "name-ending")
-    assert (
-        "ending in '.png' instead of '.jpg': rear/100.png should be rear/100.jpg" in finding.message
-    )
-
-
-def test_the_whole_path_where_the_last_part_is_wanted() -> None:
-    finding = only(match(list(AACHEN.values()), AACHEN))
-    assert finding.kind == "name-path"
-    assert "query/day/nexus4/IMG_0.jpg should be IMG_0.jpg" in finding.message
-
-
-@pytest.mark.parametrize("prefix", ["./", "/"])
-def test_marks_before_the_name(prefix: str) -> None:
-    assert only(match([prefix + name for name in AACHEN], AACHEN)).kind == "name-path"
-
-
-def test_several_differences_at_once() -> None:
-    names = [f"{image.removesuffix('.jpg')}.PNG" for image in AACHEN.values()]
-    finding = only(match(names, AACHEN))
-    assert finding.kind == "name-path"
-    assert (
-        "more of the path than the list and ending in '.PNG' instead of '.jpg'" in finding.message
-    )
-
-
-def test_letters() -> None:
-    finding = only(match([name.replace(".jpg", ".JPG") for name in AACHEN], AACHEN))
-    assert finding.kind == "name-letters" and "upper and lower case" in finding.message
-
-
-def test_the_folder_of_something_else() -> None:
-    finding = only(
-        match([f"phones/{name}" for name in AACHEN], {f"q/{n}": i for n, i in AACHEN.items()})
-    )
-    assert (
-        finding.kind == "name-folders"
-        and "phones/IMG_0.jpg should be q/IMG_0.jpg" in finding.message
-    )
+    words = "ending in '.png' instead of '.jpg': rear/100.png should be rear/100.jpg"
+    assert words in finding.message
 
 
 def test_unknown_and_missing_names() -> None:
@@ -142,9 +128,7 @@ def test_unknown_and_missing_names() -> None:
     assert (missing.severity, missing.kind) == ("warning", "missing")
     assert missing.message.startswith("3 of 5 queries have no row")
     assert missing.names == ("IMG_2.jpg", "IMG_3.jpg", "IMG_4.jpg")
-
-
-def test_a_condition_that_is_missing_as_a_whole() -> None:
+    # a condition that is missing as a whole
     groups = {image: ImageGroup(condition=image.split("/")[0]) for image in ROBOTCAR.values()}
     names = [name for name, image in ROBOTCAR.items() if image.startswith("dawn")][:2]
     finding = only(match(names, ROBOTCAR, queries=CAMERAS, groups=groups, dataset="robotcar"))
@@ -165,6 +149,8 @@ def test_one_query_under_two_names() -> None:
 
 
 def test_order_is_a_note_and_only_where_there_is_one() -> None:
+    right = match(list(AACHEN), AACHEN)
+    assert right.images == AACHEN and not right.findings
     backwards = list(AACHEN)[::-1]
     assert kinds_of(match(backwards, AACHEN)) == [("note", "order")]
     assert not match(backwards, AACHEN, listed=False).findings
@@ -177,34 +163,28 @@ def test_a_stem_that_several_names_share_is_unknown() -> None:
 
 
 @pytest.mark.parametrize(
-    ("dataset", "name", "kind"),
+    ("dataset", "name", "kinds"),
     [
-        ("robotcar", "1418.jpg", "name-folder"),
-        ("robotcar", "rear/1418.tif", "name-ending"),
-        ("aachen", "query/IMG.jpg", "name-path"),
-        ("inloc", "IMG_0801.jpg", "name-ending"),
+        ("robotcar", "1418.jpg", ["name-folder"]),
+        ("robotcar", "rear/1418.tif", ["name-ending"]),
+        ("aachen", "query/IMG.jpg", ["name-path"]),
+        ("inloc", "IMG_0801.jpg", ["name-ending"]),
+        ("robotcar", "rear/1.png", []),
+        ("aachen", "a.jpg", []),
+        ("inloc", "A.JPG", []),
+        ("kapture", "a/b.tif", []),
     ],
 )
-def test_what_names_alone_show(dataset: str, name: str, kind: str) -> None:
-    assert [finding.kind for finding in check_shape({name: 1}, dataset)] == [kind]
-
-
-@pytest.mark.parametrize(
-    ("dataset", "name"),
-    [("robotcar", "rear/1.png"), ("aachen", "a.jpg"), ("inloc", "A.JPG"), ("kapture", "a/b.tif")],
-)
-def test_names_that_look_right(dataset: str, name: str) -> None:
-    assert not check_shape({name: 1}, dataset)
-
-
-PAIRS = ["1 10", "2 20", "3 30"]
+def test_what_names_alone_show(dataset: str, name: str, kinds: list[str]) -> None:
+    assert [finding.kind for finding in check_shape({name: 1}, dataset)] == kinds
 
 
 def test_pairs() -> None:
-    assert match_pairs({"1 10": 1, "2 20": 2, "3 30": 3}, PAIRS) == (False, [])
-    swapped, findings = match_pairs({"10 1": 1, "20 2": 2, "30 3": 3}, PAIRS)
+    pairs = ["1 10", "2 20", "3 30"]
+    assert match_pairs({"1 10": 1, "2 20": 2, "3 30": 3}, pairs) == (False, [])
+    swapped, findings = match_pairs({"10 1": 1, "20 2": 2, "30 3": 3}, pairs)
     assert swapped and [f.kind for f in findings] == ["swapped"]
-    swapped, findings = match_pairs({"3 30": 1, "1 10": 2, "2 30": 3}, PAIRS)
+    swapped, findings = match_pairs({"3 30": 1, "1 10": 2, "2 30": 3}, pairs)
     assert not swapped
     assert [(f.severity, f.kind, f.line) for f in findings] == [
         ("error", "unknown", 3),

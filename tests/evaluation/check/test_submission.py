@@ -110,22 +110,19 @@ def told(report: CheckReport) -> list[tuple[str, str]]:
     return [(finding.severity, finding.kind) for finding in report.sorted_findings]
 
 
-def test_a_right_mlad_file(check: Check) -> None:
-    report = check(DRIVE.lines())
-    assert report.findings == () and (report.poses, report.expected) == (120, 120)
-    assert report.lines() == ["120 poses of 120 queries: no problem found"]
-
-
-@pytest.mark.parametrize("mistake", ["inverted", "wxyz"])
-def test_mistakes_of_mlad_files(check: Check, mistake: str) -> None:
-    (error,) = check(DRIVE.lines(mistake)).findings
-    assert error.severity == "error" and error.kind == mistake
-
-
-def test_a_centre_in_an_mlad_file_is_hard_to_tell_from_an_inverse(check: Check) -> None:
-    # between keyframes some metres apart a car hardly turns
+def test_mistakes_of_mlad_files(check: Check) -> None:
+    right = check(DRIVE.lines())
+    assert right.findings == () and (right.poses, right.expected) == (120, 120)
+    assert right.lines() == ["120 poses of 120 queries: no problem found"]
+    for mistake in ("inverted", "wxyz"):
+        (error,) = check(DRIVE.lines(mistake)).findings
+        assert error.severity == "error" and error.kind == mistake
+    # between keyframes some metres apart a car hardly turns: what cannot be told apart is said
     (error,) = check(DRIVE.lines("centre")).findings
     assert "centre stands where the translation belongs" in error.message
+    few = replace(DRIVE.reference, relocalization=DRIVE.reference.relocalization[:12])
+    assert told(check(DRIVE.lines()[:12], few)) in ([], [("note", "undecided")])
+    assert told(check(DRIVE.lines("wxyz")[:12], few)) == [("error", "wxyz")]
 
 
 def test_absolute_poses_in_an_mlad_file(check: Check) -> None:
@@ -151,6 +148,9 @@ def test_rows_of_an_mlad_file(check: Check) -> None:
     swapped = [" ".join([b, a, rest]) for a, b, rest in (line.split(" ", 2) for line in lines)]
     assert told(check(swapped)) == [("error", "swapped")]
     assert told(check(lines[::-1])) == [("note", "order")]
+    named = check(lines, name="mine.txt")
+    assert told(named) == [("error", "file-name")]
+    assert "reloc_a_to_b.txt" in named.findings[0].message
 
 
 def test_dummies_are_noted_and_prove_nothing(check: Check) -> None:
@@ -162,68 +162,46 @@ def test_dummies_are_noted_and_prove_nothing(check: Check) -> None:
     assert told(allowed) == [("note", "dummies")]
 
 
-def test_few_rows_leave_doubts(check: Check) -> None:
-    few = replace(DRIVE.reference, relocalization=DRIVE.reference.relocalization[:12])
-    report = check(DRIVE.lines()[:12], few)
-    assert told(report) in ([], [("note", "undecided")])
-    assert told(check(DRIVE.lines("wxyz")[:12], few)) == [("error", "wxyz")]
-
-
 def test_a_folder_of_mlad_files(tmp_path: Path, check: Check) -> None:
     pairs = [replace(p, file="second.txt") for p in DRIVE.reference.relocalization[60:]]
     both = replace(DRIVE.reference, relocalization=[*DRIVE.reference.relocalization[:60], *pairs])
     folder = tmp_path / "submission"
     folder.mkdir()
-    (folder / "reloc_a_to_b.txt").write_text("".join(DRIVE.lines()[:60]))
-    report = check_submission(folder, dataset="4seasons", reference=both)
+
+    def with_file(name: str, lines: Sequence[str]) -> CheckReport:
+        (folder / name).write_text("".join(lines))
+        return check_submission(folder, dataset="4seasons", reference=both)
+
+    report = with_file("reloc_a_to_b.txt", DRIVE.lines()[:60])
     assert told(report) == [("error", "missing-file")]
-    (folder / "second.txt").write_text("".join(DRIVE.lines()[60:]))
-    report = check_submission(folder, dataset="4seasons", reference=both)
+    report = with_file("second.txt", DRIVE.lines()[60:])
     assert not report.findings and report.poses == 120
-    (folder / "third.txt").write_text("")
-    report = check_submission(folder, dataset="4seasons", reference=both)
-    assert told(report) == [("warning", "unknown-file")]
-    (folder / "second.txt").write_text("1 2 3\n")
-    report = check_submission(folder, dataset="4seasons", reference=both)
+    assert told(with_file("third.txt", [])) == [("warning", "unknown-file")]
+    report = with_file("second.txt", ["1 2 3\n"])
     assert "error: second.txt:1: 3 columns instead of 9" in "\n".join(report.lines())
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    with pytest.raises(DataError, match="no pose file"):
-        check_submission(empty, dataset="4seasons")
+    (tmp_path / "empty").mkdir()
+    for name, dataset, words in (
+        ("empty", "4seasons", "no pose file"),
+        ("empty", "kapture", "one file"),
+        ("absent.txt", "kapture", "cannot read"),
+    ):
+        with pytest.raises(DataError, match=words):
+            check_submission(tmp_path / name, dataset=dataset)
+    with pytest.raises(DataError, match="no imported dataset"):
+        read_reference(tmp_path)
 
 
-def test_the_name_of_an_mlad_file(check: Check) -> None:
-    report = check(DRIVE.lines(), name="mine.txt")
-    assert told(report) == [("error", "file-name")]
-    assert "reloc_a_to_b.txt" in report.findings[0].message
-
-
-def test_a_file_alone(check: Check) -> None:
+def test_a_file_alone_or_empty(check: Check) -> None:
     report = check(DRIVE.lines(), None)
     assert told(report) == [("note", "not-checked")] * 2 and not report.has_problems
     report = check(["a.jpg 1 0 0 0 0 0 0\n"], None, dataset="robotcar")
     assert told(report) == [("error", "name-folder"), *[("note", "not-checked")] * 2]
     assert "give one with --data" in report.lines()[1]
-
-
-def test_an_import_without_a_map(check: Check) -> None:
     report = check(DRIVE.lines(), replace(DRIVE.reference, cameras=None))
     assert told(report) == [("note", "not-checked")]
-
-
-@pytest.mark.parametrize("content", ["", "\n\n"])
-def test_empty_files(check: Check, content: str) -> None:
-    assert ("error", "empty") in told(check([content]))
-    assert ("error", "empty") in told(check([content], None, dataset="kapture"))
-
-
-def test_what_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="cannot read"):
-        check_submission(tmp_path / "absent.txt", dataset="kapture")
-    with pytest.raises(DataError, match="one file"):
-        check_submission(tmp_path, dataset="kapture")
-    with pytest.raises(DataError, match="no imported dataset"):
-        read_reference(tmp_path)
+    for content in ("", "\n\n"):
+        assert ("error", "empty") in told(check([content]))
+        assert ("error", "empty") in told(check([content], None, dataset="kapture"))
 
 
 def test_reports_are_short_as_text_and_whole_as_json() -> None:
@@ -233,14 +211,8 @@ def test_reports_are_short_as_text_and_whole_as_json() -> None:
     )
     note = Finding("note", "order", "in another order", file="x.txt")
     warning = Finding("warning", "far", "far away", file="x.txt", names=("a", "b"))
-    report = CheckReport(
-        dataset="aachen",
-        file="x.txt",
-        reference="",
-        poses=5,
-        expected=None,
-        findings=(note, *findings, warning),
-    )
+    told = {"dataset": "aachen", "file": "x.txt", "reference": "", "poses": 5, "expected": None}
+    report = CheckReport(**told, findings=(note, *findings, warning))
     lines = report.lines()
     assert lines[0] == "error: x.txt:1: broken 1" and lines[9] == "error: x.txt:10: broken 10"
     assert lines[10:] == [

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pytest
 
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.reports import report_text
@@ -60,14 +59,9 @@ def test_the_whole_table() -> None:
 
 def test_fits_a_terminal_and_is_ascii(world: Any) -> None:
     world.estimated["stranger.jpg"] = HERE
-    text = report_text(
-        evaluate_poses(
-            world.estimated,
-            world.truth,
-            conditions={name: f"{c}-in-a-hard-winter" for name, c in world.conditions.items()},
-            statuses=world.statuses,
-        )
-    )
+    conditions = {name: f"{c}-in-a-hard-winter" for name, c in world.conditions.items()}
+    options = {"conditions": conditions, "statuses": world.statuses}
+    text = report_text(evaluate_poses(world.estimated, world.truth, **options))
     assert text.isascii()
     assert max(map(len, text.splitlines())) <= 100
     assert "(+4)" in text and "(+n): fallback poses" in text
@@ -75,35 +69,20 @@ def test_fits_a_terminal_and_is_ascii(world: Any) -> None:
     assert "1 image has no true pose and is not counted: stranger.jpg." in text
 
 
-def test_no_pose_at_all_says_so_and_asks_about_names() -> None:
-    text = report_text(evaluate_poses({"other/a.jpg": HERE}, {"a.jpg": HERE}))
-    assert "0.0 / 0.0 / 0.0 / 0.0" in text
-    assert "no query has a pose" in text
-    assert "do the names agree?" in text
-
-
-def test_long_lists_of_strangers_are_cut() -> None:
+def test_no_pose_at_all_strangers_and_thresholds_without_angles() -> None:
     strangers = {f"x{i}.jpg": HERE for i in range(1000)}
     text = report_text(evaluate_poses(strangers, {"a.jpg": HERE}))
-    assert "1000 images have no true pose" in text
-    assert "x5.jpg" not in text
-
-
-def test_position_only_thresholds() -> None:
-    text = report_text(
-        evaluate_poses({"a": HERE}, {"a": HERE}, thresholds=[Threshold(position_m=0.1)])
-    )
+    for words in ("0.0 / 0.0 / 0.0 / 0.0", "no query has a pose", "do the names agree?"):
+        assert words in text
+    assert "1000 images have no true pose" in text and "x5.jpg" not in text
+    metres = [Threshold(position_m=0.1)]
+    text = report_text(evaluate_poses({"a": HERE}, {"a": HERE}, thresholds=metres))
     assert "recall (%) at 0.1 m\nPosition error at or below" in text
 
 
-@pytest.mark.parametrize(
-    ("recall", "printed"), [(0.0, "0.0"), (0.8975, "89.8"), (1.0, "100.0"), (2 / 3, "66.7")]
-)
-def test_percent(recall: float, printed: str) -> None:
-    assert format_percent(recall) == printed
-
-
-def test_errors_are_printed_to_what_can_be_read() -> None:
+def test_figures_are_printed_to_what_can_be_read() -> None:
+    shares = [format_percent(recall) for recall in (0.0, 0.8975, 1.0, 2 / 3)]
+    assert shares == ["0.0", "89.8", "100.0", "66.7"]
     assert (format_metres(0.00123), format_metres(12.3456)) == ("0.0012", "12.35")
     assert (format_degrees(0.0456), format_degrees(1.2345)) == ("0.046", "1.23")
 
@@ -111,32 +90,30 @@ def test_errors_are_printed_to_what_can_be_read() -> None:
 THRESHOLD = Threshold(position_m=0.25, angle_deg=2.0)
 
 
-def by_hand(label: str, only: int, other: int, both: int = 10) -> tuple[Evaluation, Evaluation]:
+def by_hand(only: int, other: int, both: int = 10) -> tuple[Evaluation, Evaluation]:
     """Two results, one alone within the threshold on ``only`` queries, the other on ``other``."""
-    near, far = [RigidTransform((1.0, 0.0, 0.0, 0.0), (m, 0.0, 0.0)) for m in (0.1, 3.0)]
+    near, far = moved(0.1), moved(3.0)
     names = [f"{i:03d}.jpg" for i in range(only + other + both)]
     truth = dict.fromkeys(names, HERE)
     first = {n: far if only <= i < only + other else near for i, n in enumerate(names)}
     second = {n: far if i < only else near for i, n in enumerate(names)}
+    options = {"thresholds": [THRESHOLD]}
     return (
-        evaluate_poses(first, truth, thresholds=[THRESHOLD], label="A"),
-        evaluate_poses(second, truth, thresholds=[THRESHOLD], label="B"),
+        evaluate_poses(first, truth, label="A", **options),
+        evaluate_poses(second, truth, label="B", **options),
     )
 
 
 def sentence_of(only: int, other: int, both: int = 10) -> str:
-    comparison = compare(by_hand("", only, other, both))
+    comparison = compare(by_hand(only, other, both))
     return threshold_sentence(comparison.tests[0], ["A", "B"])
 
 
-def test_a_real_difference() -> None:
+def test_differences_that_are_real_and_that_could_be_chance() -> None:
     assert sentence_of(12, 3) == (
         "At 0.25 m, 2 deg A finds 12 queries that B misses and B finds 3 that A misses: "
         "the difference is real (p = 0.035)."
     )
-
-
-def test_differences_that_could_be_chance() -> None:
     assert sentence_of(9, 4).endswith("the difference could be chance (p = 0.27).")
     assert sentence_of(1, 0) == (
         "At 0.25 m, 2 deg A finds 1 query that B misses and B finds none that A misses: "
@@ -149,14 +126,11 @@ def test_differences_that_could_be_chance() -> None:
 
 def test_no_difference() -> None:
     assert sentence_of(0, 0) == "At 0.25 m, 2 deg A and B find the same 10 queries."
-    everything_far = by_hand("", 2, 0, 0)
-    worse = [
-        evaluate_poses({}, e.truth, thresholds=[THRESHOLD], label=e.label) for e in everything_far
+    nothing = [
+        evaluate_poses({}, e.truth, thresholds=[THRESHOLD], label=e.label) for e in by_hand(2, 0)
     ]
-    test = compare(worse).tests[0]
-    assert threshold_sentence(test, ["A", "B"]) == (
-        "At 0.25 m, 2 deg neither A nor B finds a query."
-    )
+    said = threshold_sentence(compare(nothing).tests[0], ["A", "B"])
+    assert said == "At 0.25 m, 2 deg neither A nor B finds a query."
 
 
 def test_sentences_about_medians() -> None:
