@@ -90,33 +90,33 @@ def points(frames: list[Frame], depths: Depths) -> SparsePoints:
 
 
 def test_colmap_projects_the_points_where_they_are_seen(
-    frames: list[Frame], points: SparsePoints
+    frames: list[Frame], depths: Depths, points: SparsePoints
 ) -> None:
     assert {frame.camera.model for frame in frames} == {"PINHOLE", "SIMPLE_RADIAL"}
     for index, frame in enumerate(frames):
         mine = points.image_ids == index
         assert mine.sum() > 20
-        px = colmap_px(frame, points.xyz[points.point_ids[mine]])
-        np.testing.assert_allclose(points.xy_px[mine], px, atol=1e-4)
-
-
-def test_the_points_lie_on_what_the_images_see(
-    frames: list[Frame], depths: Depths, points: SparsePoints
-) -> None:
-    for index, frame in enumerate(frames):
-        mine = points.image_ids == index
+        xyz = points.xyz[points.point_ids[mine]]
+        np.testing.assert_allclose(points.xy_px[mine], colmap_px(frame, xyz), atol=1e-4)
+        # on what the image sees
         column, row = points.xy_px[mine].astype(int).T
-        z = frame.cam_from_world.apply(points.xyz[points.point_ids[mine]])[:, 2]
+        z = frame.cam_from_world.apply(xyz)[:, 2]
         error = np.abs(depths[frame.name][row, column] - z)
-        assert (error < 0.021 + 0.011 * z).all()
-        assert np.median(error) < 0.02
+        assert (error < 0.021 + 0.011 * z).all() and np.median(error) < 0.02
+    again = exact_tracks(frames, depths, points_per_frame=60, rng=rng())
+    assert np.array_equal(again.xyz, points.xyz) and np.array_equal(again.xy_px, points.xy_px)
+    # poses may stand in another frame
+    other_from_world = RigidTransform.from_matrix(np.diag([1.0, -1.0, -1.0]), np.array([9, 8, 7]))
+    back = other_from_world.inverse()
+    moved = [replace(frame, cam_from_world=frame.cam_from_world @ back) for frame in frames]
+    there = exact_tracks(moved, depths, points_per_frame=60, rng=rng())
+    np.testing.assert_allclose(there.xyz, other_from_world.apply(points.xyz), atol=1e-9)
 
 
 def test_tracks_are_in_order_and_within_a_place(frames: list[Frame], points: SparsePoints) -> None:
     assert len(points) > 200
     counts = np.bincount(points.point_ids, minlength=len(points))
-    assert counts.min() == 2
-    assert counts.max() > 3
+    assert counts.min() == 2 and counts.max() > 3
     keys = list(zip(points.point_ids.tolist(), points.image_ids.tolist(), strict=True))
     assert keys == sorted(set(keys))
     place = np.array([frame.place for frame in frames])[points.image_ids]
@@ -125,14 +125,6 @@ def test_tracks_are_in_order_and_within_a_place(frames: list[Frame], points: Spa
     for index in range(len(frames)):
         features = points.feature_ids[points.image_ids == index]
         assert features.tolist() == list(range(len(features)))
-
-
-def test_the_same_seed_gives_the_same_points(
-    frames: list[Frame], depths: Depths, points: SparsePoints
-) -> None:
-    again = exact_tracks(frames, depths, points_per_frame=60, rng=rng())
-    assert np.array_equal(again.xyz, points.xyz)
-    assert np.array_equal(again.xy_px, points.xy_px)
 
 
 def frame(name: str, x: float, *, camera: Camera, yaw_deg: float = 90.0) -> Frame:
@@ -182,17 +174,6 @@ def test_strong_distortion_folds_nothing_back_into_the_image() -> None:
     assert len(exact_tracks(pair, both, points_per_frame=1200, rng=rng())) == 0
 
 
-def test_poses_may_stand_in_another_frame(frames: list[Frame], depths: Depths) -> None:
-    other_from_world = RigidTransform.from_matrix(np.diag([1.0, -1.0, -1.0]), np.array([9, 8, 7]))
-    moved = [
-        replace(frame, cam_from_world=frame.cam_from_world @ other_from_world.inverse())
-        for frame in frames
-    ]
-    there = exact_tracks(moved, depths, points_per_frame=20, rng=rng())
-    here = exact_tracks(frames, depths, points_per_frame=20, rng=rng())
-    np.testing.assert_allclose(there.xyz, other_from_world.apply(here.xyz), atol=1e-9)
-
-
 OPTIONS = AachenTwinOptions(
     num_places=1,
     stations_per_place=7,
@@ -221,23 +202,16 @@ def test_the_database_is_what_colmap_extracts(root: Path, tmp_path: Path) -> Non
     with ColmapDatabase(root / "aachen.db") as ours:
         assert len(ours.images) == 21  # without the sequence, which v1.0 does not have
         names = sorted(ours.images)[:4]
-        pycolmap.extract_features(
-            tmp_path / "theirs.db",
-            root / "images_upright",
-            image_names=names,
-            extraction_options=options,
-            device=pycolmap.Device.cpu,
-        )
+        how = {"extraction_options": options, "device": pycolmap.Device.cpu}
+        images = root / "images_upright"
+        pycolmap.extract_features(tmp_path / "theirs.db", images, image_names=names, **how)
         with ColmapDatabase(tmp_path / "theirs.db") as theirs:
             assert sorted(theirs.images) == names
             for name in names:
-                rows = [
-                    np.hstack([found.keypoints(name), found.descriptors(name)])
-                    for found in (ours, theirs)
-                ]
+                both = ((each.keypoints(name), each.descriptors(name)) for each in (ours, theirs))
+                rows = [np.hstack(each) for each in both]
                 assert len(rows[0]) > 300
-                a, b = (some[np.lexsort(some.T)] for some in rows)
-                np.testing.assert_array_equal(a, b)
+                np.testing.assert_array_equal(*(some[np.lexsort(some.T)] for some in rows))
 
 
 @pytest.mark.slow
@@ -294,11 +268,9 @@ def localized(
                 px.append(keypoints[rows[found >= 0, 0]])
                 points.append(xyz[found[found >= 0]])
         camera = query.read().camera_of(name)
+        seen_px, seen_xyz = np.concatenate(px).astype(np.float64), np.concatenate(points)
         result = pycolmap.estimate_and_refine_absolute_pose(
-            np.concatenate(px).astype(np.float64),
-            np.concatenate(points),
-            new_colmap_camera(camera),
-            options,
+            seen_px, seen_xyz, new_colmap_camera(camera), options
         )
         if result is None:  # a night's
             continue
@@ -348,11 +320,8 @@ def test_robotcars_models_share_a_database(tmp_path: Path) -> None:
     RobotCarTwin(options).write(tmp_path / "root")
     observations = []
     for model in ("merged", "individual"):
-        out = tmp_path / model
-        dataset = RobotCar(RobotCarOptions(model=model, reference_model=True)).read(
-            tmp_path / "root"
-        )
-        write_official(dataset, out)
+        out, adapter = tmp_path / model, RobotCarOptions(model=model, reference_model=True)
+        write_official(RobotCar(adapter).read(tmp_path / "root"), out)
         reference = KaptureFolder(out / "reference")
         # features and models fit each other, or the import would refuse them
         reference.validate()
