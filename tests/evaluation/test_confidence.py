@@ -78,7 +78,6 @@ def test_of_a_result() -> None:
     }
     evaluation = evaluate_poses(found, truth, statuses=statuses, nowhere=["stray", "refused"])
     known = evaluation.confidence
-    assert known is not None
     assert (known.num_queries, known.num_poses, known.num_wrong) == (6, 4, 2)
     assert (known.num_nowhere, known.num_nowhere_refused) == (2, 1)
     # a and c first, then the stray, then b

@@ -82,7 +82,6 @@ def test_counts_and_inliers(found: WithoutTruth) -> None:
 
 def test_agreement_with_the_candidates(found: WithoutTruth) -> None:
     one, two, guess, _ = found.results[0].queries
-    assert one.near is not None and two.near is not None
     assert (one.near.first_m, one.near.nearest) == (pytest.approx(1.0), "m/0.jpg")
     assert one.near.first_deg == pytest.approx(20.0)
     assert (two.near.first_m, two.near.nearest) == (pytest.approx(21.0), "m/8.jpg")
@@ -91,7 +90,6 @@ def test_agreement_with_the_candidates(found: WithoutTruth) -> None:
     # the pose of a guess is its candidate's: that is no agreement
     assert guess.near is None
     whole = found.results[0].rows[-1]
-    assert whole.first_candidate is not None and whole.nearest_candidate is not None
     assert whole.first_candidate.num_compared == 2
     assert [at.num_within for at in whole.first_candidate.within] == [1, 1, 2]
     assert whole.first_candidate.num_same_direction == 1
@@ -176,7 +174,6 @@ def test_from_a_workspace(first: Result, tmp_path: Path, kaptures: Callable[...,
     kaptures(workspace / "mapping", list(MAP), MAP)
     kaptures(workspace / "query", [*CONDITIONS, "d/training.jpg"], {})
     kaptures(workspace / "localized", [*CONDITIONS, "d/training.jpg"], first.poses)
-    assert first.statuses is not None
     write_status(workspace / "localized/status.csv", first.statuses.values())
     tables = workspace / "megloc"
     write_protocol(tables, protocol_of("aachen"))

@@ -95,7 +95,6 @@ def test_a_corner_is_found_again() -> None:
     turn = Rotation.from_rotvec(np.radians([2.0, -1.5, 1.0])).as_matrix()
     start = RigidTransform.from_matrix(turn, np.array([0.03, -0.02, 0.04]))
     found = fit_to_surface(surface, points, start, 0.3)
-    assert found is not None
     assert np.linalg.norm(found.translation) < 2e-3
     assert np.degrees(Rotation.from_matrix(found.rotation_matrix()).magnitude()) < 0.1
 
@@ -172,7 +171,6 @@ def test_the_covariance_is_that_of_many_trials() -> None:
         world, normals = corner(rng, 600)
         seen = truth.apply(world + 0.01 * rng.standard_normal((600, 1)) * normals)
         found = fit_weighted(surface, seen, np.ones(600), truth.inverse(), 0.2)
-        assert found is not None
         delta = found.inverse() @ truth.inverse()
         turn = Rotation.from_matrix(delta.rotation_matrix()).as_rotvec()
         errors.append([*turn, *delta.translation])
@@ -191,7 +189,6 @@ def surface() -> Surface:
 
 
 def moved_and_turned(found: RigidTransform | None) -> tuple[float, float]:
-    assert found is not None
     turn = Rotation.from_matrix(found.rotation_matrix()).magnitude()
     # of the points' middle: what the origin does depends on the turn
     middle = np.ones((1, 3))
@@ -233,7 +230,6 @@ def test_noise_weighs(surface: Surface) -> None:
     assert alike > 2 * moved_and_turned(found)[0]
     # its scale does not matter
     scaled = fit_weighted(surface, points, 64.0 * noise, IDENTITY, 0.2)
-    assert found is not None and scaled is not None
     np.testing.assert_allclose(found.translation, scaled.translation, atol=1e-12)
 
 

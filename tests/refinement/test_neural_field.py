@@ -71,7 +71,6 @@ def depth_error(field: NeuralField, tests: list[FieldView]) -> float:
     """Median share by which rendered depths are off."""
     errors = []
     for view in tests:
-        assert view.depth is not None
         known = view.depth.depth_m
         found = field.render(view.camera, view.cam_from_world).depth_m
         errors.append(np.abs(found - known) / known)
@@ -183,7 +182,6 @@ def test_depth_of_another_camera_is_brought_to_the_image() -> None:
         moved.append(replace(view, depth=depth))
     for view, other in zip(plain, moved, strict=True):
         own, brought = pixels_of(view, 32)[3], pixels_of(other, 32)[3]
-        assert own is not None and brought is not None
         both = (own > 0) & (brought > 0)
         assert both.mean() > 0.75
         assert np.median(np.abs(brought[both] / own[both] - 1)) < 0.01

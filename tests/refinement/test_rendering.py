@@ -80,7 +80,6 @@ def neighbours(world: SyntheticWorld, query: Frame, count: int) -> list[Frame]:
 
 
 def reference(shot: Frame, view: RenderedFrame) -> RenderingReference:
-    assert view.depth_m is not None
     depth = DepthView(shot.camera, view.depth_m, HERE)
     return RenderingReference(view.image, shot.camera, shot.cam_from_world, depth, view.mask)
 
@@ -152,7 +151,6 @@ def test_gain_colour_and_noise_of_the_night_do_not_matter(case: Case, seed: int)
     assert refined.measures["cost_after"] < refined.measures["cost_before"]
     assert refined.measures["moved_m"] == pytest.approx(errors(refined.cam_from_world, start)[0])
     covariance = refined.covariance
-    assert covariance is not None
     difference = case.truth @ refined.cam_from_world.inverse()
     vector = np.concatenate([2 * np.array(difference.quat_wxyz[1:]), difference.translation])
     # 22.5 is the 99.9 % quantile of six degrees of freedom; it is an estimate, so twice that
@@ -237,7 +235,6 @@ def test_what_a_references_mask_hides_changes_nothing(case: Case) -> None:
         references = []
         for each in case.references:
             image, free = occluded(each.image, seed)
-            assert each.mask is not None
             references.append(replace(each, image=image, mask=free & each.mask))
         found.append(run(replace(case, references=tuple(references)), start))
     assert found[0].accepted
@@ -279,7 +276,6 @@ def test_a_depth_camera_beside_the_image_is_honoured(
         pose = depth_from_image @ shot.cam_from_world
         beside = replace(shot, camera=depth_camera, cam_from_world=pose, bonnet=False)
         depth_m = painter.render(beside, depth=True).depth_m
-        assert depth_m is not None
         view = DepthView(depth_camera, depth_m, depth_from_image.inverse())
         references.append(replace(each, depth=view))
         careless.append(replace(each, depth=replace(view, image_from_depth=HERE)))

@@ -45,7 +45,6 @@ def true_poses(root: Path, part: str) -> dict[str, RigidTransform]:
 
 
 def test_what_it_asks_for(root: Path, dataset: OfficialDataset) -> None:
-    assert dataset.missing is not None
     assert not dataset.missing.files and not dataset.remarks
     # the map is recentred
     assert all(np.linalg.norm(pose.center()) < 100 for pose in dataset.mapping.poses().values())
@@ -166,7 +165,6 @@ def test_kaptures_importer_has_the_same_poses(
         right = kapture.PoseTransform.compose([rig, other])
         image = dataset.mapping.records_camera[timestamp, "cam1"]
         ours = dataset.mapping.cam_from_world(image)
-        assert ours is not None
         center = dataset.world.pose_in_official(ours).center()
         np.testing.assert_allclose(center, right.inverse().t_raw, atol=1e-6)
 

@@ -90,7 +90,6 @@ def quats_of(rotations: np.ndarray) -> np.ndarray:
 
 
 def matrix_of(turn: Mistake) -> np.ndarray:
-    assert turn.turn_wxyz is not None
     return Rotation.from_quat(np.roll(turn.turn_wxyz, -1)).as_matrix()
 
 

@@ -102,7 +102,6 @@ def test_the_page_has_them_all_and_stands_without_the_script(
 def test_without_images_there_is_none(evaluation: Evaluation) -> None:
     shown = shown_queries(evaluation)
     assert gallery_blocks(StoredInliers(ResultContext()), shown) == ()
-    assert evaluation.context.queries is not None
     for path in evaluation.context.queries.root.rglob("*.jpg"):
         path.unlink()
     assert gallery_blocks(StoredInliers(evaluation.context), shown) == ()
@@ -169,7 +168,6 @@ def test_matches_are_found_in_the_workspace(run: Run) -> None:
     assert (stored.count(QUERY, NEAR), stored.count(QUERY, FAR)) == (42, 5)
     assert stored.count("query/other.jpg", NEAR) is None
     lines = stored.lines(QUERY, NEAR)
-    assert lines is not None
     np.testing.assert_allclose(lines.query_px, run.lines.query_px, atol=1e-3)
     np.testing.assert_allclose(lines.map_px, run.lines.map_px, atol=1e-3)
     assert StoredMatches(ResultContext()).lines(QUERY, NEAR) is None
@@ -191,7 +189,6 @@ def test_the_best_match_stands_beside_the_query(run: Run, chosen: Chosen) -> Non
     pictures = QueryPictures(run.context, run.context.map_poses())
     shown = pictures.of(chosen)
     # ranked second, but with more matches
-    assert shown.main is not None
     assert f'<span class="name">{NEAR}</span>, candidate 2' in shown.main.caption
     assert "42 matches, 30 of them agree with the true pose" in shown.main.caption
     picture = str(shown.main.element)

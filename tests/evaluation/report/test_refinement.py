@@ -140,13 +140,11 @@ def wall(tmp_path: Path) -> ResultContext:
 
 def decoded(picture: str) -> np.ndarray:
     found = re.search(r"base64,([^\"]+)", picture)
-    assert found is not None
     data = np.frombuffer(base64.b64decode(found.group(1)), np.uint8)
     return cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1].astype(np.float64)
 
 
 def test_tiles_of_query_and_map_meet_at_the_true_pose_only(wall: ResultContext) -> None:
-    assert wall.queries is not None
     query = cv2.imread(str(wall.queries.image_path("query.png")))[..., ::-1].astype(np.float64)
     wrong = RigidTransform.identity()
     found = refinement_blocks(wall, {"query.png": wrong}, {"query.png": TRUE})
@@ -165,7 +163,6 @@ def test_a_pose_that_stayed_and_a_map_without_depth_are_not_shown(wall: ResultCo
     kept = {"query.png": [row("query.png", "icp", TRUE, "no depth")]}
     stayed = replace(wall, refinements=kept)
     assert pictures_of(refinement_blocks(stayed, {"query.png": TRUE})) == []
-    assert wall.mapping is not None
     (wall.mapping.root / "sensors" / "records_depth.txt").unlink()
     fresh = replace(wall, mapping=KaptureFolder(wall.mapping.root))
     found = refinement_blocks(fresh, {"query.png": TRUE})

@@ -45,7 +45,6 @@ CAMERAS = (
 def data_of(page: str) -> dict[str, Any]:
     """The data of a view, arrays decoded."""
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
-    assert found is not None
     data: dict[str, Any] = json.loads(found[1])
     for name in ("points", "inliers"):
         data[name] = decoded(data[name], "<f4").reshape(-1, 3)
