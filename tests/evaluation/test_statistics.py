@@ -117,22 +117,6 @@ def test_every_threshold_pair_and_row_is_tested_and_corrected() -> None:
     assert [(m.first, m.second) for m in found.medians] == [(0, 1), (0, 2), (1, 2)]
 
 
-def test_equal_methods_raise_no_more_false_alarms_than_said() -> None:
-    # results share how hard a query is, and differ by chance only; three thresholds each
-    rng = np.random.default_rng(11)
-    thresholds = [Threshold(position_m=m) for m in (0.25, 0.5, 5.0)]
-    num_runs = 200
-    alarms = 0
-    for _ in range(num_runs):
-        hardness = rng.normal(-0.6, 0.8, 120)
-        pair = [
-            result(x, (10 ** (hardness + rng.normal(0, 0.4, 120))).tolist(), thresholds=thresholds)
-            for x in "AB"
-        ]
-        alarms += any(test.is_real for test in compare(pair).tests)
-    assert alarms / num_runs <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / num_runs)
-
-
 def test_the_interval_of_a_median_difference_covers_the_true_one() -> None:
     rng = np.random.default_rng(3)
     num_runs, held = 200, 0

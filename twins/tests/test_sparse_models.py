@@ -174,18 +174,10 @@ def test_strong_distortion_folds_nothing_back_into_the_image() -> None:
     assert len(exact_tracks(pair, both, points_per_frame=1200, rng=rng())) == 0
 
 
-OPTIONS = AachenTwinOptions(
-    num_places=1,
-    stations_per_place=7,
-    sequence_images=3,
-    day_queries=2,
-    night_queries=1,
-    additional_night_queries=1,
-    width=256,
-    height=192,
-    supersampling=1,
-    model_features=True,
-)
+QUERIES = {"day_queries": 2, "night_queries": 1, "additional_night_queries": 1}
+CITY = {"num_places": 1, "stations_per_place": 7, "sequence_images": 3}
+SIZE = {"width": 256, "height": 192, "supersampling": 1}
+OPTIONS = AachenTwinOptions(**QUERIES, **CITY, **SIZE, model_features=True)
 
 
 @pytest.fixture(scope="module")
@@ -309,14 +301,8 @@ def test_queries_localize_in_the_given_map(root: Path, tmp_path: Path, version: 
 
 @pytest.mark.slow
 def test_robotcars_models_share_a_database(tmp_path: Path) -> None:
-    options = RobotCarTwinOptions(
-        num_locations=1,
-        stops_per_location=8,
-        moments_per_condition=2,
-        size_px=128,
-        supersampling=1,
-        model_features=True,
-    )
+    street = {"num_locations": 1, "stops_per_location": 8, "moments_per_condition": 2}
+    options = RobotCarTwinOptions(**street, size_px=128, supersampling=1, model_features=True)
     RobotCarTwin(options).write(tmp_path / "root")
     observations = []
     for model in ("merged", "individual"):
