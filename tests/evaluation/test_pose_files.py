@@ -97,24 +97,25 @@ def test_a_list_names_the_rows_and_orders_them() -> None:
     assert [line.split()[0] for line in text.splitlines()] == ["rear/2.png", "rear/1.png"]
 
 
-def test_a_list_that_calls_two_images_alike_is_refused() -> None:
-    with pytest.raises(DataError, match=r"a/1\.jpg.*b/1\.jpg.*'1\.jpg'"):
-        names_in_pose_file(["a/1.jpg", "b/1.jpg"], {"a/1.jpg": "1.jpg", "b/1.jpg": "1.jpg"})
-    with pytest.raises(DataError, match="cannot hold"):
-        names_in_pose_file(["a"], {"a": "a b"})
+TWO_DAYS = ["query/day/1.jpg", "query/night/1.jpg"]
 
 
-def test_basenames_that_collide_are_refused_by_both_names() -> None:
-    images = ["query/day/1.jpg", "query/night/1.jpg"]
-    with pytest.raises(DataError, match=r"query/day/1\.jpg.*query/night/1\.jpg"):
-        names_in_pose_file(images, "basename")
-    assert names_in_pose_file(images, "full") == {image: image for image in images}
-
-
-@pytest.mark.parametrize("image", ["a b.jpg", "a\tb.jpg", " a.jpg", "folder/", "a\u00a0b.jpg"])
-def test_names_the_format_cannot_hold(image: str) -> None:
-    with pytest.raises(DataError, match="cannot hold"):
-        names_in_pose_file([image], "basename")
+@pytest.mark.parametrize(
+    ("images", "names", "words"),
+    [
+        (TWO_DAYS, "basename", r"query/day/1\.jpg.*query/night/1\.jpg"),
+        (TWO_DAYS, dict.fromkeys(TWO_DAYS, "1.jpg"), r"day/1\.jpg.*night/1\.jpg.*'1\.jpg'"),
+        (["a"], {"a": "a b"}, "cannot hold"),
+        *[
+            ([image], "basename", "cannot hold")
+            for image in ("a b.jpg", "a\tb.jpg", " a.jpg", "folder/", "a\u00a0b.jpg")
+        ],
+    ],
+)
+def test_names_that_a_file_cannot_have(images: list[str], names: Any, words: str) -> None:
+    with pytest.raises(DataError, match=words):
+        names_in_pose_file(images, names)
+    assert names_in_pose_file(TWO_DAYS, "full") == {image: image for image in TWO_DAYS}
 
 
 @pytest.mark.parametrize(

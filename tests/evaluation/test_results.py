@@ -38,9 +38,8 @@ from megloc_kapture.io.dataset_tables import (
     write_protocol,
     write_world,
 )
-from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.io.tables import write_status
-from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
+from megloc_kapture.values import Failure, Pose, RigidTransform
 
 
 @pytest.fixture
@@ -202,22 +201,6 @@ def test_statuses_and_side_tables_are_used(
     assert evaluation.row().num_fallback == 4
     other = evaluate(result, truth, side_tables=tmp_path, thresholds=[Threshold(position_m=1.0)])
     assert other.thresholds == (Threshold(position_m=1.0),)
-
-
-def test_rigs_are_resolved(tmp_path: Path, world: Any) -> None:
-    name = sorted(world.truth)[0]
-    offset = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.5, 0.0, 0.0))
-    camera = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0)))
-    data = KaptureData(
-        sensors={"left": camera},
-        rigs={"car": {"left": offset}},
-        trajectories={(3, "car"): offset.inverse() @ world.truth[name]},
-        records_camera={(3, "left"): name},
-        records_depth={},
-    )
-    write_sensors(tmp_path / "rig", data)
-    found = read_result(tmp_path / "rig", Benchmark()).poses
-    np.testing.assert_allclose(found[name].center(), world.truth[name].center(), atol=1e-9)
 
 
 def test_absent_results_are_named(truth: Path, tmp_path: Path) -> None:

@@ -193,21 +193,14 @@ def test_mean_deviation_and_stability() -> None:
     assert (whole.recall[1].found_always, whole.recall[1].found_sometimes) == (3, 1)
     assert whole.num_localized.mean == pytest.approx(11 / 3)
     assert seeds.rows[0].recall[0].mean == pytest.approx((1 + 1 + 0.5) / 3)
-
-
-def test_a_run_without_median() -> None:
+    # a run without a median
     seeds = over_seeds([run("1", [np.inf, np.inf]), run("2", [0.1, 0.2])])
     spread = seeds.rows[-1].median_position_m
     assert np.isinf(spread.mean) and spread.smallest == pytest.approx(0.15)
-    assert format_spread(spread) == "inf"
-    assert "inf" in report_text(seeds)
-
-
-def test_as_text() -> None:
+    assert format_spread(spread) == "inf" and "inf" in report_text(seeds)
     text = report_text(over_seeds([run("a", [0.1, 0.1]), run("b", [0.1, 0.5])]))
     assert text.startswith("2 runs of one method: a, b\n")
-    assert "75.0 +- 35.4 / 100.0 +- 0.0" in text
-    assert "0.25 m  1 / 1 / 0\n" in text
+    assert "75.0 +- 35.4 / 100.0 +- 0.0" in text and "0.25 m  1 / 1 / 0\n" in text
     assert max(map(len, text.splitlines())) <= 100 and text.isascii()
 
 
