@@ -40,7 +40,6 @@ from megloc_kapture.values import Camera, RigidTransform
 SMALL_CAMERA = Camera("PINHOLE", 80, 60, (70.0, 70.0, 40.0, 30.0))
 HERE = RigidTransform.identity()
 KIND = PyramidKind(levels=2, max_side_px=640, appearance="intensity")
-Array = NDArray[np.float64]
 Map = Mapping[str, RenderingReference]
 Verdict = Callable[[Map], Consistency]
 
