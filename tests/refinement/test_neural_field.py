@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,19 +30,11 @@ IDENTITY = RigidTransform.identity()
 def train_field(
     given: Sequence[FieldView],
     options: FieldTrainingOptions,
+    *,
     module: TriPlane | None = None,
-    **told: Any,
+    progress: Callable[[int, float, list[float]], None] | None = None,
 ) -> tuple[NeuralField, dict[str, float]]:
-    return FieldTrainer(given, options, module).train(**told)
-
-
-def states(given: Sequence[FieldView], *options: FieldTrainingOptions) -> list[dict[str, Any]]:
-    """What is learnt under each of the options."""
-    return [train_field(given, each)[0].module.state_dict() for each in options]
-
-
-def assert_equal(one: dict[str, Any], other: dict[str, Any]) -> None:
-    assert all(torch.equal(one[name], other[name]) for name in one)
+    return FieldTrainer(given, options, module).train(progress=progress)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -71,6 +62,7 @@ def depth_error(field: NeuralField, tests: list[FieldView]) -> float:
     """Median share by which rendered depths are off."""
     errors = []
     for view in tests:
+        assert view.depth is not None
         known = view.depth.depth_m
         found = field.render(view.camera, view.cam_from_world).depth_m
         errors.append(np.abs(found - known) / known)
@@ -90,18 +82,10 @@ def test_a_small_field_learns_the_room_and_the_same_bytes_twice() -> None:
     assert min(psnr.values()) > 16 and depth_error(field, views(4)) < 0.2
     assert [step for step, _ in seen] == list(range(16, 80, 16))
     assert all(len(values) == 1 for _, values in seen)
-    one, other, changed = states(views(5), QUICK, QUICK, QUICK.model_copy(update={"seed": 1}))
-    assert_equal(one, other)
-    assert not torch.equal(changed["planes.0"], one["planes.0"])
-    # half precision learns nearly the same
-    fields = [
-        train_field(views(5), each)[0]
-        for each in (QUICK, QUICK.model_copy(update={"half_precision": True}))
-    ]
-    near = fields[1].module.state_dict()
-    assert any(not torch.equal(one[name], near[name]) for name in one)
-    images = np.float64([field.render(SMALL, IDENTITY).image for field in fields])
-    assert np.abs(np.subtract(*images)).mean() < 8
+    one, other = (train_field(views(5), QUICK)[0].module.state_dict() for _ in range(2))
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    changed, _ = train_field(views(5), QUICK.model_copy(update={"seed": 1}))
+    assert not torch.equal(changed.module.state_dict()["planes.0"], one["planes.0"])
 
 
 def test_gaussians_learn_the_room_and_begin_with_its_depth() -> None:
@@ -111,34 +95,46 @@ def test_gaussians_learn_the_room_and_begin_with_its_depth() -> None:
     field, psnr = train_field(views(8), options)
     assert min(psnr.values()) > 16 and depth_error(field, views(4)) < 0.08
     brief = options.model_copy(update={"steps": 8})
-    assert_equal(*states(views(5), brief, brief))
+    one, other = (train_field(views(5), brief)[0].module.state_dict() for _ in range(2))
+    assert all(torch.equal(one[name], other[name]) for name in one)
     with pytest.raises(DataError, match="and 0 pixels have any; megloc densify"):
         train_field(views(5, depth=False), brief)
+
+
+def test_half_precision_learns_nearly_the_same() -> None:
+    half = QUICK.model_copy(update={"half_precision": True})
+    exact, near = (train_field(views(5), each)[0].module.state_dict() for each in (QUICK, half))
+    assert any(not torch.equal(exact[name], near[name]) for name in exact)
+    images = [
+        train_field(views(5), each)[0].render(SMALL, IDENTITY).image for each in (QUICK, half)
+    ]
+    assert np.abs(np.subtract(*np.float64(images))).mean() < 8
 
 
 @pytest.mark.slow
 def test_compiled_learns_the_same() -> None:
     brief = QUICK.model_copy(update={"steps": 2})
     compiled = brief.model_copy(update={"compiled": True})
-    one, other = states(views(5), brief, compiled)
+    one, other = (train_field(views(5), each)[0].module.state_dict() for each in (brief, compiled))
     for name in one:
         torch.testing.assert_close(one[name], other[name], atol=5e-3, rtol=0)
 
 
 def test_interrupted_and_resumed_is_uninterrupted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(field_training, "_KEEP_EVERY", 3)
-    path, kept = Path("field.state.pt"), list[bytes]()
-    whole, _ = train_field(views(5), QUICK, keep=kept.append)
-    assert len(kept) == 2  # after three steps and after six of eight
+    path, states = Path("field.state.pt"), list[bytes]()
+    whole, _ = FieldTrainer(views(5), QUICK).train(keep=states.append)
+    assert len(states) == 2  # after three steps and after six of eight
     trainer = FieldTrainer(views(5), QUICK)
-    trainer.resume(kept[0], path)
-    resumed, _ = trainer.train(keep=kept.append)
-    assert_equal(resumed.module.state_dict(), whole.module.state_dict())
+    trainer.resume(states[0], path)
+    resumed, _ = trainer.train(keep=states.append)
+    expected = whole.module.state_dict()
+    assert all(torch.equal(expected[n], v) for n, v in resumed.module.state_dict().items())
     for given in (views(5, seed=2), views(4)):
         with pytest.raises(DataError, match=r"state\.pt: .* -f begins again"):
-            FieldTrainer(given, QUICK).resume(kept[0], path)
+            FieldTrainer(given, QUICK).resume(states[0], path)
     with pytest.raises(DataError, match=r"state\.pt: not the state .* or damaged"):
-        trainer.resume(kept[0][:-100], path)
+        trainer.resume(states[0][:-100], path)
 
 
 def test_images_of_a_folder_may_share_their_light() -> None:
@@ -160,13 +156,17 @@ def test_masked_pixels_change_nothing() -> None:
     plain = views(4)
     mask = np.ones((24, 32), bool)
     mask[:, :10] = False
-    masked = [replace(view, mask=mask) for view in plain]
-    spoiled = [
-        replace(view, image=np.where(mask[..., None], view.image, 255).astype(np.uint8))
-        for view in masked
-    ]
-    (one,), (other,), (whole,) = (states(given, QUICK) for given in (masked, spoiled, plain))
-    assert_equal(one, other)
+    spoiled, masked = [], []
+    for view in plain:
+        image = view.image.copy()
+        image[~mask] = 255
+        arguments = (view.camera, view.cam_from_world, mask, view.depth)
+        masked.append(FieldView(view.name, view.image, *arguments))
+        spoiled.append(FieldView(view.name, image, *arguments))
+    one, other, whole = (
+        train_field(given, QUICK)[0].module.state_dict() for given in (masked, spoiled, plain)
+    )
+    assert all(torch.equal(one[name], other[name]) for name in one)
     assert not torch.equal(one["planes.0"], whole["planes.0"])
 
 
@@ -179,9 +179,12 @@ def test_depth_of_another_camera_is_brought_to_the_image() -> None:
         assert view.depth is not None
         seen = room.render(shift.inverse() @ view.cam_from_world, camera=finer)
         depth = DepthView(finer, seen.depth_m, shift)
-        moved.append(replace(view, depth=depth))
+        moved.append(
+            FieldView(view.name, view.image, view.camera, view.cam_from_world, None, depth)
+        )
     for view, other in zip(plain, moved, strict=True):
         own, brought = pixels_of(view, 32)[3], pixels_of(other, 32)[3]
+        assert own is not None and brought is not None
         both = (own > 0) & (brought > 0)
         assert both.mean() > 0.75
         assert np.median(np.abs(brought[both] / own[both] - 1)) < 0.01
@@ -192,10 +195,12 @@ def test_what_cannot_be_trained_is_refused() -> None:
     with pytest.raises(DataError, match="1 images with poses and pixels are too few"):
         train_field(few, QUICK)
     one = few[0]
-    wrong = replace(one, image=one.image[:-1], depth=None)
+    wrong = FieldView(one.name, one.image[:-1], one.camera, one.cam_from_world)
     with pytest.raises(DataError, match=r"000\.png: \(23, 32, 3\) does not fit .* 32x24"):
         train_field([wrong, wrong], QUICK)
-    hidden = replace(one, mask=np.zeros((24, 32), bool), depth=None)
+    hidden = FieldView(
+        one.name, one.image, one.camera, one.cam_from_world, np.zeros((24, 32), bool)
+    )
     with pytest.raises(DataError, match="no pixel"):
         train_field([hidden, hidden], QUICK)
     field, _ = train_field(views(4, depth=False), QUICK)
@@ -213,7 +218,7 @@ def test_two_lights_and_what_moves_need_their_embeddings() -> None:
         kept = len(trained) - len(trained[7::8])
         module = TriPlane(kept, unconstrained=unconstrained)
         options = FieldTrainingOptions(steps=1000, rays_per_step=1024, device="cpu")
-        field, _ = train_field(trained, options, module)
+        field, _ = train_field(trained, options, module=module)
         psnr_db.append(float(np.mean([field.held_out_psnr(view) for view in clean])))
         errors.append(depth_error(field, clean))
     print(f"PSNR {psnr_db[0]:.1f} dB, without embeddings {psnr_db[1]:.1f} dB; depth {errors}")

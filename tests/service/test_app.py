@@ -48,24 +48,11 @@ def picture(width: int, height: int, form: str = "PNG") -> bytes:
     return content.getvalue()
 
 
-def pinhole(width: int, height: int) -> str:
-    params = [300.0, width / 2, height / 2]
+def pinhole(width: int, height: int, focal: float = 300.0) -> str:
+    params = [focal, width / 2, height / 2]
     return json.dumps(
         {"model": "SIMPLE_PINHOLE", "width": width, "height": height, "params": params}
     )
-
-
-def form_of(width: int, height: int) -> dict[str, Any]:
-    return {
-        "files": {"image": picture(width, height)},
-        "data": {"camera": pinhole(width, height)},
-    }
-
-
-def assert_same_pose(said: dict[str, Any], found: Pose) -> None:
-    pose = said["cam_from_world"]
-    assert tuple(pose["quat_wxyz"]) == found.cam_from_world.quat_wxyz
-    assert tuple(pose["translation"]) == found.cam_from_world.translation
 
 
 # ------------------------------------------------------------------------------------- answers
@@ -74,14 +61,14 @@ def assert_same_pose(said: dict[str, Any], found: Pose) -> None:
 def test_answers_are_those_of_the_localizer(
     client: TestClient, localizer: Localizer, photos: list[Photo]
 ) -> None:
-    alone = []
     for photo in photos:
         answer = client.post("/localize", **photo.form())
         found = localizer.localize(photo.path, photo.camera)
         assert answer.status_code == 200 and isinstance(found, Pose)
         said = answer.json()
         assert said["localized"] is True and said["reason"] is None
-        assert_same_pose(said, found)
+        assert tuple(said["cam_from_world"]["quat_wxyz"]) == found.cam_from_world.quat_wxyz
+        assert tuple(said["cam_from_world"]["translation"]) == found.cam_from_world.translation
         assert said["camera_center"] == found.cam_from_world.center().tolist()
         assert found.covariance is not None and said["covariance"] == found.covariance.tolist()
         assert said["confidence"] == found.confidence
@@ -89,32 +76,25 @@ def test_answers_are_those_of_the_localizer(
         assert numbers == (found.num_matches, found.num_inliers, found.candidates)
         camera = said["camera"]
         assert tuple(camera["params"]) == photo.camera.params and camera["width"] == 400
-        url = f"/localize?camera={quote(photo.camera_json())}"
-        for headers in ({}, {"content-type": "image/jpeg"}):
-            other = client.post(url, content=photo.content, headers=headers)
+        for other in (
+            client.post(
+                "/localize",
+                content=photo.content,
+                params={"camera": photo.camera_json()},
+                headers={"content-type": "image/jpeg"},
+            ),
+            client.post(f"/localize?camera={quote(photo.camera_json())}", content=photo.content),
+        ):
             assert other.content == answer.content
-        alone.append(answer.content)
-    # clients at once get the same
-    with ThreadPoolExecutor(8) as pool:
-        sent = [pool.submit(client.post, "/localize", **photo.form()) for photo in photos * 3]
-        assert [one.result().content for one in sent] == alone * 3
-    # names of files mean nothing
-    names = [
-        "../../../../etc/passwd",
-        "/etc/passwd",
-        "C:\\boot.ini",
-        "a\0.jpg",
-        "%2e%2e/x",
-        "x" * 1000,
-    ]
-    for name in names:
-        form = photos[0].form() | {"files": {"image": (name, photos[0].content)}}
-        assert client.post("/localize", **form).content == alone[0]
 
 
 @pytest.mark.parametrize("orientation", [1, 6])
 def test_a_camera_by_exif_is_that_of_the_package(
-    client: TestClient, localizer: Localizer, photos: list[Photo], tmp_path: Path, orientation: int
+    client: TestClient,
+    localizer: Localizer,
+    photos: list[Photo],
+    tmp_path: Path,
+    orientation: int,
 ) -> None:
     exif = Image.Exif()
     exif[0x0112] = orientation
@@ -129,14 +109,24 @@ def test_a_camera_by_exif_is_that_of_the_package(
     ):
         assert isinstance(found, Pose) and found.camera is not None
         said = answer.json()
-        assert_same_pose(said, found)
+        assert tuple(said["cam_from_world"]["quat_wxyz"]) == found.cam_from_world.quat_wxyz
+        assert tuple(said["cam_from_world"]["translation"]) == found.cam_from_world.translation
         assert said["camera"]["params"] == list(found.camera.params)
         assert (said["camera"]["width"], said["camera"]["height"]) == (400, 300)
         assert said["remarks"] == list(found.remarks)
 
 
+def test_clients_at_once_get_the_same(client: TestClient, photos: list[Photo]) -> None:
+    alone = [client.post("/localize", **photo.form()).content for photo in photos]
+    with ThreadPoolExecutor(8) as pool:
+        sent = [pool.submit(client.post, "/localize", **photo.form()) for photo in photos * 3]
+        assert [one.result().content for one in sent] == alone * 3
+
+
 def test_a_photograph_of_something_else_has_a_reason(client: TestClient) -> None:
-    answer = client.post("/localize", **form_of(400, 300))
+    answer = client.post(
+        "/localize", files={"image": picture(400, 300)}, data={"camera": pinhole(400, 300)}
+    )
     assert answer.status_code == 200
     said = answer.json()
     assert said["localized"] is False and said["cam_from_world"] is None
@@ -253,9 +243,20 @@ def test_what_is_no_image_is_refused(
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 3), (1, 900), (900, 1), (16, 16), (7, 500)])
 def test_tiny_images_are_no_defect(client: TestClient, size: tuple[int, int]) -> None:
-    answer = client.post("/localize", **form_of(*size))
+    form = {"files": {"image": picture(*size)}, "data": {"camera": pinhole(*size)}}
+    answer = client.post("/localize", **form)
     assert answer.status_code in (200, 422), answer.text
     assert not PATH.search(answer.text)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../../../../etc/passwd", "/etc/passwd", "C:\\boot.ini", "a\0.jpg", "%2e%2e/x", "x" * 1000],
+)
+def test_names_of_files_mean_nothing(client: TestClient, photos: list[Photo], name: str) -> None:
+    plain = client.post("/localize", **photos[0].form())
+    form = {"files": {"image": (name, photos[0].content)}, "data": photos[0].form()["data"]}
+    assert client.post("/localize", **form).content == plain.content
 
 
 @pytest.mark.parametrize(

@@ -88,24 +88,27 @@ def test_the_import_is_the_truth(
             assert image_size(path) == (int(width), int(height))
 
 
-@pytest.mark.parametrize("name", ["robotcar", "4seasons"])
-def test_published_poses_are_the_truth(name: str, rendered: Rendered, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "published", "count"),
+    [("robotcar", "", 6), ("4seasons", "recording_2021-01-15_13-04-17/", 12)],
+)
+def test_published_poses_are_the_truth(
+    name: str, published: str, count: int, rendered: Rendered, tmp_path: Path
+) -> None:
     """Without what lies beside the data."""
     root = rendered(name)
-    # of robotcar the training list, of 4Seasons a whole recording
-    published = "" if name == "robotcar" else "recording_2021-01-15_13-04-17/"
     for entry in root.iterdir():
         if entry.name != "ground_truth":
             (tmp_path / entry.name).symlink_to(entry)
     dataset = load_plugin(DATASETS, name).read(tmp_path)
     truth, _ = read(root / "ground_truth/query")
     poses = dataset.query_gt.poses()
-    if published:
+    assert len(poses) == count
+    assert all(image.startswith(published) for image in poses)
+    if name == "4seasons":  # the whole recording
         assert set(poses) == {image for image in truth if image.startswith(published)}
-        assert len(poses) == 12
-    else:
-        train = (root / "robotcar_v2_train.txt").read_text().splitlines()
-        assert len(poses) == len(train) == 6
+    if name == "robotcar":
+        assert count == len((root / "robotcar_v2_train.txt").read_text().splitlines())
     for image, pose in poses.items():
         assert_same(dataset.world.pose_in_official(pose), truth[image])
 

@@ -33,9 +33,13 @@ def world() -> SyntheticWorld:
     return build_world(OPTIONS)
 
 
+def new_painter(world: SyntheticWorld) -> PlaceRenderer:
+    return PlaceRenderer(world.places[0], seed=OPTIONS.seed, supersampling=OPTIONS.supersampling)
+
+
 @pytest.fixture(scope="module")
 def painter(world: SyntheticWorld) -> PlaceRenderer:
-    return PlaceRenderer(world.places[0], seed=OPTIONS.seed, supersampling=OPTIONS.supersampling)
+    return new_painter(world)
 
 
 def first(world: SyntheticWorld, prefix: str) -> Frame:
@@ -47,8 +51,7 @@ def test_drawing_gives_the_same_bytes_whatever_was_drawn_before(
 ) -> None:
     frames = [first(world, p) for p in ("db/place0/front", "query/day", "query/night")]
     images = [painter.render(frame).image for frame in frames]
-    options = {"seed": OPTIONS.seed, "supersampling": OPTIONS.supersampling}
-    fresh = PlaceRenderer(world.places[0], **options)
+    fresh = new_painter(world)
     for frame, image in reversed(list(zip(frames, images, strict=True))):
         assert image.shape == (480, 640, 3) and image.dtype == np.uint8
         np.testing.assert_array_equal(fresh.render(frame).image, image)
@@ -103,6 +106,7 @@ def test_moving_objects_hide_what_is_behind_and_nothing_else(
     frame = first(world, "query/day")
     with_movers = painter.render(frame, depth=True)
     without = painter.render(replace(frame, moving_objects=()), depth=True)
+    assert with_movers.depth_m is not None and without.depth_m is not None
     changed = with_movers.depth_m != without.depth_m
     assert 0.005 < changed.mean() < 0.6
     in_front = with_movers.depth_m[changed]
@@ -113,14 +117,10 @@ def test_moving_objects_hide_what_is_behind_and_nothing_else(
 def test_depth_and_poses_of_two_views_agree(world: SyntheticWorld, painter: PlaceRenderer) -> None:
     # what one camera sees, carried over by its depth and COLMAP's cameras, is where the other
     # camera's depth puts it, and has the same colour there
-    views, query = world.coarse_views(), first(world, "query/day")
-    near = max(world.mapping, key=lambda m: overlap(views[query.name], views[m.name]))
-
-    def evenly_lit(frame: Frame) -> Frame:
-        light = replace(frame.lighting, sun=(0.0, 0.0, 0.0), sky=(0.9, 0.9, 0.9), vignetting=0.0)
-        return replace(frame, lighting=light, moving_objects=(), bonnet=False)
-
-    a, b = (painter.render(evenly_lit(frame), depth=True) for frame in (query, near))
+    query, near = _overlapping(world)
+    a = painter.render(_evenly_lit(query), depth=True)
+    b = painter.render(_evenly_lit(near), depth=True)
+    assert a.depth_m is not None and b.depth_m is not None
     row, column = (g.ravel() for g in np.mgrid[8:472:4, 8:632:4])
     z = a.depth_m[row, column].astype(np.float64)
     row, column, z = row[z > 0], column[z > 0], z[z > 0]
@@ -145,6 +145,18 @@ def test_depth_and_poses_of_two_views_agree(world: SyntheticWorld, painter: Plac
     assert correlation > 0.7 > scrambled + 0.2
 
 
+def _evenly_lit(frame: Frame) -> Frame:
+    lighting = replace(frame.lighting, sun=(0.0, 0.0, 0.0), sky=(0.9, 0.9, 0.9), vignetting=0.0)
+    return replace(frame, lighting=lighting, moving_objects=(), bonnet=False)
+
+
+def _overlapping(world: SyntheticWorld) -> tuple[Frame, Frame]:
+    views = world.coarse_views()
+    query = first(world, "query/day")
+    best = max(world.mapping, key=lambda m: overlap(views[query.name], views[m.name]))
+    return query, best
+
+
 CAR = RobotCarTwinOptions(num_locations=1, moments_per_condition=2, size_px=256)
 SEED = CAR.world().seed
 
@@ -159,29 +171,33 @@ def car_renderer() -> PlaceRenderer:
     return PlaceRenderer(build_place(CAR.world(), 0), seed=SEED, supersampling=1)
 
 
-def test_masks_are_where_bonnet_and_movers_are(
+def test_only_the_rear_camera_sees_the_car_always_at_the_same_place(
+    car_frames: list[Frame],
+) -> None:
+    rear = [frame for frame in car_frames if frame.sensor_id == "rear"]
+    places = [on_bonnet(frame, SEED) for frame in rear]
+    assert len(rear) == 12 and all((place == places[0]).all() for place in places)
+    assert 0.05 < places[0].mean() < 0.25
+    assert places[0][-1].all() and not places[0][: CAR.size_px // 2].any()
+    assert not any(
+        on_bonnet(frame, SEED).any() for frame in car_frames if frame.sensor_id != "rear"
+    )
+
+
+def test_movers_are_where_the_image_changes_without_them(
     car_frames: list[Frame], car_renderer: PlaceRenderer
 ) -> None:
-    # only the rear camera sees the car, always at the same place
-    rear = [frame for frame in car_frames if frame.sensor_id == "rear"]
-    bonnet, *others = (on_bonnet(frame, SEED) for frame in rear)
-    assert len(rear) == 12 and all((other == bonnet).all() for other in others)
-    assert 0.05 < bonnet.mean() < 0.25
-    assert bonnet[-1].all() and not bonnet[: CAR.size_px // 2].any()
-    aside = (frame for frame in car_frames if frame.sensor_id != "rear")
-    assert not any(on_bonnet(frame, SEED).any() for frame in aside)
-    # movers are where the image changes without them
     place = build_place(CAR.world(), 0)
     frame = max(car_frames, key=lambda one: on_moving_objects(one, place).mean())
     hidden = on_moving_objects(frame, place)
     assert 0.02 < hidden.mean() < 0.6
     # without sun: a shadow is no mover
     frame = replace(frame, lighting=replace(frame.lighting, sun=(0.0, 0.0, 0.0)), bonnet=False)
-    empty = replace(frame, moving_objects=())
-    there, gone = (car_renderer.render(one, depth=True).depth_m for one in (frame, empty))
+    there = car_renderer.render(frame, depth=True).depth_m
+    gone = car_renderer.render(replace(frame, moving_objects=()), depth=True).depth_m
     assert there is not None and gone is not None
     assert np.array_equal(there != gone, hidden)
-    assert not on_moving_objects(empty, place).any()
+    assert not on_moving_objects(replace(frame, moving_objects=()), place).any()
 
 
 def test_no_feature_is_left_on_the_bonnet_or_on_a_mover(
