@@ -48,35 +48,32 @@ def displaced(pose: RigidTransform, shift_m: np.ndarray, angle_deg: float) -> Ri
 def make_world(num_queries: int = 40, seed: int = 0) -> World:
     rng = np.random.default_rng(seed)
     world = World()
+
+    def on_ring(along: float) -> np.ndarray:
+        return np.array([20 * np.cos(along), 10 * np.sin(along), 1.6])
+
     for i in range(60):
         along = 2 * np.pi * i / 60
-        center = np.array([20 * np.cos(along), 10 * np.sin(along), 1.6])
-        world.mapped[f"map/{i:03d}.jpg"] = upright_camera(center, along)
+        world.mapped[f"map/{i:03d}.jpg"] = upright_camera(on_ring(along), along)
     for i in range(num_queries):
         condition = "night" if i % 4 == 0 else "day"
         name = f"query/{condition}/{i:05d}.jpg"
         along = rng.uniform(0, 2 * np.pi)
-        center = np.array([20 * np.cos(along), 10 * np.sin(along), 1.6]) + rng.normal(size=3)
-        world.truth[name] = upright_camera(center, along)
+        world.truth[name] = upright_camera(on_ring(along) + rng.normal(size=3), along)
         world.conditions[name] = condition
         if i % 10 == 8:
-            world.statuses[name] = QueryStatus(
-                image=name, status="failed", reason="6 inliers, 12 needed", num_inliers=6
-            )
-            continue
-        if i % 10 == 4:
-            world.statuses[name] = QueryStatus(
-                image=name, status="failed", reason="no matches", fallback="retrieval"
-            )
+            told = {"status": "failed", "reason": "6 inliers, 12 needed", "num_inliers": 6}
+        elif i % 10 == 4:
+            told = {"status": "failed", "reason": "no matches", "fallback": "retrieval"}
             world.estimated[name] = world.mapped[f"map/{i % 60:03d}.jpg"]
-            continue
-        error = 10 ** rng.normal(-1.5, 0.7)
-        shift = rng.normal(size=3)
-        shift *= error / np.linalg.norm(shift)
-        world.estimated[name] = displaced(world.truth[name], shift, 5 * error)
-        world.statuses[name] = QueryStatus(
-            image=name, status="localized", num_matches=300, num_inliers=int(rng.integers(12, 250))
-        )
+        else:
+            error = 10 ** rng.normal(-1.5, 0.7)
+            shift = rng.normal(size=3)
+            shift *= error / np.linalg.norm(shift)
+            world.estimated[name] = displaced(world.truth[name], shift, 5 * error)
+            inliers = int(rng.integers(12, 250))
+            told = {"status": "localized", "num_matches": 300, "num_inliers": inliers}
+        world.statuses[name] = QueryStatus(image=name, **told)
     return world
 
 

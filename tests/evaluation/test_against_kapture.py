@@ -23,6 +23,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
 
 Poses = dict[str, RigidTransform]
+Figures = Callable[..., Any]
 BINS = [(0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0)]
 
 
@@ -32,14 +33,13 @@ def kapture_of(poses: Poses, images: list[str]) -> kapture.Kapture:
     sensors["camera0"] = kapture.Camera(
         kapture.CameraType.SIMPLE_PINHOLE, [640, 480, 500.0, 320.0, 240.0]
     )
-    records = kapture.RecordsCamera()
-    trajectories = kapture.Trajectories()
+    records, trajectories = kapture.RecordsCamera(), kapture.Trajectories()
     for timestamp, image in enumerate(sorted(images)):
         records[timestamp, "camera0"] = image
         if image in poses:
-            trajectories[timestamp, "camera0"] = kapture.PoseTransform(
-                list(poses[image].quat_wxyz), list(poses[image].translation)
-            )
+            quat, translation = poses[image].quat_wxyz, poses[image].translation
+            pose = kapture.PoseTransform(list(quat), list(translation))
+            trajectories[timestamp, "camera0"] = pose
     return kapture.Kapture(sensors=sensors, records_camera=records, trajectories=trajectories)
 
 
@@ -49,7 +49,27 @@ def random_pose(rng: np.random.Generator) -> RigidTransform:
 
 
 @pytest.fixture
-def figures_of_kapture() -> Callable[..., Any]:
+def random_poses(displace: Callable[..., RigidTransform]) -> Callable[..., tuple[Poses, Poses]]:
+    """Function: estimated and true poses, with errors of about so many metres and degrees."""
+
+    def make(count: int, metres: float, degrees: float, *, missing: int = 0) -> tuple[Poses, Poses]:
+        rng = np.random.default_rng(count + missing)
+        truth = {f"q/{i:03d}.jpg": random_pose(rng) for i in range(count)}
+        estimated = {
+            name: displace(
+                pose,
+                rng.normal(size=3) * metres * 10 ** rng.normal(0, 0.5),
+                rng.uniform(0, degrees),
+            )
+            for name, pose in list(truth.items())[missing:]
+        }
+        return estimated, truth
+
+    return make
+
+
+@pytest.fixture
+def figures_of_kapture() -> Figures:
     """kapture-localization's statistics of (estimated, truth, thresholds), and its errors."""
     evaluation = pytest.importorskip(
         "kapture_localization.evaluation",
@@ -67,26 +87,26 @@ def figures_of_kapture() -> Callable[..., Any]:
 
 
 def assert_equal_figures(
-    estimated: Poses, truth: Poses, bins: list[tuple[float, float]], oracle: Callable[..., Any]
+    estimated: Poses, truth: Poses, bins: list[tuple[float, float]], oracle: Figures
 ) -> None:
     statistics, results = oracle(estimated, truth, bins)
     found = evaluate_poses(estimated, truth, thresholds=thresholds_from_pairs(bins))
     row = found.row()
     assert row.num_queries == statistics.number_of_images
     assert row.num_localized == statistics.number_of_localized_positions
-    assert [at.num_within for at in row.recall] == [count for _, _, count in statistics.filled_bins]
-    ours = [
-        row.median_position_m,
-        row.median_angle_deg,
-        row.median_localized_position_m,
-        row.median_localized_angle_deg,
-    ]
-    theirs = [
-        statistics.median_all_positions,
-        statistics.median_all_rotations,
-        statistics.median_localized_positions,
-        statistics.median_localized_rotations,
-    ]
+    counts = [count for _, _, count in statistics.filled_bins]
+    assert [at.num_within for at in row.recall] == counts
+    shares = [count / statistics.number_of_images for count in counts]
+    assert [at.recall for at in row.recall] == pytest.approx(shares, abs=1e-9)
+    assert all(at.low <= at.recall <= at.high for at in row.recall)
+    ours = (
+        *(row.median_position_m, row.median_angle_deg),
+        *(row.median_localized_position_m, row.median_localized_angle_deg),
+    )
+    theirs = (
+        *(statistics.median_all_positions, statistics.median_all_rotations),
+        *(statistics.median_localized_positions, statistics.median_localized_rotations),
+    )
     assert ours == pytest.approx(theirs, abs=1e-9)
     assert list(found.errors.names) == [name for name, _, _ in results]
     theirs_by_query = np.nan_to_num([errors for _, *errors in results], nan=np.inf)
@@ -94,31 +114,20 @@ def assert_equal_figures(
     np.testing.assert_allclose(found.errors.angle_deg, theirs_by_query[:, 1], rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("num_missing", [0, 5, 21])
+@pytest.mark.parametrize("num_missing", [0, 5, 21, 40])
 def test_equal_on_random_poses(
-    num_missing: int,
-    displace: Callable[..., RigidTransform],
-    figures_of_kapture: Callable[..., Any],
+    num_missing: int, random_poses: Callable[..., Any], figures_of_kapture: Figures
 ) -> None:
-    rng = np.random.default_rng(num_missing)
-    truth = {f"q/{i:03d}.jpg": random_pose(rng) for i in range(40)}
-    estimated = {
-        name: displace(pose, rng.normal(size=3) * 10 ** rng.normal(-1, 1), rng.exponential(3))
-        for name, pose in list(truth.items())[num_missing:]
-    }
+    estimated, truth = random_poses(40, 0.2, 9.0, missing=num_missing)
     assert_equal_figures(estimated, truth, BINS, figures_of_kapture)
 
 
-def test_equal_where_thresholds_are_met_exactly(
-    upright: Callable[..., RigidTransform],
-    figures_of_kapture: Callable[..., Any],
-) -> None:
+def test_equal_where_thresholds_are_met_exactly(figures_of_kapture: Figures) -> None:
     truth, estimated = {}, {}
     for i, (position_m, angle_deg) in enumerate(BINS):
         half = np.deg2rad(angle_deg) / 2
-        name = f"{i}.jpg"
-        truth[name] = RigidTransform.identity()
-        estimated[name] = RigidTransform(
+        truth[f"{i}.jpg"] = RigidTransform.identity()
+        estimated[f"{i}.jpg"] = RigidTransform(
             (float(np.cos(half)), 0.0, 0.0, float(np.sin(half))), (0.0, 0.0, position_m)
         )
     statistics, _ = figures_of_kapture(estimated, truth, BINS)
@@ -129,25 +138,17 @@ def test_equal_where_thresholds_are_met_exactly(
 
 @pytest.mark.parametrize("share", [1 - 1e-9, 1 + 1e-9])
 def test_equal_just_below_and_just_above_every_measured_error(
-    share: float,
-    displace: Callable[..., RigidTransform],
-    figures_of_kapture: Callable[..., Any],
+    share: float, random_poses: Callable[..., Any], figures_of_kapture: Figures
 ) -> None:
     # each query's own errors as kapture computes them are a threshold, but for the last bits, which
     # differ between processors: a figure that is off by more gains or loses a query
-    rng = np.random.default_rng(7)
-    truth = {f"{i:03d}.jpg": random_pose(rng) for i in range(60)}
-    estimated = {
-        name: displace(pose, rng.normal(size=3), rng.uniform(0, 20)) for name, pose in truth.items()
-    }
+    estimated, truth = random_poses(60, 1.0, 20.0)
     _, results = figures_of_kapture(estimated, truth, BINS)
     bins = [(float(metres) * share, float(degrees) * share) for _, metres, degrees in results]
     assert_equal_figures(estimated, truth, bins, figures_of_kapture)
 
 
-def test_a_negative_quaternion_is_the_same_for_both(
-    figures_of_kapture: Callable[..., Any],
-) -> None:
+def test_a_negative_quaternion_is_the_same_for_both(figures_of_kapture: Figures) -> None:
     rng = np.random.default_rng(3)
     truth = {f"{i}.jpg": random_pose(rng) for i in range(10)}
     estimated = {
@@ -157,9 +158,19 @@ def test_a_negative_quaternion_is_the_same_for_both(
     assert_equal_figures(estimated, truth, [(1e-9, 1e-4)], figures_of_kapture)
 
 
-def test_nothing_estimated(figures_of_kapture: Callable[..., Any]) -> None:
-    truth = {"a.jpg": RigidTransform.identity()}
-    assert_equal_figures({}, truth, BINS, figures_of_kapture)
+def test_equal_without_rotation(
+    random_poses: Callable[..., Any], figures_of_kapture: Figures
+) -> None:
+    # MLAD's thresholds: kapture leaves the rotation out where its bound is negative
+    estimated, truth = random_poses(50, 0.2, 90.0, missing=4)
+    _, results = figures_of_kapture(estimated, truth, BINS)
+    # thresholds that single queries meet exactly, to the last bit
+    bounds = [float(position_m) for _, position_m, _ in results if np.isfinite(position_m)][:8]
+    statistics, _ = figures_of_kapture(estimated, truth, [(bound, -1.0) for bound in bounds])
+    thresholds = thresholds_from_pairs((bound, None) for bound in bounds)
+    row = evaluate_poses(estimated, truth, thresholds=thresholds).row()
+    assert [at.num_within for at in row.recall] == [count for _, _, count in statistics.filled_bins]
+    assert len({at.num_within for at in row.recall}) == len(bounds)
 
 
 @pytest.fixture
@@ -176,15 +187,11 @@ def test_kaptures_exporter_gives_the_same_poses(
 ) -> None:
     theirs_path, ours_path = tmp_path / "theirs.txt", tmp_path / "ours.txt"
     tool = Path(sys.executable).with_name("kapture_export_LTVL2020")
-    subprocess.run(
-        [str(tool), "-i", str(localized), "-o", str(theirs_path), "-f", *options],
-        check=True,
-        capture_output=True,
-    )
+    command = [str(tool), "-i", str(localized), "-o", str(theirs_path), "-f", *options]
+    subprocess.run(command, check=True, capture_output=True)
     write_pose_file(ours_path, KaptureFolder(localized).read().poses(), names=names)
     ours, theirs = read_pose_file(ours_path), read_pose_file(theirs_path)
-    assert len(ours) == 36
-    assert sorted(ours) == sorted(theirs)
+    assert len(ours) == 36 and sorted(ours) == sorted(theirs)
     quats, translations = stack_poses(ours[name] for name in ours)
     their_quats, their_translations = stack_poses(theirs[name] for name in ours)
     np.testing.assert_allclose(translations, their_translations, rtol=0, atol=1e-12)
@@ -197,46 +204,7 @@ def test_folders_written_by_kapture_are_evaluated(
     truth = tmp_path / "query_gt"
     kapture.io.csv.kapture_to_dir(str(truth), kapture_of(world.truth, list(world.truth)))
     found = evaluate(localized, truth)
-    expected = evaluate_poses(world.estimated, world.truth)
+    expected = evaluate_poses(world.estimated, world.truth).errors.position_m
     assert found.row().num_queries == 40
-    np.testing.assert_allclose(
-        found.errors.position_m, expected.errors.position_m, rtol=0, atol=1e-9
-    )
+    np.testing.assert_allclose(found.errors.position_m, expected, rtol=0, atol=1e-9)
     assert found.thresholds[1] == Threshold(position_m=0.25, angle_deg=2.0)
-
-
-def test_equal_without_rotation(
-    displace: Callable[..., RigidTransform], figures_of_kapture: Callable[..., Any]
-) -> None:
-    # MLAD's thresholds: kapture leaves the rotation out where its bound is negative
-    rng = np.random.default_rng(9)
-    truth = {f"{i:03d}.jpg": random_pose(rng) for i in range(50)}
-    estimated = {
-        name: displace(pose, rng.normal(size=3) * 0.2, rng.uniform(0, 90))
-        for name, pose in list(truth.items())[4:]
-    }
-    _, results = figures_of_kapture(estimated, truth, BINS)
-    # thresholds that single queries meet exactly, to the last bit
-    bounds = [float(position_m) for _, position_m, _ in results if np.isfinite(position_m)][:8]
-    statistics, _ = figures_of_kapture(estimated, truth, [(bound, -1.0) for bound in bounds])
-    row = evaluate_poses(
-        estimated, truth, thresholds=thresholds_from_pairs((bound, None) for bound in bounds)
-    ).row()
-    assert [at.num_within for at in row.recall] == [count for _, _, count in statistics.filled_bins]
-    assert len(set(at.num_within for at in row.recall)) == len(bounds)
-
-
-def test_recall_is_the_share_that_kapture_prints(
-    displace: Callable[..., RigidTransform], figures_of_kapture: Callable[..., Any]
-) -> None:
-    rng = np.random.default_rng(2)
-    truth = {f"{i:03d}.jpg": random_pose(rng) for i in range(37)}
-    estimated = {
-        name: displace(pose, rng.normal(size=3) * 0.3, rng.exponential(2))
-        for name, pose in list(truth.items())[3:]
-    }
-    statistics, _ = figures_of_kapture(estimated, truth, BINS)
-    shares = [count / statistics.number_of_images for _, _, count in statistics.filled_bins]
-    row = evaluate_poses(estimated, truth, thresholds=thresholds_from_pairs(BINS)).row()
-    assert [at.recall for at in row.recall] == pytest.approx(shares, abs=1e-9)
-    assert all(at.low <= at.recall <= at.high for at in row.recall)

@@ -78,7 +78,6 @@ def test_of_a_result() -> None:
     }
     evaluation = evaluate_poses(found, truth, statuses=statuses, nowhere=["stray", "refused"])
     known = evaluation.confidence
-    assert known is not None
     assert (known.num_queries, known.num_poses, known.num_wrong) == (6, 4, 2)
     assert (known.num_nowhere, known.num_nowhere_refused) == (2, 1)
     # a and c first, then the stray, then b
@@ -88,20 +87,14 @@ def test_of_a_result() -> None:
     assert known.wrong_low < 0.5 < known.wrong_high
     # they stand in no row of recall, and are not images without truth
     assert evaluation.row().num_queries == 4 and evaluation.without_truth == ()
-    text = report_text(evaluation)
-    assert "2 queries show nothing of the map: 1 refused, 1 given a pose" in " ".join(text.split())
-    assert "of 4 poses with a confidence 2 are wrong" in " ".join(text.split())
+    text = " ".join(report_text(evaluation).split())
+    assert "2 queries show nothing of the map: 1 refused, 1 given a pose" in text
+    assert "of 4 poses with a confidence 2 are wrong" in text
     assert evaluation.to_pandas().loc["a", "confidence"] == 0.9
-
-
-def test_a_result_without_confidences_says_nothing_of_them() -> None:
+    # a result without confidences says nothing of them
     evaluation = evaluate_poses({"a": at(0.0)}, {"a": at(0.0)}, statuses={"a": status("a", None)})
-    assert evaluation.confidence is None
-    assert "onfidence:" not in report_text(evaluation)
+    assert evaluation.confidence is None and "onfidence:" not in report_text(evaluation)
     assert "confidence" not in evaluation.to_pandas().columns
-
-
-def test_nowhere_is_no_truth() -> None:
     with pytest.raises(DataError, match="'a' is said to show nothing of the map, and has"):
         evaluate_poses({}, {"a": at(0.0)}, nowhere=["a"])
 

@@ -1,7 +1,9 @@
-"""Pose files of visuallocalization.net and of the MLAD challenges."""
+"""Pose files of visuallocalization.net and of the MLAD challenges, and the JSON beside them."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +28,7 @@ from megloc_kapture.evaluation.pose_files import (
     timestamp_of,
     write_pose_file,
 )
+from megloc_kapture.evaluation.provenance import package_versions, write_provenance
 from megloc_kapture.values import RigidTransform
 
 HERE = RigidTransform.identity()
@@ -45,28 +48,46 @@ quats = (
     .map(unit)
 )
 poses = st.builds(RigidTransform, quats, st.tuples(finite, finite, finite))
+stamps = st.integers(0, 10**19)
+pairs = st.lists(
+    st.builds(RelativePose, stamps, stamps, poses),
+    max_size=5,
+    unique_by=lambda row: (row.reference, row.query),
+)
 names = st.text(
     st.characters(exclude_categories=["Cc", "Cs", "Z"], codec="utf-8"), min_size=1, max_size=10
 ).filter(lambda name: name.split() == [name])
 
 
-@given(st.dictionaries(names, poses, max_size=6))
+@given(st.dictionaries(names, poses, max_size=6), pairs)
 def test_every_bit_reads_back(
-    tmp_path_factory: pytest.TempPathFactory, written: dict[str, RigidTransform]
+    tmp_path_factory: pytest.TempPathFactory,
+    written: dict[str, RigidTransform],
+    rows: list[RelativePose],
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "round_trip.txt"
     write_pose_file(path, written)
     assert read_pose_file(path) == written
     assert list(read_pose_file(path)) == sorted(written)
+    path.write_text(format_mlad_file(rows))
+    assert read_mlad_file(path) == rows
 
 
-def test_what_a_server_reads() -> None:
+def test_what_a_server_reads(tmp_path: Path) -> None:
     pose = RigidTransform((1.0, 0.0, 0.0, 0.0), (1.5, -0.2, 3.0))
     third = RigidTransform((0.5, 0.5, -0.5, 0.5), (1 / 3, -2e-17, 1e6))
     assert format_pose_file({"q/b.jpg": third, "q/a.jpg": pose}, names="basename") == (
         "a.jpg 1.0 0.0 0.0 0.0 1.5 -0.2 3.0\n"
         "b.jpg 0.5 0.5 -0.5 0.5 0.3333333333333333 -2e-17 1000000.0\n"
     )
+    pose = RigidTransform((0.6, 0.8, 0.0, 0.0), (1.5, -0.2, 3.0))
+    text = format_mlad_file([RelativePose(1602074877390449152, 5, pose)])
+    assert text == "1602074877390449152 5 1.5 -0.2 3.0 0.8 0.0 0.0 0.6\n"
+    assert format_pose_file({}) == format_mlad_file([]) == ""
+    (tmp_path / "file").write_text("")
+    assert read_pose_file(tmp_path / "file") == {} and read_mlad_file(tmp_path / "file") == []
+    with pytest.raises(OutputError, match="file"):
+        write_pose_file(tmp_path / "file" / "poses.txt", {"a.jpg": HERE})
 
 
 def test_a_list_names_the_rows_and_orders_them() -> None:
@@ -76,30 +97,25 @@ def test_a_list_names_the_rows_and_orders_them() -> None:
     assert [line.split()[0] for line in text.splitlines()] == ["rear/2.png", "rear/1.png"]
 
 
-def test_a_list_that_calls_two_images_alike_is_refused() -> None:
-    with pytest.raises(DataError, match=r"a/1\.jpg.*b/1\.jpg.*'1\.jpg'"):
-        names_in_pose_file(["a/1.jpg", "b/1.jpg"], {"a/1.jpg": "1.jpg", "b/1.jpg": "1.jpg"})
-    with pytest.raises(DataError, match="cannot hold"):
-        names_in_pose_file(["a"], {"a": "a b"})
+TWO_DAYS = ["query/day/1.jpg", "query/night/1.jpg"]
 
 
-def test_no_poses_make_an_empty_file(tmp_path: Path) -> None:
-    write_pose_file(tmp_path / "poses.txt", {})
-    assert (tmp_path / "poses.txt").read_bytes() == b""
-    assert read_pose_file(tmp_path / "poses.txt") == {}
-
-
-def test_basenames_that_collide_are_refused_by_both_names() -> None:
-    images = ["query/day/1.jpg", "query/night/1.jpg"]
-    with pytest.raises(DataError, match=r"query/day/1\.jpg.*query/night/1\.jpg"):
-        names_in_pose_file(images, "basename")
-    assert names_in_pose_file(images, "full") == {image: image for image in images}
-
-
-@pytest.mark.parametrize("image", ["a b.jpg", "a\tb.jpg", " a.jpg", "folder/", "a\u00a0b.jpg"])
-def test_names_the_format_cannot_hold(image: str) -> None:
-    with pytest.raises(DataError, match="cannot hold"):
-        names_in_pose_file([image], "basename")
+@pytest.mark.parametrize(
+    ("images", "names", "words"),
+    [
+        (TWO_DAYS, "basename", r"query/day/1\.jpg.*query/night/1\.jpg"),
+        (TWO_DAYS, dict.fromkeys(TWO_DAYS, "1.jpg"), r"day/1\.jpg.*night/1\.jpg.*'1\.jpg'"),
+        (["a"], {"a": "a b"}, "cannot hold"),
+        *[
+            ([image], "basename", "cannot hold")
+            for image in ("a b.jpg", "a\tb.jpg", " a.jpg", "folder/", "a\u00a0b.jpg")
+        ],
+    ],
+)
+def test_names_that_a_file_cannot_have(images: list[str], names: Any, words: str) -> None:
+    with pytest.raises(DataError, match=words):
+        names_in_pose_file(images, names)
+    assert names_in_pose_file(TWO_DAYS, "full") == {image: image for image in TWO_DAYS}
 
 
 @pytest.mark.parametrize(
@@ -109,13 +125,17 @@ def test_names_the_format_cannot_hold(image: str) -> None:
         (RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, math.inf, 0.0)), "not finite"),
         (RigidTransform((math.nan, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "not finite"),
         (RigidTransform((0.9, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), "length 0.9"),
+        (None, "pair 1 2 has no pose; MLAD wants every row"),
     ],
 )
 def test_a_pose_that_must_not_be_handed_in(
-    tmp_path: Path, pose: RigidTransform, words: str
+    tmp_path: Path, pose: RigidTransform | None, words: str
 ) -> None:
     with pytest.raises(DataError, match=words):
-        write_pose_file(tmp_path / "poses.txt", {"good.jpg": HERE, "bad.jpg": pose})
+        format_mlad_file([RelativePose(1, 1, HERE), RelativePose(1, 2, pose)])
+    if pose is not None:
+        with pytest.raises(DataError, match=words):
+            write_pose_file(tmp_path / "poses.txt", {"good.jpg": HERE, "bad.jpg": pose})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -172,7 +192,8 @@ BROKEN_PAIRS = [
 @pytest.mark.parametrize(
     ("read", "good", "line", "words"),
     [(read_pose_file, GOOD, *one) for one in BROKEN]
-    + [(read_mlad_file, GOOD_PAIR, *one) for one in BROKEN_PAIRS],
+    + [(read_mlad_file, GOOD_PAIR, *one) for one in BROKEN_PAIRS]
+    + [(read_mlad_file, "1 2\n", GOOD_PAIR, "9 columns instead of 2, as in the rows before")],
 )
 def test_broken_lines_are_named(
     tmp_path: Path, read: Callable[..., Any], good: str, line: str, words: str
@@ -184,16 +205,12 @@ def test_broken_lines_are_named(
     assert caught.value.line == 3 and str(caught.value).startswith(f"{path}:3: ")
 
 
-def test_a_file_cut_short_is_not_read(tmp_path: Path) -> None:
+def test_a_file_that_is_cut_short_or_no_text(tmp_path: Path) -> None:
     path = tmp_path / "poses.txt"
     path.write_text(GOOD + "b.jpg 1 0 0 0 1.5 -0.2 3.14")
     with pytest.raises(DataError, match="cut short") as caught:
         read_pose_file(path)
     assert caught.value.line == 2
-
-
-def test_a_file_that_is_no_text(tmp_path: Path) -> None:
-    path = tmp_path / "poses.txt"
     path.write_bytes(GOOD.encode() + b"\xff\xfe\n")
     with pytest.raises(DataError, match="UTF-8") as caught:
         read_pose_file(path)
@@ -232,12 +249,6 @@ def test_random_damage_never_crashes(
     assert all(np.isfinite(pose.translation).all() for pose in rows if pose is not None)
 
 
-def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="file"):
-        write_pose_file(tmp_path / "file" / "poses.txt", {"a.jpg": HERE})
-
-
 def test_short_names_find_their_images() -> None:
     images = ["q/day/1.jpg", "q/day/2.jpg", "q/night/2.jpg"]
     found = poses_by_image({"1.jpg": HERE, "q/day/2.jpg": HERE, "9.jpg": HERE}, images)
@@ -246,37 +257,11 @@ def test_short_names_find_their_images() -> None:
         poses_by_image({"2.jpg": HERE}, images)
     with pytest.raises(DataError, match="in two ways"):
         poses_by_image({"1.jpg": HERE, "q/day/1.jpg": HERE}, images)
-
-
-def test_names_of_a_list_find_their_images() -> None:
     listed = {"dawn/rear/1.jpg": "rear/1.png", "dusk/rear/2.jpg": "rear/2.png"}
     found = poses_by_image({"rear/1.png": HERE, "dusk/rear/2.jpg": HERE}, listed, listed)
     assert list(found) == ["dawn/rear/1.jpg", "dusk/rear/2.jpg"]
     with pytest.raises(DataError, match="in two ways"):
         poses_by_image({"rear/1.png": HERE, "dawn/rear/1.jpg": HERE}, listed, listed)
-
-
-stamps = st.integers(0, 10**19)
-rows = st.lists(
-    st.builds(RelativePose, stamps, stamps, poses),
-    max_size=5,
-    unique_by=lambda row: (row.reference, row.query),
-)
-
-
-@given(rows)
-def test_every_bit_of_pairs_reads_back(
-    tmp_path_factory: pytest.TempPathFactory, written: list[RelativePose]
-) -> None:
-    path = tmp_path_factory.getbasetemp() / "mlad_round_trip.txt"
-    path.write_text(format_mlad_file(written))
-    assert read_mlad_file(path) == written
-
-
-def test_the_columns_of_the_challenge() -> None:
-    pose = RigidTransform((0.6, 0.8, 0.0, 0.0), (1.5, -0.2, 3.0))
-    text = format_mlad_file([RelativePose(1602074877390449152, 5, pose)])
-    assert text == "1602074877390449152 5 1.5 -0.2 3.0 0.8 0.0 0.0 0.6\n"
 
 
 def test_relative_poses_are_query_from_reference() -> None:
@@ -303,40 +288,11 @@ def test_lists_of_pairs(tmp_path: Path, end: str) -> None:
         RelativePose(1600000000000000000, 1600000000000000001),
         RelativePose(3, 4),
     ]
-
-
-def test_true_poses_of_training_files_without_a_last_line_end(tmp_path: Path) -> None:
-    path = tmp_path / "poses.txt"
-    path.write_text(GOOD_PAIR + "100 206 0 0 0 0 0 0 1")
+    # and true poses of training files
+    path.write_text(GOOD_PAIR + "100 206 0 0 0 0 0 0 1" + end)
     first, second = read_mlad_file(path)
     assert first.query_from_reference == RigidTransform((0.6, 0.8, 0.0, 0.0), (1.5, -0.2, 3.0))
     assert second == RelativePose(100, 206, HERE)
-
-
-def test_an_empty_file_has_no_rows(tmp_path: Path) -> None:
-    (tmp_path / "poses.txt").write_text(format_mlad_file([]))
-    assert (tmp_path / "poses.txt").read_bytes() == b""
-    assert read_mlad_file(tmp_path / "poses.txt") == []
-
-
-def test_a_pose_among_pairs(tmp_path: Path) -> None:
-    path = tmp_path / "pairs.txt"
-    path.write_text("1 2\n" + GOOD_PAIR)
-    with pytest.raises(DataError, match="9 columns instead of 2, as in the rows before"):
-        read_mlad_file(path)
-
-
-@pytest.mark.parametrize(
-    ("row", "words"),
-    [
-        (RelativePose(1, 2), "pair 1 2 has no pose; MLAD wants every row"),
-        (RelativePose(1, 2, RigidTransform((1, 0, 0, 0), (math.inf, 0, 0))), "not finite"),
-        (RelativePose(1, 2, RigidTransform((0.9, 0, 0, 0), (0, 0, 0))), "length 0.9"),
-    ],
-)
-def test_rows_that_must_not_be_handed_in(row: RelativePose, words: str) -> None:
-    with pytest.raises(DataError, match=words):
-        format_mlad_file([RelativePose(1, 1, HERE), row])
 
 
 def test_timestamps_are_the_names_of_images() -> None:
@@ -344,3 +300,48 @@ def test_timestamps_are_the_names_of_images() -> None:
     for name in ("a/frame_1.png", "0100.png", "1.5.png", "-5.png", "a/.png"):
         with pytest.raises(DataError, match="not named after a timestamp"):
             timestamp_of(name)
+
+
+def test_holds_what_was_given_and_binds_the_file(tmp_path: Path) -> None:
+    import numpy
+
+    pose_file = tmp_path / "aachen.txt"
+    pose_file.write_text("a.jpg 1 0 0 0 0 0 0\n")
+    options = {"preset": "classic", "options": {"max_error_px": 8.0}}
+    path = write_provenance(pose_file, options, counts={"queries": 2, "poses": 1})
+    assert path == tmp_path / "aachen.txt.json"
+    content = json.loads(path.read_text())
+    assert content["files"] == {"aachen.txt": hashlib.sha256(pose_file.read_bytes()).hexdigest()}
+    assert content["counts"] == {"queries": 2, "poses": 1}
+    assert content["preset"] == "classic"
+    assert content["options"] == {"max_error_px": 8.0}
+    assert content["versions"] == package_versions()
+    assert package_versions()["numpy"] == numpy.__version__
+    first = path.read_bytes()
+    again = write_provenance(pose_file, options, counts={"queries": 2, "poses": 1})
+    assert again.read_bytes() == first
+
+
+def test_several_files_of_a_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "mlad"
+    (folder / "sub").mkdir(parents=True)
+    (folder / "b.txt").write_text("b")
+    (folder / "sub" / "a.txt").write_text("a")
+    (folder / "older.txt").write_text("of another run")
+    path = write_provenance(folder, {}, counts={}, files=["sub/a.txt", "b.txt"])
+    assert path == tmp_path / "mlad.json"
+    assert json.loads(path.read_text())["files"] == {
+        "b.txt": hashlib.sha256(b"b").hexdigest(),
+        "sub/a.txt": hashlib.sha256(b"a").hexdigest(),
+    }
+
+
+def test_refusals(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="cannot read"):
+        write_provenance(tmp_path / "absent.txt", {}, counts={})
+    (tmp_path / "poses.txt").write_text("")
+    with pytest.raises(ValueError, match="already ours: files"):
+        write_provenance(tmp_path / "poses.txt", {"files": ""}, counts={})
+    with pytest.raises(ValueError, match="JSON"):
+        write_provenance(tmp_path / "poses.txt", {"x": float("nan")}, counts={})
+    assert not (tmp_path / "poses.txt.json").exists()

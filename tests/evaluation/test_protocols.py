@@ -18,14 +18,11 @@ def test_thresholds_of_the_challenges() -> None:
     assert protocol_of("4seasons").thresholds == ((0.1, None), (0.2, None), (0.5, None))
     assert protocol_of("4seasons").pose_file == "mlad"
     assert protocol_of("kapture") == Protocol()
-
-
-def test_pools_of_robotcar_hold_each_condition_once() -> None:
-    protocol = protocol_of("robotcar")
-    pooled = [condition for parts in protocol.pools.values() for condition in parts]
-    assert sorted(pooled) == sorted(protocol.conditions)
-    assert protocol.pools["night-all"] == ("night", "night-rain")
-    assert len(protocol.pools["day-all"]) == 7
+    robotcar = protocol_of("robotcar")
+    pooled = [condition for parts in robotcar.pools.values() for condition in parts]
+    assert sorted(pooled) == sorted(robotcar.conditions)
+    assert robotcar.pools["night-all"] == ("night", "night-rain")
+    assert len(robotcar.pools["day-all"]) == 7
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)

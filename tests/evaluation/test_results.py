@@ -1,19 +1,24 @@
-"""Results on disk: kapture folders, pose files, side tables."""
+"""Results on disk and in memory: kapture folders, pose files, side tables; what they come to."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from megloc_kapture.errors import DataError
+import megloc_kapture as megloc
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.evaluate import evaluate, evaluate_results
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.pose_files import write_pose_file
 from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of, protocol_of
+from megloc_kapture.evaluation.report.reports import report_text, write_report
 from megloc_kapture.evaluation.results import (
     are_ranked,
     context_of,
@@ -22,6 +27,7 @@ from megloc_kapture.evaluation.results import (
     side_tables_near,
     workspace_of,
 )
+from megloc_kapture.evaluation.statistics import over_seeds
 from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,
@@ -32,9 +38,20 @@ from megloc_kapture.io.dataset_tables import (
     write_protocol,
     write_world,
 )
-from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.io.tables import write_status
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import Failure, Pose, RigidTransform
+
+
+@pytest.fixture
+def truth(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
+    return kaptures(tmp_path / "query_gt", list(world.truth), world.truth)
+
+
+@pytest.fixture
+def result(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
+    folder = kaptures(tmp_path / "localized", list(world.truth), world.estimated)
+    write_status(folder / "status.csv", world.statuses.values())
+    return folder
 
 
 @pytest.mark.parametrize(
@@ -88,10 +105,9 @@ def test_workspaces_that_were_recentred_in_other_ways_are_brought_together(
             quat_wxyz=(0.8, 0.0, 0.6, 0.0), translation=(-7.0, 1.0, 0.0)
         )
     )
-    write_world(tmp_path / "one/megloc", truth_world)
-    write_protocol(tmp_path / "one/megloc", Protocol())
-    write_world(tmp_path / "two/megloc", other_world)
-    write_protocol(tmp_path / "two/megloc", Protocol())
+    for name, own in (("one", truth_world), ("two", other_world)):
+        write_world(tmp_path / name / "megloc", own)
+        write_protocol(tmp_path / name / "megloc", Protocol())
     names = list(world.truth)
     official = {n: truth_world.pose_in_official(p) for n, p in world.estimated.items()}
     moved = {n: other_world.pose_in_local(p) for n, p in official.items()}
@@ -102,37 +118,41 @@ def test_workspaces_that_were_recentred_in_other_ways_are_brought_together(
     found = evaluate_results(
         [here, there, tmp_path / "poses.txt"], truth, benchmark_of(tmp_path / "one/megloc")
     )
-    for other in found[1:]:
-        np.testing.assert_allclose(
-            other.errors.position_m, found[0].errors.position_m, rtol=0, atol=1e-9
-        )
+    first, *others = (one.errors.position_m for one in found)
+    for other in others:
+        np.testing.assert_allclose(other, first, rtol=0, atol=1e-9)
     # the guard: in its own frame it is metres off
     wrong = evaluate_results([kaptures(tmp_path / "lone", names, moved)], truth, Benchmark())
     assert np.median(wrong[0].errors.position_m) > 1.0
+    # and so is a file in the official frame, of another scale and far away
+    similarity = SimilarityTransform(
+        quat_wxyz=(0.8, 0.0, 0.6, 0.0), translation=(4.1e6, 8.6e5, 4.7e6), scale=2.0
+    )
+    official_world = World(official_from_local=similarity)
+    write_world(tmp_path, official_world)
+    poses = {name: official_world.pose_in_official(pose) for name, pose in world.truth.items()}
+    write_pose_file(tmp_path / "far.txt", poses)
+    near = evaluate(tmp_path / "far.txt", truth, side_tables=tmp_path)
+    assert near.errors.position_m.max() < 1e-6
+    assert evaluate(tmp_path / "far.txt", truth).errors.position_m.min() > 1e6
 
 
 def test_the_challenges_names_are_read_back(
-    world: Any, tmp_path: Path, kaptures: Callable[..., Path]
+    world: Any, truth: Path, result: Path, tmp_path: Path
 ) -> None:
     names = {name: f"rear/{number}.png" for number, name in enumerate(sorted(world.truth))}
     write_protocol(tmp_path / "megloc", protocol_of("robotcar"))
     write_names(tmp_path / "megloc", names)
     write_pose_file(tmp_path / "poses.txt", world.estimated, names=names)
-    truth = kaptures(tmp_path / "query_gt", list(world.truth), world.truth)
     rules = benchmark_of(tmp_path / "megloc")
     (found,) = evaluate_results([tmp_path / "poses.txt"], truth, rules)
     assert found.row().num_missing == 4 and found.without_truth == ()
     assert "RobotCar Seasons v2 publishes" in found.truth_known_by
-
-
-def test_a_result_knows_all_its_queries(
-    world: Any, tmp_path: Path, kaptures: Callable[..., Path]
-) -> None:
-    names = sorted(world.truth)
-    folder = kaptures(tmp_path / "localized", names, world.estimated)
-    found = read_result(folder, Benchmark(), label="x")
-    assert found.images == tuple(names)
-    assert len(found.poses) == 36 and found.statuses is None
+    # last parts of the path alone give the figures of the folder
+    write_pose_file(tmp_path / "poses.txt", world.estimated, names="basename")
+    from_file, from_folder = evaluate(tmp_path / "poses.txt", truth), evaluate(result, truth)
+    np.testing.assert_array_equal(from_file.errors.position_m, from_folder.errors.position_m)
+    assert from_file.without_truth == ()
 
 
 def test_what_lies_around(tmp_path: Path, kaptures: Callable[..., Path]) -> None:
@@ -156,35 +176,23 @@ def test_what_lies_around(tmp_path: Path, kaptures: Callable[..., Path]) -> None
     assert nothing.query_images() == [] and nothing.queries is None
 
 
-@pytest.fixture
-def truth(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
-    return kaptures(tmp_path / "query_gt", list(world.truth), world.truth)
-
-
-@pytest.fixture
-def result(world: Any, tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
-    folder = kaptures(tmp_path / "localized", list(world.truth), world.estimated)
-    write_status(folder / "status.csv", world.statuses.values())
-    return folder
-
-
 def test_statuses_and_side_tables_are_used(
     world: Any, result: Path, truth: Path, tmp_path: Path
 ) -> None:
+    alone = evaluate(result, truth)
+    assert [row.name for row in alone.rows] == ["all"] and len(alone.thresholds) == 4
+    found = read_result(result, Benchmark())
+    assert found.images == tuple(sorted(world.truth))
+    assert len(found.poses) == 36 and found.statuses == world.statuses
     unscored = sorted(world.truth)[0]
     groups = {
         name: ImageGroup(condition=condition, scored=name != unscored)
         for name, condition in world.conditions.items()
     }
     write_groups(tmp_path, groups)
-    write_protocol(
-        tmp_path,
-        Protocol(
-            thresholds=((0.1, None),),
-            conditions=("night", "day"),
-            pools={"any light": ("day", "night")},
-        ),
-    )
+    pools = {"any light": ("day", "night")}
+    rules = Protocol(thresholds=((0.1, None),), conditions=("night", "day"), pools=pools)
+    write_protocol(tmp_path, rules)
     evaluation = evaluate(result, truth, side_tables=tmp_path, label="x")
     assert [row.name for row in evaluation.rows] == ["night", "day", "any light", "all"]
     assert evaluation.thresholds == (Threshold(position_m=0.1),)
@@ -195,59 +203,10 @@ def test_statuses_and_side_tables_are_used(
     assert other.thresholds == (Threshold(position_m=1.0),)
 
 
-def test_without_side_tables(result: Path, truth: Path) -> None:
-    evaluation = evaluate(result, truth)
-    assert [row.name for row in evaluation.rows] == ["all"]
-    assert len(evaluation.thresholds) == 4
-
-
-def test_a_pose_file_gives_the_figures_of_its_folder(
-    world: Any, result: Path, truth: Path, tmp_path: Path
-) -> None:
-    pose_file = tmp_path / "poses.txt"
-    write_pose_file(pose_file, world.estimated, names="basename")
-    from_file, from_folder = evaluate(pose_file, truth), evaluate(result, truth)
-    np.testing.assert_array_equal(from_file.errors.position_m, from_folder.errors.position_m)
-    assert from_file.without_truth == ()
-
-
-def test_a_pose_file_in_the_official_frame_is_brought_back(
-    world: Any, truth: Path, tmp_path: Path
-) -> None:
-    similarity = SimilarityTransform(
-        quat_wxyz=(0.8, 0.0, 0.6, 0.0), translation=(4.1e6, 8.6e5, 4.7e6), scale=2.0
-    )
-    official = World(official_from_local=similarity)
-    write_world(tmp_path, official)
-    poses = {name: official.pose_in_official(pose) for name, pose in world.truth.items()}
-    write_pose_file(tmp_path / "poses.txt", poses)
-    evaluation = evaluate(tmp_path / "poses.txt", truth, side_tables=tmp_path)
-    assert evaluation.errors.position_m.max() < 1e-6
-    # the guard: left where it is, the file is thousands of kilometres off
-    assert evaluate(tmp_path / "poses.txt", truth).errors.position_m.min() > 1e6
-
-
-def test_rigs_are_resolved(tmp_path: Path, world: Any) -> None:
-    name = sorted(world.truth)[0]
-    offset = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.5, 0.0, 0.0))
-    camera = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0)))
-    data = KaptureData(
-        sensors={"left": camera},
-        rigs={"car": {"left": offset}},
-        trajectories={(3, "car"): offset.inverse() @ world.truth[name]},
-        records_camera={(3, "left"): name},
-        records_depth={},
-    )
-    write_sensors(tmp_path / "rig", data)
-    found = read_result(tmp_path / "rig", Benchmark()).poses
-    np.testing.assert_allclose(found[name].center(), world.truth[name].center(), atol=1e-9)
-
-
 def test_absent_results_are_named(truth: Path, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="nowhere"):
-        evaluate(tmp_path / "nowhere", truth)
-    with pytest.raises(DataError, match="nowhere"):
-        evaluate(truth, tmp_path / "nowhere")
+    for paths in ((tmp_path / "nowhere", truth), (truth, tmp_path / "nowhere")):
+        with pytest.raises(DataError, match="nowhere"):
+            evaluate(*paths)
 
 
 def test_lists_in_the_order_of_names_are_no_ranking() -> None:
@@ -257,3 +216,71 @@ def test_lists_in_the_order_of_names_are_no_ranking() -> None:
     # of few candidates the order may be chance
     assert are_ranked([names[:2], names[:3]]) and are_ranked([]) and are_ranked([()])
     assert not are_ranked([names[:2]] * 7)
+
+
+def test_it_prints_as_the_recall_table(world: Any, result: Path, tmp_path: Path) -> None:
+    found = megloc.evaluate(result, truth=world.truth)
+    in_memory = evaluate(world.estimated, world.truth)
+    np.testing.assert_array_equal(in_memory.errors.position_m, found.errors.position_m)
+    assert str(found) + "\n" == report_text(found)
+    assert "95 % confidence intervals" in str(found) and str(result) in str(found)
+    found.html(tmp_path / "report.html")
+    assert "How large the errors are" in (tmp_path / "report.html").read_text()
+
+
+def test_what_localizing_gives_brings_reasons_and_inliers(world: Any) -> None:
+    first, second, third, *_ = sorted(world.estimated)
+    truth = {name: world.truth[name] for name in (first, second, third)}
+    pose, failure = Pose(world.estimated[first], 300, 120), Failure("no matches", num_matches=7)
+    found = evaluate({first: pose, second: failure}, truth, label="mine")
+    table = found.to_pandas()
+    assert table.loc[first, "num_inliers"] == 120 and table.loc[first, "outcome"] == "localized"
+    assert table.loc[second, "reason"] == "no matches" and table.loc[second, "num_matches"] == 7
+    assert table.loc[third, "outcome"] == "missing" and table.loc[third, "num_inliers"] is pd.NA
+    assert found.label == "mine"
+
+
+def test_two_results_are_compared(world: Any, tmp_path: Path) -> None:
+    lost = sorted(world.estimated)[:12]
+    fewer = {name: pose for name, pose in world.estimated.items() if name not in lost}
+    all_of_them = evaluate(world.estimated, world.truth, label="all of them")
+    comparison = all_of_them.compare(evaluate(fewer, world.truth, label="fewer"))
+    assert "all of them finds" in " ".join(str(comparison).split())
+    table = comparison.to_pandas()
+    assert (table.loc[lost, "fewer: outcome"] == "missing").all()
+    comparison.html(tmp_path / "comparison.html")
+    assert "Is the difference real?" in (tmp_path / "comparison.html").read_text()
+    with pytest.raises(OptionError, match="two results are called 'all of them'"):
+        all_of_them.compare(all_of_them)
+    # those without a label are told apart
+    first, second = evaluate_results([world.estimated, {}], world.truth, Benchmark())
+    assert (first.label, second.label) == ("result 1", "result 2")
+    assert "+-" in str(over_seeds([first, second]))
+
+
+def test_tables_in_python_are_those_of_the_files(world: Any, result: Path, tmp_path: Path) -> None:
+    found = evaluate(result, world.truth)
+    table, at = found.to_pandas(), found.row().recall[1]
+    within = (table["position_error_m"] <= at.threshold.position_m) & (
+        table["angle_error_deg"] <= at.threshold.angle_deg
+    )
+    assert list(table.index) == sorted(world.truth) and within.mean() == at.recall
+    assert table["position_error_m"].median() == found.row().median_position_m
+    assert set(table["outcome"]) == {"localized", "fallback", "missing"}
+    comparison = found.compare(evaluate({}, world.truth, label="nothing"))
+    for number, reported in enumerate((found, comparison)):
+        paths = write_report(tmp_path / str(number), reported)
+        # a missing pose is infinitely far in Python, and empty in the file
+        written = pd.read_csv(paths["per_query.csv"], keep_default_na=False, na_values=[""])
+        here = reported.to_pandas().reset_index().replace({np.inf: np.nan, "": np.nan})
+        pd.testing.assert_frame_equal(written, here, check_dtype=False)
+
+
+def test_nothing_heavy_is_loaded_before_it_is_needed() -> None:
+    code = (
+        "import sys; import megloc_kapture.evaluation.evaluate as e; "
+        "import megloc_kapture.evaluation.report.reports; "
+        "print([m for m in ('pandas', 'matplotlib', 'torch', 'jinja2') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -48,21 +48,22 @@ def test_every_true_query_is_counted_once(world: Any) -> None:
     assert list(evaluation.estimated) == sorted(world.estimated)
     with pytest.raises(KeyError):
         evaluation.row("noon")
+    # in whatever order they come
+    first = evaluate_poses(world.estimated, world.truth)
+    backwards = (dict(reversed(each.items())) for each in (world.estimated, world.truth))
+    second = evaluate_poses(*backwards)
+    assert (first.rows, first.queries) == (second.rows, second.queries)
 
 
-def test_images_without_truth_are_reported_and_not_counted() -> None:
+def test_images_without_truth_or_not_scored_are_reported_and_not_counted() -> None:
     evaluation = evaluate_poses({"b": HERE, "x": HERE, "c": HERE}, {"a": HERE, "b": HERE})
     assert evaluation.without_truth == ("c", "x")
     assert evaluation.row().num_queries == 2
     assert "x" not in evaluation.estimated
-
-
-def test_only_scored_images_are_counted() -> None:
     truth = {"a": HERE, "b": HERE, "c": HERE}
     evaluation = evaluate_poses({"a": HERE}, truth, scored={"a", "c", "unknown"})
     assert [q.image for q in evaluation.queries] == ["a", "c"]
-    assert evaluation.not_scored == ("b",)
-    assert evaluation.without_truth == ("unknown",)
+    assert (evaluation.not_scored, evaluation.without_truth) == (("b",), ("unknown",))
 
 
 def test_statuses_tell_fallback_and_reason() -> None:
@@ -84,23 +85,11 @@ def test_statuses_tell_fallback_and_reason() -> None:
 
 
 def test_nothing_to_count_is_an_error() -> None:
-    with pytest.raises(DataError, match="no query with a true pose"):
-        evaluate_poses({"a": HERE}, {})
-    with pytest.raises(DataError, match="no query with a true pose"):
-        evaluate_poses({}, {"a": HERE}, scored=set())
-
-
-def test_no_threshold_is_an_error() -> None:
+    for truth, options in (({}, {}), ({"a": HERE}, {"scored": set()})):
+        with pytest.raises(DataError, match="no query with a true pose"):
+            evaluate_poses({"a": HERE}, truth, **options)
     with pytest.raises(OptionError, match="threshold"):
         evaluate_poses({}, {"a": HERE}, thresholds=())
-
-
-def test_the_order_of_the_input_does_not_matter(world: Any) -> None:
-    backwards = dict(reversed(world.estimated.items()))
-    first = evaluate_poses(world.estimated, world.truth)
-    second = evaluate_poses(backwards, dict(reversed(world.truth.items())))
-    assert first.rows == second.rows
-    assert first.queries == second.queries
 
 
 THRESHOLDS = thresholds_from_pairs(((0.1, None), (0.2, None), (0.5, None)))
@@ -126,24 +115,21 @@ def evaluate_all(
 
 
 @pytest.mark.parametrize(("distance_m", "turn_deg"), [(10.0, 1.0), (3.0, 20.0), (50.0, 0.2)])
-def test_a_rotation_alone_costs_the_chord_it_cuts(distance_m: float, turn_deg: float) -> None:
+def test_a_rotation_costs_the_chord_it_cuts_and_a_shift_its_length(
+    distance_m: float, turn_deg: float
+) -> None:
     # right place, wrong heading: the reference is seen on a circle around the query
-    truth = {"q.png": pose_at([distance_m, 0.0, 0.0])}
-    estimated = {"q.png": pose_at([distance_m, 0.0, 0.0], turn_deg)}
-    references = {"ref/0.png": pose_at([0.0, 0.0, 0.0], 33.0)}
-    found = evaluate_all(estimated, truth, references, pairs_of(["q.png"]))
+    at, turned = [distance_m, 0.0, 0.0], pose_at([distance_m, 0.0, 0.0], turn_deg)
+    references, pairs = {"ref/0.png": pose_at([0.0, 0.0, 0.0], 33.0)}, pairs_of(["q.png"])
+    found = evaluate_all({"q.png": turned}, {"q.png": pose_at(at)}, references, pairs)
     chord = 2 * distance_m * np.sin(np.deg2rad(turn_deg) / 2)
     assert found.errors.position_m[0] == pytest.approx(chord, rel=1e-12)
     assert found.by_center.errors.position_m[0] == pytest.approx(0.0, abs=1e-12)
     assert found.errors.angle_deg[0] == pytest.approx(turn_deg)
-
-
-def test_a_shift_alone_is_the_distance_of_the_centers() -> None:
-    truth = {"q.png": pose_at([4.0, 1.0, 2.0], 50.0)}
-    estimated = {"q.png": pose_at([4.1, 1.0, 2.2], 50.0)}
-    found = evaluate_all(estimated, truth, {"ref/0.png": pose_at([9.0, 0, 0])}, pairs_of(["q.png"]))
-    assert found.errors.position_m[0] == pytest.approx(np.hypot(0.1, 0.2))
-    assert found.by_center.errors.position_m[0] == pytest.approx(np.hypot(0.1, 0.2))
+    shifted = {"q.png": pose_at([distance_m + 0.1, 0.0, 0.2], turn_deg)}
+    found = evaluate_all(shifted, {"q.png": turned}, references, pairs)
+    for errors in (found.errors, found.by_center.errors):
+        assert errors.position_m[0] == pytest.approx(np.hypot(0.1, 0.2))
 
 
 def test_equal_to_matrices() -> None:
@@ -181,13 +167,9 @@ def test_pairs_count_and_files_are_conditions() -> None:
     }
     references = {"r0.png": pose_at([0.0, 0.0, 5.0]), "r1.png": pose_at([0.0, 5.0, 0.0])}
     first, second = "reloc_town_1_to_town_2.txt", "reloc_park_1_to_park_2.txt"
-    pairs = [
-        RelocalizationPair(first, "r0.png", "q0.png"),
-        RelocalizationPair(first, "r1.png", "q0.png"),
-        RelocalizationPair(second, "r0.png", "q1.png"),
-        RelocalizationPair(second, "r0.png", "q3.png"),
-        RelocalizationPair(second, "r1.png", "unknown.png"),
-    ]
+    asked = [(first, "r0", "q0"), (first, "r1", "q0"), (second, "r0", "q1"), (second, "r0", "q3")]
+    asked += [(second, "r1", "unknown")]
+    pairs = [RelocalizationPair(file, f"{r}.png", f"{q}.png") for file, r, q in asked]
     found = evaluate_pairs(
         {pair: estimated[pair.query] for pair in pairs if pair.query in estimated},
         truth,
@@ -225,39 +207,34 @@ def test_what_cannot_be_right_is_refused() -> None:
 def challenge(tmp_path: Path, kaptures: Callable[..., Path]) -> tuple[Path, Path]:
     """A workspace with two relocalization files, one query of six without a pose; a result."""
     rng = np.random.default_rng(4)
-    workspace = tmp_path / "workspace"
+    workspace, files, tables = tmp_path / "workspace", tmp_path / "submission", []
+    reference_of = {"b": "a/100.png", "c": "a/200.png"}
     references = {f"a/{i}.png": pose_at([i, 0.0, 0.0], 10.0 * i) for i in (100, 200)}
-    truth = {f"b/{i}.png": pose_at([i + 1.0, 0.5, 2.0], 5.0 * i) for i in (103, 104, 105)}
-    truth |= {f"c/{i}.png": pose_at([i + 1.0, 0.5, 2.0], 5.0 * i) for i in (206, 207, 208)}
+    names = [f"b/{i}.png" for i in (103, 104, 105)] + [f"c/{i}.png" for i in (206, 207, 208)]
+    truth = {n: pose_at([int(n[2:5]) + 1.0, 0.5, 2.0], 5.0 * int(n[2:5])) for n in names}
     estimated = {
         name: pose_at((pose.center() + rng.normal(size=3) * 0.1).tolist(), 5.0 * int(name[2:5]) + 1)
         for name, pose in list(truth.items())[:-1]
     }
     kaptures(workspace / "mapping", list(references), references)
-    kaptures(workspace / "query_gt", list(truth), truth)
-    kaptures(workspace / "localized", list(truth), estimated)
-    tables = workspace / "megloc"
-    write_protocol(tables, protocol_of("4seasons"))
-    write_relocalization(
-        tables,
-        [
-            RelocalizationPair(
-                f"reloc_{name[0]}.txt", "a/100.png" if name[0] == "b" else "a/200.png", name
-            )
-            for name in truth
-        ],
-    )
-    files = tmp_path / "submission"
-    for letter, reference in (("b", "a/100.png"), ("c", "a/200.png")):
+    kaptures(workspace / "query_gt", names, truth)
+    kaptures(workspace / "localized", names, estimated)
+    write_protocol(workspace / "megloc", protocol_of("4seasons"))
+    files.mkdir()
+    for letter, reference in reference_of.items():
+        own = [name for name in names if name[0] == letter]
+        tables += [RelocalizationPair(f"reloc_{letter}.txt", reference, name) for name in own]
         rows = [
             RelativePose(
-                int(reference[2:5]), int(name[2:5]), relative_pose(pose, references[reference])
+                int(reference[2:5]),
+                int(name[2:5]),
+                relative_pose(estimated[name], references[reference]),
             )
-            for name, pose in estimated.items()
-            if name[0] == letter
+            for name in own
+            if name in estimated
         ]
-        files.mkdir(exist_ok=True)
         (files / f"reloc_{letter}.txt").write_text(format_mlad_file(rows))
+    write_relocalization(workspace / "megloc", tables)
     return workspace, files
 
 
@@ -303,32 +280,25 @@ def test_both_errors_are_told_everywhere(challenge: tuple[Path, Path], tmp_path:
     assert '"rows_by_center"' in paths["recall.json"].read_text()
 
 
-def test_bad_pose_files_are_named(challenge: tuple[Path, Path], tmp_path: Path) -> None:
+def test_bad_pose_files_are_named(
+    challenge: tuple[Path, Path], tmp_path: Path, kaptures: Callable[..., Path]
+) -> None:
     workspace, files = challenge
     rules = benchmark_of(workspace / "megloc")
 
-    def evaluate(source: Path) -> None:
-        evaluate_results([source], workspace / "query_gt", rules, mapping=workspace / "mapping")
+    def assert_refused(source: Path, words: str, **options: Path) -> None:
+        with pytest.raises(DataError, match=words):
+            evaluate_results([source], workspace / "query_gt", rules, **options)
 
+    there = {"mapping": workspace / "mapping"}
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match=r"neither a kapture folder .*reloc_b\.txt"):
-        evaluate(tmp_path / "empty")
-    strange = tmp_path / "poses.txt"
+    assert_refused(tmp_path / "empty", r"neither a kapture folder .*reloc_b\.txt", **there)
+    strange, known = tmp_path / "poses.txt", files / "reloc_b.txt"
     strange.write_text("100 103 0 0 0 0 0 0 1\n")
-    with pytest.raises(DataError, match=r"call it as that one: reloc_b\.txt, reloc_c\.txt"):
-        evaluate(strange)
-    (files / "reloc_b.txt").write_text("100 999 0 0 0 0 0 0 1\n")
-    with pytest.raises(DataError, match="pair 100 999 is not asked for"):
-        evaluate(files)
-    (files / "reloc_b.txt").write_text("100 103\n")
-    with pytest.raises(DataError, match="pairs without poses"):
-        evaluate(files)
-
-
-def test_without_a_map_the_option_is_named(
-    challenge: tuple[Path, Path], tmp_path: Path, kaptures: Callable[..., Path]
-) -> None:
-    workspace, _ = challenge
-    elsewhere = kaptures(tmp_path / "elsewhere", ["b/103.png"], {})
-    with pytest.raises(DataError, match="6 pairs .* --map"):
-        evaluate_results([elsewhere], workspace / "query_gt", benchmark_of(workspace / "megloc"))
+    assert_refused(strange, r"call it as that one: reloc_b\.txt, reloc_c\.txt", **there)
+    known.write_text("100 999 0 0 0 0 0 0 1\n")
+    assert_refused(files, "pair 100 999 is not asked for", **there)
+    known.write_text("100 103\n")
+    assert_refused(files, "pairs without poses", **there)
+    # without a map the option is named
+    assert_refused(kaptures(tmp_path / "elsewhere", ["b/103.png"], {}), "6 pairs .* --map")

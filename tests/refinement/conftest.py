@@ -1,8 +1,9 @@
-"""Points whose values are what a query shows, for the tests of photometric alignment."""
+"""Points whose values are what a query shows, and scenes in memory."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import bearing_rays
+from megloc_kapture.plugins import DepthView
 from megloc_kapture.refinement.photometric import LevelProblem
 from megloc_kapture.refinement.pyramid import ChosenPoints, Level
 from megloc_kapture.values import Camera, RigidTransform
@@ -75,6 +77,49 @@ def made_problem(
     level = Level(query, np.ones((HEIGHT, WIDTH), bool), scale, scale)
     chosen = ChosenPoints(points, values, groups)
     return LevelProblem(chosen, level, camera, pose), pose
+
+
+@dataclass
+class Scene:
+    """A map and its queries by image; what is not given is not there."""
+
+    poses: dict[str, RigidTransform]
+    cameras: dict[str, Camera]
+    depths: dict[str, DepthView] = field(default_factory=dict)
+    images: dict[str, NDArray[np.uint8]] = field(default_factory=dict)
+    masks: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    asked: list[str] = field(default_factory=list)
+
+    def query_image(self, name: str) -> NDArray[np.uint8]:
+        return self.images[name]
+
+    def map_image(self, name: str) -> NDArray[np.uint8]:
+        self.asked.append(name)
+        return self.images[name]
+
+    def map_mask(self, name: str) -> NDArray[np.bool_] | None:
+        return self.masks.get(name)
+
+    def map_depth(self, name: str) -> DepthView | None:
+        return self.depths.get(name)
+
+    def map_points(self, name: str) -> Array:
+        return self.points
+
+    def map_camera(self, name: str) -> Camera:
+        return self.cameras[name]
+
+    def map_pose(self, name: str) -> RigidTransform:
+        return self.poses[name]
+
+    query_mask, query_depth = map_mask, map_depth
+
+
+@pytest.fixture(scope="session")
+def new_scene() -> Callable[..., Scene]:
+    """Makes scenes; no pixels are needed by what looks at depth alone."""
+    return Scene
 
 
 @pytest.fixture(scope="session")

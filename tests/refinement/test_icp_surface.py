@@ -32,13 +32,22 @@ SMALL_CAMERA = Camera("PINHOLE", 9, 7, (8.0, 9.0, 4.2, 3.6))
 IMAGE_FROM_DEPTH = RigidTransform.from_matrix(
     Rotation.from_euler("xyz", [0.02, -0.05, 0.01]).as_matrix(), np.array([0.03, -0.01, 0.02])
 )
-CAMERA = Camera("PINHOLE", 64, 48, (60.0, 60.0, 32.0, 24.0))
 
 
-def walls(seed: int, count: int) -> np.ndarray:
-    points = np.random.default_rng(seed).uniform(0.0, 2.0, (count, 3))
-    points[np.arange(count), np.arange(count) % 3] = 0.0
-    return points
+def corner(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points on three walls, and the walls' normals."""
+    points = rng.uniform(0.1, 2.0, (count, 3))
+    walls = np.arange(count) % 3
+    points[np.arange(count), walls] = 0.0
+    return points, np.eye(3)[walls]
+
+
+def corner_surface(seed: int, count: int = 60000) -> Surface:
+    return surface_of(downsample(corner(np.random.default_rng(seed), count)[0], 0.05))
+
+
+def fit_of(points: np.ndarray, normals: np.ndarray) -> SurfaceFit:
+    return SurfaceFit(1.0, 1.0, 0.0, points, normals, np.zeros(len(points)))
 
 
 def test_thinned_points_are_means_of_voxels() -> None:
@@ -56,9 +65,8 @@ def test_thinned_points_are_means_of_voxels() -> None:
 
 
 def test_normals_are_the_least_varying_directions() -> None:
-    points = downsample(walls(1, 20000) + 0.002 * np.random.default_rng(1).standard_normal(3), 0.05)
-    surface = surface_of(points)
-    np.testing.assert_array_equal(surface.points, points)
+    surface = corner_surface(1, 20000)
+    points = surface.points
     _, rows = cKDTree(points).query(points, NORMAL_NEIGHBOURS)
     around = points[rows] - points[rows].mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
@@ -69,8 +77,9 @@ def test_normals_are_the_least_varying_directions() -> None:
 
 
 def test_nearest_and_spacing() -> None:
-    points = downsample(walls(2, 20000), 0.05)
+    points = downsample(corner(np.random.default_rng(2), 20000)[0], 0.05)
     surface, tree = surface_of(points), cKDTree(points)
+    np.testing.assert_array_equal(surface.points, points)
     asked = np.random.default_rng(2).uniform(-0.5, 2.5, (300, 3))
     expected, expected_rows = tree.query(asked)
     rows, distances = surface.nearest(asked)
@@ -81,26 +90,13 @@ def test_nearest_and_spacing() -> None:
 
 
 def test_a_corner_is_found_again() -> None:
-    surface = surface_of(downsample(walls(3, 60000), 0.05))
-    points = downsample(walls(4, 6000), 0.1)
+    surface = corner_surface(3)
+    points = downsample(corner(np.random.default_rng(4), 6000)[0], 0.1)
     turn = Rotation.from_rotvec(np.radians([2.0, -1.5, 1.0])).as_matrix()
     start = RigidTransform.from_matrix(turn, np.array([0.03, -0.02, 0.04]))
     found = fit_to_surface(surface, points, start, 0.3)
-    assert found is not None
     assert np.linalg.norm(found.translation) < 2e-3
     assert np.degrees(Rotation.from_matrix(found.rotation_matrix()).magnitude()) < 0.1
-
-
-def fit_of(points: np.ndarray, normals: np.ndarray) -> SurfaceFit:
-    return SurfaceFit(1.0, 1.0, 0.0, points, normals, np.zeros(len(points)))
-
-
-def corner(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points on three walls, and the walls' normals."""
-    points = rng.uniform(0.1, 2.0, (count, 3))
-    walls = np.arange(count) % 3
-    points[np.arange(count), walls] = 0.0
-    return points, np.eye(3)[walls]
 
 
 def directions(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -140,8 +136,7 @@ def test_the_condition_of_a_cube() -> None:
 
 
 def test_the_fit_is_that_of_the_nearest_planes() -> None:
-    rng = np.random.default_rng(1)
-    surface = surface_of(downsample(corner(rng, 20000)[0], 0.05))
+    rng, surface = np.random.default_rng(1), corner_surface(1, 20000)
     points = rng.uniform(-0.2, 1.0, (400, 3))
     turn = Rotation.from_rotvec([0.1, 0.2, -0.1]).as_matrix()
     surface_from_points = RigidTransform.from_matrix(turn, np.array([0.05, 0.0, -0.05]))
@@ -155,22 +150,19 @@ def test_the_fit_is_that_of_the_nearest_planes() -> None:
     assert fit.residual_m == pytest.approx(np.median(np.abs(residuals[distances <= 0.3])))
     np.testing.assert_allclose(fit.residuals_m, residuals[distances <= 0.1])
     np.testing.assert_allclose(fit.points, points[distances <= 0.1])
-    np.testing.assert_allclose(
-        fit.normals @ turn.T, surface.normals[rows[distances <= 0.1]], atol=1e-12
-    )
-
-
-def test_no_overlap_where_nothing_is_near() -> None:
-    surface = surface_of(downsample(corner(np.random.default_rng(0), 5000)[0], 0.05))
+    normals = surface.normals[rows[distances <= 0.1]]
+    np.testing.assert_allclose(fit.normals @ turn.T, normals, atol=1e-12)
+    # no overlap and no transform where nothing is near
     far = RigidTransform((1.0, 0.0, 0.0, 0.0), (50.0, 0.0, 0.0))
     fit = surface_fit(surface, np.zeros((30, 3)), far, near_m=0.1, far_m=0.3)
     assert (fit.overlap, fit.reach, fit.residual_m) == (0.0, 0.0, np.inf)
+    assert fit_weighted(surface, points, np.ones(400), far, 0.1) is None
+    assert fit_to_surface(surface, points, far, 0.1) is None
 
 
 def test_the_covariance_is_that_of_many_trials() -> None:
     """Left perturbation of ``cam_from_world``, the camera two metres away from the corner."""
-    rng = np.random.default_rng(2)
-    surface = surface_of(downsample(corner(rng, 60000)[0], 0.05))
+    rng, surface = np.random.default_rng(2), corner_surface(2)
     truth = RigidTransform.from_matrix(
         Rotation.from_euler("xyz", [0.4, -0.3, 0.2]).as_matrix(), np.array([0.3, -0.4, 2.0])
     )
@@ -179,7 +171,6 @@ def test_the_covariance_is_that_of_many_trials() -> None:
         world, normals = corner(rng, 600)
         seen = truth.apply(world + 0.01 * rng.standard_normal((600, 1)) * normals)
         found = fit_weighted(surface, seen, np.ones(600), truth.inverse(), 0.2)
-        assert found is not None
         delta = found.inverse() @ truth.inverse()
         turn = Rotation.from_matrix(delta.rotation_matrix()).as_rotvec()
         errors.append([*turn, *delta.translation])
@@ -194,11 +185,10 @@ def test_the_covariance_is_that_of_many_trials() -> None:
 
 @pytest.fixture(scope="module")
 def surface() -> Surface:
-    return surface_of(downsample(corner(np.random.default_rng(0), 60000)[0], 0.05))
+    return corner_surface(0)
 
 
 def moved_and_turned(found: RigidTransform | None) -> tuple[float, float]:
-    assert found is not None
     turn = Rotation.from_matrix(found.rotation_matrix()).magnitude()
     # of the points' middle: what the origin does depends on the turn
     middle = np.ones((1, 3))
@@ -234,27 +224,13 @@ def test_noise_weighs(surface: Surface) -> None:
     noise = np.where(rng.random(3000) < 0.5, 0.02, 0.002)
     points = corner(rng, 3000)[0] + noise[:, None] * rng.standard_normal((3000, 3))
     points[noise > 0.01] += 0.01
-    weighted = moved_and_turned(fit_weighted(surface, points, noise, IDENTITY, 0.2))[0]
+    found = fit_weighted(surface, points, noise, IDENTITY, 0.2)
     alike = moved_and_turned(fit_weighted(surface, points, np.ones(3000), IDENTITY, 0.2))[0]
-    assert weighted < 0.001
-    assert alike > 2 * weighted
-
-
-def test_the_scale_of_the_noise_does_not_matter(surface: Surface) -> None:
-    rng = np.random.default_rng(3)
-    points = corner(rng, 1000)[0] + 0.005 * rng.standard_normal((1000, 3))
-    noise = rng.uniform(0.5, 2.0, 1000)
-    first = fit_weighted(surface, points, noise, IDENTITY, 0.1)
-    second = fit_weighted(surface, points, 64.0 * noise, IDENTITY, 0.1)
-    assert first is not None and second is not None
-    np.testing.assert_allclose(first.translation, second.translation, atol=1e-12)
-
-
-def test_no_transform_where_nothing_is_near(surface: Surface) -> None:
-    far = RigidTransform((1.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0))
-    points = corner(np.random.default_rng(0), 100)[0]
-    assert fit_weighted(surface, points, np.ones(100), far, 0.1) is None
-    assert fit_to_surface(surface, points, far, 0.1) is None
+    assert moved_and_turned(found)[0] < 0.001
+    assert alike > 2 * moved_and_turned(found)[0]
+    # its scale does not matter
+    scaled = fit_weighted(surface, points, 64.0 * noise, IDENTITY, 0.2)
+    np.testing.assert_allclose(found.translation, scaled.translation, atol=1e-12)
 
 
 def pixel_by_pixel(depth: np.ndarray, options: DepthCloudOptions, step_px: int) -> np.ndarray:
@@ -295,20 +271,20 @@ def test_every_pixel(seed: int, step_px: int, max_depth_m: float, spread: float)
     np.testing.assert_allclose(points, pixel_by_pixel(depth, options, step_px), atol=1e-9)
 
 
-def test_an_infinite_depth_is_none() -> None:
-    depth = np.full((7, 9), np.inf, np.float32)
-    view = DepthView(SMALL_CAMERA, depth, RigidTransform.identity())
-    assert depth_cloud(view, DepthCloudOptions(max_depth_m=1e9)).shape == (0, 3)
-
-
 def test_pixels_beside_a_step_go_and_those_beside_a_hole_stay() -> None:
     depth = np.full((7, 9), 1.0, np.float32)
     depth[:, 5:] = 2.0
     depth[:, 1] = 0.0
-    view = DepthView(SMALL_CAMERA, depth, RigidTransform.identity())
+    view = DepthView(SMALL_CAMERA, depth, IDENTITY)
     kept = depth_cloud(view)
     columns = np.floor(kept[:, 0] / kept[:, 2] * 8.0 + 4.2).astype(int)
     assert sorted(set(columns.tolist())) == [0, 2, 3, 6, 7, 8]
+    # an infinite depth is none
+    infinite = DepthView(SMALL_CAMERA, np.full((7, 9), np.inf, np.float32), IDENTITY)
+    assert depth_cloud(infinite, DepthCloudOptions(max_depth_m=1e9)).shape == (0, 3)
+    for wrong in ({"max_depth_m": 0.0}, {"max_jump": 0.0}):
+        with pytest.raises(ValidationError):
+            DepthCloudOptions.model_validate(wrong)
 
 
 def test_a_slanted_plane_is_no_edge() -> None:
@@ -316,7 +292,7 @@ def test_a_slanted_plane_is_no_edge() -> None:
     camera = Camera("PINHOLE", 640, 480, (585.0, 585.0, 320.0, 240.0))
     x = (np.arange(640) + 0.5 - 320) / 585
     depth = np.tile((1.0 / (1.0 + np.tan(np.radians(80)) * (x + 0.1))), (480, 1))
-    view = DepthView(camera, depth.astype(np.float32), RigidTransform.identity())
+    view = DepthView(camera, depth.astype(np.float32), IDENTITY)
     in_range = (depth > 0) & (depth <= 1.5)
     assert len(depth_cloud(view, DepthCloudOptions(max_depth_m=1.5))) == in_range.sum()
 
@@ -335,9 +311,3 @@ def test_the_mask_is_the_images() -> None:
     outside = (u < 0) | (u >= 18) | (v < 0) | (v >= 14)
     np.testing.assert_array_equal(left, everything[outside | (u >= 6)])
     assert 0 < len(left) < len(everything)
-
-
-@pytest.mark.parametrize("wrong", [{"max_depth_m": 0.0}, {"max_jump": 0.0}])
-def test_options_that_cannot_be_used(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValidationError):
-        DepthCloudOptions.model_validate(wrong)

@@ -13,7 +13,6 @@ from megloc_kapture.plugins import DepthView
 from megloc_kapture.refinement.pyramid import (
     Appearance,
     DepthPoints,
-    Level,
     build_pyramid,
     choose_points,
     lift_points,
@@ -74,30 +73,24 @@ def test_what_a_mask_hides_enters_no_value(appearance: Appearance) -> None:
         np.testing.assert_array_equal(a.valid, b.valid)
     assert not first[0].valid[30:90, 50:120].any() and first[0].valid[:28].all()
     assert first[2].valid.any() and not first[2].valid.all()
-
-
-@pytest.mark.parametrize("appearance", APPEARANCES)
-def test_a_full_mask_changes_nothing(appearance: Appearance) -> None:
-    full = np.ones((150, 200), bool)
-    with_mask = build_pyramid(picture(), full, appearance=appearance)
-    for a, b in zip(with_mask, build_pyramid(picture(), appearance=appearance), strict=True):
+    # a full mask changes nothing
+    plain, full = (
+        build_pyramid(picture(), each, appearance=appearance) for each in (None, mask | True)
+    )
+    for a, b in zip(plain, full, strict=True):
         np.testing.assert_allclose(a.values, b.values, atol=1e-6)
 
 
-def test_colours_are_normalised_each_as_brightness_is() -> None:
+def test_colours_are_normalised_each_as_brightness_is_whatever_the_exposure() -> None:
     image = picture()
     found = build_pyramid(image, levels=2, appearance="colours")
     for channel in range(3):
         grey = build_pyramid(np.repeat(image[..., channel : channel + 1], 3, axis=2), levels=2)
         for a, b in zip(found, grey, strict=True):
             np.testing.assert_allclose(a.values[..., channel], b.values[..., 0], atol=1e-5)
-
-
-def test_normalised_values_do_not_depend_on_exposure() -> None:
     # grey, so that brightness is not rounded
-    grey = np.repeat(picture()[..., :1], 3, axis=2)
-    first, second = build_pyramid(grey), build_pyramid(grey * 2 + 10)
-    for a, b in zip(first, second, strict=True):
+    grey = np.repeat(image[..., :1], 3, axis=2)
+    for a, b in zip(build_pyramid(grey), build_pyramid(grey * 2 + 10), strict=True):
         np.testing.assert_allclose(a.values, b.values, atol=1e-4)
         assert 0.5 < a.values.std() < 1.5
 
@@ -136,12 +129,8 @@ def test_what_does_not_fit_is_refused() -> None:
         build_pyramid(picture(), features=lambda image: np.zeros((3, 4)))
     with pytest.raises(DataError, match="finite"):
         build_pyramid(picture(), features=lambda image: np.full((1, 40, 40), np.nan))
-
-
-def plane(camera: Camera, slope: float = 0.1, at: float = 3.0) -> NDArray[np.float32]:
-    """Depth of the plane z = at + slope x."""
-    x = (np.arange(camera.width) + 0.5 - 80.0) / 130.0
-    return np.broadcast_to(at / (1 - slope * x), (camera.height, camera.width)).astype(np.float32)
+    with pytest.raises(DataError, match="depth map"):
+        lift_points(CAMERA, HERE, DepthView(CAMERA, np.ones((10, 10), np.float32), HERE))
 
 
 def test_points_project_to_their_pixels() -> None:
@@ -157,7 +146,10 @@ def test_another_depth_camera_is_honoured() -> None:
     image_from_depth = RigidTransform.from_matrix(
         Rotation.from_rotvec([0.0, 0.05, 0.0]).as_matrix(), np.array([0.1, -0.02, 0.03])
     )
-    view = DepthView(DEPTH_CAMERA, plane(DEPTH_CAMERA), image_from_depth)
+    # of the plane z = 3 + 0.1 x
+    x = (np.arange(160) + 0.5 - 80.0) / 130.0
+    plane = np.broadcast_to(3.0 / (1 - 0.1 * x), (120, 160)).astype(np.float32)
+    view = DepthView(DEPTH_CAMERA, plane, image_from_depth)
     lifted = lift_points(CAMERA, POSE, view)
     points = (image_from_depth.inverse() @ POSE).apply(lifted.points)
     assert len(points) > 10_000
@@ -177,11 +169,6 @@ def test_edges_and_unknown_depths_give_no_points() -> None:
         assert not there[row, 30] and there[row + 3, 30]
 
 
-def test_a_depth_map_of_another_size_is_refused() -> None:
-    with pytest.raises(DataError, match="depth map"):
-        lift_points(CAMERA, HERE, DepthView(CAMERA, np.ones((10, 10), np.float32), HERE))
-
-
 def test_near_surfaces_hide_far_ones() -> None:
     far = lift_points(CAMERA, HERE, DepthView(CAMERA, np.full((240, 320), 6.0, np.float32), HERE))
     small = np.zeros((240, 320), np.float32)
@@ -198,22 +185,16 @@ def test_near_surfaces_hide_far_ones() -> None:
     # from behind, nothing is in front of the camera
     turned = RigidTransform((0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0))
     assert not visibility([far, near], CAMERA, turned).covered.any()
-
-
-def test_usable_cells_are_those_whose_middle_is_valid() -> None:
+    # cells are usable whose middle is valid
     valid = np.ones((240, 320), bool)
     valid[:, :100] = False
     usable = usable_cells(valid, (60, 80))
     assert not usable[:, :25].any() and usable[:, 25:].all()
 
 
-def level_of(seed: int) -> Level:
-    image = np.random.default_rng(seed).integers(0, 256, (240, 320, 3)).astype(np.uint8)
-    return build_pyramid(image, levels=1)[0]
-
-
 def test_the_strongest_of_each_cell_are_chosen() -> None:
-    levels = [level_of(0), level_of(1)]
+    noise = [np.random.default_rng(k).integers(0, 256, (240, 320, 3), np.uint8) for k in (0, 1)]
+    levels = [build_pyramid(each, levels=1)[0] for each in noise]
     depth = DepthView(CAMERA, np.full((240, 320), 4.0, np.float32), HERE)
     lifted = [lift_points(CAMERA, HERE, depth), lift_points(CAMERA, POSE, depth)]
     wanted = [np.ones(len(lifted[0].points), bool), lifted[1].px[:, 0] < 160]
@@ -229,13 +210,10 @@ def test_the_strongest_of_each_cell_are_chosen() -> None:
         rows_columns = np.round(px[:, ::-1] - 0.5).astype(int)
         blocks = energy[:, : 10 * columns].reshape(24, 10, columns, 10).max((1, 3))
         np.testing.assert_array_equal(energy[tuple(rows_columns.T)], blocks.ravel())
-        np.testing.assert_allclose(
-            chosen.values[ours], level.values[tuple(rows_columns.T)], atol=1e-5
-        )
+        expected = level.values[tuple(rows_columns.T)]
+        np.testing.assert_allclose(chosen.values[ours], expected, atol=1e-5)
     assert len(chosen.thinned(100).points) <= 100
-
-
-def test_a_flat_image_gives_no_points() -> None:
+    # a flat image gives no points
     flat = build_pyramid(np.full((240, 320, 3), 90, np.uint8), levels=1)[0]
-    lifted = DepthPoints(np.ones((4, 3)), np.full((4, 2), 20.5))
-    assert len(choose_points([lifted], [flat], [np.ones(4, bool)], 100).points) == 0
+    few = DepthPoints(np.ones((4, 3)), np.full((4, 2), 20.5))
+    assert len(choose_points([few], [flat], [np.ones(4, bool)], 100).points) == 0

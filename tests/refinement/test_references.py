@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -39,8 +40,8 @@ from megloc_kapture.values import Camera, RigidTransform
 SMALL_CAMERA = Camera("PINHOLE", 80, 60, (70.0, 70.0, 40.0, 30.0))
 HERE = RigidTransform.identity()
 KIND = PyramidKind(levels=2, max_side_px=640, appearance="intensity")
-Array = NDArray[np.float64]
 Map = Mapping[str, RenderingReference]
+Verdict = Callable[[Map], Consistency]
 
 CAMERA = Camera("PINHOLE", 240, 180, (195.0, 197.0, 120.0, 90.0))
 PX_PER_M = 60
@@ -71,6 +72,13 @@ def test_the_same_content_is_prepared_once() -> None:
     np.testing.assert_array_equal(first.pyramid[1].values, expected.pyramid[1].values)
     cache.clear()
     assert cache.prepared(reference(0), KIND) is not first
+    # those used longest ago go first
+    cache = ReferenceCache(int(2.5 * expected.nbytes))
+    first, second = (cache.prepared(reference(seed), KIND) for seed in (0, 1))
+    assert cache.prepared(reference(0), KIND) is first
+    cache.prepared(reference(2), KIND)
+    assert cache.prepared(reference(0), KIND) is first
+    assert cache.prepared(reference(1), KIND) is not second
 
 
 def test_any_other_content_is_prepared_anew() -> None:
@@ -95,35 +103,18 @@ def test_any_other_content_is_prepared_anew() -> None:
     found += [cache.prepared(one, replace(KIND, levels=1))]
     assert len({id(each) for each in (first, *found)}) == 9
     assert cache.prepared(one, KIND) is first
-
-
-def test_those_used_longest_ago_go_first() -> None:
-    size = prepare(reference(0), KIND).nbytes
-    cache = ReferenceCache(int(2.5 * size))
-    first, second = (cache.prepared(reference(seed), KIND) for seed in (0, 1))
-    assert cache.prepared(reference(0), KIND) is first
-    cache.prepared(reference(2), KIND)
-    assert cache.prepared(reference(0), KIND) is first
-    assert cache.prepared(reference(1), KIND) is not second
-
-
-def test_feature_maps_are_not_kept() -> None:
+    # feature maps are not kept
     calls = []
 
     def maps(image: NDArray[np.uint8]) -> NDArray[np.float32]:
         calls.append(image)
         return np.ones((2, 30, 40), np.float32)
 
-    cache = ReferenceCache(2**24)
     for _ in range(2):
-        cache.prepared(reference(0), replace(KIND, features=maps))
+        cache.prepared(one, replace(KIND, features=maps))
     assert len(calls) == 2
-
-
-def test_images_of_another_size_are_refused() -> None:
-    one = reference(0)
     with pytest.raises(DataError, match="does not fit a camera"):
-        ReferenceCache(2**24).prepared(replace(one, image=one.image[:50]), KIND)
+        cache.prepared(replace(one, image=one.image[:50]), KIND)
 
 
 def texture(width: int, height: int, seed: int) -> NDArray[np.uint8]:
@@ -187,49 +178,48 @@ def corner() -> Map:
     return drawn(CAMERA)
 
 
-@pytest.fixture(scope="module")
-def exact(corner: Map) -> Consistency:
-    return verdict(corner)
-
-
-class Scene:
+def scene_of(images: Map, new_scene: Callable[..., Any]) -> Any:
     """A map of images in memory; nothing of queries."""
-
-    def __init__(self, images: Map) -> None:
-        self.images = images
-
-    def map_image(self, name: str) -> NDArray[np.uint8]:
-        return self.images[name].image
-
-    def map_mask(self, name: str) -> None:
-        return None
-
-    def map_depth(self, name: str) -> DepthView | None:
-        depth = self.images[name].depth
-        return depth if depth.depth_m.any() else None
-
-    def map_camera(self, name: str) -> Camera:
-        return self.images[name].camera
-
-    def map_pose(self, name: str) -> RigidTransform:
-        return self.images[name].cam_from_world
-
-
-def verdict(images: Map) -> Consistency:
-    rendering = Rendering(QUICK)
-    assert isinstance(rendering, HoldsOut)
-    poses = ReferenceImages({name: each.cam_from_world for name, each in images.items()})
-    scene = Scene(images)
-    return judge_consistency(
-        rendering.hold_out(name, poses, scene) for name in spread_names(list(images))
+    return new_scene(
+        {name: each.cam_from_world for name, each in images.items()},
+        {name: each.camera for name, each in images.items()},
+        {name: each.depth for name, each in images.items() if each.depth.depth_m.any()},
+        {name: each.image for name, each in images.items()},
     )
 
 
+@pytest.fixture(scope="module")
+def verdict(new_scene: Callable[..., Any]) -> Verdict:
+    """Judges a map by its images."""
+
+    def judge(images: Map) -> Consistency:
+        rendering, scene = Rendering(QUICK), scene_of(images, new_scene)
+        assert isinstance(rendering, HoldsOut)
+        poses = ReferenceImages(scene.poses)
+        return judge_consistency(
+            rendering.hold_out(name, poses, scene) for name in spread_names(list(images))
+        )
+
+    return judge
+
+
+@pytest.fixture(scope="module")
+def exact(corner: Map, verdict: Verdict) -> Consistency:
+    return verdict(corner)
+
+
+def changed(images: Map, change: Callable[[int, RenderingReference], dict[str, Any]]) -> Map:
+    """Every image with the fields that ``change`` gives for its number."""
+    return {n: replace(each, **change(k, each)) for k, (n, each) in enumerate(images.items())}
+
+
 def posed(images: Map, change: Callable[[int, RigidTransform], RigidTransform]) -> Map:
-    return {
-        name: replace(each, cam_from_world=change(k, each.cam_from_world))
-        for k, (name, each) in enumerate(images.items())
-    }
+    return changed(images, lambda k, each: {"cam_from_world": change(k, each.cam_from_world)})
+
+
+def with_depth(images: Map, change: Callable[[DepthView], dict[str, Any]]) -> Map:
+    """Every image with these fields of its depth changed."""
+    return changed(images, lambda _, each: {"depth": replace(each.depth, **change(each.depth))})
 
 
 def displaced(pose: RigidTransform, seed: int, m: float, deg: float) -> RigidTransform:
@@ -243,7 +233,6 @@ def displaced(pose: RigidTransform, seed: int, m: float, deg: float) -> RigidTra
 
 def test_an_exact_map_is_consistent(exact: Consistency) -> None:
     assert exact.consistent and exact.images == len(POSES)
-    assert exact.median is not None
     assert exact.median.moved_m < 0.005 and exact.median.turned_deg < 0.08
 
 
@@ -251,44 +240,37 @@ def test_an_exact_map_is_consistent(exact: Consistency) -> None:
     ("m", "deg"),
     [(0.02, 0.5), pytest.param(0.02, 0.0, marks=SLOW), pytest.param(0.0, 0.5, marks=SLOW)],
 )
-def test_poses_that_are_off_contradict_each_other(corner: Map, m: float, deg: float) -> None:
+def test_poses_that_are_off_contradict_each_other(
+    corner: Map, verdict: Verdict, m: float, deg: float
+) -> None:
     found = verdict(posed(corner, lambda k, each: displaced(each, k, m, deg)))
     assert "contradicts itself" in found.reason
-    assert found.median is not None
     assert found.median.moved_m > 0.5 * m and found.median.turned_deg > 0.5 * deg
 
 
 @pytest.mark.parametrize("shift_px", [7, pytest.param(-7, marks=SLOW)])
 def test_depth_that_is_shifted_against_colour_shows_between_views(
-    corner: Map, shift_px: int
+    corner: Map, verdict: Verdict, shift_px: int
 ) -> None:
-    shifted = {
-        name: replace(
-            each, depth=replace(each.depth, depth_m=np.roll(each.depth.depth_m, shift_px, axis=1))
-        )
-        for name, each in corner.items()
-    }
+    shifted = with_depth(corner, lambda view: {"depth_m": np.roll(view.depth_m, shift_px, axis=1)})
     assert "contradicts itself" in verdict(shifted).reason
 
 
 @SLOW
 def test_a_depth_camera_that_stands_elsewhere_than_said_shows_between_views(
-    corner: Map, exact: Consistency
+    corner: Map, exact: Consistency, verdict: Verdict
 ) -> None:
     beside = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.025, 0.0, 0.0))
-    off = {
-        name: replace(each, depth=replace(each.depth, image_from_depth=beside))
-        for name, each in corner.items()
-    }
     # that all images are off by as much and look nearly the same way hides most of it
-    found = verdict(off)
-    assert found.median is not None and exact.median is not None
+    found = verdict(with_depth(corner, lambda view: {"image_from_depth": beside}))
     assert found.median.squared_distance > 2.0 * exact.median.squared_distance
 
 
 @SLOW
 @pytest.mark.parametrize(("scale", "off_deg"), [(0.1, 0.0), (0.1, 0.5), (12.0, 0.0), (12.0, 0.5)])
-def test_neither_unit_nor_frame_matters(corner: Map, scale: float, off_deg: float) -> None:
+def test_neither_unit_nor_frame_matters(
+    corner: Map, verdict: Verdict, scale: float, off_deg: float
+) -> None:
     elsewhere = pose((30.0, -20.0, 5.0), 40, 20)
 
     def change(k: int, each: RigidTransform) -> RigidTransform:
@@ -297,17 +279,13 @@ def test_neither_unit_nor_frame_matters(corner: Map, scale: float, off_deg: floa
             moved.rotation_matrix(), scale * np.array(moved.translation)
         )
 
-    other = {
-        name: replace(
-            each, depth=replace(each.depth, depth_m=np.float32(scale) * each.depth.depth_m)
-        )
-        for name, each in posed(corner, change).items()
-    }
+    moved = posed(corner, change)
+    other = with_depth(moved, lambda view: {"depth_m": np.float32(scale) * view.depth_m})
     assert verdict(other).consistent == (off_deg == 0.0)
 
 
 @SLOW
-def test_the_size_of_images_does_not_matter() -> None:
+def test_the_size_of_images_does_not_matter(verdict: Verdict) -> None:
     large = drawn(Camera("PINHOLE", 720, 540, tuple(3.0 * x for x in CAMERA.params)))
     assert verdict(large).consistent
     noisy = posed(large, lambda k, each: displaced(each, k, 0.02, 0.5))
@@ -315,7 +293,7 @@ def test_the_size_of_images_does_not_matter() -> None:
 
 
 @SLOW
-def test_images_that_share_a_displacement_do_not_vouch_for_each_other() -> None:
+def test_images_that_share_a_displacement_do_not_vouch_for_each_other(verdict: Verdict) -> None:
     # two scans of three views each, a centimetre apart
     centers = [(-0.6, 0.0, 0.0), (0.4, 0.1, 0.2)]
     scans = {
@@ -331,7 +309,8 @@ def test_images_that_share_a_displacement_do_not_vouch_for_each_other() -> None:
     assert "6 of 6" in verdict(off).reason
 
 
-def test_images_of_one_position_say_nothing_of_each_other(corner: Map) -> None:
+def test_images_that_say_nothing_of_each_other(corner: Map, verdict: Verdict) -> None:
+    # of one position
     rotations = [each.rotation_matrix() for each in POSES]
     center = POSES[2].center()
     there = {
@@ -340,18 +319,12 @@ def test_images_of_one_position_say_nothing_of_each_other(corner: Map) -> None:
     }
     found = verdict(there)
     assert found.images == 0 and "seen by others from elsewhere" in found.reason
-
-
-def test_a_map_without_depth_is_not_known(corner: Map) -> None:
-    flat = {
-        name: replace(each, depth=replace(each.depth, depth_m=np.zeros_like(each.depth.depth_m)))
-        for name, each in corner.items()
-    }
-    found = verdict(flat)
+    # and without depth
+    found = verdict(with_depth(corner, lambda view: {"depth_m": np.zeros_like(view.depth_m)}))
     assert found == Consistency(0, 0, None, found.reason) and "depth" in found.reason
 
 
-def test_what_a_wall_hides_is_no_reference(corner: Map) -> None:
+def test_what_a_wall_hides_is_no_reference(corner: Map, new_scene: Callable[..., Any]) -> None:
     # two rooms back to back: what looks the same way from behind the wall sees nothing of it
     behind = {
         f"behind-{k}.png": view(
@@ -359,24 +332,17 @@ def test_what_a_wall_hides_is_no_reference(corner: Map) -> None:
         )
         for k in range(3)
     }
-    shifted = {  # the same pictures and depths, said to be 6 m further on
-        name: replace(
-            each,
-            cam_from_world=RigidTransform(
-                each.cam_from_world.quat_wxyz,
-                tuple(np.array(each.cam_from_world.translation) - (0.0, 0.0, 6.0)),
-            ),
-        )
-        for name, each in behind.items()
-    }
-    images = {"0.png": corner["0.png"], **shifted}
-    poses = ReferenceImages({name: each.cam_from_world for name, each in images.items()})
+    # the same pictures and depths, said to be 6 m further on
+    onwards = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -6.0))
+    shifted = posed(behind, lambda _, each: onwards @ each)
+    scene = scene_of({"0.png": corner["0.png"], **shifted}, new_scene)
     asked: list[int] = []
 
     def displace(query: object, references: object, given: object) -> None:
         asked.append(len(references))  # type: ignore[arg-type]
 
-    assert refine_held_out("0.png", poses, Scene(images), displace, max_references=4) is None
+    poses = ReferenceImages(scene.poses)
+    assert refine_held_out("0.png", poses, scene, displace, max_references=4) is None
     assert not asked
 
 
@@ -390,25 +356,21 @@ def test_most_of_the_images_decide(wrong: list[bool]) -> None:
     found = judge_consistency(map(known, values))
     assert (found.images, found.contradicting) == (len(wrong), sum(wrong))
     assert found.consistent == (sum(wrong) <= len(wrong) / 2)
-    assert found.median is not None
     assert found.median.squared_distance == pytest.approx(np.median(values))
 
 
-def test_what_alignment_does_not_resolve_contradicts_nothing() -> None:
-    assert known(1e4, 0.06).contradicts and not known(1e4, 0.04).contradicts
-    assert not known(CHI2_OF_CHANCE, 100.0).contradicts
-
-
-def test_few_images_decide_nothing() -> None:
+def test_few_images_decide_nothing_and_no_more_are_asked_for_than_needed() -> None:
     few = judge_consistency([None, *[known(1.0)] * (MIN_TESTED - 1), None])
     assert "not known" in few.reason and few.images == MIN_TESTED - 1
     assert judge_consistency([None, *[known(1.0)] * MIN_TESTED]).consistent
-
-
-def test_no_more_is_asked_for_than_is_needed() -> None:
     asked = iter([known(1.0)] * 100)
     assert judge_consistency(asked).images == MAX_TESTED
     assert len(list(asked)) == 100 - MAX_TESTED
+    # what alignment does not resolve contradicts nothing
+    assert known(1e4, 0.06).contradicts and not known(1e4, 0.04).contradicts
+    assert not known(CHI2_OF_CHANCE, 100.0).contradicts
+    assert Rendering().require_consistent_map
+    assert not Rendering(RenderingOptions(require_consistent_map=False)).require_consistent_map
 
 
 @given(st.integers(0, 3000))
@@ -422,8 +384,3 @@ def test_a_sample_is_bounded_and_spread(count: int) -> None:
             ranks = sorted(int(name) for name in found[:first])
             gaps = np.diff([-1, *ranks, count])
             assert gaps.max() <= 4 * count / first + 1
-
-
-def test_it_can_be_switched_off() -> None:
-    assert Rendering().require_consistent_map
-    assert not Rendering(RenderingOptions(require_consistent_map=False)).require_consistent_map

@@ -15,66 +15,26 @@ from megloc_twins.options import SyntheticDataset, SyntheticWorldOptions
 from megloc_twins.robotcar import RobotCarTwin, RobotCarTwinOptions
 from megloc_twins.synthetic_kapture import SyntheticKapture
 
+SIZE = {"width": 160, "height": 120, "supersampling": 1}
+PLACES = {"num_places": 2, "day_queries": 2, "night_queries": 2}
+CITY = {**PLACES, "day_queries": 4, "additional_night_queries": 2, "sequence_images": 3}
+STREETS = {"num_locations": 2, "stops_per_location": 3, "moments_per_condition": 2}
+DRIVES = {"num_places": 2, "map_keyframes": 6, "winter_keyframes": 3, "dusk_keyframes": 2}
+CUTOUTS = {"cutout_width": 64, "cutout_height": 48, "query_width": 96, "query_height": 72}
 SMALL: dict[str, SyntheticDataset[Any]] = {
     "synthetic": SyntheticKapture(
-        SyntheticWorldOptions(
-            num_places=2,
-            stations_per_place=4,
-            day_queries=2,
-            night_queries=2,
-            width=160,
-            height=120,
-            supersampling=1,
-            depth=True,
-            masks=True,
-        )
+        SyntheticWorldOptions(**PLACES, **SIZE, stations_per_place=4, depth=True, masks=True)
     ),
     "aachen": AachenTwin(
-        AachenTwinOptions(
-            num_places=2,
-            stations_per_place=7,
-            sequence_images=3,
-            day_queries=4,
-            night_queries=2,
-            additional_night_queries=2,
-            width=160,
-            height=120,
-            supersampling=1,
-            points_per_image=60,
-        )
+        AachenTwinOptions(**CITY, **SIZE, stations_per_place=7, points_per_image=60)
     ),
     "robotcar": RobotCarTwin(
-        RobotCarTwinOptions(
-            num_locations=2,
-            stops_per_location=3,
-            moments_per_condition=2,
-            size_px=96,
-            supersampling=1,
-            points_per_image=40,
-        )
+        RobotCarTwinOptions(**STREETS, size_px=96, supersampling=1, points_per_image=40)
     ),
     "4seasons": FourSeasonsTwin(
-        FourSeasonsTwinOptions(
-            num_places=2,
-            map_keyframes=6,
-            winter_keyframes=3,
-            dusk_keyframes=2,
-            width=200,
-            height=100,
-            supersampling=1,
-        )
+        FourSeasonsTwinOptions(**DRIVES, width=200, height=100, supersampling=1)
     ),
-    "inloc": InLocTwin(
-        InLocTwinOptions(
-            modules=1,
-            queries=5,
-            cutout_width=64,
-            cutout_height=48,
-            query_width=96,
-            query_height=72,
-            supersampling=1,
-        )
-    ),
+    "inloc": InLocTwin(InLocTwinOptions(**CUTOUTS, modules=1, queries=5, supersampling=1)),
 }
 
 

@@ -8,7 +8,7 @@ import kapture
 import numpy as np
 import pytest
 from kapture.io.csv import kapture_from_dir
-from megloc_twins.aachen import AachenFrames, AachenTwin, AachenTwinOptions, build_aachen_frames
+from megloc_twins.aachen import AachenTwin, AachenTwinOptions, build_aachen_frames
 
 from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
 from megloc_kapture.datasets.official import write_official
@@ -49,30 +49,25 @@ def listed(path: Path) -> list[list[str]]:
     return [line.split() for line in path.read_text().split("\n")]
 
 
-def test_the_official_frame_is_far_from_the_origin(root: Path) -> None:
-    poses = KaptureFolder(root / "ground_truth/mapping").read().poses().values()
-    assert min(np.linalg.norm(pose.center()) for pose in poses) > 500
-    cameras = cameras_by_image(root / "ground_truth/mapping").values()
-    assert any(int(params[1]) < int(params[2]) for params in cameras)  # portraits
-
-
 def test_versions(imported: Path) -> None:
     mapping, query = cameras_by_image(imported / "mapping"), cameras_by_image(imported / "query")
     sensors = kapture_from_dir(str(imported / "mapping")).sensors
     num_added = sum(name.startswith("query/night/nexus5x_additional_night/") for name in query)
-    if imported.name == "1.0":
-        assert all(name.startswith("db/") for name in mapping)
-        assert len(mapping) == len(sensors) == NUM_DATABASE
-        assert (len(query), num_added) == (6, 0)
-    else:
-        in_sequences = sum(name.startswith("sequences/") for name in mapping)
-        assert in_sequences == NUM_SEQUENCE
-        # each sequence has one camera
-        assert len(sensors) == NUM_DATABASE + 2
-        assert (len(query), num_added) == (8, 2)
+    in_sequences = sum(name.startswith("sequences/") for name in mapping)
+    in_database = sum(name.startswith("db/") for name in mapping)
+    found = (in_database, in_sequences, len(mapping), len(sensors), len(query), num_added)
+    # each sequence has one camera
+    newer = (NUM_DATABASE, NUM_SEQUENCE, NUM_DATABASE + NUM_SEQUENCE, NUM_DATABASE + 2, 8, 2)
+    older = (NUM_DATABASE, 0, NUM_DATABASE, NUM_DATABASE, 6, 0)
+    assert found == (older if imported.name == "1.0" else newer)
 
 
 def test_colmap_reads_the_added_model(root: Path) -> None:
+    # the official frame is far from the origin
+    poses = KaptureFolder(root / "ground_truth/mapping").read().poses().values()
+    assert min(np.linalg.norm(pose.center()) for pose in poses) > 500
+    cameras = cameras_by_image(root / "ground_truth/mapping").values()
+    assert any(int(params[1]) < int(params[2]) for params in cameras)  # portraits
     model = pycolmap.Reconstruction(str(root / "3D-models/aachen_v_1_1"))
     assert model.num_reg_images() == NUM_DATABASE + NUM_SEQUENCE
     assert len(model.cameras) == NUM_DATABASE + 2
@@ -84,22 +79,18 @@ def test_colmap_reads_the_added_model(root: Path) -> None:
 
 def test_quirks_of_the_layout(root: Path) -> None:
     models, queries = root / "3D-models", root / "queries"
-    rows = [line.split() for line in (models / "aachen_cvpr2018_db.nvm").read_text().split("\n")]
+    rows = listed(models / "aachen_cvpr2018_db.nvm")
     rows = [row for row in rows if row and row[0].startswith("db/")]
     names = [row[0] for row in rows]
     # numbered without order, the model's order is its own, and so is that of the intrinsics
     numbers = [int(name[3:-4]) for name in names]
-    assert numbers != sorted(numbers)
-    assert max(numbers) > len(numbers)
+    assert numbers != sorted(numbers) and max(numbers) > len(numbers)
     assert (models / "aachen_cvpr2018_db.list.txt").read_text().split() == names
-    intrinsics = listed(models / "database_intrinsics.txt")
-    assert {row[0] for row in intrinsics if row} == set(names)
-    assert [row[0] for row in intrinsics if row] != names
     # the NVM's distortion has the other sign
-    k = {row[0]: float(row[-1]) for row in intrinsics if row}
+    k = {row[0]: float(row[-1]) for row in listed(models / "database_intrinsics.txt") if row}
+    assert set(k) == set(names) and list(k) != names
     assert [float(row[-2]) for row in rows] == [-k[name] for name in names]
     assert any(value != 0 for value in k.values())
-
     day, night = (
         listed(queries / f"{when}_time_queries_with_intrinsics.txt") for when in ("day", "night")
     )
@@ -110,18 +101,16 @@ def test_quirks_of_the_layout(root: Path) -> None:
     # the list without intrinsics has line ends
     text = (queries / "day_time_queries_without_intrinsics.txt").read_text()
     assert text == "".join(f"{row[0]}\n" for row in day)
-    on_disk = {
-        str(path.relative_to(root / "images_upright"))
-        for path in (root / "images_upright/query").rglob("*.jpg")
-    }
+    images = root / "images_upright"
+    on_disk = {str(path.relative_to(images)) for path in (images / "query").rglob("*.jpg")}
     in_lists = {row[0] for row in day + night}
-    assert in_lists < on_disk
-    assert len(on_disk - in_lists) == 2
+    assert in_lists < on_disk and len(on_disk - in_lists) == 2
     assert len({name.split("/")[-1] for name in on_disk}) == len(on_disk)
     assert sum("additional" in row[0] for row in night) == 2
 
 
 def test_version_10_alone(options: AachenTwinOptions, tmp_path: Path) -> None:
+    assert AachenTwinOptions(version=1.0).version == "1.0"  # type: ignore[arg-type]
     AachenTwin(options.model_copy(update=TINY | {"version": "1.0"})).write(tmp_path)
     assert sorted(path.name for path in (tmp_path / "3D-models").iterdir()) == [
         "aachen_cvpr2018_db.list.txt",
@@ -135,30 +124,20 @@ def test_version_10_alone(options: AachenTwinOptions, tmp_path: Path) -> None:
     assert dataset.remarks == []
 
 
-@pytest.fixture(scope="module")
-def frames(options: AachenTwinOptions) -> AachenFrames:
-    return build_aachen_frames(options)
-
-
-def test_every_image_is_there_once(frames: AachenFrames) -> None:
+def test_every_image_is_there_once(options: AachenTwinOptions) -> None:
+    frames = build_aachen_frames(options)
     everything = [*frames.mapping(), *frames.queries(), *frames.unlisted]
     assert len({frame.name for frame in everything}) == len(everything)
     assert not any(frame.bonnet for frame in everything)
-    assert {frame.condition for frame in frames.day} == {"day"}
-    assert {frame.condition for frame in frames.night + frames.additional_night} == {"night"}
-    assert (
-        {frame.place for frame in frames.day} == {frame.place for frame in frames.night} == {0, 1}
-    )
+    conditions = (frames.day, "day"), (frames.night, "night"), (frames.additional_night, "night")
+    for own, condition in conditions:
+        assert {frame.condition for frame in own} == {condition}
+    for own in (frames.day, frames.night):
+        assert {frame.place for frame in own} == {0, 1}
     # the digits the published lists have
     assert all(float(f"{p:.6g}") == p for frame in frames.day for p in frame.camera.params)
-
-
-def test_another_seed_is_another_world(options: AachenTwinOptions) -> None:
+    # another seed is another world
     tiny = options.model_copy(update=TINY)
     one, other = (build_aachen_frames(tiny.model_copy(update={"seed": seed})) for seed in (0, 1))
     assert [frame.name for frame in other.database] != [frame.name for frame in one.database]
     assert other.day[0].cam_from_world != one.day[0].cam_from_world
-
-
-def test_a_version_may_be_a_number() -> None:
-    assert AachenTwinOptions(version=1.0).version == "1.0"  # type: ignore[arg-type]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise, permutations
 from pathlib import Path
 
 import numpy as np
@@ -43,28 +44,17 @@ def true_poses(root: Path, part: str) -> dict[str, RigidTransform]:
     return KaptureFolder(root / "ground_truth" / part).read().poses()
 
 
-def assert_same(found: RigidTransform, expected: RigidTransform) -> None:
-    """To 1e-6 m and 1e-6 deg, by scipy."""
-    rotations = [Rotation.from_quat(p.quat_wxyz, scalar_first=True) for p in (found, expected)]
-    turn_deg = np.degrees((rotations[0] * rotations[1].inv()).magnitude())
-    assert turn_deg < 1e-6
-    centers = [
-        -rotation.inv().apply(pose.translation)
-        for rotation, pose in zip(rotations, (found, expected), strict=True)
-    ]
-    assert np.linalg.norm(centers[0] - centers[1]) < 1e-6
-
-
-def test_the_map_is_recentred(root: Path, dataset: OfficialDataset) -> None:
+def test_what_it_asks_for(root: Path, dataset: OfficialDataset) -> None:
+    assert not dataset.missing.files and not dataset.remarks
+    # the map is recentred
     assert all(np.linalg.norm(pose.center()) < 100 for pose in dataset.mapping.poses().values())
-    for pose in true_poses(root, "mapping").values():
+    mapping, query = (true_poses(root, part) for part in ("mapping", "query"))
+    for pose in mapping.values():
         assert np.linalg.norm(pose.center()) == pytest.approx(6.37e6, rel=1e-2)
-
-
-def test_what_it_asks_for(dataset: OfficialDataset) -> None:
-    assert dataset.missing is not None
-    assert not dataset.missing.files
-    assert not dataset.remarks
+    # references are near
+    for pair in dataset.relocalization:
+        apart = mapping[pair.reference].center() - query[pair.query].center()
+        assert np.linalg.norm(apart) < 4
     assert dataset.protocol.pose_file == "mlad"
     assert dataset.protocol.conditions == (WINTER, DUSK)
     assert len(dataset.relocalization) == 10
@@ -75,13 +65,6 @@ def test_what_it_asks_for(dataset: OfficialDataset) -> None:
     assert scored == sorted(pair.query for pair in dataset.relocalization)
     assert set(dataset.priors) == set(dataset.query.image_names())
     assert {dataset.groups[i].condition for i in dataset.query.image_names()} == {WINTER, DUSK}
-
-
-def test_references_are_near(root: Path, dataset: OfficialDataset) -> None:
-    mapping, query = (true_poses(root, part) for part in ("mapping", "query"))
-    for pair in dataset.relocalization:
-        distance = np.linalg.norm(mapping[pair.reference].center() - query[pair.query].center())
-        assert distance < 4
 
 
 def test_the_layouts_quirks(root: Path) -> None:
@@ -123,8 +106,7 @@ def test_frames_between_the_recordings(root: Path) -> None:
         rows = read_gnss_poses(root / name / "GNSSPoses.txt")
         odometry = {k.timestamp: k.world_from_cam for k in keyframes_of(root, name)}
         assert set(odometry) == set(rows)
-        times = sorted(rows)
-        for first, second in zip(times[:-1], times[1:], strict=True):
+        for first, second in pairwise(sorted(rows)):
             a, b = (rows[time].slam_from_cam for time in (first, second))
             gnss, vio = a.inverse() @ b, odometry[first].inverse() @ odometry[second]
             np.testing.assert_allclose(gnss.translation, vio.translation, atol=1e-9)
@@ -168,26 +150,22 @@ def test_kaptures_importer_has_the_same_poses(
     from kapture.io.records import TransferAction
     from tools.kapture_import_4seasons import import_4seasons_sequence
 
-    import_4seasons_sequence(
-        str(root / "calibration"),
-        str(root / REFERENCE),
-        str(tmp_path / "theirs"),
-        TransferAction.skip,
-        True,
-    )
-    theirs = kapture_from_dir(str(tmp_path / "theirs"))
+    folders = [str(each) for each in (root / "calibration", root / REFERENCE, tmp_path / "theirs")]
+    import_4seasons_sequence(*folders, TransferAction.skip, True)
+    theirs = kapture_from_dir(folders[-1])
     assert len(theirs.trajectories) == len(dataset.mapping.trajectories)
     rig = theirs.rigs["car", "cam1"]
     for (timestamp, car), pose in dataset.mapping.trajectories.items():
         other = theirs.trajectories[timestamp, car]
-        assert_same(
-            dataset.world.pose_in_official(pose),
-            RigidTransform(tuple(other.r_raw / np.linalg.norm(other.r_raw)), tuple(other.t_raw)),
-        )
+        unit = tuple(other.r_raw / np.linalg.norm(other.r_raw))
+        found = dataset.world.pose_in_official(pose)
+        expected = RigidTransform(unit, tuple(other.t_raw))
+        assert np.linalg.norm(found.center() - expected.center()) < 1e-6
+        rotations = Rotation.from_quat([found.quat_wxyz, unit], scalar_first=True)
+        assert np.degrees((rotations[0] * rotations[1].inv()).magnitude()) < 1e-6
         right = kapture.PoseTransform.compose([rig, other])
         image = dataset.mapping.records_camera[timestamp, "cam1"]
         ours = dataset.mapping.cam_from_world(image)
-        assert ours is not None
         center = dataset.world.pose_in_official(ours).center()
         np.testing.assert_allclose(center, right.inverse().t_raw, atol=1e-6)
 
@@ -220,9 +198,8 @@ def test_point_clouds_reproject(root: Path, workspace: Path) -> None:
 
     theirs = kapture_from_dir(str(workspace / "mapping"))
     model, width, height, *params = theirs.sensors["cam0"].sensor_params
-    camera = pycolmap.Camera(
-        model=model, width=int(width), height=int(height), params=list(map(float, params))
-    )
+    size = {"width": int(width), "height": int(height)}
+    camera = pycolmap.Camera(model=model, params=list(map(float, params)), **size)
     rows = read_gnss_poses(root / REFERENCE / "GNSSPoses.txt")
     clouds: dict[int, NDArray[np.float64]] = {}
     for keyframe in keyframes_of(root, REFERENCE):
@@ -236,16 +213,13 @@ def test_point_clouds_reproject(root: Path, workspace: Path) -> None:
         clouds[keyframe.timestamp] = pose.inverse().transform_points(in_cam)
     found = 0
     pixels = {k.timestamp: k.points[:, :2] for k in keyframes_of(root, REFERENCE)}
-    for first in clouds:
-        for second in clouds:
-            if first == second or not len(clouds[first]) or not len(clouds[second]):
-                continue
-            apart = np.linalg.norm(clouds[first][:, None] - clouds[second][None], axis=2)
-            a, b = np.nonzero(apart < 1e-4)
-            found += len(a)
-            pose = theirs.trajectories[second, "car"]
-            projected = camera.img_from_cam(pose.transform_points(clouds[first][a]))
-            assert np.abs(projected - pixels[second][b]).max(initial=0) < 1e-3
+    for first, second in permutations((time for time, cloud in clouds.items() if len(cloud)), 2):
+        apart = np.linalg.norm(clouds[first][:, None] - clouds[second][None], axis=2)
+        a, b = np.nonzero(apart < 1e-4)
+        found += len(a)
+        pose = theirs.trajectories[second, "car"]
+        projected = camera.img_from_cam(pose.transform_points(clouds[first][a]))
+        assert np.abs(projected - pixels[second][b]).max(initial=0) < 1e-3
     assert found > 100
 
 

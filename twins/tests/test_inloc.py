@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from itertools import permutations
+from itertools import permutations, product
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,6 @@ from megloc_twins.inloc import (
     PITCHES_DEG,
     YAWS_DEG,
     InLocTwinOptions,
-    QueryView,
     cam_from_scan,
     cutout_camera,
     phone_camera,
@@ -31,6 +30,7 @@ from megloc_twins.inloc import (
     scanned_points,
 )
 from megloc_twins.rasterization import NO_SURFACE, depth_map, sample_grid, visible_surfaces
+from megloc_twins.surfaces import Surfaces
 
 from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions
 from megloc_kapture.datasets.official import write_official
@@ -65,7 +65,13 @@ def test_the_layout_is_the_official_one(root: Path) -> None:
     assert {f"query/iphone7/IMG_080{n}.JPG" for n in range(1, 6)} <= names
 
 
-def test_matlab_files_as_published(root: Path) -> None:
+def matrix_of(path: Path, first: int) -> np.ndarray:
+    """Four rows of a transformation's file, from line ``first`` on."""
+    lines = path.read_text().splitlines()[first : first + 4]
+    return np.array([line.split() for line in lines], np.float64)
+
+
+def test_files_as_published(root: Path) -> None:
     path = root / "database/cutouts/DUC1/001/DUC_cutout_001_60_0.jpg"
     content = scipy.io.loadmat(f"{path}.mat")
     assert content["XYZcut"].dtype == np.float64
@@ -73,6 +79,10 @@ def test_matlab_files_as_published(root: Path) -> None:
     assert content["RGBcut"].dtype == np.uint8
     off = np.abs(content["RGBcut"].astype(int) - read_image_rgb(path))
     assert off.mean() < 6  # as JPEG has it
+    # the matrix before refinement is another
+    for path in root.glob("database/alignments/*/transformations/*.txt"):
+        before, after = (matrix_of(path, first) for first in (1, 7))
+        assert 0.005 < np.linalg.norm(before[:3, 3] - after[:3, 3]) < 0.5
 
 
 def test_scanned_points_are_seen_in_their_pixels(root: Path, imported: Path) -> None:
@@ -89,20 +99,15 @@ def test_scanned_points_are_seen_in_their_pixels(root: Path, imported: Path) -> 
     for timestamp, sensor, name in list(kapture.flatten(theirs.records_camera))[::5]:
         points = scipy.io.loadmat(root / f"{name}.mat")["XYZcut"]
         _, _, floor, scan, _ = name.split("/")
-        lines = (
-            (root / f"database/alignments/{floor}/transformations/DUC_trans_{scan}.txt")
-            .read_text()
-            .splitlines()
-        )
-        matrix = np.array([line.split() for line in lines[7:11]], np.float64)
+        transformations = root / f"database/alignments/{floor}/transformations"
+        matrix = matrix_of(transformations / f"DUC_trans_{scan}.txt", 7)
         seen = np.isfinite(points).all(axis=2)
         missing.append(1 - seen.mean())
         in_floor = points[seen] @ matrix[:3, :3].T + matrix[:3, 3]
         in_camera = poses[timestamp, sensor].transform_points(in_floor)
         model, width, height, *params = theirs.sensors[sensor].sensor_params
-        camera = pycolmap.Camera(
-            model=model, width=int(width), height=int(height), params=list(map(float, params))
-        )
+        size = {"width": int(width), "height": int(height)}
+        camera = pycolmap.Camera(model=model, params=list(map(float, params)), **size)
         pixels = camera.img_from_cam(in_camera)
         np.testing.assert_allclose(pixels, np.column_stack([columns[seen], rows[seen]]), atol=1e-3)
         path = imported / "mapping" / "sensors" / "records_data" / depths[timestamp]
@@ -110,15 +115,6 @@ def test_scanned_points_are_seen_in_their_pixels(root: Path, imported: Path) -> 
         np.testing.assert_allclose(depth[seen], in_camera[:, 2], rtol=1e-6)
         assert (depth[~seen] == 0).all()
     assert 0.02 < np.mean(missing) < 0.3
-
-
-def test_the_matrix_before_refinement_is_another(root: Path) -> None:
-    for path in root.glob("database/alignments/*/transformations/*.txt"):
-        lines = path.read_text().splitlines()
-        before, after = (
-            np.array([line.split() for line in lines[first : first + 4]], float) for first in (1, 7)
-        )
-        assert 0.005 < np.linalg.norm(before[:3, 3] - after[:3, 3]) < 0.5
 
 
 def test_conditions_come_from_the_truth(root: Path, imported: Path) -> None:
@@ -141,32 +137,23 @@ def test_the_default_twin_is_real_work() -> None:
     assert all(count >= 4 for count in kinds.values())  # each kind two times on each floor
 
 
-BUILDER = FloorBuilder(2)
-
-
 @pytest.fixture(scope="module")
 def floors() -> list[Floor]:
-    return BUILDER.floors(0, 2)
+    return FloorBuilder(2).floors(0, 2)
 
 
-@pytest.fixture(scope="module")
-def views(floors: list[Floor]) -> list[QueryView]:
-    return query_views(floors, 0, 24, (640, 480))
+def sizes_of(surfaces: Surfaces) -> np.ndarray:
+    """Area of each, square metres."""
+    return np.linalg.norm(np.cross(surfaces.edge_u, surfaces.edge_v), axis=1)
 
 
 def areas(parts: Parts, recipes: Recipes) -> Counter[tuple[object, ...]]:
     """Area in square metres of each surface, by what and where it is."""
     surfaces, _ = parts.surfaces()
-    sizes = np.linalg.norm(np.cross(surfaces.edge_u, surfaces.edge_v), axis=1)
     found: Counter[tuple[object, ...]] = Counter()
-    for index, size in enumerate(sizes):
-        shape = np.concatenate(
-            [
-                part[index].round(6)
-                for part in (surfaces.origin, surfaces.edge_u, surfaces.edge_v, surfaces.uv)
-            ]
-        )
-        found[recipes.items[surfaces.texture[index]], *shape] += float(size)
+    where = np.hstack([surfaces.origin, surfaces.edge_u, surfaces.edge_v, surfaces.uv]).round(6)
+    for texture, shape, size in zip(surfaces.texture, where, sizes_of(surfaces), strict=True):
+        found[recipes.items[texture], *shape] += float(size)
     return found
 
 
@@ -188,8 +175,7 @@ def test_rooms_of_a_kind_differ_in_at_most_a_tenth_of_their_surface(kind: str) -
 def test_floors_are_alike_and_their_own_surfaces_few(floors: list[Floor]) -> None:
     first, second = floors
     for floor in floors:
-        surfaces = floor.place.surfaces
-        sizes = np.linalg.norm(np.cross(surfaces.edge_u, surfaces.edge_v), axis=1)
+        sizes = sizes_of(floor.place.surfaces)
         assert 0.05 < sizes[floor.own].sum() / sizes.sum() <= 0.1
         assert 0 < sizes[floor.glass].sum() / sizes.sum() < 0.1
         assert not (floor.own & floor.glass).any()
@@ -198,97 +184,72 @@ def test_floors_are_alike_and_their_own_surfaces_few(floors: list[Floor]) -> Non
     recipes = [[floor.place.recipes[t] for t in floor.place.surfaces.texture] for floor in floors]
     same = np.array([a == b for a, b in zip(*recipes, strict=True)])
     assert same[~first.own].all()
-    sizes = np.linalg.norm(
-        np.cross(first.place.surfaces.edge_u, first.place.surfaces.edge_v), axis=1
-    )
+    sizes = sizes_of(first.place.surfaces)
     # what is own and yet the same are edges of posters
     assert sizes[first.own & ~same].sum() > 0.8 * sizes[first.own].sum()
 
 
 def test_floors_have_frames_of_their_own_that_overlap(floors: list[Floor]) -> None:
-    corners = [floor.place.surfaces_in_world().corners().reshape(-1, 3) for floor in floors]
-    low, high = (
-        [getattr(np, name)(points, axis=0) for points in corners] for name in ("min", "max")
-    )
-    assert (np.maximum(*low) < np.minimum(*high)).all()
+    first, second = (f.place.surfaces_in_world().corners().reshape(-1, 3) for f in floors)
+    low, high = np.maximum(first.min(0), second.min(0)), np.minimum(first.max(0), second.max(0))
+    assert (low < high).all()
     between = floors[0].place.place_from_world.inverse() @ floors[1].place.place_from_world
     assert np.linalg.norm(between.translation) > 1
     angle = np.degrees(2 * np.arccos(min(1.0, abs(between.quat_wxyz[0]))))
     assert angle > 10
 
 
-def test_there_is_something_in_every_direction(floors: list[Floor]) -> None:
+def test_scanners_see_something_in_every_direction(floors: list[Floor]) -> None:
+    # they stand nearly upright and turned at random
+    poses = [zone.scan_from_place for floor in floors for zone in floor.zones]
+    rotations = np.array([pose.rotation_matrix() for pose in poses])
+    tilts = np.degrees(np.arccos(np.minimum(1.0, rotations[:, 2, 2])))
+    assert 0.1 < tilts.max() < 5
+    assert np.ptp(np.arctan2(rotations[:, 0, 1], rotations[:, 0, 0])) > 2
+    assert all(abs(pose.center()[2] - 1.5) < 0.15 for pose in poses)
     grid = sample_grid(cutout_camera(40, 30), 1)
     for floor in floors:
         assert sorted({zone.kind for zone in floor.zones}) == ["corridor", *ROOM_KINDS]
         assert len(floor.zones) == 6
-        for zone in floor.zones:
-            for yaw in YAWS_DEG[::3]:
-                for pitch in PITCHES_DEG:
-                    pose = cam_from_scan(yaw, pitch) @ zone.scan_from_place
-                    seen = visible_surfaces(floor.place.surfaces, pose, grid)
-                    assert (seen.surface != NO_SURFACE).mean() > 0.999
-                    assert 0.3 < np.median(depth_map(seen)) < 8
-
-
-def test_scanners_stand_nearly_upright_and_turned_at_random(floors: list[Floor]) -> None:
-    rotations = [z.scan_from_place.rotation_matrix() for floor in floors for z in floor.zones]
-    tilts = [np.degrees(np.arccos(min(1.0, r[2, 2]))) for r in rotations]
-    assert 0.1 < max(tilts) < 5
-    headings = [np.arctan2(r[0, 1], r[0, 0]) for r in rotations]
-    assert np.ptp(headings) > 2
-    centers = np.array([z.scan_from_place.center() for floor in floors for z in floor.zones])
-    assert (np.abs(centers[:, 2] - 1.5) < 0.15).all()
+        for zone, yaw, pitch in product(floor.zones, YAWS_DEG[::3], PITCHES_DEG):
+            pose = cam_from_scan(yaw, pitch) @ zone.scan_from_place
+            seen = visible_surfaces(floor.place.surfaces, pose, grid)
+            assert (seen.surface != NO_SURFACE).mean() > 0.999
+            assert 0.3 < np.median(depth_map(seen)) < 8
 
 
 def test_what_a_scanner_measures(floors: list[Floor]) -> None:
-    import pycolmap
-
-    floor = floors[0]
-    camera = cutout_camera(100, 75)
-    theirs = pycolmap.Camera(model=camera.model, width=100, height=75, params=list(camera.params))
-    columns, rows = np.meshgrid(np.arange(100) + 0.5, np.arange(75) + 0.5)
+    floor, camera = floors[0], cutout_camera(100, 75)
     bright = np.full((75, 100, 3), 128, np.uint8)
     bright[:10] = 5
     missing = []
-    for zone in floor.zones:
-        for yaw, pitch in ((0, 0), (120, -30), (240, 30)):
-            own = cam_from_scan(yaw, pitch)
-            pose = own @ zone.scan_from_place
-            rng = np.random.default_rng(0)
-            points = scanned_points(floor, camera, pose, own, bright, rng)
-            seen = visible_surfaces(floor.place.surfaces, pose, sample_grid(camera, 1))
-            known = np.isfinite(points).all(axis=2)
-            assert not known[:10].any()  # too dark
-            assert not known[floor.glass[np.maximum(seen.surface, 0)]].any()
-            in_camera = own.apply(points[known])
-            pixels = np.column_stack([columns[known], rows[known]])
-            np.testing.assert_allclose(theirs.img_from_cam(in_camera), pixels, atol=1e-3)
-            off = in_camera[:, 2] - depth_map(seen)[known]
-            assert np.abs(off).max() < 0.006 and 1e-4 < np.std(off) < 2e-3
-            np.testing.assert_array_equal(points[known], points[known].astype(np.float32))
-            missing.append(1 - known[10:].mean())
-            assert missing[-1] > 0.005  # dropouts
+    for zone, (yaw, pitch) in product(floor.zones, ((0, 0), (120, -30), (240, 30))):
+        own = cam_from_scan(yaw, pitch)
+        pose = own @ zone.scan_from_place
+        points = scanned_points(floor, camera, pose, own, bright, np.random.default_rng(0))
+        seen = visible_surfaces(floor.place.surfaces, pose, sample_grid(camera, 1))
+        known = np.isfinite(points).all(axis=2)
+        assert not known[:10].any()  # too dark
+        assert not known[floor.glass[np.maximum(seen.surface, 0)]].any()
+        off = own.apply(points[known])[:, 2] - depth_map(seen)[known]
+        assert np.abs(off).max() < 0.006 and 1e-4 < np.std(off) < 2e-3
+        np.testing.assert_array_equal(points[known], points[known].astype(np.float32))
+        missing.append(1 - known[10:].mean())
+        assert missing[-1] > 0.005  # dropouts
     assert 0.02 < np.mean(missing) < 0.3
 
 
 def test_cutouts_turn_to_the_right_and_up() -> None:
-    ahead = np.array([[0.0, 0.0, 1.0]])
-    for yaw, pitch, expected in (
-        (0, 0, (-1, 0, 0)),
-        (90, 0, (0, 1, 0)),
-        (0, 30, (-np.cos(np.pi / 6), 0, 0.5)),
-    ):
-        direction = cam_from_scan(yaw, pitch).inverse().apply(ahead)[0]
-        np.testing.assert_allclose(direction, expected, atol=1e-8)  # of a settled pose
+    expected = {(0, 0): (-1, 0, 0), (90, 0): (0, 1, 0), (0, 30): (-np.sqrt(0.75), 0, 0.5)}
+    for angles, direction in expected.items():
+        ahead = cam_from_scan(*angles).rotation_matrix()[2]
+        np.testing.assert_allclose(ahead, direction, atol=1e-8)  # of a settled pose
     assert phone_camera(4032, 3024).params[0] == 3136
     np.testing.assert_allclose(cutout_camera(1600, 1200).params[0], 1385.6406460551, rtol=1e-12)
 
 
-def test_queries_are_held_elsewhere_than_scanners_stand(
-    floors: list[Floor], views: list[QueryView]
-) -> None:
-    assert len(views) == 24
+def test_queries_are_held_elsewhere_than_scanners_stand(floors: list[Floor]) -> None:
+    views = query_views(floors, 0, 24, (640, 480))
     assert Counter(view.floor for view in views) == {0: 12, 1: 12}
     gaps = []
     for view in views:
@@ -296,9 +257,8 @@ def test_queries_are_held_elsewhere_than_scanners_stand(
         center = view.cam_from_place.center()
         assert zones[view.zone].plan.is_free(center[0], center[1], 0.5)
         assert 1.3 < center[2] < 1.8
-        gaps.append(
-            min(np.linalg.norm(z.scan_from_place.center() - center) for z in zones.values())
-        )
+        scanners = [zone.scan_from_place.center() for zone in zones.values()]
+        gaps.append(np.linalg.norm(np.subtract(scanners, center), axis=1).min())
     assert np.median(gaps) > 0.6
     assert Counter(view.zone for view in views if view.floor == 0) == dict.fromkeys(zones, 2)
     upright = [view.camera.height > view.camera.width for view in views]
@@ -307,21 +267,16 @@ def test_queries_are_held_elsewhere_than_scanners_stand(
     with_people = [bool(view.people) for view in views]
     assert 0.2 < np.mean(with_people) < 0.8
     assert all(person.kind == "person" for view in views for person in view.people)
-
-
-def test_queries_do_not_depend_on_how_many_there_are() -> None:
+    # they do not depend on how many there are
     small = FloorBuilder(1)
     few, more = (query_views(small.floors(0, 2), 0, count, (640, 480)) for count in (2, 4))
     assert few == [more[0], more[2]]
     other = query_views(small.floors(1, 2), 1, 2, (640, 480))
     assert other[0].cam_from_place != few[0].cam_from_place
-
-
-def test_light_varies_between_telephones_not_within_a_scan() -> None:
-    first, second = (lamp_lighting(np.random.default_rng(i), noise=1, noise_seed=0) for i in (0, 1))
-    assert first == second
-    phones = [
-        lamp_lighting(np.random.default_rng(i), noise=1, noise_seed=0, spread=0.2) for i in (0, 1)
-    ]
+    # light varies between telephones, not within a scan
+    rngs = (np.random.default_rng(i % 2) for i in range(4))
+    scans = [lamp_lighting(next(rngs), noise=1, noise_seed=0) for _ in range(2)]
+    phones = [lamp_lighting(next(rngs), noise=1, noise_seed=0, spread=0.2) for _ in range(2)]
+    assert scans[0] == scans[1]
     assert phones[0].exposure != phones[1].exposure
     assert phones[0].white_balance != phones[1].white_balance

@@ -57,8 +57,16 @@ def assert_equal_poses(
         assert np.degrees(2 * np.linalg.norm(relative)) < MAX_DEG, name
 
 
-def test_rig_is_consistent(root: Path, imported: Path) -> None:
-    truth = kapture_from_dir(str(root / "ground_truth/query"))
+def test_rig_is_consistent_and_its_cameras_are_synchronous(root: Path, imported: Path) -> None:
+    for role, moments in (("mapping", 6), ("query", 12)):
+        truth = kapture_from_dir(str(root / "ground_truth" / role))
+        cameras = [set(of_time) for of_time in truth.records_camera.values()]
+        assert len(cameras) == moments
+        # two of the map's images are in no model
+        assert sum(map(len, cameras)) == 3 * moments - 2 * (role == "mapping")
+    # the official frame is another than the rendered one, and metric
+    assert abs(np.linalg.norm(OFFICIAL_FROM_WORLD.quat_wxyz) - 1) < 1e-12
+    assert np.linalg.norm(OFFICIAL_FROM_WORLD.translation) > 1000
     rigs = kapture_from_dir(str(imported / "query")).rigs
     assert rigs is not None and list(rigs) == ["car"]
     for poses in truth.trajectories.values():
@@ -92,9 +100,8 @@ def nvm_observations(root: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]
 
 def colmap_camera(sensor: kapture.Camera) -> pycolmap.Camera:
     model, width, height, *params = sensor.sensor_params
-    return pycolmap.Camera(
-        model=model, width=int(width), height=int(height), params=[float(p) for p in params]
-    )
+    size = {"width": int(width), "height": int(height)}
+    return pycolmap.Camera(model=model, params=[float(p) for p in params], **size)
 
 
 def test_points_of_the_model_reproject(root: Path, imported: Path) -> None:
@@ -178,7 +185,7 @@ def test_against_kaptures_importer(
         assert {n: (t, s) for t, s, n in kapture.flatten(ours.records_camera)} == records
 
 
-def test_layout_has_the_quirks_of_the_original(root: Path) -> None:
+def test_layout_has_the_quirks_of_the_original(root: Path, imported: Path) -> None:
     first, second = sorted((root / "3D-models/individual/queries_per_location").iterdir())
     assert first.read_bytes().endswith(b".jpg\n\n") and b"\r" not in first.read_bytes()
     assert second.read_bytes().endswith(b".jpg\r\n")
@@ -190,31 +197,15 @@ def test_layout_has_the_quirks_of_the_original(root: Path) -> None:
     assert all("/rear/" in row.split()[0] and len(row.split()) == 17 for row in train_list)
     # the last moments of the rain are in neither
     assert len(test_list) + len(train_list) == 12 - 2
+    names, groups = (read(imported / "megloc") for read in (read_names, read_groups))
+    assert list(names.values()) == test_list
+    scored = {name for name, group in groups.items() if group.scored}
+    assert len(scored) == 10 and names.keys() < scored
+    assert all("/rear/" in name for name in scored)
     for path in root.glob("images/*/*/*.jpg"):
         assert int(path.stem) > 1 << 32
         assert image_size(path) == (96, 96)
     assert (root / "intrinsics/rear_intrinsics.txt").read_text().startswith("fx 57.600000\n")
-
-
-def test_names_are_the_test_list(root: Path, imported: Path) -> None:
-    names = read_names(imported / "megloc")
-    assert list(names.values()) == (root / "robotcar_v2_test.txt").read_text().split()
-    groups = read_groups(imported / "megloc")
-    scored = {name for name, group in groups.items() if group.scored}
-    assert len(scored) == 10 and names.keys() < scored
-    assert all("/rear/" in name for name in scored)
-
-
-def test_cameras_are_synchronous(root: Path) -> None:
-    for role, moments in (("mapping", 6), ("query", 12)):
-        truth = kapture_from_dir(str(root / "ground_truth" / role))
-        cameras = [set(of_time) for of_time in truth.records_camera.values()]
-        assert len(cameras) == moments
-        # two of the map's images are in no model
-        assert sum(len(of_time) for of_time in cameras) == 3 * moments - 2 * (role == "mapping")
-    # the official frame is another than the rendered one, and metric
-    assert abs(np.linalg.norm(OFFICIAL_FROM_WORLD.quat_wxyz) - 1) < 1e-12
-    assert np.linalg.norm(OFFICIAL_FROM_WORLD.translation) > 1000
 
 
 def test_the_car_stands_in_the_rear_cameras_way(root: Path) -> None:

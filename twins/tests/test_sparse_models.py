@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,22 +22,15 @@ from megloc_twins.sparse_models import exact_tracks
 from megloc_twins.squares import build_place
 from megloc_twins.synthetic_kapture import SyntheticWorld, build_world
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
 from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.datasets.official import write_official
 from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
-from megloc_kapture.features.colmap_sift import ColmapSift
-from megloc_kapture.io.colmap_cameras import new_colmap_camera, px_from_cam
-from megloc_kapture.io.kapture import ImagePair, KaptureFolder
-from megloc_kapture.localization.map_index import MapIndex
-from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
-from megloc_kapture.matching.verification import TwoViewOptions
-from megloc_kapture.stages.given_map import given_map, has_descriptors
-from megloc_kapture.stages.local_features import extract_local_features
-from megloc_kapture.stages.matches import match_pairs
+from megloc_kapture.io.colmap_cameras import px_from_cam
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.stages.given_map import has_descriptors
 from megloc_kapture.values import Camera, RigidTransform
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
@@ -90,33 +82,33 @@ def points(frames: list[Frame], depths: Depths) -> SparsePoints:
 
 
 def test_colmap_projects_the_points_where_they_are_seen(
-    frames: list[Frame], points: SparsePoints
+    frames: list[Frame], depths: Depths, points: SparsePoints
 ) -> None:
     assert {frame.camera.model for frame in frames} == {"PINHOLE", "SIMPLE_RADIAL"}
     for index, frame in enumerate(frames):
         mine = points.image_ids == index
         assert mine.sum() > 20
-        px = colmap_px(frame, points.xyz[points.point_ids[mine]])
-        np.testing.assert_allclose(points.xy_px[mine], px, atol=1e-4)
-
-
-def test_the_points_lie_on_what_the_images_see(
-    frames: list[Frame], depths: Depths, points: SparsePoints
-) -> None:
-    for index, frame in enumerate(frames):
-        mine = points.image_ids == index
+        xyz = points.xyz[points.point_ids[mine]]
+        np.testing.assert_allclose(points.xy_px[mine], colmap_px(frame, xyz), atol=1e-4)
+        # on what the image sees
         column, row = points.xy_px[mine].astype(int).T
-        z = frame.cam_from_world.apply(points.xyz[points.point_ids[mine]])[:, 2]
+        z = frame.cam_from_world.apply(xyz)[:, 2]
         error = np.abs(depths[frame.name][row, column] - z)
-        assert (error < 0.021 + 0.011 * z).all()
-        assert np.median(error) < 0.02
+        assert (error < 0.021 + 0.011 * z).all() and np.median(error) < 0.02
+    again = exact_tracks(frames, depths, points_per_frame=60, rng=rng())
+    assert np.array_equal(again.xyz, points.xyz) and np.array_equal(again.xy_px, points.xy_px)
+    # poses may stand in another frame
+    other_from_world = RigidTransform.from_matrix(np.diag([1.0, -1.0, -1.0]), np.array([9, 8, 7]))
+    back = other_from_world.inverse()
+    moved = [replace(frame, cam_from_world=frame.cam_from_world @ back) for frame in frames]
+    there = exact_tracks(moved, depths, points_per_frame=60, rng=rng())
+    np.testing.assert_allclose(there.xyz, other_from_world.apply(points.xyz), atol=1e-9)
 
 
 def test_tracks_are_in_order_and_within_a_place(frames: list[Frame], points: SparsePoints) -> None:
     assert len(points) > 200
     counts = np.bincount(points.point_ids, minlength=len(points))
-    assert counts.min() == 2
-    assert counts.max() > 3
+    assert counts.min() == 2 and counts.max() > 3
     keys = list(zip(points.point_ids.tolist(), points.image_ids.tolist(), strict=True))
     assert keys == sorted(set(keys))
     place = np.array([frame.place for frame in frames])[points.image_ids]
@@ -125,14 +117,6 @@ def test_tracks_are_in_order_and_within_a_place(frames: list[Frame], points: Spa
     for index in range(len(frames)):
         features = points.feature_ids[points.image_ids == index]
         assert features.tolist() == list(range(len(features)))
-
-
-def test_the_same_seed_gives_the_same_points(
-    frames: list[Frame], depths: Depths, points: SparsePoints
-) -> None:
-    again = exact_tracks(frames, depths, points_per_frame=60, rng=rng())
-    assert np.array_equal(again.xyz, points.xyz)
-    assert np.array_equal(again.xy_px, points.xy_px)
 
 
 def frame(name: str, x: float, *, camera: Camera, yaw_deg: float = 90.0) -> Frame:
@@ -182,29 +166,10 @@ def test_strong_distortion_folds_nothing_back_into_the_image() -> None:
     assert len(exact_tracks(pair, both, points_per_frame=1200, rng=rng())) == 0
 
 
-def test_poses_may_stand_in_another_frame(frames: list[Frame], depths: Depths) -> None:
-    other_from_world = RigidTransform.from_matrix(np.diag([1.0, -1.0, -1.0]), np.array([9, 8, 7]))
-    moved = [
-        replace(frame, cam_from_world=frame.cam_from_world @ other_from_world.inverse())
-        for frame in frames
-    ]
-    there = exact_tracks(moved, depths, points_per_frame=20, rng=rng())
-    here = exact_tracks(frames, depths, points_per_frame=20, rng=rng())
-    np.testing.assert_allclose(there.xyz, other_from_world.apply(here.xyz), atol=1e-9)
-
-
-OPTIONS = AachenTwinOptions(
-    num_places=1,
-    stations_per_place=7,
-    sequence_images=3,
-    day_queries=2,
-    night_queries=1,
-    additional_night_queries=1,
-    width=256,
-    height=192,
-    supersampling=1,
-    model_features=True,
-)
+QUERIES = {"day_queries": 2, "night_queries": 1, "additional_night_queries": 1}
+CITY = {"num_places": 1, "stations_per_place": 7, "sequence_images": 3}
+SIZE = {"width": 256, "height": 192, "supersampling": 1}
+OPTIONS = AachenTwinOptions(**QUERIES, **CITY, **SIZE, model_features=True)
 
 
 @pytest.fixture(scope="module")
@@ -221,23 +186,23 @@ def test_the_database_is_what_colmap_extracts(root: Path, tmp_path: Path) -> Non
     with ColmapDatabase(root / "aachen.db") as ours:
         assert len(ours.images) == 21  # without the sequence, which v1.0 does not have
         names = sorted(ours.images)[:4]
-        pycolmap.extract_features(
-            tmp_path / "theirs.db",
-            root / "images_upright",
-            image_names=names,
-            extraction_options=options,
-            device=pycolmap.Device.cpu,
-        )
+        how = {"extraction_options": options, "device": pycolmap.Device.cpu}
+        images = root / "images_upright"
+        pycolmap.extract_features(tmp_path / "theirs.db", images, image_names=names, **how)
         with ColmapDatabase(tmp_path / "theirs.db") as theirs:
             assert sorted(theirs.images) == names
             for name in names:
-                rows = [
-                    np.hstack([found.keypoints(name), found.descriptors(name)])
-                    for found in (ours, theirs)
-                ]
+                both = ((each.keypoints(name), each.descriptors(name)) for each in (ours, theirs))
+                rows = [np.hstack(each) for each in both]
                 assert len(rows[0]) > 300
-                a, b = (some[np.lexsort(some.T)] for some in rows)
-                np.testing.assert_array_equal(a, b)
+                np.testing.assert_array_equal(*(some[np.lexsort(some.T)] for some in rows))
+    # v1.0's descriptors are published, v1.1's have to be extracted again
+    for version in ("1.0", "1.1"):
+        adapter = Aachen(AachenOptions(version=version, reference_model=True))
+        write_official(adapter.read(root), tmp_path / version)
+        reference = KaptureFolder(tmp_path / version / "reference")
+        reference.validate()
+        assert has_descriptors(reference) == (version == "1.0")
 
 
 @pytest.mark.slow
@@ -270,89 +235,15 @@ def test_points_lie_on_what_the_images_show(root: Path) -> None:
     assert np.quantile(errors, 0.9) < 0.05
 
 
-def localized(
-    query: KaptureFolder, made: KaptureFolder, output: Path
-) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Rotation and centre of the queries that COLMAP's PnP finds, by matches with all images."""
-    seen = made.observations()["sift"]
-    xyz = made.points3d()[:, :3]
-    index = MapIndex.build(xyz, seen.image_names, seen.image_ids, seen.keypoint_ids, seen.point_ids)
-    options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac.random_seed = 0
-    names, images = query.read().image_names(), sorted(made.read().poses())
-    pairs = [ImagePair(name, image, 1.0) for name in names for image in images]
-    match_pairs(query, made, pairs, "sift", NearestNeighbours(), TwoViewOptions(), output)
-    matches = KaptureFolder(made.root, features_dirs=[output]).matches("sift")
-    for name in names:
-        keypoints = query.keypoints("sift").read(name)
-        px, points = [], []
-        for image in images:
-            if (name, image) in matches:
-                rows, _ = matches.read(name, image)
-                point_of = dict(zip(*(ids.tolist() for ids in index.observed(image)), strict=True))
-                found = np.array([point_of.get(row, -1) for row in rows[:, 1].tolist()], int)
-                px.append(keypoints[rows[found >= 0, 0]])
-                points.append(xyz[found[found >= 0]])
-        camera = query.read().camera_of(name)
-        result = pycolmap.estimate_and_refine_absolute_pose(
-            np.concatenate(px).astype(np.float64),
-            np.concatenate(points),
-            new_colmap_camera(camera),
-            options,
-        )
-        if result is None:  # a night's
-            continue
-        rotation = result["cam_from_world"].rotation.matrix()
-        yield name, rotation, -rotation.T @ result["cam_from_world"].translation
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("version", ["1.0", "1.1"])
-def test_queries_localize_in_the_given_map(root: Path, tmp_path: Path, version: str) -> None:
-    dataset = Aachen(AachenOptions(version=version, reference_model=True)).read(root)
-    write_official(dataset, tmp_path)
-    reference = KaptureFolder(tmp_path / "reference")
-    # v1.0's are published, v1.1's have to be extracted again
-    assert has_descriptors(reference) == (version == "1.0")
-    wanted = [KaptureFolder(tmp_path / "query")]
-    if version == "1.1":
-        wanted.append(KaptureFolder(tmp_path / "mapping"))
-    extract_local_features(wanted, ColmapSift(), tmp_path)
-    mapping = KaptureFolder(tmp_path / "mapping", features_dirs=[tmp_path])
-    counts = given_map(reference, mapping, tmp_path / "map")
-    assert counts["found_again"] == 1.0
-    assert counts["points"] == len(reference.points3d())
-    made = KaptureFolder(tmp_path / "map")
-    made.validate()
-    query = KaptureFolder(tmp_path / "query", features_dirs=[tmp_path])
-    truth = KaptureFolder(root / "ground_truth/query").read().poses()
-    results = localized(query, made, tmp_path / "matches")
-    found = {name: pose for name, *pose in results if name.startswith("query/day")}
-    assert len(found) == OPTIONS.day_queries
-    for name, (rotation, centre) in found.items():
-        turned = Rotation.from_matrix(rotation @ truth[name].rotation_matrix().T)
-        assert np.linalg.norm(centre - truth[name].center()) < 0.25
-        assert np.degrees(turned.magnitude()) < 2.0
-
-
 @pytest.mark.slow
 def test_robotcars_models_share_a_database(tmp_path: Path) -> None:
-    options = RobotCarTwinOptions(
-        num_locations=1,
-        stops_per_location=8,
-        moments_per_condition=2,
-        size_px=128,
-        supersampling=1,
-        model_features=True,
-    )
+    street = {"num_locations": 1, "stops_per_location": 8, "moments_per_condition": 2}
+    options = RobotCarTwinOptions(**street, size_px=128, supersampling=1, model_features=True)
     RobotCarTwin(options).write(tmp_path / "root")
     observations = []
     for model in ("merged", "individual"):
-        out = tmp_path / model
-        dataset = RobotCar(RobotCarOptions(model=model, reference_model=True)).read(
-            tmp_path / "root"
-        )
-        write_official(dataset, out)
+        out, adapter = tmp_path / model, RobotCarOptions(model=model, reference_model=True)
+        write_official(RobotCar(adapter).read(tmp_path / "root"), out)
         reference = KaptureFolder(out / "reference")
         # features and models fit each other, or the import would refuse them
         reference.validate()

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 from megloc_twins.frames import looking_at
@@ -27,25 +29,18 @@ def places() -> list[Place]:
 
 def test_places_lie_apart_and_are_a_few_metres_across(places: list[Place]) -> None:
     assert len(places) >= 3
-    boxes = []
-    for place in places:
-        corners = place.surfaces_in_world().corners().reshape(-1, 3)
-        boxes.append(corners)
-        assert 10 < np.ptp(corners[:, :2], axis=0).max() < 35
-    for i, first in enumerate(boxes):
-        for second in boxes[i + 1 :]:
-            gaps = np.linalg.norm(first[:, None, :2] - second[None, :, :2], axis=-1)
-            assert gaps.min() >= 50
+    plans = [place.surfaces_in_world().corners().reshape(-1, 3)[:, :2] for place in places]
+    assert all(10 < np.ptp(plan, axis=0).max() < 35 for plan in plans)
+    for first, second in combinations(plans, 2):
+        assert np.linalg.norm(first[:, None] - second[None], axis=-1).min() >= 50
 
 
 def test_places_share_textures_and_have_their_own(places: list[Place]) -> None:
     moving_objects = set(moving_object_recipes(OPTIONS.seed))
     kinds = [{r for r in p.recipes if r not in moving_objects} for p in places]
-    for i, first in enumerate(kinds):
-        for second in kinds[i + 1 :]:
-            common = {r.painter for r in first & second}
-            assert {"poster", "window", "sign"} <= common
-            assert {r.painter for r in first - second} >= {"poster", "wall", "ground"}
+    for first, second in combinations(kinds, 2):
+        assert {"poster", "window", "sign"} <= {r.painter for r in first & second}
+        assert {r.painter for r in first - second} >= {"poster", "wall", "ground"}
 
 
 def test_repetition_decides_how_much_is_shared() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kapture.io.csv import kapture_from_dir
 from megloc_twins.options import SyntheticWorldOptions
 from megloc_twins.synthetic_kapture import SyntheticKapture, SyntheticWorld, build_world, depth_name
 from megloc_twins.viewpoints import coarse_view, overlap, support
@@ -21,6 +22,12 @@ LAYOUT = "synthetic"
 @pytest.fixture(scope="module")
 def world() -> SyntheticWorld:
     return build_world()
+
+
+def assert_same(found: RigidTransform, expected: RigidTransform) -> None:
+    rotations = found.rotation_matrix(), expected.rotation_matrix()
+    np.testing.assert_allclose(*rotations, atol=1e-12)
+    np.testing.assert_allclose(found.translation, expected.translation, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -44,6 +51,10 @@ def test_queries_have_their_own_cameras_and_moving_objects(world: SyntheticWorld
     spots = {m.position for frame in world.queries for m in frame.moving_objects}
     assert not spots & {m.position for frame in world.mapping for m in frame.moving_objects}
     assert any(m.kind == "car" for frame in world.frames() for m in frame.moving_objects)
+    # they stand elsewhere than the map images
+    centers = np.array([frame.cam_from_world.center() for frame in world.mapping])
+    apart = [centers - frame.cam_from_world.center() for frame in world.queries]
+    assert np.median([np.linalg.norm(each, axis=1).min() for each in apart]) > 0.8
 
 
 def test_every_query_shares_its_view_with_the_map_of_its_place_only(world: SyntheticWorld) -> None:
@@ -56,55 +67,28 @@ def test_every_query_shares_its_view_with_the_map_of_its_place_only(world: Synth
         assert all(shares[m.name] == 0 for m in world.mapping if m.place != query.place)
 
 
-def test_queries_stand_elsewhere_than_the_map_images(world: SyntheticWorld) -> None:
-    map_centers = np.array([frame.cam_from_world.center() for frame in world.mapping])
-    gaps = [
-        np.linalg.norm(map_centers - frame.cam_from_world.center(), axis=1).min()
-        for frame in world.queries
-    ]
-    assert np.median(gaps) > 0.8
-
-
 def test_poses_of_the_map_are_those_of_the_rig(world: SyntheticWorld) -> None:
     assert len(world.rig_from_world) * 3 == len(world.mapping)
     for frame in world.mapping:
         expected = world.sensor_from_rig[frame.sensor_id] @ world.rig_from_world[frame.timestamp]
-        np.testing.assert_allclose(
-            frame.cam_from_world.rotation_matrix(), expected.rotation_matrix(), atol=1e-12
-        )
-        np.testing.assert_allclose(
-            frame.cam_from_world.translation, expected.translation, atol=1e-9
-        )
+        assert_same(frame.cam_from_world, expected)
     offsets = [pose.center() for pose in world.sensor_from_rig.values()]
     assert max(np.linalg.norm(a - b) for a in offsets for b in offsets) > 0.5
 
 
-def test_the_same_options_give_the_same_world() -> None:
-    options = SyntheticWorldOptions(num_places=2, day_queries=2, night_queries=2)
-    first, second = build_world(options), build_world(options)
-    assert first.frames() == second.frames()
-    assert first.frames() != build_world(options.model_copy(update={"seed": 1})).frames()
+def test_the_same_options_give_the_same_world_and_others_another() -> None:
+    options = SyntheticWorldOptions(num_places=1, day_queries=2, night_queries=1)
 
+    def changed(**update: object) -> SyntheticWorld:
+        return build_world(options.model_copy(update=update))
 
-def test_more_queries_leave_the_others_as_they_are() -> None:
-    few = build_world(SyntheticWorldOptions(num_places=1, day_queries=2, night_queries=1))
-    more = build_world(SyntheticWorldOptions(num_places=1, day_queries=3, night_queries=1))
-    assert more.mapping == few.mapping
-    assert set(few.queries) < set(more.queries)
-
-
-def test_without_extras() -> None:
-    options = SyntheticWorldOptions(
-        num_places=1,
-        day_queries=1,
-        night_queries=0,
-        moving_objects=0,
-        bonnet=False,
-        distortion=False,
-    )
-    world = build_world(options)
-    assert not any(frame.moving_objects or frame.bonnet for frame in world.frames())
-    assert world.queries[0].camera.model == "SIMPLE_PINHOLE"
+    few, more = build_world(options), changed(day_queries=3)
+    assert few.frames() == changed().frames() != changed(seed=1).frames()
+    # more queries leave the others as they are
+    assert more.mapping == few.mapping and set(few.queries) < set(more.queries)
+    plain = changed(moving_objects=0, bonnet=False, distortion=False)
+    assert not any(frame.moving_objects or frame.bonnet for frame in plain.frames())
+    assert plain.queries[0].camera.model == "SIMPLE_PINHOLE"
 
 
 def test_overlap_is_whole_with_itself_and_none_behind(world: SyntheticWorld) -> None:
@@ -138,27 +122,33 @@ def test_what_is_written_is_the_world(root: Path, small_world: SyntheticWorld) -
         assert len(poses) == len(frames)
         for frame in frames:
             assert folder.read().camera_of(frame.name) == frame.camera
-            np.testing.assert_allclose(
-                poses[frame.name].rotation_matrix(),
-                frame.cam_from_world.rotation_matrix(),
-                atol=1e-12,
-            )
-            np.testing.assert_allclose(
-                poses[frame.name].translation, frame.cam_from_world.translation, atol=1e-9
-            )
+            assert_same(poses[frame.name], frame.cam_from_world)
     for folder, frames in ((mapping, small_world.mapping), (query, small_world.queries)):
         for frame in frames:
             assert read_image_rgb(folder.image_path(frame.name)).shape == (120, 160, 3)
+    theirs = kapture_from_dir(str(root / "mapping"))
+    ours = to_kapture(root / "mapping")
+    assert theirs.records_camera == ours.records_camera
+    assert theirs.sensors.keys() == ours.sensors.keys()
+    assert len(theirs.records_depth) == len(ours.records_depth)
+    assert len(theirs.trajectories) == len(small_world.rig_from_world)
+    # side tables
+    groups, protocol = read_groups(root / "megloc"), read_protocol(root / "megloc")
+    conditions = {frame.name: frame.condition for frame in small_world.queries}
+    assert {name: group.condition for name, group in groups.items()} == conditions
+    assert {group.location for group in groups.values()} == {"place0", "place1"}
+    assert (protocol.dataset, protocol.conditions) == ("synthetic", ("day", "night"))
+    assert protocol.thresholds == ((0.05, 5), (0.25, 2), (0.5, 5), (5, 10))
+    assert read_world(root / "megloc").unit == "m"
 
 
 def test_depth_and_masks(root: Path, small_world: SyntheticWorld) -> None:
     data = KaptureFolder(root / "mapping").read()
     assert len(data.records_depth) == len(small_world.mapping)
     for frame in small_world.mapping:
-        assert data.records_depth[frame.timestamp, f"{frame.sensor_id}_depth"] == depth_name(
-            frame.name
-        )
-        pose = data.device_from_world(frame.timestamp, f"{frame.sensor_id}_depth")
+        sensor = f"{frame.sensor_id}_depth"
+        assert data.records_depth[frame.timestamp, sensor] == depth_name(frame.name)
+        pose = data.device_from_world(frame.timestamp, sensor)
         assert pose == data.cam_from_world(frame.name)
         path = root / "mapping/sensors/records_data" / depth_name(frame.name)
         depth = read_depth_map(path, width=160, height=120)
@@ -169,27 +159,3 @@ def test_depth_and_masks(root: Path, small_world: SyntheticWorld) -> None:
             mask = read_image_rgb(mask_path)[..., 0]
             assert set(np.unique(mask)) == {0, 255}
             assert (depth[mask == 0] == 0).all()
-
-
-def test_side_tables(root: Path, small_world: SyntheticWorld) -> None:
-    groups = read_groups(root / "megloc")
-    assert {name: g.condition for name, g in groups.items()} == {
-        frame.name: frame.condition for frame in small_world.queries
-    }
-    assert {g.location for g in groups.values()} == {"place0", "place1"}
-    protocol = read_protocol(root / "megloc")
-    assert protocol.dataset == "synthetic"
-    assert protocol.conditions == ("day", "night")
-    assert protocol.thresholds == ((0.05, 5), (0.25, 2), (0.5, 5), (5, 10))
-    assert read_world(root / "megloc").unit == "m"
-
-
-def test_kapture_itself_reads_it(root: Path, small_world: SyntheticWorld) -> None:
-    from kapture.io.csv import kapture_from_dir
-
-    theirs = kapture_from_dir(str(root / "mapping"))
-    ours = to_kapture(root / "mapping")
-    assert theirs.records_camera == ours.records_camera
-    assert theirs.sensors.keys() == ours.sensors.keys()
-    assert len(theirs.records_depth) == len(ours.records_depth)
-    assert len(theirs.trajectories) == len(small_world.rig_from_world)

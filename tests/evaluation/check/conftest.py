@@ -43,14 +43,10 @@ class Scene:
         """The map as it is read from an import."""
         images = tuple(f"m/{i:05d}.jpg" for i in range(len(self.map_centers)))
         queries = self.query_names()
-        groups = {
-            image: ImageGroup(frame=frame)
-            for image, frame in zip(images, self.map_frames, strict=False)
-        }
-        groups |= {
-            query: ImageGroup(condition=frame)
-            for query, frame in zip(queries, self.query_frames, strict=False)
-        }
+        of_images = zip(images, self.map_frames, strict=False)
+        of_queries = zip(queries, self.query_frames, strict=False)
+        groups = {image: ImageGroup(frame=frame) for image, frame in of_images}
+        groups |= {query: ImageGroup(condition=frame) for query, frame in of_queries}
         return Reference(
             folder="import",
             groups=groups,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.evaluation.check.mistakes import (
@@ -32,11 +31,18 @@ def test_a_clear_gain_explains() -> None:
     found = explain(scores(-5, -1, -5), ALL, [0, 1, 1])
     assert found is not None and found.best == 1 and found.as_good == ()
     assert (found.fitting, found.fitting_as_is) == (1.0, 1.0)
-
-
-def test_no_gain_explains_nothing() -> None:
+    # no gain does not
     assert explain(scores(-1, -1, -5), ALL, [0, 1, 1]) is None
     assert explain(scores(-1, -0.6, -5), ALL, [0, 1, 1]) is None
+    # nor poses that do not fit where they are put
+    fits = ALL.copy()
+    fits[1, :6] = False
+    assert explain(scores(-5, -1, -5), fits, [0, 1, 1]) is None
+    # nor few poses
+    given = scores(-5, -1, -5)
+    assert explain(given[:, :2], ALL[:, :2], [0, 1, 1]) is None
+    assert explain(given[:, :0], ALL[:, :0], [0, 1, 1]) is None
+    assert explain(given[:, :3], ALL[:, :3], [0, 1, 1]) is not None
 
 
 def test_a_gain_has_to_be_most_poses() -> None:
@@ -47,12 +53,6 @@ def test_a_gain_has_to_be_most_poses() -> None:
     assert explain(given, ALL, [0, 1, 1]) is not None
 
 
-def test_poses_have_to_fit_where_they_are_put() -> None:
-    fits = ALL.copy()
-    fits[1, :6] = False
-    assert explain(scores(-5, -1, -5), fits, [0, 1, 1]) is None
-
-
 def test_of_equals_both_are_told_and_the_simpler_comes_first() -> None:
     found = explain(scores(-5, -1.1, -1), ALL, [0, 1, 1])
     assert found is not None and {found.best, *found.as_good} == {1, 2}
@@ -60,13 +60,8 @@ def test_of_equals_both_are_told_and_the_simpler_comes_first() -> None:
     assert found is not None and (found.best, found.as_good) == (1, ())
     found = explain(scores(-5, -3, -0.5), ALL, [0, 1, 2])
     assert found is not None and (found.best, found.as_good) == (2, ())
-
-
-def test_few_poses_say_nothing() -> None:
-    given = scores(-5, -1, -5)
-    assert explain(given[:, :2], ALL[:, :2], [0, 1, 1]) is None
-    assert explain(given[:, :0], ALL[:, :0], [0, 1, 1]) is None
-    assert explain(given[:, :3], ALL[:, :3], [0, 1, 1]) is not None
+    assert undecided(scores(-1, -1.1, -4)) == [1]
+    assert undecided(scores(-1, -3, -4)) == []
 
 
 def test_infinite_distances_are_no_numbers_to_trip_over() -> None:
@@ -75,11 +70,6 @@ def test_infinite_distances_are_no_numbers_to_trip_over() -> None:
     found = explain(given, ALL, [0, 1, 1])
     assert found is not None and found.best == 1
     assert explain(np.full((3, 10), -np.inf), ~ALL, [0, 1, 1]) is None
-
-
-def test_what_is_not_ruled_out() -> None:
-    assert undecided(scores(-1, -1.1, -4)) == [1]
-    assert undecided(scores(-1, -3, -4)) == []
 
 
 OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -100,7 +90,6 @@ def quats_of(rotations: np.ndarray) -> np.ndarray:
 
 
 def matrix_of(turn: Mistake) -> np.ndarray:
-    assert turn.turn_wxyz is not None
     return Rotation.from_quat(np.roll(turn.turn_wxyz, -1)).as_matrix()
 
 
@@ -184,14 +173,11 @@ def test_the_right_reading_comes_first_and_says_nothing() -> None:
     assert all(own.cost > 0 and own.kind and str(own) for own in others)
     costs = [own.cost for own in others]
     assert costs == sorted(costs)
-
-
-@pytest.mark.parametrize("frames", [False, True])
-@pytest.mark.parametrize("floors", [False, True])
-def test_frames_and_floors_are_tried_where_there_are_some(frames: bool, floors: bool) -> None:
-    tried = absolute_hypotheses(frames=frames, floors=floors)
-    assert any("frame" in own for own in tried) == frames
-    assert any("floor" in own for own in tried) == floors
+    # frames and floors are tried where there are some
+    for frames, floors in itertools.product((False, True), repeat=2):
+        tried = absolute_hypotheses(frames=frames, floors=floors)
+        assert any("frame" in own for own in tried) == frames
+        assert any("floor" in own for own in tried) == floors
 
 
 def test_the_turns_are_all_that_take_axes_to_axes() -> None:
@@ -200,12 +186,9 @@ def test_the_turns_are_all_that_take_axes_to_axes() -> None:
     for a, b in itertools.combinations(matrices, 2):
         assert np.abs(a - b).max() == 1 or np.abs(a - b).max() == 2
     assert all(np.isin(np.abs(matrix), (0, 1)).all() for matrix in matrices)
-
-
-@pytest.mark.parametrize("turn", TURNS, ids=lambda turn: turn.said.rsplit("map's ", 1)[1])
-def test_turns_are_said_as_they_are(turn: Mistake) -> None:
-    said = turn.said.rsplit("map's ", 1)[1].split(", ")
-    for row, name in zip(matrix_of(turn), said, strict=True):
-        expected = np.zeros(3)
-        expected["xyz".index(name[-1])] = -1 if name[0] == "-" else 1
-        np.testing.assert_allclose(row, expected, atol=1e-12)
+    # and they are said as they are
+    for turn in TURNS:
+        said = turn.said.rsplit("map's ", 1)[1].split(", ")
+        signs = [-1.0 if name[0] == "-" else 1.0 for name in said]
+        expected = np.eye(3)[["xyz".index(name[-1]) for name in said]] * np.array(signs)[:, None]
+        np.testing.assert_allclose(matrix_of(turn), expected, atol=1e-12, err_msg=turn.said)

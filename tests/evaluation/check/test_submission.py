@@ -1,11 +1,12 @@
-"""Whole checks: files alone, MLAD's files and folders, and how they are told."""
+"""Whole checks: files alone, MLAD's files and folders, how they are told; names and pairs."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -21,8 +22,13 @@ from megloc_kapture.evaluation.check.reading import (
     Reference,
     read_reference,
 )
-from megloc_kapture.evaluation.check.submission import check_submission
-from megloc_kapture.io.dataset_tables import Protocol, RelocalizationPair
+from megloc_kapture.evaluation.check.submission import (
+    check_shape,
+    check_submission,
+    match_names,
+    match_pairs,
+)
+from megloc_kapture.io.dataset_tables import ImageGroup, Protocol, RelocalizationPair
 
 START = 1_600_000_000_000_000_000
 
@@ -110,27 +116,23 @@ def told(report: CheckReport) -> list[tuple[str, str]]:
     return [(finding.severity, finding.kind) for finding in report.sorted_findings]
 
 
-def test_a_right_mlad_file(check: Check) -> None:
-    report = check(DRIVE.lines())
-    assert report.findings == () and (report.poses, report.expected) == (120, 120)
-    assert report.lines() == ["120 poses of 120 queries: no problem found"]
-
-
-@pytest.mark.parametrize("mistake", ["inverted", "wxyz"])
-def test_mistakes_of_mlad_files(check: Check, mistake: str) -> None:
-    (error,) = check(DRIVE.lines(mistake)).findings
-    assert error.severity == "error" and error.kind == mistake
-
-
-def test_a_centre_in_an_mlad_file_is_hard_to_tell_from_an_inverse(check: Check) -> None:
-    # between keyframes some metres apart a car hardly turns
+def test_mistakes_of_mlad_files(check: Check) -> None:
+    right = check(DRIVE.lines())
+    assert right.findings == () and (right.poses, right.expected) == (120, 120)
+    assert right.lines() == ["120 poses of 120 queries: no problem found"]
+    for mistake in ("inverted", "wxyz"):
+        (error,) = check(DRIVE.lines(mistake)).findings
+        assert error.severity == "error" and error.kind == mistake
+    # between keyframes some metres apart a car hardly turns: what cannot be told apart is said
     (error,) = check(DRIVE.lines("centre")).findings
     assert "centre stands where the translation belongs" in error.message
+    few = replace(DRIVE.reference, relocalization=DRIVE.reference.relocalization[:12])
+    assert told(check(DRIVE.lines()[:12], few)) in ([], [("note", "undecided")])
+    assert told(check(DRIVE.lines("wxyz")[:12], few)) == [("error", "wxyz")]
 
 
 def test_absolute_poses_in_an_mlad_file(check: Check) -> None:
     cameras = DRIVE.reference.cameras
-    assert cameras is not None
     quats = Rotation.from_quat(np.roll(cameras.quats, -1, axis=1))
     translations = -quats.apply(cameras.centers)
     chosen = [
@@ -151,6 +153,9 @@ def test_rows_of_an_mlad_file(check: Check) -> None:
     swapped = [" ".join([b, a, rest]) for a, b, rest in (line.split(" ", 2) for line in lines)]
     assert told(check(swapped)) == [("error", "swapped")]
     assert told(check(lines[::-1])) == [("note", "order")]
+    named = check(lines, name="mine.txt")
+    assert told(named) == [("error", "file-name")]
+    assert "reloc_a_to_b.txt" in named.findings[0].message
 
 
 def test_dummies_are_noted_and_prove_nothing(check: Check) -> None:
@@ -162,68 +167,46 @@ def test_dummies_are_noted_and_prove_nothing(check: Check) -> None:
     assert told(allowed) == [("note", "dummies")]
 
 
-def test_few_rows_leave_doubts(check: Check) -> None:
-    few = replace(DRIVE.reference, relocalization=DRIVE.reference.relocalization[:12])
-    report = check(DRIVE.lines()[:12], few)
-    assert told(report) in ([], [("note", "undecided")])
-    assert told(check(DRIVE.lines("wxyz")[:12], few)) == [("error", "wxyz")]
-
-
 def test_a_folder_of_mlad_files(tmp_path: Path, check: Check) -> None:
     pairs = [replace(p, file="second.txt") for p in DRIVE.reference.relocalization[60:]]
     both = replace(DRIVE.reference, relocalization=[*DRIVE.reference.relocalization[:60], *pairs])
     folder = tmp_path / "submission"
     folder.mkdir()
-    (folder / "reloc_a_to_b.txt").write_text("".join(DRIVE.lines()[:60]))
-    report = check_submission(folder, dataset="4seasons", reference=both)
+
+    def with_file(name: str, lines: Sequence[str]) -> CheckReport:
+        (folder / name).write_text("".join(lines))
+        return check_submission(folder, dataset="4seasons", reference=both)
+
+    report = with_file("reloc_a_to_b.txt", DRIVE.lines()[:60])
     assert told(report) == [("error", "missing-file")]
-    (folder / "second.txt").write_text("".join(DRIVE.lines()[60:]))
-    report = check_submission(folder, dataset="4seasons", reference=both)
+    report = with_file("second.txt", DRIVE.lines()[60:])
     assert not report.findings and report.poses == 120
-    (folder / "third.txt").write_text("")
-    report = check_submission(folder, dataset="4seasons", reference=both)
-    assert told(report) == [("warning", "unknown-file")]
-    (folder / "second.txt").write_text("1 2 3\n")
-    report = check_submission(folder, dataset="4seasons", reference=both)
+    assert told(with_file("third.txt", [])) == [("warning", "unknown-file")]
+    report = with_file("second.txt", ["1 2 3\n"])
     assert "error: second.txt:1: 3 columns instead of 9" in "\n".join(report.lines())
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    with pytest.raises(DataError, match="no pose file"):
-        check_submission(empty, dataset="4seasons")
+    (tmp_path / "empty").mkdir()
+    for name, dataset, words in (
+        ("empty", "4seasons", "no pose file"),
+        ("empty", "kapture", "one file"),
+        ("absent.txt", "kapture", "cannot read"),
+    ):
+        with pytest.raises(DataError, match=words):
+            check_submission(tmp_path / name, dataset=dataset)
+    with pytest.raises(DataError, match="no imported dataset"):
+        read_reference(tmp_path)
 
 
-def test_the_name_of_an_mlad_file(check: Check) -> None:
-    report = check(DRIVE.lines(), name="mine.txt")
-    assert told(report) == [("error", "file-name")]
-    assert "reloc_a_to_b.txt" in report.findings[0].message
-
-
-def test_a_file_alone(check: Check) -> None:
+def test_a_file_alone_or_empty(check: Check) -> None:
     report = check(DRIVE.lines(), None)
     assert told(report) == [("note", "not-checked")] * 2 and not report.has_problems
     report = check(["a.jpg 1 0 0 0 0 0 0\n"], None, dataset="robotcar")
     assert told(report) == [("error", "name-folder"), *[("note", "not-checked")] * 2]
     assert "give one with --data" in report.lines()[1]
-
-
-def test_an_import_without_a_map(check: Check) -> None:
     report = check(DRIVE.lines(), replace(DRIVE.reference, cameras=None))
     assert told(report) == [("note", "not-checked")]
-
-
-@pytest.mark.parametrize("content", ["", "\n\n"])
-def test_empty_files(check: Check, content: str) -> None:
-    assert ("error", "empty") in told(check([content]))
-    assert ("error", "empty") in told(check([content], None, dataset="kapture"))
-
-
-def test_what_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="cannot read"):
-        check_submission(tmp_path / "absent.txt", dataset="kapture")
-    with pytest.raises(DataError, match="one file"):
-        check_submission(tmp_path, dataset="kapture")
-    with pytest.raises(DataError, match="no imported dataset"):
-        read_reference(tmp_path)
+    for content in ("", "\n\n"):
+        assert ("error", "empty") in told(check([content]))
+        assert ("error", "empty") in told(check([content], None, dataset="kapture"))
 
 
 def test_reports_are_short_as_text_and_whole_as_json() -> None:
@@ -233,14 +216,8 @@ def test_reports_are_short_as_text_and_whole_as_json() -> None:
     )
     note = Finding("note", "order", "in another order", file="x.txt")
     warning = Finding("warning", "far", "far away", file="x.txt", names=("a", "b"))
-    report = CheckReport(
-        dataset="aachen",
-        file="x.txt",
-        reference="",
-        poses=5,
-        expected=None,
-        findings=(note, *findings, warning),
-    )
+    told = {"dataset": "aachen", "file": "x.txt", "reference": "", "poses": 5, "expected": None}
+    report = CheckReport(**told, findings=(note, *findings, warning))
     lines = report.lines()
     assert lines[0] == "error: x.txt:1: broken 1" and lines[9] == "error: x.txt:10: broken 10"
     assert lines[10:] == [
@@ -267,3 +244,186 @@ def test_random_damage_never_crashes(
         assert str(path) in str(error) and "\n" not in str(error)
     else:
         assert report.lines() and json.dumps(report.to_json(), allow_nan=False)
+
+
+ROBOTCAR = {
+    f"rear/{100 + i}.jpg": f"{c}/rear/{100 + i}.jpg" for i, c in enumerate(["dawn", "night"] * 3)
+}
+CAMERAS = [
+    image.replace("/rear/", f"/{side}/")
+    for image in ROBOTCAR.values()
+    for side in ("left", "rear", "right")
+]
+AACHEN = {f"IMG_{i}.jpg": f"query/day/nexus4/IMG_{i}.jpg" for i in range(5)}
+
+
+class NamedRows(NamedTuple):
+    images: Mapping[str, str]
+    findings: list[Finding]
+
+
+def match(
+    names: Sequence[str],
+    expected: Mapping[str, str],
+    *,
+    queries: Sequence[str] = (),
+    groups: Mapping[str, ImageGroup] | None = None,
+    dataset: str = "aachen",
+    listed: bool = True,
+) -> NamedRows:
+    named: dict[str, int] = {}
+    for line, name in enumerate(names, start=1):
+        named.setdefault(name, line)
+    reference = Reference(
+        folder="import",
+        expected=expected,
+        queries=frozenset(queries or expected.values()),
+        groups=groups or {},
+        listed=listed,
+    )
+    return NamedRows(*match_names(named, reference, dataset))
+
+
+def kinds_of(found: NamedRows) -> list[tuple[str, str]]:
+    return [(finding.severity, finding.kind) for finding in found.findings]
+
+
+def only(found: NamedRows) -> Finding:
+    (finding,) = found.findings
+    return finding
+
+
+def test_all_three_cameras_of_robotcar() -> None:
+    names = [image.split("/", 1)[1] for image in CAMERAS]
+    finding = only(match(names, ROBOTCAR, queries=CAMERAS, dataset="robotcar"))
+    assert (finding.severity, finding.kind) == ("note", "not-scored")
+    assert len(finding.names) == 12 and "left/100.jpg" in finding.message
+
+
+@pytest.mark.parametrize(
+    ("names", "expected", "kind", "words"),
+    [
+        (
+            [name.removeprefix("rear/") for name in ROBOTCAR],
+            ROBOTCAR,
+            "name-folder",
+            "6 names without the folder before them: 100.jpg should be rear/100.jpg; the server "
+            "finds none of them, and every figure is zero",
+        ),
+        (AACHEN.values(), AACHEN, "name-path", "query/day/nexus4/IMG_0.jpg should be IMG_0.jpg"),
+        ([f"./{name}" for name in AACHEN], AACHEN, "name-path", "./IMG_0.jpg should be IMG_0.jpg"),
+        ([f"/{name}" for name in AACHEN], AACHEN, "name-path", "/IMG_0.jpg should be IMG_0.jpg"),
+        (
+            [f"{image.removesuffix('.jpg')}.PNG" for image in AACHEN.values()],
+            AACHEN,
+            "name-path",
+            "more of the path than the list and ending in '.PNG' instead of '.jpg'",
+        ),
+        (
+            [name.replace(".jpg", ".JPG") for name in AACHEN],
+            AACHEN,
+            "name-letters",
+            "upper and lower case",
+        ),
+        (
+            [f"phones/{name}" for name in AACHEN],
+            {f"q/{name}": image for name, image in AACHEN.items()},
+            "name-folders",
+            "phones/IMG_0.jpg should be q/IMG_0.jpg",
+        ),
+    ],
+    ids=["no folder", "path", "./", "/", "path and ending", "letters", "other folder"],
+)
+def test_names_that_are_wrong_in_one_way(
+    names: Iterable[str], expected: Mapping[str, str], kind: str, words: str
+) -> None:
+    found = match(list(names), expected, queries=CAMERAS if expected is ROBOTCAR else ())
+    finding = only(found)
+    assert (finding.severity, finding.kind) == ("error", kind) and words in finding.message
+    assert list(found.images.values()) == list(expected.values())
+
+
+@pytest.mark.parametrize(("dataset", "severity"), [("robotcar", "warning"), ("aachen", "error")])
+def test_the_other_ending(dataset: str, severity: str) -> None:
+    names = [name.replace(".jpg", ".png") for name in ROBOTCAR]
+    finding = only(match(names, ROBOTCAR, queries=CAMERAS, dataset=dataset))
+    assert (finding.severity, finding.kind) == (severity, "name-ending")
+    words = "ending in '.png' instead of '.jpg': rear/100.png should be rear/100.jpg"
+    assert words in finding.message
+
+
+def test_unknown_and_missing_names() -> None:
+    found = match(["IMG_0.jpg", "else.jpg", "IMG_1.jpg", "more.jpg"], AACHEN)
+    unknown = [finding for finding in found.findings if finding.kind == "unknown"]
+    assert [(f.line, f.names, f.severity) for f in unknown] == [
+        (2, ("else.jpg",), "error"),
+        (4, ("more.jpg",), "error"),
+    ]
+    missing = found.findings[-1]
+    assert (missing.severity, missing.kind) == ("warning", "missing")
+    assert missing.message.startswith("3 of 5 queries have no row")
+    assert missing.names == ("IMG_2.jpg", "IMG_3.jpg", "IMG_4.jpg")
+    # a condition that is missing as a whole
+    groups = {image: ImageGroup(condition=image.split("/")[0]) for image in ROBOTCAR.values()}
+    names = [name for name, image in ROBOTCAR.items() if image.startswith("dawn")][:2]
+    finding = only(match(names, ROBOTCAR, queries=CAMERAS, groups=groups, dataset="robotcar"))
+    assert finding.message.endswith("there is no row at all of condition night")
+
+
+def test_nothing_of_the_list() -> None:
+    found = match(["x.jpg"], AACHEN)
+    assert kinds_of(found) == [("error", "unknown"), ("error", "missing")]
+    assert kinds_of(match([], AACHEN)) == [("error", "missing")]
+
+
+def test_one_query_under_two_names() -> None:
+    found = match([*AACHEN, "query/day/nexus4/IMG_3.jpg"], AACHEN)
+    assert kinds_of(found) == [("error", "name-path"), ("error", "duplicate")]
+    double = found.findings[1]
+    assert double.line == 6 and "IMG_3.jpg (line 4)" in double.message
+
+
+def test_order_is_a_note_and_only_where_there_is_one() -> None:
+    right = match(list(AACHEN), AACHEN)
+    assert right.images == AACHEN and not right.findings
+    backwards = list(AACHEN)[::-1]
+    assert kinds_of(match(backwards, AACHEN)) == [("note", "order")]
+    assert not match(backwards, AACHEN, listed=False).findings
+
+
+def test_a_stem_that_several_names_share_is_unknown() -> None:
+    expected = {"a/1.jpg": "a/1.jpg", "b/1.jpg": "b/1.jpg"}
+    assert kinds_of(match(["1.jpg"], expected))[0] == ("error", "unknown")
+    assert match(["b/1.png"], expected).images == {"b/1.png": "b/1.jpg"}
+
+
+@pytest.mark.parametrize(
+    ("dataset", "name", "kinds"),
+    [
+        ("robotcar", "1418.jpg", ["name-folder"]),
+        ("robotcar", "rear/1418.tif", ["name-ending"]),
+        ("aachen", "query/IMG.jpg", ["name-path"]),
+        ("inloc", "IMG_0801.jpg", ["name-ending"]),
+        ("robotcar", "rear/1.png", []),
+        ("aachen", "a.jpg", []),
+        ("inloc", "A.JPG", []),
+        ("kapture", "a/b.tif", []),
+    ],
+)
+def test_what_names_alone_show(dataset: str, name: str, kinds: list[str]) -> None:
+    assert [finding.kind for finding in check_shape({name: 1}, dataset)] == kinds
+
+
+def test_pairs() -> None:
+    pairs = ["1 10", "2 20", "3 30"]
+    assert match_pairs({"1 10": 1, "2 20": 2, "3 30": 3}, pairs) == (False, [])
+    swapped, findings = match_pairs({"10 1": 1, "20 2": 2, "30 3": 3}, pairs)
+    assert swapped and [f.kind for f in findings] == ["swapped"]
+    swapped, findings = match_pairs({"3 30": 1, "1 10": 2, "2 30": 3}, pairs)
+    assert not swapped
+    assert [(f.severity, f.kind, f.line) for f in findings] == [
+        ("error", "unknown", 3),
+        ("error", "missing", None),
+        ("note", "order", None),
+    ]
+    assert findings[1].names == ("2 20",)

@@ -55,8 +55,14 @@ def cards_of(evaluation: Evaluation) -> Cards:
     return next(block for block in blocks if isinstance(block, Cards))
 
 
-def test_best_typical_and_worst_come_first_then_the_worst(evaluation: Evaluation) -> None:
-    cards = cards_of(evaluation).cards
+def test_best_typical_and_worst_come_first_then_the_worst(
+    evaluation: Evaluation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = cards_of(evaluation)
+    assert found.values("condition") == ["day", "night"]
+    assert found.values("outcome") == ["fallback", "localized", "no pose"]
+    assert found.orders() == ["error", "inliers"]  # nobody gave confidences
+    cards = found.cards
     assert [card.role for card in cards[:9]] == ["best"] * 3 + ["typical"] * 3 + ["worst"] * 3
     assert len(cards) == len({card.name for card in cards}) == 40
     errors = [card.sort["error"] for card in cards]
@@ -65,13 +71,12 @@ def test_best_typical_and_worst_come_first_then_the_worst(evaluation: Evaluation
     assert sorted(errors[3:6]) == everything[19:22]
     assert errors[6:9] == [np.inf] * 3
     assert errors[9:] == sorted(errors[9:], reverse=True)
-
-
-def test_what_can_be_chosen(evaluation: Evaluation) -> None:
-    cards = cards_of(evaluation)
-    assert cards.values("condition") == ["day", "night"]
-    assert cards.values("outcome") == ["fallback", "localized", "no pose"]
-    assert cards.orders() == ["error", "inliers"]  # nobody gave confidences
+    # of many some are shown
+    monkeypatch.setattr(gallery, "MAX_PICTURES", 19)
+    cards = cards_of(evaluation).cards
+    assert len(cards) == 19
+    worst = sorted(shown_queries(evaluation), key=lambda query: query.rank())[3:8]
+    assert [card.name for card in cards[9:14]] == [query.name for query in worst]
 
 
 def test_the_page_has_them_all_and_stands_without_the_script(
@@ -84,9 +89,6 @@ def test_the_page_has_them_all_and_stands_without_the_script(
         assert query.image in page.text
     assert '<p class="pick" hidden>' in html  # shown by the script alone
     assert render_report(evaluation) == html
-
-
-def test_hostile_names(evaluation: Evaluation, page_of: Any) -> None:
     evil = "\"'></p></script><script>alert(1)</script>"
     queries = tuple(
         replace(query, condition=evil if k % 2 else "day", reason=query.reason and evil)
@@ -97,18 +99,9 @@ def test_hostile_names(evaluation: Evaluation, page_of: Any) -> None:
     page_of(html)
 
 
-def test_of_many_some_are_shown(evaluation: Evaluation, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gallery, "MAX_PICTURES", 19)
-    cards = cards_of(evaluation).cards
-    assert len(cards) == 19
-    worst = sorted(shown_queries(evaluation), key=lambda query: query.rank())[3:8]
-    assert [card.name for card in cards[9:14]] == [query.name for query in worst]
-
-
 def test_without_images_there_is_none(evaluation: Evaluation) -> None:
     shown = shown_queries(evaluation)
     assert gallery_blocks(StoredInliers(ResultContext()), shown) == ()
-    assert evaluation.context.queries is not None
     for path in evaluation.context.queries.root.rglob("*.jpg"):
         path.unlink()
     assert gallery_blocks(StoredInliers(evaluation.context), shown) == ()
@@ -147,18 +140,15 @@ def run(tmp_path: Path, kaptures: Callable[..., Path]) -> Run:
         for name in names:
             pixels = rng.integers(0, 256, (480, 640, 3), dtype=np.uint8)
             write_image(workspace / folder / "sensors/records_data" / name, pixels)
-    points = np.column_stack(
-        [rng.uniform(-2, 2, 60), rng.uniform(-1, 1, 60), rng.uniform(4, 9, 60)]
-    )
+    points = rng.uniform((-2, -1, 4), (2, 1, 9), (60, 3))
     query_px = project(CAMERA, POSES[QUERY], points)
     near_px = project(CAMERA, POSES[NEAR], points)
     # far beside their epipolar lines, which run across the images
     near_px[NUM_RIGHT : NUM_RIGHT + NUM_WRONG, 1] += 60.0
     config = FeatureConfig("x", np.dtype("<f4"), 2)
     with FeatureWriter(workspace, "keypoints", "x", config, orphan=True) as keypoints:
-        keypoints.write(QUERY, query_px.astype(np.float32))
-        keypoints.write(NEAR, near_px.astype(np.float32))
-        keypoints.write(FAR, near_px.astype(np.float32))
+        for name, px in ((QUERY, query_px), (NEAR, near_px), (FAR, near_px)):
+            keypoints.write(name, px.astype(np.float32))
     matched = np.arange(NUM_RIGHT + NUM_WRONG)
     with MatchesWriter(workspace / "matches/query", "x", orphan=True) as matches:
         both = np.stack([matched, matched], axis=1)
@@ -170,14 +160,7 @@ def run(tmp_path: Path, kaptures: Callable[..., Path]) -> Run:
 
 @pytest.fixture
 def chosen() -> Chosen:
-    return Chosen(
-        name=QUERY,
-        image=QUERY,
-        facts=("5 m off",),
-        candidates=(FAR, NEAR),
-        pose=POSES[QUERY],
-        pose_name="true",
-    )
+    return Chosen(QUERY, QUERY, ("5 m off",), (FAR, NEAR), POSES[QUERY], "true")
 
 
 def test_matches_are_found_in_the_workspace(run: Run) -> None:
@@ -185,7 +168,6 @@ def test_matches_are_found_in_the_workspace(run: Run) -> None:
     assert (stored.count(QUERY, NEAR), stored.count(QUERY, FAR)) == (42, 5)
     assert stored.count("query/other.jpg", NEAR) is None
     lines = stored.lines(QUERY, NEAR)
-    assert lines is not None
     np.testing.assert_allclose(lines.query_px, run.lines.query_px, atol=1e-3)
     np.testing.assert_allclose(lines.map_px, run.lines.map_px, atol=1e-3)
     assert StoredMatches(ResultContext()).lines(QUERY, NEAR) is None
@@ -204,45 +186,35 @@ def test_projections_of_one_point_fit_and_others_do_not(run: Run) -> None:
 
 
 def test_the_best_match_stands_beside_the_query(run: Run, chosen: Chosen) -> None:
-    shown = QueryPictures(run.context, run.context.map_poses()).of(chosen)
+    pictures = QueryPictures(run.context, run.context.map_poses())
+    shown = pictures.of(chosen)
     # ranked second, but with more matches
-    assert shown.main is not None
     assert f'<span class="name">{NEAR}</span>, candidate 2' in shown.main.caption
     assert "42 matches, 30 of them agree with the true pose" in shown.main.caption
     picture = str(shown.main.element)
     assert picture.count("<image ") == 2
     assert picture.count(f'stroke="{AGREES}"') == picture.count(f'stroke="{DISAGREES}"') == 1
     assert picture.count("M") >= 42
+    # lines join the matched pixels
+    x0, y0 = run.lines.query_px[0] * 400 / 640
+    x1, y1 = run.lines.map_px[0] * 400 / 640 + np.array([400 + 6, 0.0])
+    assert f"M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}" in picture
     (other,) = shown.others
     assert f'alt="{FAR}"' in other.element
     assert other.caption.startswith("candidate 1, ") and other.caption.endswith(", 5 matches")
-
-
-def test_lines_join_the_matched_pixels(run: Run, chosen: Chosen) -> None:
-    shown = QueryPictures(run.context, run.context.map_poses()).of(chosen)
-    scale = 400 / 640
-    x0, y0 = run.lines.query_px[0] * scale
-    x1, y1 = run.lines.map_px[0] * scale + np.array([400 + 6, 0.0])
-    assert f"M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}" in shown.main.element
-
-
-def test_without_a_known_pose_lines_have_one_colour(run: Run, chosen: Chosen) -> None:
-    shown = QueryPictures(run.context, {}).of(replace(chosen, pose=None))
-    assert UNKNOWN in shown.main.element and AGREES not in shown.main.element
-    assert "agree" not in shown.main.caption
-
-
-def test_without_candidates_the_nearest_map_image_is_shown(run: Run, chosen: Chosen) -> None:
-    shown = QueryPictures(run.context, run.context.map_poses()).of(replace(chosen, candidates=()))
-    assert f"{NEAR}</span>, nearest to the true pose" in shown.main.caption
+    # without candidates the map image nearest to the pose is shown
+    nearest = pictures.of(replace(chosen, candidates=())).main
+    assert f"{NEAR}</span>, nearest to the true pose" in nearest.caption
+    # without a known pose lines have one colour
+    unknown = QueryPictures(run.context, {}).of(replace(chosen, pose=None)).main
+    assert UNKNOWN in unknown.element and AGREES not in unknown.element
+    assert "agree" not in unknown.caption
 
 
 def test_what_is_missing_is_left_out(run: Run, chosen: Chosen) -> None:
     poses = run.context.map_poses()
-    other = QueryPictures(run.context, poses).of(
-        replace(chosen, name="query/other.jpg", image="query/other.jpg")
-    )
-    assert other.main is None  # no such file
+    other = replace(chosen, name="query/other.jpg", image="query/other.jpg")
+    assert QueryPictures(run.context, poses).of(other).main is None  # no such file
     shutil.rmtree(run.workspace / "matches")
     shutil.rmtree(run.workspace / "mapping/sensors/records_data")
     alone = QueryPictures(context_of(run.workspace / "localized"), poses).of(chosen)

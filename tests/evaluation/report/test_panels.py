@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,13 @@ import cv2
 import numpy as np
 import pytest
 
+from megloc_kapture.evaluation.evaluate import results_without_truth
+from megloc_kapture.evaluation.protocols import benchmark_of
 from megloc_kapture.evaluation.report.document import Paragraph, Pictures
 from megloc_kapture.evaluation.report.panels import SegmentedClasses, class_colors, mask_blocks
 from megloc_kapture.evaluation.report.reports import render_report
 from megloc_kapture.evaluation.results import ResultContext, context_of
 from megloc_kapture.evaluation.scoring import evaluate_poses
-from megloc_kapture.evaluation.without_truth import WithoutTruth
 from megloc_kapture.io.dataset_tables import Protocol, write_protocol
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
@@ -53,16 +54,11 @@ def add_image(root: Path, features: FeatureWriter, image: str, seed: int) -> np.
 
 
 @pytest.fixture
-def names() -> list[str]:
-    return [f"q{number:02d}.jpg" for number in range(10)]
-
-
-@pytest.fixture
-def workspace(tmp_path: Path, kaptures: Callable[..., Path], names: list[str]) -> Path:
-    root = tmp_path / "runs"
+def workspace(tmp_path: Path, kaptures: Callable[..., Path]) -> Path:
+    root, names = tmp_path / "runs", [f"q{number:02d}.jpg" for number in range(10)]
     write_protocol(root / "megloc", Protocol())
-    kaptures(root / "query", names, {})
-    kaptures(root / "localized", names, {})
+    for folder in ("query", "localized"):
+        kaptures(root / folder, names, {})
     prepared = kaptures(root / "preprocessed/query", names, {})
     config = FeatureConfig("x", np.dtype("<f4"), 2)
     with FeatureWriter(root, "keypoints", "x", config, orphan=True) as keypoints:
@@ -79,8 +75,13 @@ def decoded(address: str) -> np.ndarray:
     return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
 
 
-def masked(folders: Sequence[KaptureFolder]) -> list[Pictures]:
-    return [block for block in mask_blocks(folders) if isinstance(block, Pictures)]
+def folder_of(workspace: Path) -> KaptureFolder:
+    (folder,) = context_of(workspace / "localized").masked
+    return folder
+
+
+def masked(folder: KaptureFolder) -> list[Pictures]:
+    return [block for block in mask_blocks([folder]) if isinstance(block, Pictures)]
 
 
 def address_of(panel: object) -> str:
@@ -88,18 +89,28 @@ def address_of(panel: object) -> str:
     return found
 
 
-def test_a_few_images_are_chosen_evenly(workspace: Path) -> None:
-    (folder,) = context_of(workspace / "localized").masked
+def test_a_few_images_are_chosen_evenly_and_what_is_removed_is_said(workspace: Path) -> None:
+    folder = folder_of(workspace)
     assert folder.root == workspace / "preprocessed/query"
     # the middles of three thirds of ten
-    assert [one.name for one in masked([folder])] == ["q01.jpg", "q05.jpg", "q08.jpg"]
+    assert [one.name for one in masked(folder)] == ["q01.jpg", "q05.jpg", "q08.jpg"]
+    share = 100 * 120 * 320 / (WIDTH * HEIGHT)
+    expected = f"{share:.1f} % masked, 50 keypoints of x kept, 17 removed"
+    assert all(one.facts == (expected,) for one in masked(folder))
+    # where they were found without the mask, that is said too
+    config = FeatureConfig("a", np.dtype("<f4"), 2)
+    with FeatureWriter(workspace, "keypoints", "a", config, orphan=True) as keypoints:
+        corners = [(160.0, 300.0), (479.9, 419.9), (159.9, 300.0), (480.0, 419.9)]
+        keypoints.write("q01.jpg", np.array(corners, np.float32))
+    (found,) = masked(folder)[0].facts
+    assert found.endswith(" % masked, 4 keypoints of a kept, 2 of them on masked pixels")
     # those without a mask are not counted
     (workspace / "preprocessed/query/sensors/masks/q05.jpg.png").unlink()
-    assert [one.name for one in masked([folder])] == [*("q01.jpg", "q04.jpg", "q08.jpg")]
+    assert [one.name for one in masked(folder)] == ["q01.jpg", "q04.jpg", "q08.jpg"]
 
 
 def test_the_panels_show_image_classes_and_what_is_left(workspace: Path) -> None:
-    (folder,) = context_of(workspace / "localized").masked
+    folder = folder_of(workspace)
     said, key_told, one, *_ = mask_blocks([folder])
     assert isinstance(one, Pictures)
     image, classes, left = (decoded(address_of(panel.element)) for panel in one.panels)
@@ -110,13 +121,9 @@ def test_the_panels_show_image_classes_and_what_is_left(workspace: Path) -> None
     entry = r'background:(#[0-9a-f]{6})"></span>([a-z]+)<'
     key = {name: color for color, name in re.findall(entry, key_told.text)}
     assert set(key) == {"road", "building", "sky", "car"}
-    for name, (row, column) in (
-        ("sky", (10, 10)),
-        ("building", (100, 10)),
-        ("road", (250, 10)),
-        ("car", (190, 170)),
-    ):
-        assert "#{:02x}{:02x}{:02x}".format(*classes[row, column]) == key[name]
+    pixels = {"sky": (10, 10), "building": (100, 10), "road": (250, 10), "car": (190, 170)}
+    for name, pixel in pixels.items():
+        assert "#{:02x}{:02x}{:02x}".format(*classes[pixel]) == key[name]
     assert next(iter(key)) == "car"  # what is masked stands first
     assert "its classes" in said.text and "Red to orange: classes that may move" in said.text
     # the car is shaded, nothing else
@@ -132,24 +139,9 @@ def test_the_panels_show_image_classes_and_what_is_left(workspace: Path) -> None
     np.testing.assert_allclose(np.array(found, float), keypoints, atol=0.051)
 
 
-def test_what_is_kept_and_removed_is_said(workspace: Path) -> None:
-    (folder,) = context_of(workspace / "localized").masked
-    share = 100 * 120 * 320 / (WIDTH * HEIGHT)
-    expected = f"{share:.1f} % masked, 50 keypoints of x kept, 17 removed"
-    assert all(one.facts == (expected,) for one in masked([folder]))
-    # where they were found without the mask, that is said too
-    config = FeatureConfig("a", np.dtype("<f4"), 2)
-    with FeatureWriter(workspace, "keypoints", "a", config, orphan=True) as keypoints:
-        corners = [(160.0, 300.0), (479.9, 419.9), (159.9, 300.0), (480.0, 419.9)]
-        keypoints.write("q01.jpg", np.array(corners, np.float32))
-    (found,) = masked([folder])[0].facts
-    assert found.endswith(" % masked, 4 keypoints of a kept, 2 of them on masked pixels")
-
-
 def test_without_classes_the_mask_is_shown(workspace: Path) -> None:
     (workspace / "preprocessed/query/sensors/classes/classes.json").unlink()
-    (folder,) = context_of(workspace / "localized").masked
-    said, one, *_ = mask_blocks([folder])
+    said, one, *_ = mask_blocks([folder_of(workspace)])
     assert isinstance(said, Paragraph) and "in the middle its mask, right" in said.text
     assert isinstance(one, Pictures)
     mask = decoded(address_of(one.panels[1].element))
@@ -167,8 +159,7 @@ def test_without_classes_the_mask_is_shown(workspace: Path) -> None:
 )
 def test_what_is_broken_costs_no_report(workspace: Path, spoilt: str, content: bytes) -> None:
     (workspace / "preprocessed/query" / spoilt).write_bytes(content)
-    (folder,) = context_of(workspace / "localized").masked
-    shown = masked([folder])
+    shown = masked(folder_of(workspace))
     left_out = "masks" in spoilt or "records_data" in spoilt
     assert [one.name for one in shown] == ["q01.jpg", "q05.jpg", "q08.jpg"][left_out:]
 
@@ -176,20 +167,15 @@ def test_what_is_broken_costs_no_report(workspace: Path, spoilt: str, content: b
 def test_masks_beside_imported_images_are_found_where_none_are_prepared(
     workspace: Path,
 ) -> None:
-    (workspace / "preprocessed").rename(workspace / "elsewhere")
-    assert context_of(workspace / "localized").masked == []
-    write_image(workspace / "query/sensors/masks/q00.jpg.png", np.zeros((HEIGHT, WIDTH), np.uint8))
-    (folder,) = context_of(workspace / "localized").masked
-    assert folder.root == workspace / "query"
-
-
-def test_the_rest_of_the_report_sees_prepared_images_too(workspace: Path) -> None:
-    # keypoints and matches stand in their pixels
+    # keypoints and matches stand in the pixels of prepared images: all of the report sees those
     queries = context_of(workspace / "localized").queries
     assert queries is not None and queries.root == workspace / "preprocessed/query"
     (workspace / "preprocessed").rename(workspace / "elsewhere")
-    queries = context_of(workspace / "localized").queries
-    assert queries is not None and queries.root == workspace / "query"
+    context = context_of(workspace / "localized")
+    assert context.masked == []
+    assert context.queries is not None and context.queries.root == workspace / "query"
+    write_image(workspace / "query/sensors/masks/q00.jpg.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    assert folder_of(workspace).root == workspace / "query"
 
 
 def test_colors_tell_what_moves_and_no_two_are_equal() -> None:
@@ -207,34 +193,24 @@ def test_the_report_shows_them(
     workspace: Path, world: Any, page_of: Callable[[str], Any], kaptures: Callable[..., Path]
 ) -> None:
     evaluation = evaluate_poses(world.estimated, world.truth, conditions=world.conditions)
-    context = context_of(workspace / "localized")
-    masked = replace(evaluation, context=context)
-    html = render_report(masked)
+    html = render_report(replace(evaluation, context=context_of(workspace / "localized")))
     page = page_of(html)
     assert "What masks hide" in page.text
     assert "50 keypoints of x kept, 17 removed" in page.text
     # dots are nothing but round ends, and the figures' style is for every element of the page
     assert "stroke-linecap: butt" in html
     assert 'style="stroke-linecap:round"' in html
-    assert html == render_report(masked)
     assert len(html) < len(render_report(evaluation)) + 200_000
-    assert "What masks hide" not in page_of(render_report(evaluation)).text
     without = ResultContext(masked=[KaptureFolder(kaptures(workspace / "plain", ["a.jpg"], {}))])
-    assert (
-        "What masks hide" not in page_of(render_report(replace(evaluation, context=without))).text
-    )
+    for plain in (evaluation, replace(evaluation, context=without)):
+        assert "What masks hide" not in page_of(render_report(plain)).text
 
 
 def test_a_report_without_truth_shows_them_too(
     workspace: Path, page_of: Callable[[str], Any]
 ) -> None:
-    from megloc_kapture.evaluation.evaluate import results_without_truth
-    from megloc_kapture.evaluation.protocols import benchmark_of
-    from megloc_kapture.evaluation.report.reports import render_report
-
-    found: WithoutTruth = results_without_truth(
-        [workspace / "localized"], benchmark_of(workspace / "megloc"), labels=["mine"]
-    )
+    rules = benchmark_of(workspace / "megloc")
+    found = results_without_truth([workspace / "localized"], rules, labels=["mine"])
     assert "mine: what masks hide" in page_of(render_report(found)).text
     (result,) = found.results
     other = replace(found, results=(replace(result, context=ResultContext()),))

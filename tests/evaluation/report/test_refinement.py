@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -46,11 +47,6 @@ def pictures_of(blocks: tuple[Block, ...]) -> list[Pictures]:
     return [block for block in blocks if isinstance(block, Pictures)]
 
 
-def test_nothing_is_said_without_refinement() -> None:
-    pose = {"q.jpg": RigidTransform.identity()}
-    assert refinement_blocks(ResultContext(), pose) == ()
-
-
 def test_steps_tell_errors_before_and_after_each_of_them(displace: Displace) -> None:
     truth = {name: RigidTransform.identity() for name in ("a", "b", "c", "d")}
     off = {
@@ -86,16 +82,14 @@ def test_steps_tell_errors_before_and_after_each_of_them(displace: Displace) -> 
 
 def test_without_truth_only_movement_is_told() -> None:
     start = RigidTransform.identity()
+    assert refinement_blocks(ResultContext(), {"q.jpg": start}) == ()
     context = ResultContext(refinements={"a": [row("a", "icp", start, moved=0.25)]})
     found = refinement_blocks(context, {"a": start}, thresholds=[Threshold(position_m=1.0)])
     (step,) = steps_of(found)
     assert step["moved by\n(median)"] == "0.2500 m, 0.000 deg"
     assert not any("error" in heading for heading in step)
     assert found[1].text == "Movement and errors are those of the accepted poses."
-
-
-def test_refinement_of_a_query_without_a_pose_is_not_counted() -> None:
-    context = ResultContext(refinements={"a": [row("a", "icp", RigidTransform.identity())]})
+    # of a query without a pose it is not counted
     assert refinement_blocks(context, {}) == ()
 
 
@@ -132,16 +126,9 @@ def wall(tmp_path: Path) -> ResultContext:
         write_image(records / f"{role}.png", np.ascontiguousarray(image))
         if role == "map":
             write_depth_map(records / "map.depth", np.full((120, 160), DEPTH_M, np.float32))
+    # of 9 matches, inliers and score
     cluster = ClusterRow(
-        image="query.png",
-        cluster=0,
-        chosen="yes",
-        num_matches=9,
-        num_inliers=9,
-        score=9.0,
-        reason="",
-        images=("map.png",),
-        cam_from_world=RigidTransform.identity(),
+        "query.png", 0, "yes", 9, 9, 9.0, "", ("map.png",), RigidTransform.identity()
     )
     return ResultContext(
         queries=KaptureFolder(tmp_path / "query"),
@@ -153,13 +140,11 @@ def wall(tmp_path: Path) -> ResultContext:
 
 def decoded(picture: str) -> np.ndarray:
     found = re.search(r"base64,([^\"]+)", picture)
-    assert found is not None
     data = np.frombuffer(base64.b64decode(found.group(1)), np.uint8)
     return cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1].astype(np.float64)
 
 
 def test_tiles_of_query_and_map_meet_at_the_true_pose_only(wall: ResultContext) -> None:
-    assert wall.queries is not None
     query = cv2.imread(str(wall.queries.image_path("query.png")))[..., ::-1].astype(np.float64)
     wrong = RigidTransform.identity()
     found = refinement_blocks(wall, {"query.png": wrong}, {"query.png": TRUE})
@@ -175,20 +160,10 @@ def test_tiles_of_query_and_map_meet_at_the_true_pose_only(wall: ResultContext) 
 
 
 def test_a_pose_that_stayed_and_a_map_without_depth_are_not_shown(wall: ResultContext) -> None:
-    stayed = ResultContext(
-        queries=wall.queries,
-        mapping=wall.mapping,
-        clusters=wall.clusters,
-        refinements={"query.png": [row("query.png", "icp", TRUE, "no depth")]},
-    )
+    kept = {"query.png": [row("query.png", "icp", TRUE, "no depth")]}
+    stayed = replace(wall, refinements=kept)
     assert pictures_of(refinement_blocks(stayed, {"query.png": TRUE})) == []
-    assert wall.mapping is not None
     (wall.mapping.root / "sensors" / "records_depth.txt").unlink()
-    fresh = ResultContext(
-        queries=wall.queries,
-        mapping=KaptureFolder(wall.mapping.root),
-        clusters=wall.clusters,
-        refinements=wall.refinements,
-    )
+    fresh = replace(wall, mapping=KaptureFolder(wall.mapping.root))
     found = refinement_blocks(fresh, {"query.png": TRUE})
     assert found and pictures_of(found) == []

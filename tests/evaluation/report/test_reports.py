@@ -1,4 +1,4 @@
-"""Reports of one result and of several: text, files and page."""
+"""Reports of one result and of several: sentences, text, files and page."""
 
 from __future__ import annotations
 
@@ -14,11 +14,19 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import OutputError
+from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.gallery import query_table
 from megloc_kapture.evaluation.report.queries import disputed_queries, worst_queries
 from megloc_kapture.evaluation.report.reports import render_report, report_text, write_report
+from megloc_kapture.evaluation.report.wording import (
+    format_degrees,
+    format_metres,
+    format_percent,
+    median_sentence,
+    threshold_sentence,
+)
 from megloc_kapture.evaluation.scoring import Evaluation, evaluate_poses
-from megloc_kapture.evaluation.statistics import Comparison, compare, over_seeds
+from megloc_kapture.evaluation.statistics import MedianDifference, compare, over_seeds
 from megloc_kapture.io.tables import QueryStatus
 from megloc_kapture.values import RigidTransform
 
@@ -26,18 +34,14 @@ HERE = RigidTransform.identity()
 
 
 def evaluation_of(world: Any) -> Evaluation:
-    return evaluate_poses(
-        world.estimated,
-        world.truth,
-        conditions=world.conditions,
-        statuses=world.statuses,
-        label="a <b>bold</b> & daring result",
-    )
+    options = {"conditions": world.conditions, "statuses": world.statuses}
+    label = "a <b>bold</b> & daring result"
+    return evaluate_poses(world.estimated, world.truth, label=label, **options)
 
 
-def test_well_formed_and_self_contained(world: Any, page_of: Any) -> None:
-    page = page_of(render_report(evaluation_of(world), map_poses=world.mapped))
-    assert page.ids and page.references
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def test_says_what_the_table_says(world: Any, page_of: Any) -> None:
@@ -50,6 +54,11 @@ def test_says_what_the_table_says(world: Any, page_of: Any) -> None:
     for query in evaluation.queries:
         assert query.image in text
     assert "6 inliers, 12 needed" in text
+    one = page_of(render_report(evaluate_poses({"a.jpg": HERE}, {"a.jpg": HERE}))).text
+    assert "1 of 1 queries localized." in one and "Error against inliers" not in one
+    none = page_of(render_report(evaluate_poses({}, {"a": HERE, "b": HERE}))).text
+    assert "0 of 2 queries localized, 2 without a pose." in none
+    assert "median: most lack a pose" in none
 
 
 def test_names_are_escaped(world: Any, page_of: Any) -> None:
@@ -60,12 +69,9 @@ def test_names_are_escaped(world: Any, page_of: Any) -> None:
     world.statuses[name] = QueryStatus(image=name, status="failed", reason=f"why {evil}")
     evaluation = evaluation_of(world)
     html = render_report(evaluation, provenance={"root": f"/data/{evil}"})
-    assert "<script" not in html
-    assert "<i>day" not in html
-    assert "<b>bold" not in html
+    assert not any(tag in html for tag in ("<script", "<i>day", "<b>bold"))
     text = page_of(html).text
-    assert name in text
-    assert f"why {evil}" in text
+    assert name in text and f"why {evil}" in text
 
 
 def test_the_steps_of_the_paper_come_first(world: Any, page_of: Any) -> None:
@@ -80,14 +86,6 @@ def test_the_steps_of_the_paper_come_first(world: Any, page_of: Any) -> None:
     assert "<no> depth" in text and "<no>" not in html
     assert "steps" not in html.partition("<pre>")[2]  # not once more at the end
     assert "Steps of the paper" not in render_report(evaluation_of(world))
-
-
-def test_same_bytes_each_time_and_no_date(world: Any) -> None:
-    evaluation = evaluation_of(world)
-    options = {"preset": "classic"}
-    first = render_report(evaluation, map_poses=world.mapped, provenance=options)
-    assert render_report(evaluation, map_poses=world.mapped, provenance=options) == first
-    assert "dc:date" not in first
 
 
 def test_a_users_matplotlib_settings_change_nothing_and_are_kept(world: Any) -> None:
@@ -113,24 +111,14 @@ def test_queries_stand_the_worst_first(world: Any) -> None:
     assert cells["met"][-1].page == "●●●●"
 
 
-def test_a_single_query_without_status_condition_or_map(page_of: Any) -> None:
-    text = page_of(render_report(evaluate_poses({"a.jpg": HERE}, {"a.jpg": HERE}))).text
-    assert "1 of 1 queries localized." in text
-    assert "Error against inliers" not in text
-
-
-def test_nothing_localized(page_of: Any) -> None:
-    text = page_of(render_report(evaluate_poses({}, {"a": HERE, "b": HERE}))).text
-    assert "0 of 2 queries localized, 2 without a pose." in text
-    assert "median: most lack a pose" in text
-
-
 def test_estimates_off_the_page_are_counted(world: Any) -> None:
     name = next(name for name in world.estimated if world.statuses[name].status == "localized")
     world.estimated[name] = RigidTransform((1.0, 0.0, 0.0, 0.0), (-1e6, 0.0, 0.0))
     evaluation = evaluation_of(world)
     page = render_report(evaluation, map_poses=world.mapped)
     assert "1 estimate lies outside the page." in page
+    # a date would make two runs differ
+    assert "dc:date" not in page
 
 
 def test_many_queries_stay_a_small_page(worlds: Any) -> None:
@@ -141,9 +129,16 @@ def test_many_queries_stay_a_small_page(worlds: Any) -> None:
     assert render_report(evaluation) == html  # here the dots are pixels
 
 
-def test_files(world: Any, tmp_path: Path) -> None:
+def test_files(world: Any, tmp_path: Path, page_of: Any) -> None:
     evaluation = evaluation_of(world)
-    paths = write_report(tmp_path / "evaluation", evaluation, map_poses=world.mapped)
+    options = {"map_poses": world.mapped, "provenance": {"preset": "classic"}}
+    paths = write_report(tmp_path / "evaluation", evaluation, **options)
+    again = write_report(tmp_path / "again", evaluation, **options)
+    assert all(path.read_bytes() == again[name].read_bytes() for name, path in paths.items())
+    page = page_of(paths["report.html"].read_text())
+    assert page.ids and page.references
+    with pytest.raises(OutputError, match="recall"):
+        write_report(paths["recall.txt"], evaluation)
     assert sorted(path.name for path in (tmp_path / "evaluation").iterdir()) == sorted(paths)
     assert paths["recall.txt"].read_text() == report_text(evaluation)
     summary = json.loads(paths["recall.json"].read_text())
@@ -153,28 +148,13 @@ def test_files(world: Any, tmp_path: Path) -> None:
     for at in whole["recall"]:
         assert at["recall"] == at["num_within"] / whole["num_queries"]
     assert whole["num_fallback"] == 4
-    with paths["per_query.csv"].open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(paths["per_query.csv"])
     assert [row["image"] for row in rows] == sorted(world.truth)
     for row, position_m in zip(rows, evaluation.errors.position_m, strict=True):
         if row["outcome"] == "missing":
             assert row["position_error_m"] == "" and position_m == np.inf
         else:
             assert float(row["position_error_m"]) == position_m
-
-
-def test_files_are_the_same_each_time(world: Any, tmp_path: Path) -> None:
-    evaluation = evaluation_of(world)
-    first = write_report(tmp_path / "1", evaluation)
-    second = write_report(tmp_path / "2", evaluation)
-    for name, path in first.items():
-        assert path.read_bytes() == second[name].read_bytes()
-
-
-def test_an_unwritable_folder_is_named(world: Any, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="file"):
-        write_report(tmp_path / "file", evaluation_of(world))
 
 
 @pytest.fixture
@@ -191,7 +171,11 @@ def results(worlds: Callable[..., Any]) -> list[Evaluation]:
 
 
 def test_text(results: list[Evaluation]) -> None:
-    text = report_text(compare(results))
+    comparison = compare(results)
+    (median,) = comparison.medians
+    assert median.first_m == results[0].row().median_position_m
+    assert median.low_m <= median.first_m - median.second_m <= median.high_m
+    text = report_text(comparison)
     assert text.isascii() and max(map(len, text.splitlines())) <= 100
     for evaluation in results:
         for row in evaluation.rows:
@@ -201,9 +185,7 @@ def test_text(results: list[Evaluation]) -> None:
     assert "all of them finds 8 queries that fewer misses" in flat
     assert "the difference is real (p = 0." in flat
     assert "Note on fewer:" in flat
-
-
-def test_long_labels_are_cut_in_the_table_only(results: list[Evaluation]) -> None:
+    # long labels are cut, in the table only
     long = [replace(e, label=f"/data/runs/{e.label}/{'x' * 40}/localized") for e in results]
     lines = report_text(compare(long)).splitlines()
     table = lines[: lines.index("", 4)]
@@ -212,7 +194,7 @@ def test_long_labels_are_cut_in_the_table_only(results: list[Evaluation]) -> Non
 
 
 def test_files_of_a_comparison(
-    results: list[Evaluation], tmp_path: Path, page_of: Callable[..., Any]
+    results: list[Evaluation], world: Any, tmp_path: Path, page_of: Callable[..., Any]
 ) -> None:
     comparison = compare(results)
     paths = write_report(tmp_path / "out", comparison)
@@ -226,8 +208,7 @@ def test_files_of_a_comparison(
     assert (test["first"], test["second"], test["row"]) == ("all of them", "fewer", "all")
     assert len(test["only_first"]) == 8 and test["only_second"] == []
     assert len(summary["comparison"]["sentences"]) >= 5
-    with paths["per_query.csv"].open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(paths["per_query.csv"])
     assert [row["image"] for row in rows] == list(results[0].errors.names)
     lost = test["only_first"][0]
     (row,) = [row for row in rows if row["image"] == lost]
@@ -235,27 +216,17 @@ def test_files_of_a_comparison(
     assert row["fewer: position_error_m"] == ""
     index = results[0].errors.names.index(lost)
     assert float(row["all of them: position_error_m"]) == results[0].errors.position_m[index]
-    with paths["differences.csv"].open(newline="") as file:
-        listed = list(csv.DictReader(file))
+    listed = rows_of(paths["differences.csv"])
     assert len(listed) == sum(len(t.only_first) + len(t.only_second) for t in comparison.tests)
     assert {row["found_by"] for row in listed} == {"all of them"}
     page = page_of(paths["report.html"].read_text())
     for sentence in summary["comparison"]["sentences"]:
         assert sentence in page.text
-
-
-def test_the_page_is_the_same_each_time(
-    results: list[Evaluation], worlds: Callable[..., Any]
-) -> None:
-    comparison = compare(results)
-    first = render_report(comparison, map_poses=worlds().mapped)
-    assert render_report(comparison, map_poses=worlds().mapped) == first
-
-
-def test_labels_are_escaped(results: list[Evaluation], page_of: Callable[..., Any]) -> None:
     evil = replace(results[1], label="<script>alert('$x$')</script>")
-    page = page_of(render_report(compare([results[0], evil])))
-    assert evil.label in page.text
+    comparison = compare([results[0], evil])
+    html = render_report(comparison, map_poses=world.mapped)
+    assert evil.label in page_of(html).text
+    assert render_report(comparison, map_poses=world.mapped) == html
 
 
 def test_seeds_files(
@@ -292,19 +263,134 @@ def test_worst_queries_are_not_all_without_a_pose(worlds: Callable[..., Any]) ->
     chosen = worst_queries(evaluation)
     with_pose = [one.name for one in chosen if one.name in posed]
     assert len(chosen) == 10 and len(with_pose) == 5
-    worst = sorted(
-        posed, key=lambda n: -evaluation.errors.position_m[evaluation.errors.names.index(n)]
-    )
-    assert with_pose == worst[:5]
+    error_m = dict(zip(evaluation.errors.names, evaluation.errors.position_m, strict=True))
+    assert with_pose == sorted(posed, key=lambda name: -error_m[name])[:5]
     # where nothing is lost, all places are for errors
-    whole = evaluate_poses(world.truth, world.truth)
-    assert len(worst_queries(whole)) == 10
+    assert len(worst_queries(evaluate_poses(world.truth, world.truth))) == 10
     few = evaluate_poses({}, dict(list(world.truth.items())[:3]))
     assert len(worst_queries(few)) == 3
 
 
-def test_medians_stand_in_the_comparison(results: list[Evaluation]) -> None:
-    comparison: Comparison = compare(results)
-    (median,) = comparison.medians
-    assert median.first_m == results[0].row().median_position_m
-    assert median.low_m <= median.first_m - median.second_m <= median.high_m
+TABLE = """\
+aachen
+
+recall (%) at 0.05 m, 5 deg / 0.25 m, 2 deg / 0.5 m, 5 deg / 5 m, 10 deg
+Both errors at or below (<=) the threshold; a query without a pose counts as a miss.
+
+                                                           median error (m, deg)
+condition  queries  localized  recall (%)                  of all         of localized
+---------------------------------------------------------------------------------------
+day              3          3  33.3 / 66.7 / 66.7 / 100.0  0.1000, 0.000  0.1000, 0.000
+night            2          1  0.0 / 0.0 / 50.0 / 50.0     inf            0.4000, 0.000
+---------------------------------------------------------------------------------------
+all              5          4  20.0 / 40.0 / 60.0 / 80.0   0.4000, 0.000  0.2500, 0.000
+
+95 % confidence intervals of recall, queries taken as independent, (%)
+day    0.8-90.6 / 9.4-99.2 / 9.4-99.2  / 29.2-100.0
+night  0.0-84.2 / 0.0-84.2 / 1.3-98.7  / 1.3-98.7
+all    0.5-71.6 / 5.3-85.3 / 14.7-94.7 / 28.4-99.5
+
+Note: too few queries (5) to compare recall by: the intervals say how little they tell.
+"""
+
+
+def moved(metres: float) -> RigidTransform:
+    return RigidTransform((1.0, 0.0, 0.0, 0.0), (metres, 0.0, 0.0))
+
+
+def test_the_whole_table() -> None:
+    truth = dict.fromkeys(["d1", "d2", "d3", "n1", "n2"], HERE)
+    estimated = {"d1": moved(0.001), "d2": moved(0.1), "d3": moved(2.0), "n1": moved(0.4)}
+    conditions = {name: {"d": "day", "n": "night"}[name[0]] for name in truth}
+    text = report_text(evaluate_poses(estimated, truth, conditions=conditions, label="aachen"))
+    assert text == TABLE
+
+
+def test_fits_a_terminal_and_is_ascii(world: Any) -> None:
+    world.estimated["stranger.jpg"] = HERE
+    conditions = {name: f"{c}-in-a-hard-winter" for name, c in world.conditions.items()}
+    options = {"conditions": conditions, "statuses": world.statuses}
+    text = report_text(evaluate_poses(world.estimated, world.truth, **options))
+    assert text.isascii()
+    assert max(map(len, text.splitlines())) <= 100
+    assert "(+4)" in text and "(+n): fallback poses" in text
+    assert "4 queries could not be localized" in text
+    assert "1 image has no true pose and is not counted: stranger.jpg." in text
+
+
+def test_no_pose_at_all_strangers_and_thresholds_without_angles() -> None:
+    strangers = {f"x{i}.jpg": HERE for i in range(1000)}
+    text = report_text(evaluate_poses(strangers, {"a.jpg": HERE}))
+    for words in ("0.0 / 0.0 / 0.0 / 0.0", "no query has a pose", "do the names agree?"):
+        assert words in text
+    assert "1000 images have no true pose" in text and "x5.jpg" not in text
+    metres = [Threshold(position_m=0.1)]
+    text = report_text(evaluate_poses({"a": HERE}, {"a": HERE}, thresholds=metres))
+    assert "recall (%) at 0.1 m\nPosition error at or below" in text
+
+
+def test_figures_are_printed_to_what_can_be_read() -> None:
+    shares = [format_percent(recall) for recall in (0.0, 0.8975, 1.0, 2 / 3)]
+    assert shares == ["0.0", "89.8", "100.0", "66.7"]
+    assert (format_metres(0.00123), format_metres(12.3456)) == ("0.0012", "12.35")
+    assert (format_degrees(0.0456), format_degrees(1.2345)) == ("0.046", "1.23")
+
+
+THRESHOLD = Threshold(position_m=0.25, angle_deg=2.0)
+
+
+def by_hand(only: int, other: int, both: int = 10) -> tuple[Evaluation, Evaluation]:
+    """Two results, one alone within the threshold on ``only`` queries, the other on ``other``."""
+    near, far = moved(0.1), moved(3.0)
+    names = [f"{i:03d}.jpg" for i in range(only + other + both)]
+    truth = dict.fromkeys(names, HERE)
+    first = {n: far if only <= i < only + other else near for i, n in enumerate(names)}
+    second = {n: far if i < only else near for i, n in enumerate(names)}
+    options = {"thresholds": [THRESHOLD]}
+    return (
+        evaluate_poses(first, truth, label="A", **options),
+        evaluate_poses(second, truth, label="B", **options),
+    )
+
+
+def sentence_of(only: int, other: int, both: int = 10) -> str:
+    comparison = compare(by_hand(only, other, both))
+    return threshold_sentence(comparison.tests[0], ["A", "B"])
+
+
+def test_differences_that_are_real_and_that_could_be_chance() -> None:
+    assert sentence_of(12, 3) == (
+        "At 0.25 m, 2 deg A finds 12 queries that B misses and B finds 3 that A misses: "
+        "the difference is real (p = 0.035)."
+    )
+    assert sentence_of(9, 4).endswith("the difference could be chance (p = 0.27).")
+    assert sentence_of(1, 0) == (
+        "At 0.25 m, 2 deg A finds 1 query that B misses and B finds none that A misses: "
+        "too few queries differ to tell it from chance (p = 1)."
+    )
+    assert sentence_of(0, 5).startswith(
+        "At 0.25 m, 2 deg A finds no query that B misses and B finds 5 that A misses: too few"
+    )
+
+
+def test_no_difference() -> None:
+    assert sentence_of(0, 0) == "At 0.25 m, 2 deg A and B find the same 10 queries."
+    nothing = [
+        evaluate_poses({}, e.truth, thresholds=[THRESHOLD], label=e.label) for e in by_hand(2, 0)
+    ]
+    said = threshold_sentence(compare(nothing).tests[0], ["A", "B"])
+    assert said == "At 0.25 m, 2 deg neither A nor B finds a query."
+
+
+def test_sentences_about_medians() -> None:
+    def said(*values: float) -> str:
+        return median_sentence(MedianDifference(0, 1, *values), ["A", "B"])
+
+    assert said(0.1, 0.12, -0.03, -0.01) == (
+        "The median position error is 0.1000 m for A and 0.1200 m for B: -0.0200 m, "
+        "95 % interval -0.0300 to -0.0100 m; the difference is real."
+    )
+    assert said(0.1, 0.12, -0.03, 0.01).endswith("+0.0100 m; the difference could be chance.")
+    assert "Most queries of B have no pose" in said(0.1, np.inf, -np.inf, -np.inf)
+    assert "of A and of B" in said(np.inf, np.inf, 0.0, 0.0)
+    assert "to +inf m" in said(1.0, 0.1, 0.5, np.inf)

@@ -6,7 +6,7 @@ import base64
 import html
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,15 @@ import pytest
 from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.evaluation.report import scene as scenes
-from megloc_kapture.evaluation.report.queries import StoredInliers, legend, shown_queries
-from megloc_kapture.evaluation.report.scene import corner_rays, render_view, scene_of
+from megloc_kapture.evaluation.report.queries import (
+    ShownQuery,
+    StoredInliers,
+    legend,
+    shown_queries,
+)
+from megloc_kapture.evaluation.report.scene import Scene, corner_rays, render_view, scene_of
 from megloc_kapture.evaluation.results import ResultContext
-from megloc_kapture.evaluation.scoring import evaluate_poses
-from megloc_kapture.geometry.cameras import project
+from megloc_kapture.evaluation.scoring import Evaluation, evaluate_poses
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.io.kapture.points import write_points3d
@@ -41,7 +45,6 @@ CAMERAS = (
 def data_of(page: str) -> dict[str, Any]:
     """The data of a view, arrays decoded."""
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
-    assert found is not None
     data: dict[str, Any] = json.loads(found[1])
     for name in ("points", "inliers"):
         data[name] = decoded(data[name], "<f4").reshape(-1, 3)
@@ -87,17 +90,34 @@ def check_corners(camera: Camera, pose: RigidTransform, frustum: np.ndarray) -> 
 
 @pytest.fixture
 def make_map(tmp_path: Path, upright: Any, kaptures: Any) -> Callable[..., Path]:
-    def make(names: list[str], camera: Camera, points: np.ndarray, offset: float = 0.0) -> Path:
+    def make(
+        names: Sequence[str] = ("m/0.jpg", "m/1.jpg"),
+        camera: Camera = CAMERAS[0],
+        points: np.ndarray | None = None,
+        offset: float = 0.0,
+    ) -> Path:
         poses = {
             name: upright(np.array([offset + 3.0 * k, k * 0.5, 1.6]), 0.3 * k)
             for k, name in enumerate(names)
         }
         root: Path = kaptures(tmp_path / "map", names, poses, camera)
-        write_points3d(root, points)
+        write_points3d(root, np.zeros((1, 6)) if points is None else points)
         (root / "reconstruction" / "observations.txt").write_text("# kapture format: 1.1\n")
         return root
 
     return make
+
+
+def drawn(root: Path, queries: Sequence[ShownQuery] = (), **context: Any) -> Scene:
+    mapping = KaptureFolder(root)
+    scene = scene_of(EVIL, StoredInliers(ResultContext(mapping=mapping, **context)), queries)
+    assert scene is not None
+    return scene
+
+
+def evaluation_of(world: Any) -> Evaluation:
+    options = {"conditions": world.conditions, "statuses": world.statuses}
+    return evaluate_poses(world.estimated, world.truth, **options)
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.model)
@@ -108,8 +128,7 @@ def test_the_page_has_what_kapture_reads(make_map: Any, camera: Camera, offset: 
         [rng.normal((offset, 0, 0), 5, (500, 3)), rng.integers(0, 256, (500, 3))]
     )
     root = make_map([f"m/{k}.jpg" for k in range(6)], camera, points, offset)
-    scene = scene_of("a map", StoredInliers(ResultContext(mapping=KaptureFolder(root))))
-    assert scene is not None
+    scene = drawn(root)
     data = data_of(render_view(scene))
     check_against_kapture(data, kapture_from_dir(str(root), skip_list=[kapture.Observations]))
     np.testing.assert_array_equal(data["colors"], points[:, 3:])
@@ -121,8 +140,7 @@ def test_the_page_has_what_kapture_reads(make_map: Any, camera: Camera, offset: 
 
 def test_a_foreign_map_of_rigs(shared_data: Path) -> None:
     root = shared_data / "foreign_maps" / "virtual_gallery" / "map"
-    scene = scene_of("gallery", StoredInliers(ResultContext(mapping=KaptureFolder(root))))
-    assert scene is not None
+    scene = drawn(root)
     data = data_of(render_view(scene))
     check_against_kapture(data, kapture_from_dir(str(root), skip_list=[kapture.Observations]))
     read = KaptureFolder(root).read()
@@ -151,30 +169,25 @@ def test_many_points_and_cameras_are_drawn_in_part(make_map: Any, monkeypatch: A
     points = np.column_stack([rng.normal(0, 5, (90_000, 3)), rng.integers(0, 256, (90_000, 3))])
     monkeypatch.setattr(scenes, "MAX_CAMERAS", 10)
     root = make_map([f"m/{k:03d}.jpg" for k in range(30)], CAMERAS[0], points)
-    scene = scene_of("many", StoredInliers(ResultContext(mapping=KaptureFolder(root))))
-    assert scene is not None and len(scene.cameras) == 10
+    scene = drawn(root)
+    assert len(scene.cameras) == 10
     assert "60000 of the map's 90000 points" in scene.notes[0]
     assert "10 of the map's 30 cameras" in scene.notes[1]
     page = render_view(scene)
     assert len(page) < 3_000_000
-    again = scene_of("many", StoredInliers(ResultContext(mapping=KaptureFolder(root))))
-    assert again is not None and render_view(again) == page
+    assert render_view(drawn(root)) == page
     known = {tuple(row) for row in np.float32(points[:, :3] - scene.origin).tolist()}
     assert {tuple(row) for row in scene.points.tolist()} <= known
 
 
 def test_names_cannot_leave_the_data(world: Any, make_map: Any, upright: Any) -> None:
-    root = make_map(["m/0.jpg", "m/1.jpg"], CAMERAS[0], np.zeros((1, 6)))
+    root = make_map()
     name = f"query/{EVIL}"
     world.truth[name] = world.estimated[name] = upright(np.zeros(3), 0.0)
     world.conditions = dict.fromkeys(world.truth, EVIL)
     world.statuses[name] = QueryStatus(image=name, status="failed", reason=EVIL)
-    evaluation = evaluate_poses(
-        world.estimated, world.truth, conditions=world.conditions, statuses=world.statuses
-    )
-    context = ResultContext(mapping=KaptureFolder(root))
-    scene = scene_of(EVIL, StoredInliers(context), shown_queries(evaluation))
-    assert scene is not None
+    evaluation = evaluation_of(world)
+    scene = drawn(root, shown_queries(evaluation))
     page = render_view(replace(scene, cameras=(EVIL, "m/1.jpg")))
     # two scripts, of data and ours, whatever the names say
     assert page.count("<script") == page.count("</script>") == 2 and "alert('" not in page[:2000]
@@ -188,20 +201,14 @@ def test_names_cannot_leave_the_data(world: Any, make_map: Any, upright: Any) ->
 
 
 def test_queries_estimates_and_truths(world: Any, make_map: Any) -> None:
-    root = make_map(["m/0.jpg", "m/1.jpg"], CAMERAS[0], np.zeros((1, 6)))
-    evaluation = evaluate_poses(
-        world.estimated, world.truth, conditions=world.conditions, statuses=world.statuses
-    )
+    root = make_map()
+    evaluation = evaluation_of(world)
     shown = shown_queries(evaluation)
-    scene = scene_of("queries", StoredInliers(ResultContext(mapping=KaptureFolder(root))), shown)
-    assert scene is not None
+    scene = drawn(root, shown)
     data = data_of(render_view(scene))
     by_image = {query.image: query for query in evaluation.queries}
-    met = [evaluation.thresholds.index(t) for t in evaluation.thresholds]
-    assert met  # the colours below are those of the thresholds
-    for query, frustum, true in zip(
-        data["queries"], data["frusta"], data["trueFrusta"], strict=True
-    ):
+    drawings = zip(data["queries"], data["frusta"], data["trueFrusta"], strict=True)
+    for query, frustum, true in drawings:
         name = query["name"]
         one = by_image[name]
         np.testing.assert_allclose(data["origin"] + true[0], world.truth[name].center(), atol=1e-5)
@@ -209,9 +216,8 @@ def test_queries_estimates_and_truths(world: Any, make_map: Any) -> None:
             assert np.isnan(frustum).all() and query["meaning"] == "no pose"
             assert query["error"] is None and one.reason in query["facts"][0]
             continue
-        np.testing.assert_allclose(
-            data["origin"] + frustum[0], world.estimated[name].center(), atol=1e-5
-        )
+        center = world.estimated[name].center()
+        np.testing.assert_allclose(data["origin"] + frustum[0], center, atol=1e-5)
         assert query["error"] == one.position_m
         within = [
             t for t in evaluation.thresholds
@@ -226,12 +232,11 @@ def test_queries_estimates_and_truths(world: Any, make_map: Any) -> None:
 
 
 def test_of_many_queries_the_worst_are_shown(worlds: Any, make_map: Any) -> None:
-    root = make_map(["m/0.jpg", "m/1.jpg"], CAMERAS[0], np.zeros((1, 6)))
+    root = make_map()
     world = worlds(num_queries=3000)
     evaluation = evaluate_poses(world.estimated, world.truth, statuses=world.statuses)
-    context = ResultContext(mapping=KaptureFolder(root))
-    scene = scene_of("many", StoredInliers(context), shown_queries(evaluation))
-    assert scene is not None and len(scene.queries) == 2000
+    scene = drawn(root, shown_queries(evaluation))
+    assert len(scene.queries) == 2000
     assert scene.notes == ("The worst 2000 of 3000 queries are drawn and listed.",)
     assert len(render_view(scene)) < 3_000_000
 
@@ -239,57 +244,36 @@ def test_of_many_queries_the_worst_are_shown(worlds: Any, make_map: Any) -> None
 def test_a_map_without_colours_is_shaded_by_height(make_map: Any) -> None:
     points = np.zeros((50, 6))
     points[:, 2] = np.arange(50)
-    root = make_map(["m/0.jpg", "m/1.jpg"], CAMERAS[0], points)
-    scene = scene_of("grey", StoredInliers(ResultContext(mapping=KaptureFolder(root))))
-    assert scene is not None
+    root = make_map(points=points)
+    scene = drawn(root)
     assert (np.diff(scene.colors.astype(int).sum(axis=1)) >= 0).all() and scene.colors.std() > 20
-
-
-def test_nothing_to_see() -> None:
-    assert scene_of("nothing", StoredInliers(ResultContext())) is None
-
-
-def test_projection_agrees_with_the_package(make_map: Any) -> None:
-    """A point on a ray of the frustum is seen at the corner by the package's own projection."""
-    camera = CAMERAS[2]
-    root = make_map(["m/0.jpg", "m/1.jpg"], camera, np.zeros((1, 6)))
-    scene = scene_of("rays", StoredInliers(ResultContext(mapping=KaptureFolder(root))))
-    assert scene is not None
-    pose = KaptureFolder(root).read().poses()[scene.cameras[0]]
-    corners = scene.origin + scene.camera_frusta[0, 0] + 7.0 * scene.camera_frusta[0, 1:]
-    pixels = project(camera, pose, corners)
-    np.testing.assert_allclose(pixels, [[0, 0], [800, 0], [800, 600], [0, 600]], atol=1e-2)
 
 
 def test_coordinate_frames_are_kept_apart(world: Any, make_map: Any) -> None:
     names = [f"m/{k}.jpg" for k in range(4)]
-    points = np.zeros((3, 6))
-    root = make_map(names, CAMERAS[0], points)
+    root = make_map(names, points=np.zeros((3, 6)))
     (root / "reconstruction" / "observations.txt").write_text(
         "# kapture format: 1.1\n0, x, m/0.jpg, 0\n1, x, m/3.jpg, 0\n2, x, m/2.jpg, 1, m/3.jpg, 1\n"
     )
-    evaluation = evaluate_poses(
-        world.estimated, world.truth, conditions=world.conditions, statuses=world.statuses
-    )
+    evaluation = evaluation_of(world)
     shown = [
         replace(q, candidates=("m/2.jpg",) * (k % 2))
         for k, q in enumerate(shown_queries(evaluation))
     ]
     frames = dict.fromkeys(names[:2], "DUC1") | dict.fromkeys(names[2:], "DUC2")
-    context = ResultContext(mapping=KaptureFolder(root), frames=frames)
-    scene = scene_of("frames", StoredInliers(context), shown)
-    assert scene is not None and scene.frames == ("DUC1", "DUC2")
+    scene = drawn(root, shown, frames=frames)
+    assert scene.frames == ("DUC1", "DUC2")
     assert scene.point_frames.tolist() == [0, 1, 1]
     assert scene.camera_frames.tolist() == [0, 0, 1, 1]
     assert scene.query_frames.tolist() == [k % 2 for k in range(len(shown))]
     assert "DUC2</option>" in render_view(scene)
-    one = scene_of("one", StoredInliers(ResultContext(mapping=KaptureFolder(root))), shown)
-    assert one is not None and 'id="frame"' not in render_view(one)
+    assert 'id="frame"' not in render_view(drawn(root, shown))
+    assert scene_of("nothing", StoredInliers(ResultContext())) is None
 
 
 def test_points_without_colours_have_those_of_the_images(make_map: Any) -> None:
     names = ["m/0.jpg", "m/1.jpg"]
-    root = make_map(names, CAMERAS[0], np.zeros((4, 6)))
+    root = make_map(names, points=np.zeros((4, 6)))
     (root / "reconstruction" / "observations.txt").write_text(
         "# kapture format: 1.1\n0, x, m/0.jpg, 0\n1, x, m/0.jpg, 1\n2, x, m/1.jpg, 0\n"
     )
@@ -301,8 +285,7 @@ def test_points_without_colours_have_those_of_the_images(make_map: Any) -> None:
     for name, color in colors.items():
         pixels = np.full((480, 640, 3), color, np.uint8)
         write_image(root / "sensors/records_data" / name, pixels)
-    scene = scene_of("coloured", StoredInliers(ResultContext(mapping=KaptureFolder(root))))
-    assert scene is not None
+    scene = drawn(root)
     expected = np.array([colors["m/0.jpg"], colors["m/0.jpg"], colors["m/1.jpg"]])
     np.testing.assert_allclose(scene.colors[:3].astype(int), expected, atol=4)  # JPEG
     assert np.ptp(scene.colors[3].astype(int)) < 70  # a grey: nothing observes it
