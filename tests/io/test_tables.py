@@ -290,11 +290,20 @@ def test_rows_read_back_by_image_with_their_steps_in_order(tmp_path: Path) -> No
     assert read_refinement(path) == ROWS
 
 
-def test_a_reason_of_what_was_accepted_is_refused_with_its_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        (",yes,", ",no,", "contradict"),
+        ("0.6 0.0 0.8 0.0 1.0 -2.0 0.1", "", "before '' is not a pose"),
+    ],
+)
+def test_a_broken_refinement_is_named_with_its_line(
+    old: str, new: str, expected: str, tmp_path: Path
+) -> None:
     path = tmp_path / "refinement.csv"
     write_refinement(path, ROWS[:1])
-    path.write_text(path.read_text().replace(",yes,", ",no,"))
-    with pytest.raises(DataError, match=r"refinement\.csv:2: .*contradict"):
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(DataError, match=rf"refinement\.csv:2: .*{expected}"):
         read_refinement(path)
 
 

@@ -240,6 +240,19 @@ def test_the_index_is_tarfile_s(tmp_path: Path, case: str, form: int) -> None:
     assert end == -(-last // 512) * 512
 
 
+def test_plain_members_are_not_met_one_by_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    met: list[tarfile.TarFile] = []
+    plain = tarfile.TarFile.next
+    monkeypatch.setattr(tarfile.TarFile, "next", lambda tar: met.append(tar) or plain(tar))
+    for case in ("plain", "empty files"):
+        make(tmp_path / "x.tar", CASES[case])
+        met.clear()
+        assert len(index_tar(tmp_path / "x.tar")[0]) == len(CASES[case])
+        assert len(met) <= 3, case
+
+
 def test_a_global_header_holds_for_all_that_follow(tmp_path: Path) -> None:
     make(tmp_path / "x.tar", alike(20), pax_headers={"uname": "somebody"})
     assert index_tar(tmp_path / "x.tar")[0] == by_tarfile(tmp_path / "x.tar")

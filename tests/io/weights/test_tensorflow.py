@@ -21,6 +21,7 @@ from megloc_kapture.io.weights.tensorflow import (
     crc32c,
     fields,
     read_tensor_bundle,
+    varint,
 )
 
 WRITTEN = Path(__file__).parent / "data" / "tensor_bundle"
@@ -264,3 +265,9 @@ def test_reads_what_protobuf_writes(
 def test_what_is_no_message(message: bytes, reason: str) -> None:
     with pytest.raises(WireError, match=reason):
         [field.bytes() for field in fields(memoryview(message))]
+
+
+@given(st.integers(0, (1 << 64) - 1))
+def test_varints(number: int) -> None:
+    content = coded(number)
+    assert varint(memoryview(b"\xff" + content + b"\xff"), 1) == (number, 1 + len(content))
