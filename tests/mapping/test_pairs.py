@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -233,6 +233,8 @@ def by_loops(
     st.integers(1, 8),
     st.booleans(),
 )
+@example([(camera, time) for time in range(4) for camera in "ab"], 1, True)
+@example([("a", time) for time in range(8)], 2, True)
 def test_equal_to_a_walk(records: list[tuple[str, int]], window: int, loop: bool) -> None:
     cameras, timestamps = [camera for camera, _ in records], [time for _, time in records]
     options = PairsBySequenceOptions(window=window, loop=loop)

@@ -109,6 +109,25 @@ def test_a_mutual_match_uses_every_row_once_and_is_nearest_both_ways(
     assert len(scores) == len(matches)
 
 
+@pytest.mark.parametrize("max_ratio", [0.6, 0.7, 0.8, 0.9, 0.95, 1.0])
+@pytest.mark.parametrize("mutual", [True, False])
+def test_the_ratio_is_of_distances(max_ratio: float, mutual: bool) -> None:
+    rng = np.random.default_rng(3)
+    options = NearestNeighbourOptions(max_ratio=max_ratio, mutual=mutual)
+    floats = rng.normal(size=(60, 6))
+    noisy = floats[rng.permutation(60)[:50]] + 0.4 * rng.normal(size=(50, 6))
+    # as COLMAP's SIFT: 512 times a unit vector, rounded
+    whole = np.abs(rng.normal(size=(60, 128)))
+    changed = whole[:50] + np.linspace(0.1, 1.5, 50)[:, None] * rng.normal(size=(50, 128))
+    for a, b, scale, dtype in ((noisy, floats, 1, float), (abs(changed), whole, 512, np.uint8)):
+        a, b = (scale * x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))
+        a, b = (np.round(x).astype(dtype) if scale > 1 else x for x in (a, b))
+        matches = match_nearest(a, b, options)[0].tolist()
+        assert [tuple(match) for match in matches] == by_loops(a, b, options)
+        if max_ratio < 0.8:
+            assert 0 < len(matches) < 45  # the test tells ratios apart
+
+
 def test_more_rows_than_one_block() -> None:
     rng = np.random.default_rng(4)
     b = rng.integers(-3, 4, (40, 5)).astype(np.float32)
