@@ -1,4 +1,4 @@
-"""Camera models against formulas of their own, OpenCV and COLMAP."""
+"""Camera models and their derivatives against formulas, OpenCV and COLMAP."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import (
     bearing_rays,
@@ -16,42 +19,46 @@ from megloc_kapture.geometry.cameras import (
     px_from_cam,
     shift_principal_point,
 )
+from megloc_kapture.geometry.projection import project_with_jacobian
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
 F, CX, CY = 500.0, 321.0, 238.5
-CAMERAS = {
-    "SIMPLE_PINHOLE": (F, CX, CY),
-    "PINHOLE": (F, 510.0, CX, CY),
-    "SIMPLE_RADIAL": (F, CX, CY, -0.05),
-    "RADIAL": (F, CX, CY, -0.05, 0.01),
-    "OPENCV": (F, 510.0, CX, CY, -0.05, 0.01, 1e-3, -2e-3),
-    "OPENCV_FISHEYE": (F, 510.0, CX, CY, 0.02, -0.01, 3e-3, -1e-3),
-    "FULL_OPENCV": (F, 510.0, CX, CY, -0.05, 0.01, 1e-3, -2e-3, 1e-3, 0.02, -0.01, 1e-3),
-    "FOV": (F, 510.0, CX, CY, 0.9),
-    "SIMPLE_RADIAL_FISHEYE": (F, CX, CY, 0.02),
-    "RADIAL_FISHEYE": (F, CX, CY, 0.02, -0.01),
-    "THIN_PRISM_FISHEYE": (F, 510.0, CX, CY, 0.02, -0.01, 1e-3, -1e-3, 1e-3, 0.0, 1e-3, -1e-3),
+DISTORTION = {
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": (-0.1,),
+    "RADIAL": (-0.1, 0.03),
+    "OPENCV": (-0.1, 0.03, 0.002, -0.003),
+    "OPENCV_FISHEYE": (-0.1, 0.03, 0.02, -0.003),
+    "FULL_OPENCV": (-0.1, 0.03, 0.002, -0.003, 0.01, 0.05, 0.02, 0.004),
+    "FOV": (0.9,),
+    "SIMPLE_RADIAL_FISHEYE": (0.1,),
+    "RADIAL_FISHEYE": (0.1, -0.02),
+    "THIN_PRISM_FISHEYE": (-0.1, 0.03, 0.002, -0.003, 0.01, 0.005, 0.002, -0.004),
 }
 POINTS = np.random.default_rng(0).uniform((-2, -1.5, 4), (2, 1.5, 9), (100, 3))
 
 
-def camera(model: str) -> Camera:
-    return Camera(model, 640, 480, CAMERAS[model])
+def camera(model: str, distortion: tuple[float, ...] | None = None) -> Camera:
+    rest = DISTORTION[model] if distortion is None else distortion
+    focals = CAMERA_MODEL_NUM_PARAMS[model] - 2 - len(DISTORTION[model])
+    return Camera(model, 640, 480, (*(F, 510.0)[:focals], CX, CY, *rest))
 
 
-def test_every_model_that_a_camera_can_have_is_tested() -> None:
-    assert set(CAMERAS) == set(CAMERA_MODEL_NUM_PARAMS)
-
-
-@pytest.mark.parametrize("model", CAMERAS)
+@pytest.mark.parametrize("model", DISTORTION)
 def test_unprojection_undoes_projection(model: str) -> None:
     pixels = px_from_cam(camera(model), POINTS)
     rays = bearing_rays(camera(model), pixels)
     np.testing.assert_allclose(rays, POINTS / POINTS[:, 2:], atol=1e-7)
     np.testing.assert_array_equal(rays[:, :2], normalized_from_px(camera(model), pixels))
+    assert px_from_cam(camera(model), np.zeros((0, 3))).shape == (0, 2)
+    assert bearing_rays(camera(model), np.zeros((0, 2))).shape == (0, 3)
+    narrow = bearing_rays(camera(model), pixels.astype(np.float32))
+    np.testing.assert_allclose(narrow, rays, atol=1e-6)
+    assert narrow.dtype == np.float64
 
 
-@pytest.mark.parametrize("model", CAMERAS)
+@pytest.mark.parametrize("model", DISTORTION)
 def test_focal_length_and_principal_point_are_those_of_the_model(model: str) -> None:
     # on the optical axis every model is a pinhole: the point there and its derivative
     tiny = 1e-5
@@ -61,11 +68,10 @@ def test_focal_length_and_principal_point_are_those_of_the_model(model: str) -> 
     if model != "FOV":  # its focal length is scaled by the field of view
         mean = 0.5 * ((right - center)[0] + (down - center)[1]) / tiny
         np.testing.assert_allclose(focal_px(camera(model)), mean, rtol=5e-3)
-    one_focal = len(set(CAMERAS[model][:2])) == 2 and CAMERAS[model][1] == CX
-    assert focal_px(camera(model)) == (F if one_focal else 505.0)
+    assert focal_px(camera(model)) == (F if camera(model).params[1] == CX else 505.0)
 
 
-@pytest.mark.parametrize("model", CAMERAS)
+@pytest.mark.parametrize("model", DISTORTION)
 def test_a_shifted_principal_point_shifts_every_pixel(model: str) -> None:
     shifted = shift_principal_point(camera(model), 0.5)
     np.testing.assert_allclose(
@@ -74,14 +80,9 @@ def test_a_shifted_principal_point_shifts_every_pixel(model: str) -> None:
     assert (shifted.model, shifted.width, shifted.height) == (model, 640, 480)
 
 
-def test_pinhole_by_hand() -> None:
-    expected = np.array([F, 510.0]) * POINTS[:, :2] / POINTS[:, 2:] + (CX, CY)
-    np.testing.assert_allclose(px_from_cam(camera("PINHOLE"), POINTS), expected, atol=1e-10)
-
-
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"])
 def test_projection_agrees_with_opencv(model: str) -> None:
-    fx, fy, cx, cy, *distortion = CAMERAS[model]
+    fx, fy, cx, cy, *distortion = camera(model).params
     # OpenCV's first pixel has its centre at (0, 0)
     matrix = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
     zero = np.zeros(3)
@@ -102,7 +103,9 @@ def test_project_applies_the_pose() -> None:
     np.testing.assert_allclose(project(camera("PINHOLE"), pose, points), expected, atol=1e-9)
 
 
-def test_behind_the_camera_is_nan() -> None:
+def test_behind_the_camera_and_where_distortion_cannot_be_undone_is_nan() -> None:
+    strong = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
+    assert np.isnan(normalized_from_px(strong, np.array([[0.0, 0.0]]))).all()
     pixels = px_from_cam(camera("PINHOLE"), np.array([[0.1, 0.1, -1.0], [0, 0, 0], [0.1, 0, 1]]))
     assert np.isnan(pixels[:2]).all() and np.isfinite(pixels[2]).all()
     assert np.isnan(
@@ -110,26 +113,95 @@ def test_behind_the_camera_is_nan() -> None:
     ).all()
 
 
-@pytest.mark.parametrize("model", CAMERAS)
-def test_no_points(model: str) -> None:
-    assert px_from_cam(camera(model), np.zeros((0, 3))).shape == (0, 2)
-    assert bearing_rays(camera(model), np.zeros((0, 2))).shape == (0, 3)
-
-
-def test_float32_pixels_are_taken() -> None:
-    pixels = np.array([[10.25, 20.5]], dtype=np.float32)
-    rays = bearing_rays(camera("PINHOLE"), pixels)
-    assert rays.dtype == np.float64
-    np.testing.assert_allclose(rays[0], [(10.25 - CX) / F, (20.5 - CY) / 510.0, 1])
-
-
-def test_pixels_that_cannot_be_undistorted_are_nan() -> None:
-    strong = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
-    assert np.isnan(normalized_from_px(strong, np.array([[0.0, 0.0]]))).all()
-
-
 def test_the_models_number_of_parameters_is_colmaps() -> None:
+    assert set(DISTORTION) == set(CAMERA_MODEL_NUM_PARAMS)
     for model, count in CAMERA_MODEL_NUM_PARAMS.items():
         made = pycolmap.Camera(model=model, width=640, height=480, params=[0.0] * count)
         assert made.verify_params()
         assert not pycolmap.Camera(model=model, params=[0.0] * (count + 1)).verify_params()
+
+
+# --------------------------------------------------------------------------------- derivatives
+
+
+def colmap(given: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    theirs = pycolmap.Camera(
+        model=given.model, width=given.width, height=given.height, params=list(given.params)
+    )
+    return np.asarray(theirs.img_from_cam(points))
+
+
+def various_points() -> NDArray[np.float64]:
+    """In front of a camera: over its view, near its axis, and on it."""
+    rng = np.random.default_rng(0)
+    found = rng.uniform((-1.2, -1.0, 1.0), (1.2, 1.0, 1.5), (400, 3)) * rng.uniform(
+        0.1, 50, (400, 1)
+    )
+    found[:100, :2] *= 10.0 ** rng.uniform(-9, -1, (100, 1))
+    found[100:102, :2] = 0.0
+    return found
+
+
+def differences(given: Camera, at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Central differences with Richardson's extrapolation."""
+
+    def central(step: float) -> NDArray[np.float64]:
+        steps = step * at[:, 2:3]
+        rows = [
+            (colmap(given, at + steps * axis) - colmap(given, at - steps * axis)) / (2 * steps)
+            for axis in np.eye(3)
+        ]
+        return np.stack(rows, axis=2)
+
+    return (4 * central(1e-4) - central(2e-4)) / 3
+
+
+def assert_colmaps(given: Camera, at: NDArray[np.float64]) -> None:
+    """Pixels and derivatives are COLMAP's."""
+    pixels, jacobian = project_with_jacobian(given, at)
+    np.testing.assert_allclose(pixels, colmap(given, at), atol=1e-9, rtol=0)
+    assert jacobian.shape == (len(at), 2, 3)
+    scale = np.abs(jacobian).max(axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(jacobian / scale, differences(given, at) / scale, atol=2e-8, rtol=0)
+
+
+@pytest.mark.parametrize("model", CAMERA_MODEL_NUM_PARAMS)
+def test_pixels_and_derivatives_are_colmaps(model: str) -> None:
+    assert_colmaps(camera(model), various_points())
+
+
+@pytest.mark.parametrize("omega", [1e-9, 1e-3, 0.0099, 0.0101, 0.5, 2.0])
+def test_the_field_of_view_model_at_its_expansions(omega: float) -> None:
+    given, at = camera("FOV", (omega,)), various_points()
+    pixels, _ = project_with_jacobian(given, at)
+    np.testing.assert_allclose(pixels, colmap(given, at), atol=1e-9, rtol=0)
+    # COLMAP's expansions do not meet its formula where they end: no differences across that
+    radius = np.linalg.norm(at[:, :2] / at[:, 2:], axis=1)
+    assert_colmaps(given, at[np.abs(radius - 0.01) > 1e-3])
+
+
+@given(
+    st.sampled_from(sorted(DISTORTION)),
+    st.lists(st.floats(-0.1, 0.1), min_size=8, max_size=8),
+    st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(0.01, 1000)),
+)
+def test_any_camera_and_point(
+    model: str, numbers: list[float], where: tuple[float, float, float]
+) -> None:
+    rest = tuple(numbers[: len(DISTORTION[model])])
+    given = camera(model, tuple(map(abs, rest)) if model == "FOV" else rest)
+    point = np.array([[where[0] * where[2], where[1] * where[2], where[2]]])
+    pixels, jacobian = project_with_jacobian(given, point)
+    np.testing.assert_allclose(pixels, colmap(given, point), rtol=1e-9, atol=1e-9)
+    # a point farther along its own ray is seen at the same pixel
+    along = jacobian[0] @ point[0]
+    np.testing.assert_allclose(along, 0.0, atol=1e-9 * np.abs(jacobian).max() * where[2])
+
+
+def test_nothing_is_seen_behind_the_camera() -> None:
+    behind = np.array([[0.0, 0.0, -1.0], [0.1, 0.2, 0.0], [np.nan, 0.0, 1.0], [0.0, 0.0, 2.0]])
+    pixels, jacobian = project_with_jacobian(camera("OPENCV"), behind)
+    assert np.isnan(pixels[:2]).all() and np.isnan(jacobian[:2]).all()
+    assert np.isnan(pixels[2, 0]) and np.isfinite(pixels[3]).all()
+    empty_px, empty = project_with_jacobian(camera("OPENCV"), np.zeros((0, 3)))
+    assert empty_px.shape == (0, 2) and empty.shape == (0, 2, 3)

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -44,26 +45,22 @@ CAMERAS = {
 
 
 def scene(
-    camera: Camera, *, num_images: int = 5, num_points: int = 60, offset: Array | float = 0.0
+    *cameras: Camera, num_images: int = 5, num_points: int = 60, offset: Array | float = 0.0
 ) -> tuple[Array, list[MapImage], Matches]:
     """World points, images around them with keypoints in mixed order, and all true matches."""
     rng = np.random.default_rng(0)
     points = rng.uniform((-2, -1.5, -1), (2, 1.5, 1), (num_points, 3))
+    away = RigidTransform.from_matrix(np.eye(3), np.zeros(3) - offset)
     images, row_of_point = [], []
     for k in range(num_images):
+        camera = cameras[k % len(cameras)]
         rotation = Rotation.from_rotvec([0.05 * k, 0.12 * (k - num_images / 2), 0.1]).as_matrix()
         near = RigidTransform.from_matrix(rotation, np.array([0.6 * (k - 2), 0.1 * k, 8.0]))
         pixels = px_from_cam(camera, near.apply(points))
         assert (pixels > 0).all() and (pixels < (camera.width, camera.height)).all()
         order = rng.permutation(num_points)
         row_of_point.append(np.argsort(order))
-        cam_from_world = near @ RigidTransform(
-            (1.0, 0, 0, 0),
-            tuple((np.zeros(3) - offset).tolist()),  # type: ignore[arg-type]
-        )
-        images.append(
-            MapImage(f"{k}.jpg", camera, cam_from_world, pixels[order].astype(np.float32))
-        )
+        images.append(MapImage(f"{k}.jpg", camera, near @ away, pixels[order].astype(np.float32)))
     matches = {
         (i, j): np.stack([row_of_point[i], row_of_point[j]], axis=1)
         for i, j in combinations(range(num_images), 2)
@@ -71,10 +68,19 @@ def scene(
     return points + offset, images, matches
 
 
-def assert_recovered(result: TriangulatedPoints, points: Array, within: float) -> None:
+def assert_recovered(result: TriangulatedPoints, points: Array) -> None:
     distance = np.linalg.norm(result.xyz[:, None] - points, axis=2)
     assert sorted(distance.argmin(axis=1).tolist()) == list(range(len(points)))
-    assert distance.min(axis=1).max() < within
+    assert distance.min(axis=1).max() < 1e-3
+
+
+@pytest.mark.parametrize("models", [*([model] for model in CAMERAS), [*CAMERAS]], ids=str)
+def test_points_are_where_they_were(models: list[str]) -> None:
+    points, images, matches = scene(*(CAMERAS[model] for model in models))
+    result = triangulate(images, matches)
+    assert_recovered(result, points)
+    assert len(result.point_ids) == 5 * 60  # every point is seen in every image
+    assert result.errors_px.shape == (60,) and result.errors_px.max() < 1e-3
 
 
 def equal(a: TriangulatedPoints, b: TriangulatedPoints) -> bool:
@@ -82,19 +88,11 @@ def equal(a: TriangulatedPoints, b: TriangulatedPoints) -> bool:
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in names)
 
 
-@pytest.mark.parametrize("model", CAMERAS)
-def test_points_are_where_they_were(model: str) -> None:
-    points, images, matches = scene(CAMERAS[model])
-    result = triangulate(images, matches)
-    assert_recovered(result, points, within=1e-3)
-    assert result.errors_px.shape == (60,) and result.errors_px.max() < 1e-3
-
-
 def test_earth_centred_coordinates_lose_nothing() -> None:
     offset = np.array([4.2e6, 1.7e5, 4.78e6])
     points, images, matches = scene(CAMERAS["PINHOLE"], offset=offset)
     result = triangulate(images, matches)
-    assert_recovered(result, points, within=1e-3)
+    assert_recovered(result, points)
     near_points, near_images, _ = scene(CAMERAS["PINHOLE"])
     near = triangulate(near_images, matches)
     np.testing.assert_allclose(result.xyz - offset, near.xyz, atol=1e-5)
@@ -104,7 +102,6 @@ def test_earth_centred_coordinates_lose_nothing() -> None:
 def test_observations_are_the_matches_put_together() -> None:
     points, images, matches = scene(CAMERAS["PINHOLE"])
     result = triangulate(images, matches)
-    assert len(result.point_ids) == 5 * 60  # every point is seen in every image
     nearest = np.linalg.norm(result.xyz[:, None] - points, axis=2).argmin(axis=1)
     for point, image, keypoint in zip(
         result.point_ids, result.image_ids, result.keypoint_ids, strict=True
@@ -115,28 +112,12 @@ def test_observations_are_the_matches_put_together() -> None:
         np.testing.assert_allclose(entry.keypoints_px[keypoint], pixel, atol=1e-3)
     rows = np.stack([result.point_ids, result.image_ids, result.keypoint_ids], axis=1)
     np.testing.assert_array_equal(rows, rows[np.lexsort(rows.T[::-1])])  # sorted
-
-
-def test_the_same_call_gives_the_same_bits_whatever_the_threads() -> None:
-    rng = np.random.default_rng(1)
-    _, images, matches = scene(CAMERAS["SIMPLE_RADIAL"])
-    noisy = [
-        MapImage(
-            image.name,
-            image.camera,
-            image.cam_from_world,
-            image.keypoints_px + rng.normal(0, 0.7, image.keypoints_px.shape).astype(np.float32),
-        )
-        for image in images
-    ]
-    first = triangulate(noisy, matches)
-    assert len(first.xyz) > 40
-    assert equal(first, triangulate(noisy, matches))
-    assert equal(first, triangulate(noisy, matches, num_threads=2))
     # points stand in the order of what they are seen in, not in that in which COLMAP made them
-    rows = np.stack([first.point_ids, first.image_ids, first.keypoint_ids], axis=1)
-    tracks = [rows[rows[:, 0] == k, 1:].tolist() for k in range(len(first.xyz))]
+    tracks = [rows[rows[:, 0] == k, 1:].tolist() for k in range(len(result.xyz))]
     assert tracks == sorted(tracks)
+    for nothing in (triangulate([], {}), triangulate(images, {})):
+        assert nothing.xyz.shape == (0, 3) and nothing.errors_px.shape == (0,)
+        assert len(nothing.point_ids) == len(nothing.image_ids) == len(nothing.keypoint_ids) == 0
 
 
 def test_neither_poses_nor_cameras_move_and_no_bit_depends_on_the_threads(
@@ -189,24 +170,12 @@ def test_neither_poses_nor_cameras_move_and_no_bit_depends_on_the_threads(
     assert len(states[0][0]) == count
 
 
-def test_poses_and_cameras_are_not_adjusted() -> None:
-    """A wrong pose must show as error, not be moved to fit."""
-    points, images, matches = scene(CAMERAS["PINHOLE"])
-    turned = images[2].cam_from_world
-    wrong = RigidTransform(turned.quat_wxyz, (turned.translation[0] + 1.0, *turned.translation[1:]))
-    images[2] = MapImage("2.jpg", images[2].camera, wrong, images[2].keypoints_px)
-    result = triangulate(images, matches)
-    assert_recovered(result, points, within=1e-3)
-    assert 2 not in result.image_ids
-    assert len(result.point_ids) == 4 * 60
-
-
 def test_two_images_only_give_points_if_asked_for() -> None:
     points, images, matches = scene(CAMERAS["PINHOLE"])
     two = {(1, 3): matches[1, 3]}
     assert len(triangulate(images, two).xyz) == 0
     kept = triangulate(images, two, TriangulationOptions(two_view_tracks=True))
-    assert_recovered(kept, points, within=1e-3)
+    assert_recovered(kept, points)
     assert set(kept.image_ids.tolist()) == {1, 3}
 
 
@@ -216,7 +185,7 @@ def test_the_reprojection_error_is_bounded() -> None:
     shift = np.zeros(len(keypoints), dtype=bool)
     shift[::2] = True
     keypoints[shift] += (0.0, 6.0)  # across the epipolar lines
-    images[0] = MapImage("0.jpg", images[0].camera, images[0].cam_from_world, keypoints)
+    images[0] = replace(images[0], keypoints_px=keypoints)
     strict = triangulate(images, matches, TriangulationOptions(max_reprojection_error_px=2.0))
     rows = strict.keypoint_ids[strict.image_ids == 0]
     assert not shift[rows].any() and len(rows) == 30
@@ -231,43 +200,16 @@ def test_rays_that_are_nearly_parallel_give_no_point() -> None:
     assert len(triangulate(images, matches, TriangulationOptions(min_angle_deg=30.0)).xyz) == 0
 
 
-def test_several_cameras_in_one_map() -> None:
-    points, images, matches = scene(CAMERAS["PINHOLE"])
-    for k, model in ((1, "SIMPLE_RADIAL"), (3, "OPENCV_FISHEYE")):
-        _, others, other_matches = scene(CAMERAS[model])
-        images[k] = others[k]  # the same seed: the same rows
-    np.testing.assert_array_equal(other_matches[0, 1], matches[0, 1])
-    result = triangulate(images, matches)
-    assert_recovered(result, points, within=1e-3)
-    assert len(result.point_ids) == 5 * 60
-
-
 def test_keypoints_may_have_more_columns_and_images_none() -> None:
     points, images, matches = scene(CAMERAS["PINHOLE"], num_images=4)
     wide = [
-        MapImage(
-            image.name,
-            image.camera,
-            image.cam_from_world,
-            np.concatenate([image.keypoints_px, np.ones((60, 2), np.float32)], axis=1),
-        )
+        replace(image, keypoints_px=np.pad(image.keypoints_px, ((0, 0), (0, 2))))
         for image in images
     ]
-    wide.append(
-        MapImage(
-            "empty.jpg", images[0].camera, images[0].cam_from_world, np.zeros((0, 2), np.float32)
-        )
-    )
+    wide.append(replace(images[0], name="empty.jpg", keypoints_px=np.zeros((0, 2), np.float32)))
     result = triangulate(wide, {**matches, (0, 4): np.zeros((0, 2), np.int64)})
-    assert_recovered(result, points, within=1e-3)
+    assert_recovered(result, points)
     assert 4 not in result.image_ids
-
-
-def test_nothing_to_triangulate() -> None:
-    _, images, _ = scene(CAMERAS["PINHOLE"])
-    for result in (triangulate([], {}), triangulate(images, {})):
-        assert result.xyz.shape == (0, 3) and result.errors_px.shape == (0,)
-        assert len(result.point_ids) == len(result.image_ids) == len(result.keypoint_ids) == 0
 
 
 @pytest.mark.parametrize("row", [[60, 0], [0, 60], [-1, 0]])
@@ -339,22 +281,17 @@ def test_colmap_reads_what_is_written(tmp_path: Path) -> None:
     database.close()
 
 
-def test_the_same_features_give_the_same_bytes(tmp_path: Path) -> None:
+def test_the_same_features_give_the_same_bytes_and_nothing_is_written_over(tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
     for name in ("a.db", "b.db"):
         write_feature_database(tmp_path / name, IMAGES)
-    assert (tmp_path / "a.db").read_bytes() == (tmp_path / "b.db").read_bytes()
-
-
-def test_nothing_is_written_over(tmp_path: Path) -> None:
-    path = tmp_path / "a.db"
-    write_feature_database(path, IMAGES[:1])
     before = path.read_bytes()
+    assert (tmp_path / "b.db").read_bytes() == before
     with pytest.raises(OutputError, match=r"a\.db: is there already"):
-        write_feature_database(path, IMAGES)
+        write_feature_database(path, IMAGES[:1])
     assert path.read_bytes() == before
-    (tmp_path / "file").write_text("no folder")
     with pytest.raises(OutputError, match="cannot be written"):
-        write_feature_database(tmp_path / "file" / "b.db", IMAGES)
+        write_feature_database(path / "b.db", IMAGES)
 
 
 def test_a_disk_without_room_for_the_database_is_said_before_colmap_meets_it(

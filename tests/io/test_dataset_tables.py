@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import (
@@ -33,140 +34,93 @@ from megloc_kapture.io.dataset_tables import (
 )
 from megloc_kapture.values import RigidTransform
 
+READERS = {
+    "groups.csv": read_groups,
+    "priors.csv": read_priors,
+    "names.csv": read_names,
+    "relocalization.csv": read_relocalization,
+    "world.json": read_world,
+    "protocol.json": read_protocol,
+}
+
 
 def test_absent_files_stand_for_their_defaults(tmp_path: Path) -> None:
-    absent = tmp_path / "megloc"
-    assert read_groups(absent) == {}
-    assert read_priors(absent) == {}
-    assert read_world(absent) == World()
-    assert read_world(absent).unit == "m"
-    protocol = read_protocol(absent)
+    found = {name: read(tmp_path / "megloc") for name, read in READERS.items()}
+    world, protocol = found.pop("world.json"), found.pop("protocol.json")
+    assert list(found.values()) == [{}, {}, {}, []]
+    assert world == World() and world.unit == "m"
+    pose = RigidTransform((0.5, 0.5, -0.5, 0.5), (0.1, 0.2, 0.3))
+    assert world.pose_in_official(pose) == pose
     assert protocol.thresholds == ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
     assert protocol.pose_file_names == "full"
 
 
-def test_groups_read_back(tmp_path: Path) -> None:
+def test_tables_read_back_sorted_or_in_their_order(tmp_path: Path) -> None:
     groups = {
         "query/b, c.jpg": ImageGroup(condition="night-rain", frame="DUC1", location="017"),
         "map/a.jpg": ImageGroup(scored=False),
     }
     write_groups(tmp_path, groups)
-    assert read_groups(tmp_path) == groups
-    assert list(read_groups(tmp_path)) == ["map/a.jpg", "query/b, c.jpg"]
-
-
-@pytest.mark.parametrize(
-    ("rows", "line", "words"),
-    [
-        ("a.jpg,day,,,1\na.jpg,day,,,1\n", 3, "is given twice"),
-        ("a.jpg,day,,,yes\n", 2, "scored 'yes' is not 0 or 1"),
-        (",day,,,1\n", 2, "empty path"),
-        ("../a.jpg,day,,,1\n", 2, "leads out"),
-        ("/a.jpg,day,,,1\n", 2, "absolute"),
-    ],
-)
-def test_broken_groups(tmp_path: Path, rows: str, line: int, words: str) -> None:
-    (tmp_path / "groups.csv").write_text(f"image,condition,frame,location,scored\n{rows}")
-    with pytest.raises(DataError, match=words) as caught:
-        read_groups(tmp_path)
-    assert caught.value.line == line
-
-
-def test_priors_read_back_sorted(tmp_path: Path) -> None:
+    assert list(read_groups(tmp_path).items()) == sorted(groups.items())
     write_priors(tmp_path, {"q/2.jpg": ["loc-9", "loc-10"], "q/1.jpg": ["map/7.jpg"]})
-    assert (tmp_path / "priors.csv").read_text() == (
-        "query,permitted\nq/1.jpg,map/7.jpg\nq/2.jpg,loc-10\nq/2.jpg,loc-9\n"
-    )
-    assert read_priors(tmp_path) == {"q/1.jpg": ("map/7.jpg",), "q/2.jpg": ("loc-10", "loc-9")}
+    expected = {"q/1.jpg": ("map/7.jpg",), "q/2.jpg": ("loc-10", "loc-9")}
+    assert list(read_priors(tmp_path).items()) == list(expected.items())
+    names = {"rain/rear/2.jpg": "rear/2.png", "dawn/rear/1.jpg": "rear/1.png"}
+    write_names(tmp_path, names)
+    assert list(read_names(tmp_path).items()) == list(names.items())
+    pairs = [RelocalizationPair("b.txt", "r/2.png", "q/1.png")] * 2
+    pairs.append(RelocalizationPair("a.txt", "r/1.png", "q/1.png"))
+    write_relocalization(tmp_path, pairs)
+    assert read_relocalization(tmp_path) == pairs
 
 
-def test_a_prior_that_permits_nothing_is_refused(tmp_path: Path) -> None:
-    # the table has no way to say it, and an absent query may be matched with everything
+def test_what_no_table_can_say_is_not_written(tmp_path: Path) -> None:
+    # an absent query may be matched with everything
     with pytest.raises(DataError, match="permits nothing"):
         write_priors(tmp_path, {"q.jpg": []})
+    with pytest.raises(DataError):
+        write_relocalization(tmp_path, [RelocalizationPair("/etc/x", "a", "b")])
+
+
+HEADERS = {
+    "groups.csv": "image,condition,frame,location,scored",
+    "priors.csv": "query,permitted",
+    "names.csv": "image,name",
+    "relocalization.csv": "file,reference,query",
+}
 
 
 @pytest.mark.parametrize(
-    ("rows", "words"),
-    [("q.jpg,\n", "permitted is empty"), ("q.jpg,a\nq.jpg,a\n", "twice"), (",a\n", "empty path")],
+    ("rows", "message"),
+    [
+        ("a.jpg,day,,,1\na.jpg,day,,,1", r"groups\.csv:3: .*is given twice"),
+        ("a.jpg,day,,,yes", r"groups\.csv:2: scored 'yes' is not 0 or 1"),
+        (",day,,,1", r"groups\.csv:2: empty path"),
+        ("../a.jpg,day,,,1", r"groups\.csv:2: .*leads out"),
+        ("q.jpg,", r"priors\.csv:2: permitted is empty"),
+        ("q.jpg,a\nq.jpg,a", r"priors\.csv:3: .*twice"),
+        (",a", r"priors\.csv:2: empty path"),
+        ("a.jpg,x\na.jpg,y", r"names\.csv:3: image 'a\.jpg' is given twice"),
+        ("a.jpg,x\nb.jpg,x", r"names\.csv:3: name 'x' is given twice"),
+        ("a.jpg,x y", r"names\.csv:2: a pose file cannot hold the name 'x y'"),
+        ("../a.jpg,x", r"names\.csv:2: "),
+        ("../../x.txt,a,b", r"relocalization\.csv:2: "),
+    ],
 )
-def test_broken_priors(tmp_path: Path, rows: str, words: str) -> None:
-    (tmp_path / "priors.csv").write_text(f"query,permitted\n{rows}")
-    with pytest.raises(DataError, match=words):
-        read_priors(tmp_path)
+def test_broken_tables(tmp_path: Path, rows: str, message: str) -> None:
+    name = message.partition(r"\.")[0] + ".csv"
+    (tmp_path / name).write_text(f"{HEADERS[name]}\n{rows}\n")
+    with pytest.raises(DataError, match=message):
+        READERS[name](tmp_path)
 
 
-def test_world_reads_back_to_the_last_digit(tmp_path: Path) -> None:
+def test_world_and_protocol_read_back_to_the_last_digit(tmp_path: Path) -> None:
     similarity = SimilarityTransform(
         quat_wxyz=(0.5, -0.5, 0.5, 0.5), translation=(4177000.123456789, 0.1, -2e-9), scale=0.96
     )
     world = World(official_from_local=similarity, unit="m")
     write_world(tmp_path, world)
     assert read_world(tmp_path) == world
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        ('{"official_from_local": {"quat_wxyz": [1, 1, 0, 0]}}', "quat_wxyz: quaternion of length"),
-        ('{"official_from_local": {"quat_wxyz": [1, 0, 0]}}', "quat_wxyz"),
-        ('{"official_from_local": {"scale": 0}}', "scale"),
-        ('{"official_from_local": {"scale": NaN}}', "NaN"),
-        ('{"official_from_local": {"translation": [1e999, 0, 0]}}', "finite"),
-        ('{"origin": 1}', "origin"),
-        ('{"unit": "m",\n  "unit', "not JSON"),
-        ("[]", "dict"),
-    ],
-)
-def test_broken_worlds_name_the_field(tmp_path: Path, content: str, words: str) -> None:
-    (tmp_path / "world.json").write_text(content)
-    with pytest.raises(DataError, match=words) as caught:
-        read_world(tmp_path)
-    assert "world.json" in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_broken_json_names_the_line(tmp_path: Path) -> None:
-    (tmp_path / "protocol.json").write_text('{"dataset": "x",\n "thresholds": [[1 2]]}')
-    with pytest.raises(DataError) as caught:
-        read_protocol(tmp_path)
-    assert caught.value.line == 2
-
-
-def test_a_quaternion_slightly_off_is_normalised() -> None:
-    quat = SimilarityTransform(quat_wxyz=(1.0005, 0, 0, 0)).quat_wxyz
-    assert quat == (1.0, 0.0, 0.0, 0.0)
-
-
-@given(st.integers(0, 2**32 - 1), st.floats(0.1, 10))
-def test_official_poses_see_the_same_and_come_back(seed: int, scale: float) -> None:
-    rng = np.random.default_rng(seed)
-    quat = rng.normal(size=4)
-    offset = tuple(rng.normal(size=3) * 1e5)
-    world = World(
-        official_from_local=SimilarityTransform(
-            quat_wxyz=tuple(quat / np.linalg.norm(quat)), translation=offset, scale=scale
-        )
-    )
-    quat = rng.normal(size=4)
-    pose = RigidTransform(tuple(quat / np.linalg.norm(quat)), tuple(rng.normal(size=3)))
-    local = rng.normal(size=(4, 3)) * 5
-    similarity = world.official_from_local
-    turned = RigidTransform(similarity.quat_wxyz, (0.0, 0.0, 0.0)).apply(local)
-    official = scale * turned + np.array(offset)
-    in_official = world.pose_in_official(pose)
-    # the camera sees every point in the same direction, as many official units away
-    np.testing.assert_allclose(in_official.apply(official), scale * pose.apply(local), atol=1e-8)
-    back = world.pose_in_local(in_official)
-    np.testing.assert_allclose(back.apply(local), pose.apply(local), atol=1e-8)
-
-
-def test_identity_world_changes_no_digit() -> None:
-    pose = RigidTransform((0.5, 0.5, -0.5, 0.5), (0.1, 0.2, 0.3))
-    assert World().pose_in_official(pose) == pose
-
-
-def test_protocol_reads_back(tmp_path: Path) -> None:
     protocol = Protocol(
         dataset="robotcar",
         thresholds=((0.1, None), (0.25, 2.0)),
@@ -176,80 +130,57 @@ def test_protocol_reads_back(tmp_path: Path) -> None:
     )
     write_protocol(tmp_path, protocol)
     assert read_protocol(tmp_path) == protocol
-    assert json.loads((tmp_path / "protocol.json").read_text())["thresholds"] == [
-        [0.1, None],
-        [0.25, 2.0],
-    ]
+    told = json.loads((tmp_path / "protocol.json").read_text())["thresholds"]
+    assert told == [[0.1, None], [0.25, 2.0]]
+    quat = SimilarityTransform(quat_wxyz=(1.0005, 0, 0, 0)).quat_wxyz
+    assert quat == (1.0, 0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("name", "content", "words"),
     [
-        {"thresholds": []},
-        {"thresholds": [[-1.0, 2.0]]},
-        {"thresholds": [[0.25, -2.0]]},
-        {"thresholds": [[0.25]]},
-        {"pose_file_names": "stem"},
-        {"conditions": ["day", "day"]},
-        {"threshold": [[0.25, 2.0]]},
+        ("world", '{"official_from_local": {"quat_wxyz": [1, 1, 0, 0]}}', "quaternion of length"),
+        ("world", '{"official_from_local": {"quat_wxyz": [1, 0, 0]}}', "quat_wxyz"),
+        ("world", '{"official_from_local": {"scale": 0}}', "scale"),
+        ("world", '{"official_from_local": {"scale": NaN}}', "NaN"),
+        ("world", '{"official_from_local": {"translation": [1e999, 0, 0]}}', "finite"),
+        ("world", '{"origin": 1}', "origin"),
+        ("world", '{"unit": "m",\n  "unit', r"json:2: not JSON"),
+        ("world", "[]", "dict"),
+        ("protocol", '{"thresholds": []}', "at least one"),
+        ("protocol", '{"thresholds": [[-1.0, 2.0]]}', "threshold"),
+        ("protocol", '{"thresholds": [[0.25, -2.0]]}', "threshold"),
+        ("protocol", '{"thresholds": [[0.25]]}', "thresholds"),
+        ("protocol", '{"pose_file_names": "stem"}', "pose_file_names"),
+        ("protocol", '{"conditions": ["day", "day"]}', "twice"),
+        ("protocol", '{"threshold": [[0.25, 2.0]]}', "threshold"),
     ],
 )
-def test_broken_protocols(tmp_path: Path, change: dict) -> None:
-    (tmp_path / "protocol.json").write_text(json.dumps(change))
-    with pytest.raises(DataError, match=r"protocol\.json"):
-        read_protocol(tmp_path)
+def test_broken_models_name_the_field(tmp_path: Path, name: str, content: str, words: str) -> None:
+    (tmp_path / f"{name}.json").write_text(content)
+    with pytest.raises(DataError, match=words) as caught:
+        READERS[f"{name}.json"](tmp_path)
+    assert f"{name}.json" in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_names_keep_their_order(tmp_path: Path) -> None:
-    names = {"rain/rear/2.jpg": "rear/2.png", "dawn/rear/1.jpg": "rear/1.png"}
-    write_names(tmp_path, names)
-    assert list(read_names(tmp_path).items()) == list(names.items())
-    assert (tmp_path / "names.csv").read_text().splitlines()[1] == "rain/rear/2.jpg,rear/2.png"
-
-
-def test_pairs_keep_their_order(tmp_path: Path) -> None:
-    pairs = [RelocalizationPair("b.txt", "r/2.png", "q/1.png")] * 2
-    pairs.append(RelocalizationPair("a.txt", "r/1.png", "q/1.png"))
-    write_relocalization(tmp_path, pairs)
-    assert read_relocalization(tmp_path) == pairs
-
-
-def test_absent_tables_are_empty(tmp_path: Path) -> None:
-    assert read_names(tmp_path) == {} and read_relocalization(tmp_path) == []
-
-
-@pytest.mark.parametrize(
-    ("rows", "message"),
-    [
-        ("a.jpg,x\na.jpg,y\n", r"names\.csv:3: image 'a\.jpg' is given twice"),
-        ("a.jpg,x\nb.jpg,x\n", r"names\.csv:3: name 'x' is given twice"),
-        ("a.jpg,x y\n", r"names\.csv:2: a pose file cannot hold the name 'x y'"),
-        ("../a.jpg,x\n", r"names\.csv:2: "),
-        ("a.jpg\n", r"names\.csv:2: "),
-    ],
-)
-def test_broken_names(tmp_path: Path, rows: str, message: str) -> None:
-    (tmp_path / "names.csv").write_text(f"image,name\n{rows}")
-    with pytest.raises(DataError, match=message):
-        read_names(tmp_path)
-
-
-def test_a_pose_file_outside_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "relocalization.csv").write_text("file,reference,query\n../../x.txt,a,b\n")
-    with pytest.raises(DataError, match=r"relocalization\.csv:2: "):
-        read_relocalization(tmp_path)
-    with pytest.raises(DataError):
-        write_relocalization(tmp_path, [RelocalizationPair("/etc/x", "a", "b")])
-
-
-READERS = {
-    "groups.csv": read_groups,
-    "priors.csv": read_priors,
-    "names.csv": read_names,
-    "relocalization.csv": read_relocalization,
-    "world.json": read_world,
-    "protocol.json": read_protocol,
-}
+@given(st.integers(0, 2**32 - 1), st.floats(0.1, 10))
+def test_official_poses_see_the_same_and_come_back(seed: int, scale: float) -> None:
+    rng = np.random.default_rng(seed)
+    turn, pose = (
+        RigidTransform.from_matrix(Rotation.random(random_state=rng).as_matrix(), at)
+        for at in (np.zeros(3), rng.normal(size=3))
+    )
+    offset, local = rng.normal(size=3) * 1e5, rng.normal(size=(4, 3)) * 5
+    similarity = SimilarityTransform(
+        quat_wxyz=turn.quat_wxyz, translation=tuple(offset), scale=scale
+    )
+    world = World(official_from_local=similarity)
+    in_official = world.pose_in_official(pose)
+    # the camera sees every point in the same direction, as many official units away
+    seen = in_official.apply(scale * turn.apply(local) + offset)
+    np.testing.assert_allclose(seen, scale * pose.apply(local), atol=1e-8)
+    back = world.pose_in_local(in_official)
+    np.testing.assert_allclose(back.apply(local), pose.apply(local), atol=1e-8)
 
 
 @pytest.mark.parametrize("name", READERS)

@@ -53,6 +53,13 @@ def test_points_lie_on_the_plane_and_on_their_rays(image_from_depth: RigidTransf
         model=IMAGE.model, width=IMAGE.width, height=IMAGE.height, params=IMAGE.params
     )
     np.testing.assert_allclose(camera.img_from_cam(points), keypoints, atol=1e-3)
+    # what the depth camera does not see has none
+    wide = Camera("PINHOLE", 640, 480, (300.0, 300.0, 320.0, 240.0))
+    keypoints = np.array([[5.0, 240.0], [320.0, 240.0]])
+    _, valid = lift_keypoints(keypoints, plane_depth(DEPTH), wide, DEPTH, image_from_depth)
+    assert valid.tolist() == [False, True]
+    empty, none = lift_keypoints(np.zeros((0, 2)), plane_depth(DEPTH), wide, DEPTH, IDENTITY)
+    assert empty.shape == (0, 3) and none.shape == (0,)
 
 
 def test_the_centre_of_the_first_pixel_is_half() -> None:
@@ -89,28 +96,12 @@ def test_missing_depth_falls_back_to_the_nearest_that_is_there() -> None:
     assert not lift_keypoints(np.array([[1.6, 1.6]]), nothing, camera, camera, IDENTITY)[1].any()
 
 
-def test_what_the_depth_camera_does_not_see_has_none() -> None:
-    wide = Camera("PINHOLE", 640, 480, (300.0, 300.0, 320.0, 240.0))
-    keypoints = np.array([[5.0, 240.0], [320.0, 240.0]])
-    _, valid = lift_keypoints(keypoints, plane_depth(DEPTH), wide, DEPTH, IDENTITY)
-    assert valid.tolist() == [False, True]
-    empty, none = lift_keypoints(np.zeros((0, 2)), plane_depth(DEPTH), wide, DEPTH, IDENTITY)
-    assert empty.shape == (0, 3) and none.shape == (0,)
-
-
-def tilted_plane() -> tuple[np.ndarray, np.ndarray]:
-    """A depth map of the plane z = 2 + 0.3 x, and a normal form n . X = 2 of it."""
-    x = (np.arange(64) + 0.5 - 32.0) / 60.0
-    depth = np.broadcast_to(2.0 / (1.0 - 0.3 * x), (48, 64)).astype(np.float32)
-    return depth, np.array([-0.3, 0.0, 1.0])
-
-
 @given(
     seed=st.integers(0, 2**32 - 1),
     off=st.floats(-0.2, 0.2).filter(lambda off: abs(abs(off) - 0.03) > 0.02),
 )
 def test_points_off_the_plane_by_more_than_the_noise_contradict(seed: int, off: float) -> None:
-    depth, normal = tilted_plane()
+    depth, normal = plane_depth(SMALL), np.array([-0.3, 0.0, 1.0])  # n . X = 2
     rng = np.random.default_rng(seed)
     rays = np.column_stack([rng.uniform(-0.4, 0.4, 50), rng.uniform(-0.3, 0.3, 50), np.ones(50)])
     on_plane = rays * (2.0 / (rays @ normal))[:, None]
@@ -135,16 +126,12 @@ def test_near_an_edge_either_surface_may_be_meant() -> None:
     depth = np.full((48, 64), 2.0, np.float32)
     depth[:, 32:] = 1.0
     options = EXACT.model_copy(update={"window_px": 2})
-    # pixel columns 28 to 35: one metre away is right from column 30 on
-    columns = np.arange(28, 36) + 0.5
-    near = np.column_stack([(columns - 32.0) / 60.0, np.zeros(8), np.ones(8)])
-    found, checked = contradicted_by_depth(near, depth, SMALL, IDENTITY, options)
-    assert checked.all()
-    assert found.tolist() == [True, True] + [False] * 6
-    found, _ = contradicted_by_depth(near * 2.0, depth, SMALL, IDENTITY, options)
-    assert found.tolist() == [False] * 6 + [True, True]
-    # and behind both there is nothing
-    assert contradicted_by_depth(near * 2.5, depth, SMALL, IDENTITY, options)[0].all()
+    # pixel columns 28 to 35: one metre away is right from column 30 on, two up to 33
+    near = np.column_stack([(np.arange(28, 36) + 0.5 - 32.0) / 60.0, np.zeros(8), np.ones(8)])
+    wrong = {1.0: [True] * 2 + [False] * 6, 2.0: [False] * 6 + [True] * 2}
+    for metres, expected in (wrong | {2.5: [True] * 8}).items():  # behind both there is nothing
+        found, checked = contradicted_by_depth(near * metres, depth, SMALL, IDENTITY, options)
+        assert checked.all() and found.tolist() == expected
 
 
 @pytest.mark.parametrize("missing", [0.0, -1.0, np.nan, np.inf])
@@ -154,19 +141,14 @@ def test_missing_depth_says_nothing(missing: float) -> None:
     wrong = np.array([[0.0, 0.0, 5.0]])
     options = EXACT.model_copy(update={"window_px": 1})
     for point in (wrong, wrong + [0.3, 0.0, 0.0]):  # in the hole, and one pixel beside it
-        contradicted, checked = contradicted_by_depth(point, depth, SMALL, IDENTITY, options)
-        assert not contradicted.any()
-        assert not checked.any()
+        for judged in contradicted_by_depth(point, depth, SMALL, IDENTITY, options):
+            assert not judged.any()
     far_from_it = wrong + [1.0, 0.0, 0.0]
     assert contradicted_by_depth(far_from_it, depth, SMALL, IDENTITY, options)[0].all()
-
-
-def test_points_outside_and_behind_are_not_judged() -> None:
-    depth = np.full((48, 64), 2.0, np.float32)
+    # neither is judged what is outside or behind
     points = np.array([[0.0, 0.0, -2.0], [10.0, 0.0, 2.0], [0.0, -10.0, 2.0], [0.0, 0.0, 0.0]])
-    contradicted, checked = contradicted_by_depth(points, depth, SMALL, IDENTITY, EXACT)
-    assert not contradicted.any()
-    assert not checked.any()
+    for judged in contradicted_by_depth(points, depth, SMALL, IDENTITY, EXACT):
+        assert not judged.any()
 
 
 def test_an_uncertain_point_may_be_farther_off() -> None:

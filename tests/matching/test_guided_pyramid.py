@@ -41,15 +41,13 @@ CAMERA = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
 ALL_VARIANTS = GuidedPyramidOptions().variants(320, 240)
 
 
-# ---------------------------------------------------------------------------- options
-
-
 def test_the_variants_are_all_scales_with_all_turns_but_the_image_itself() -> None:
-    options = GuidedPyramidOptions(scales=(2.0, 0.5, 1.0), rotations_deg=(270, 0))
-    assert options.variants(640, 480) == [
-        ImageVariant(0.5, 0), ImageVariant(0.5, 270), ImageVariant(1.0, 270),
-        ImageVariant(2.0, 0), ImageVariant(2.0, 270),
-    ]  # fmt: skip
+    options = GuidedPyramidOptions(scales=(2.0, 0.5, 1.0), rotations_deg=(-90, 360, 630))
+    half, same, twice = (ImageVariant(scale, 270) for scale in (0.5, 1.0, 2.0))
+    expected = [ImageVariant(0.5), half, same, ImageVariant(2.0), twice]
+    assert options.variants(640, 480) == expected
+    assert pyramid_type("rootsift") == "rootsift-pyramid"
+    assert base_type("rootsift-pyramid") == base_type("rootsift") == "rootsift"
 
 
 @pytest.mark.parametrize(
@@ -73,28 +71,19 @@ def test_no_variant_is_larger_than_the_bound(side: int, expected: list[float]) -
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    ("name", "values"),
     [
-        {"scales": ()}, {"scales": (0.0,)}, {"scales": (-1.0,)}, {"scales": (float("nan"),)},
-        {"scales": (100.0,)}, {"rotations_deg": (45,)}, {"rotations_deg": ()}, {"mode": "some"},
-        {"min_matches": 0}, {"max_side_px": 0},
+        ("scales", [(), (0.0,), (-1.0,), (float("nan"),), (100.0,)]),
+        ("rotations_deg", [(45,), ()]),
+        ("mode", ["some"]),
+        ("min_matches", [0]),
+        ("max_side_px", [0]),
     ],
-)  # fmt: skip
-def test_wrong_options_are_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ValidationError):
-        GuidedPyramidOptions(**wrong)
-
-
-def test_turns_are_counted_round() -> None:
-    assert GuidedPyramidOptions(rotations_deg=(-90, 360, 450)).rotations_deg == (0, 90, 270)
-
-
-def test_the_type_of_a_pyramid_says_what_it_begins_with() -> None:
-    assert pyramid_type("rootsift") == "rootsift-pyramid"
-    assert base_type("rootsift-pyramid") == base_type("rootsift") == "rootsift"
-
-
-# ---------------------------------------------------------------------------- extraction
+)
+def test_wrong_options_are_refused(name: str, values: list[Any]) -> None:
+    for value in values:
+        with pytest.raises(ValidationError):
+            GuidedPyramidOptions(**{name: value})
 
 
 def blobs() -> tuple[np.ndarray, np.ndarray]:
@@ -164,64 +153,43 @@ def test_a_variant_that_cannot_be_extracted_is_skipped_and_says_why() -> None:
     ]
 
 
-def test_features_that_do_not_fit_those_of_the_image_are_refused() -> None:
-    more = ImageFeatures(np.zeros((1, 3), np.float32), np.zeros((1, 128), np.float32), 320, 240)
-    with pytest.raises(DataError, match="3 numbers per keypoint and 128 .* 2 and 128"):
-        extract_variants(IMAGE, None, ALL_VARIANTS[:1], extract, like=more)
-    other = ImageFeatures(np.zeros((1, 2), np.float32), np.zeros((1, 64), np.float32), 320, 240)
-    with pytest.raises(DataError, match="64 per descriptor"):
-        extract_variants(IMAGE, None, ALL_VARIANTS[:1], extract, like=other)
-
-
-def test_columns_beside_the_place_are_kept_as_they_are_stored() -> None:
+def test_columns_beside_the_place_are_kept_as_they_are_stored_and_must_fit() -> None:
     def scored(image: np.ndarray, mask: np.ndarray | None) -> LocalFeatures:
         found = extract(image, mask)
-        wide = np.concatenate(
-            [found.keypoints_px, found.scores[:, None], found.scores[:, None]], axis=1
-        )
+        wide = np.column_stack([found.keypoints_px, found.scores, found.scores])
         return LocalFeatures(wide, found.scores, found.descriptors)
 
     like = ImageFeatures(np.zeros((1, 3), np.float32), LIKE.descriptors, 320, 240)
     (found,), _ = extract_variants(IMAGE, None, [ImageVariant(0.5, 90)], scored, like=like)
     assert found.keypoints_px.shape[1] == found.features.keypoints_px.shape[1] == 3
     np.testing.assert_array_equal(found.keypoints_px[:, 2], found.features.keypoints_px[:, 2])
-
-
-# ---------------------------------------------------------------------------- matching
+    other = ImageFeatures(LIKE.keypoints_px, np.zeros((1, 64), np.float32), 320, 240)
+    told = {"3 numbers per keypoint and 128 .* 2 and 128": like, "64 per descriptor": other}
+    for match, wrong in told.items():
+        with pytest.raises(DataError, match=match):
+            extract_variants(IMAGE, None, ALL_VARIANTS[:1], extract, like=wrong)
 
 
 def test_the_verified_rows_are_what_is_found() -> None:
-    found, _ = extract_variants(IMAGE, None, [ImageVariant(0.5, 90)], extract, like=LIKE)
+    (found,), _ = extract_variants(IMAGE, None, [ImageVariant(0.5, 90)], extract, like=LIKE)
 
     def match(a: ImageFeatures, others: Any) -> Any:
         assert (a.width, a.height) == (120, 160)
         return [match_nearest(a.descriptors, other.descriptors) for other in others]
 
-    def even(variant: VariantFeatures, matches: np.ndarray) -> np.ndarray:
-        return matches[:, 0] % 2 == 0
-
-    def none(variant: VariantFeatures, matches: np.ndarray) -> np.ndarray:
-        return np.zeros(len(matches), bool)
-
+    even = PairVerifier(lambda _, matches: matches[:, 0] % 2 == 0)
+    none = PairVerifier(lambda _, matches: np.zeros(len(matches), bool))
     nothing = ImageFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), 9, 9)
-    kept, refused, empty = match_variants(
-        found,
-        [LIKE, LIKE, nothing],
-        match,
-        [PairVerifier(even), PairVerifier(none), PairVerifier(none)],
-    )
-    assert refused == empty == []
-    (result,) = kept
-    matches, scores = match_nearest(found[0].features.descriptors, LIKE.descriptors)
+    others = [LIKE, LIKE, nothing]
+    (result,), *rest = match_variants([found], others, match, [even, none, none])
+    assert rest == [[], []]
+    matches, scores = match_nearest(found.features.descriptors, LIKE.descriptors)
     assert result.variant == ImageVariant(0.5, 90)
     rows, other_rows = matches[kept_rows := matches[:, 0] % 2 == 0].T
     np.testing.assert_array_equal(result.other_rows, other_rows)
-    np.testing.assert_array_equal(result.keypoints_px, found[0].keypoints_px[rows])
-    np.testing.assert_array_equal(result.descriptors, found[0].features.descriptors[rows])
+    np.testing.assert_array_equal(result.keypoints_px, found.keypoints_px[rows])
+    np.testing.assert_array_equal(result.descriptors, found.features.descriptors[rows])
     np.testing.assert_array_equal(result.scores, scores[kept_rows])
-
-
-# ---------------------------------------------------------------------------- verification
 
 
 def two_views(error_px: float) -> tuple[np.ndarray, np.ndarray, RigidTransform]:
@@ -299,9 +267,6 @@ def test_variants_that_agree_with_the_richest_remain(rich: str) -> None:
     assert judgement.agree([]) == []
 
 
-# ---------------------------------------------------------------------------- what is not tried
-
-
 def matched_by(variant: VariantFeatures, count: int) -> VariantMatches:
     zeros = np.zeros((count, 2), np.float32)
     return VariantMatches(
@@ -375,19 +340,6 @@ def test_corners_stay_corners(size: tuple[int, int], variant: ImageVariant) -> N
 
 
 @pytest.mark.parametrize("rotation", (0, 90, 180, 270))
-def test_a_turned_pixel_is_where_the_map_says(rotation: int) -> None:
-    variant = ImageVariant(1.0, rotation)
-    for column, row in ((0, 0), (6, 0), (2, 3), (6, 4)):
-        image = np.zeros((5, 7, 3), np.uint8)
-        image[row, column] = (1, 2, 3)
-        turned = variant.of_image(image)
-        assert turned.shape[:2] == variant.size(7, 5)[::-1]
-        ((x, y),) = px_in_variant(variant, np.array([[column + 0.5, row + 0.5]]), 7, 5)
-        assert (x % 1, y % 1) == (0.5, 0.5)
-        assert turned[int(y), int(x)].tolist() == [1, 2, 3]
-
-
-@pytest.mark.parametrize("rotation", (0, 90, 180, 270))
 @pytest.mark.parametrize("scale", SCALES)
 def test_a_scaled_ramp_shows_the_places_its_pixels_come_from(scale: float, rotation: int) -> None:
     # a pixel's value is its place in the original, which means and interpolation leave right
@@ -436,9 +388,7 @@ def test_the_identity_changes_nothing() -> None:
     assert ImageVariant().is_identity
     np.testing.assert_array_equal(ImageVariant().of_image(image), image)
     assert not ImageVariant(1.0, 90).is_identity and not ImageVariant(0.5).is_identity
-
-
-def test_a_small_image_keeps_a_pixel() -> None:
+    # a small image keeps a pixel
     assert ImageVariant(0.1).of_image(np.zeros((2, 30, 3), np.uint8)).shape == (1, 3, 3)
 
 

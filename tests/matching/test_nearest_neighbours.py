@@ -28,11 +28,11 @@ def by_loops(
     matches: list[tuple[int, int]] = []
     taken: set[int] = set()
     for i, row in enumerate(products):
-        best = max(range(len(b)), key=lambda j: (row[j], -j))
-        if options.max_ratio is not None and len(b) > 1:
-            distances = sorted(float(np.linalg.norm(a[i] - y)) for y in b)
-            # distances of unit vectors that are equal in truth differ by rounding
-            if distances[0] > options.max_ratio * distances[1] + 1e-7:
+        best, *others = sorted(range(len(b)), key=lambda j: (-row[j], j))
+        if options.max_ratio is not None and others:
+            nearest, second = (np.linalg.norm(a[i] - b[j]) for j in (best, others[0]))
+            # equal ones differ by rounding
+            if nearest > options.max_ratio * second + 1e-7:
                 continue
         if options.min_similarity is not None and row[best] < options.min_similarity:
             continue
@@ -57,13 +57,20 @@ def descriptors(draw: st.DrawFn) -> tuple[NDArray[Any], NDArray[Any], int]:
     return a.astype(np.float32), b.astype(np.float32), block
 
 
-@given(descriptors(), st.booleans(), st.sampled_from([None, 2.5]))
+@given(
+    descriptors(), st.booleans(), st.sampled_from([None, 2.5]), st.sampled_from([None, 0.75, 0.95])
+)
 @settings(deadline=None)
 def test_equal_to_loops_over_all_pairs(
-    problem: tuple[NDArray[Any], NDArray[Any], int], mutual: bool, min_similarity: float | None
+    problem: tuple[NDArray[Any], NDArray[Any], int],
+    mutual: bool,
+    min_similarity: float | None,
+    max_ratio: float | None,
 ) -> None:
     a, b, block = problem
-    options = NearestNeighbourOptions(mutual=mutual, min_similarity=min_similarity)
+    options = NearestNeighbourOptions(
+        mutual=mutual, min_similarity=min_similarity, max_ratio=max_ratio
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(nearest_neighbours, "_BLOCK_ROWS", block)
         matches, scores = match_nearest(a, b, options)
@@ -102,46 +109,23 @@ def test_a_mutual_match_uses_every_row_once_and_is_nearest_both_ways(
     assert len(scores) == len(matches)
 
 
-@pytest.mark.parametrize("max_ratio", [0.6, 0.8, 0.95, 1.0])
+@pytest.mark.parametrize("max_ratio", [0.6, 0.7, 0.8, 0.9, 0.95, 1.0])
 @pytest.mark.parametrize("mutual", [True, False])
 def test_the_ratio_is_of_distances(max_ratio: float, mutual: bool) -> None:
     rng = np.random.default_rng(3)
-    b = rng.normal(size=(60, 6))
-    a = b[rng.permutation(60)[:50]] + 0.4 * rng.normal(size=(50, 6))
-    a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))
     options = NearestNeighbourOptions(max_ratio=max_ratio, mutual=mutual)
-    matches, _ = match_nearest(a, b, options)
-    assert [tuple(m) for m in matches.tolist()] == by_loops(a, b, options)
-    if max_ratio == 0.6:
-        assert 0 < len(matches) < 40  # the test tells ratios apart
-
-
-@pytest.mark.parametrize("max_ratio", [0.7, 0.9])
-def test_the_ratio_of_uint8_descriptors_is_of_distances_too(max_ratio: float) -> None:
+    floats = rng.normal(size=(60, 6))
+    noisy = floats[rng.permutation(60)[:50]] + 0.4 * rng.normal(size=(50, 6))
     # as COLMAP's SIFT: 512 times a unit vector, rounded
-    rng = np.random.default_rng(6)
-    b = np.abs(rng.normal(size=(60, 128)))
-    a = b[:50] + np.linspace(0.1, 1.5, 50)[:, None] * rng.normal(size=(50, 128))
-    a, b = (
-        np.round(512 * np.abs(x) / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.uint8)
-        for x in (a, b)
-    )
-    options = NearestNeighbourOptions(max_ratio=max_ratio, mutual=False)
-    products = a.astype(np.float64) @ b.astype(np.float64).T
-    expected = []
-    for i, order in enumerate(np.argsort(-products, axis=1)):
-        distances = [float(np.linalg.norm(a[i].astype(float) - b[j])) for j in order[:2]]
-        if distances[0] <= max_ratio * distances[1]:
-            expected.append([i, int(order[0])])
-    matches = match_nearest(a, b, options)[0].tolist()
-    assert matches == expected
-    assert 5 < len(matches) < 45
-
-
-def test_ratio_with_a_single_candidate_is_no_test() -> None:
-    a, b = np.eye(2, 4, dtype=np.float32), np.eye(1, 4, dtype=np.float32)
-    matches, _ = match_nearest(a, b, NearestNeighbourOptions(max_ratio=0.5))
-    assert matches.tolist() == [[0, 0]]
+    whole = np.abs(rng.normal(size=(60, 128)))
+    changed = whole[:50] + np.linspace(0.1, 1.5, 50)[:, None] * rng.normal(size=(50, 128))
+    for a, b, scale, dtype in ((noisy, floats, 1, float), (abs(changed), whole, 512, np.uint8)):
+        a, b = (scale * x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))
+        a, b = (np.round(x).astype(dtype) if scale > 1 else x for x in (a, b))
+        matches = match_nearest(a, b, options)[0].tolist()
+        assert [tuple(match) for match in matches] == by_loops(a, b, options)
+        if max_ratio < 0.8:
+            assert 0 < len(matches) < 45  # the test tells ratios apart
 
 
 def test_more_rows_than_one_block() -> None:
@@ -153,11 +137,20 @@ def test_more_rows_than_one_block() -> None:
     assert matches[:, 0].max() > 512  # some come from later blocks
 
 
-def test_ties_go_to_the_smaller_index() -> None:
+def test_ties_go_to_the_smaller_index_and_few_candidates_are_no_fault() -> None:
     same = np.ones((3, 4), dtype=np.float32)
     assert match_nearest(same, same)[0].tolist() == [[0, 0]]
     one_way = match_nearest(same, same, NearestNeighbourOptions(mutual=False))[0]
     assert one_way.tolist() == [[0, 0], [1, 0], [2, 0]]
+    # of a single candidate there is no ratio
+    alone = match_nearest(same[:2], same[:1], NearestNeighbourOptions(max_ratio=0.5))[0]
+    assert alone.tolist() == [[0, 0]]
+    for a, b in ((same[:0], same), (same, same[:0]), (same[:0], same[:0])):
+        matches, scores = match_nearest(a, b)
+        assert matches.shape == (0, 2) and matches.dtype == np.int64
+        assert scores.shape == (0,) and scores.dtype == np.float32
+    with pytest.raises(DataError, match="4 and 2 dimensions"):
+        match_nearest(same, same[:, :2])
 
 
 def test_uint8_descriptors_do_not_wrap_around() -> None:
@@ -170,28 +163,10 @@ def test_uint8_descriptors_do_not_wrap_around() -> None:
     np.testing.assert_allclose(scores, distances, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("count_a", "count_b"), [(0, 3), (3, 0), (0, 0)])
-def test_no_descriptors(count_a: int, count_b: int) -> None:
-    matches, scores = match_nearest(np.zeros((count_a, 8)), np.zeros((count_b, 8)))
-    assert matches.shape == (0, 2) and matches.dtype == np.int64
-    assert scores.shape == (0,) and scores.dtype == np.float32
-
-
-def test_different_dimensions_are_refused() -> None:
-    with pytest.raises(DataError, match="8 and 4 dimensions"):
-        match_nearest(np.zeros((2, 8)), np.zeros((2, 4)))
-
-
 def test_the_plugin_passes_its_options_on() -> None:
-    rng = np.random.default_rng(5)
-    a, b = (
-        ImageFeatures(np.zeros((count, 2), np.float32), rng.normal(size=(count, 4)), 640, 480)
-        for count in (30, 20)
-    )
+    rng, xy = np.random.default_rng(5), np.zeros((30, 2), np.float32)
+    a, b = (ImageFeatures(xy[:n], rng.normal(size=(n, 4)), 640, 480) for n in (30, 20))
     options = NearestNeighbourOptions(mutual=False)
-    np.testing.assert_array_equal(
-        NearestNeighbours(options).match(a, b)[0],
-        match_nearest(a.descriptors, b.descriptors, options)[0],
-    )
-    assert len(NearestNeighbours(options).match(a, b)[0]) == 30
-    assert len(NearestNeighbours().match(a, b)[0]) < 30
+    found = NearestNeighbours(options).match(a, b)[0]
+    np.testing.assert_array_equal(found, match_nearest(a.descriptors, b.descriptors, options)[0])
+    assert len(found) == 30 > len(NearestNeighbours().match(a, b)[0])

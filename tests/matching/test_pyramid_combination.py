@@ -49,6 +49,7 @@ def test_against_looking_at_all_of_them(
             kept = np.concatenate([kept, keypoint[None]])
     assert len(union) == len(kept)
     np.testing.assert_array_equal(union.added(), kept[len(base) :])
+    assert union.find(np.zeros((0, 3), np.float32)).shape == (0,)
     # opened again with what was added, it finds the same
     again = KeypointUnion(array(base), union.added())
     np.testing.assert_array_equal(again.find(array(more)), union.find(array(more)))
@@ -67,18 +68,6 @@ def test_what_is_taken_back_was_never_there(
     union.truncate(length)
     np.testing.assert_array_equal(union.added(), expected.added())
     np.testing.assert_array_equal(union.find(array(more)), expected.find(array(more)))
-
-
-def test_of_several_at_one_place_the_first_is_meant() -> None:
-    # SIFT has a keypoint for each orientation
-    union = KeypointUnion(array([(9.0, 9.0), (5.0, 5.0), (5.0, 5.0)]))
-    assert union.find(array([(5.3, 5.0)])).tolist() == [1]
-
-
-def test_no_keypoints_at_all() -> None:
-    union = KeypointUnion(np.zeros((0, 2), np.float32))
-    assert union.find(np.zeros((0, 2), np.float32)).shape == (0,)
-    assert union.added().shape == (0, 2)
 
 
 def variant_matches(
@@ -138,11 +127,11 @@ def test_max_is_the_richest() -> None:
 
 def test_max_keeps_the_images_as_they_are_where_no_variant_has_more() -> None:
     keypoints = KeypointUnion(grid(5))
-    as_many = variant_matches([(5, 5), (15, 5)], [4, 5])
-    # three matches, but two of their keypoints are one
+    # as many matches; three, but two of their keypoints are one
+    some = variant_matches([(5, 5), (15, 5)], [4, 5])
     seemingly = variant_matches([(5, 5), (5, 5.5), (15, 5)], [4, 5, 6])
-    for tried in ([], [as_many], [seemingly]):
-        combined = combine(BASE, [(0, each) for each in tried], "max", (keypoints, None))
+    for tried in ([], [(0, some)], [(0, seemingly)]):
+        combined = combine(BASE, tried, "max", (keypoints, None))
         assert combined.matches.tolist() == BASE[0].tolist()
         assert combined.best is None
         assert len(combined.added[0]) == 0 and len(keypoints) == 5

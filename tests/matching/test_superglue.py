@@ -108,26 +108,22 @@ def test_many_are_each_alone(weights: Path) -> None:
         np.testing.assert_allclose(found[1], scores, atol=1e-5)
     assert len(alone[0][0]) > 15 and len(alone[2][0]) > 15
     assert plugin.match_many(a, []) == []
-
-
-def test_no_keypoints_no_matches(weights: Path) -> None:
-    for a, b in ((image(0, 0), image(9, 1)), (image(9, 1), image(0, 0))):
-        matches, scores = matcher(weights).match(a, b)
+    nothing = ImageFeatures(np.zeros((0, 3), np.float32), np.zeros((0, 0)), 640, 480)
+    for first, second in ((image(0, 0), a), (a, image(0, 0)), (nothing, a)):
+        matches, scores = plugin.match(first, second)
         assert matches.shape == (0, 2) and matches.dtype == np.int64
         assert scores.shape == (0,) and scores.dtype == np.float32
-    nothing = ImageFeatures(np.zeros((0, 3), np.float32), np.zeros((0, 0)), 640, 480)
-    assert len(matcher(weights).match(nothing, image(9, 1))[0]) == 0
 
 
 def test_half_precision_keeps_the_matches(weights: Path) -> None:
     a = image(80, 0)
     b = seen_again(a, 60, 1)
-    whole, _ = matcher(weights).match(a, b)
-    half, scores = matcher(weights, half_precision=True).match(a, b)
+    (whole, _), (half, scores) = (
+        matcher(weights, half_precision=half).match(a, b) for half in (False, True)
+    )
     assert scores.dtype == np.float32
-    both = set(map(tuple, whole.tolist())) & set(map(tuple, half.tolist()))
-    either = set(map(tuple, whole.tolist())) | set(map(tuple, half.tolist()))
-    assert len(both) / len(either) > 0.9
+    found, exact = ({*map(tuple, matches.tolist())} for matches in (half, whole))
+    assert len(found & exact) / len(found | exact) > 0.9
 
 
 def test_what_it_cannot_use_is_named(weights: Path) -> None:

@@ -35,20 +35,19 @@ DISTORTED = [
 
 
 def pose(rotation_vector: list[float], translation: list[float]) -> RigidTransform:
-    x, y, z, w = Rotation.from_rotvec(rotation_vector).as_quat()
-    tx, ty, tz = translation
-    return RigidTransform((w, x, y, z), (tx, ty, tz))
+    rotation = Rotation.from_rotvec(rotation_vector).as_matrix()
+    return RigidTransform.from_matrix(rotation, np.array(translation))
+
+
+def plain(rays: Array, focal_px: float) -> tuple[Array, Array]:
+    """Rays, and their slopes in a camera without distortion."""
+    return rays, np.repeat(np.eye(2)[None] / focal_px, len(rays), axis=0)
 
 
 def seen(camera: Camera, pixels: Array) -> tuple[Array, Array]:
     """Rays and slopes of pixels."""
     rays = bearing_rays(camera, pixels)
     return rays, ray_slopes(camera, pixels, rays)
-
-
-def plain(rays: Array, focal_px: float) -> tuple[Array, Array]:
-    """Rays, and their slopes in a camera without distortion."""
-    return rays, np.repeat(np.eye(2)[None] / focal_px, len(rays), axis=0)
 
 
 # what the old measure, normalised coordinates times the focal length, got wrong
@@ -65,28 +64,19 @@ def scene(
 ) -> tuple[Array, Array, Array]:
     """Points (N, 3) in a's frame that both cameras see, and their pixels in both."""
     rng = np.random.default_rng(seed)
-    points = np.stack(
-        [
-            rng.uniform(-3, 3, 8 * count),
-            rng.uniform(-2, 2, 8 * count),
-            rng.uniform(4, 9, 8 * count),
-        ],
-        axis=1,
-    )
+    points = rng.uniform((-3, -2, 4), (3, 2, 9), (8 * count, 3))
     in_a = project(camera_a, RigidTransform.identity(), points)
     in_b = project(camera_b, B_FROM_A, points)
     seen = np.ones(len(points), dtype=bool)
     for camera, pixels in ((camera_a, in_a), (camera_b, in_b)):
-        seen &= (pixels > 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+        seen &= ((pixels > 0) & (pixels < (camera.width, camera.height))).all(axis=1)
     assert seen.sum() >= count
     return points[seen][:count], in_a[seen][:count], in_b[seen][:count]
 
 
 def test_essential_matrix_is_colmaps() -> None:
-    w, x, y, z = B_FROM_A.quat_wxyz
-    rigid = pycolmap.Rigid3d(
-        pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(B_FROM_A.translation)
-    )
+    turn = pycolmap.Rotation3d(B_FROM_A.rotation_matrix())
+    rigid = pycolmap.Rigid3d(turn, np.array(B_FROM_A.translation))
     ours = essential_matrix(B_FROM_A)
     theirs = pycolmap.essential_matrix_from_pose(rigid)
     # COLMAP's has the translation at unit length
@@ -141,32 +131,12 @@ def test_the_error_is_that_of_optimal_triangulation_to_first_order(
     points, in_a, in_b = scene(camera_a, camera_b, count=20)
     in_a, in_b = in_a + rng.normal(size=in_a.shape), in_b + rng.normal(size=in_b.shape)
     ours = sampson_error_px(*seen(camera_a, in_a), *seen(camera_b, in_b), B_FROM_A)
-    expected = np.array(
-        [
-            smallest_correction_px(camera_a, px_a, camera_b, px_b, point)
-            for px_a, px_b, point in zip(in_a, in_b, points, strict=True)
-        ]
-    )
+    expected = [
+        smallest_correction_px(camera_a, px_a, camera_b, px_b, point)
+        for px_a, px_b, point in zip(in_a, in_b, points, strict=True)
+    ]
     assert np.median(expected) > 0.2
     np.testing.assert_allclose(ours, expected, rtol=0.01, atol=0.01)
-
-
-def test_pixels_at_the_rim_of_a_fisheye_count_as_pixels() -> None:
-    """In normalised coordinates they would count several times as much."""
-    camera = WIDE[0]
-    angles = np.radians(np.linspace(60, 80, 20))
-    points = 5 * np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=1)
-    along = pose([0.0, 0.0, 0.0], [-0.5, 0.0, 0.0])
-    in_a = project(camera, RigidTransform.identity(), points)
-    in_b = project(camera, along, points)
-    in_b[:, 1] += 5.0  # across the epipolar lines: more than 3.5 px of both together
-    rays = [seen(camera, px) for px in (in_a, in_b)]
-    good = verify_with_poses(*rays[0], *rays[1], along, KnownPoseOptions(max_error_px=3.4))
-    assert not good.any()
-    assert verify_with_poses(*rays[0], *rays[1], along).all()
-    focal = camera.params[0]
-    as_before = sampson_error_px(*plain(rays[0][0], focal), *plain(rays[1][0], focal), along)
-    assert as_before.min() > 4.0
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, *DISTORTED, *WIDE], ids=lambda c: c.model)
@@ -177,24 +147,6 @@ def test_exact_matches_pass_and_others_do_not(camera: Camera) -> None:
     # the same matches under another pose do not
     wrong = pose([0.02, -0.05, 0.05], [-1.0, 0.9, 0.2])
     assert not verify_with_poses(*matches, wrong, KnownPoseOptions(max_error_px=2.0)).any()
-
-
-def test_only_errors_across_the_epipolar_line_count() -> None:
-    points, in_a, in_b = scene(PINHOLE, PINHOLE, count=100)
-    rays_a, slopes_a = seen(PINHOLE, in_a)
-    line = rays_a @ essential_matrix(B_FROM_A).T
-    focal = np.array([520.0, 510.0])
-    normal = line[:, :2] / focal
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    along = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
-
-    def verified(shift_px: Array) -> NDArray[np.bool_]:
-        return verify_with_poses(rays_a, slopes_a, *seen(PINHOLE, in_b + shift_px), B_FROM_A)
-
-    # the distance is shared by both images: sqrt(2) of a shift of one where both lines are alike
-    assert verified(3.0 * normal).all()
-    assert not verified(9.0 * normal).any()
-    assert verified(9.0 * along).all()
 
 
 def test_points_behind_a_camera_do_not_pass() -> None:
@@ -210,6 +162,10 @@ def test_points_behind_a_camera_do_not_pass() -> None:
     expected = (behind[:, 2] > 0) & (in_b_frame[:, 2] > 0)
     np.testing.assert_array_equal(in_front_of_both(rays_a, rays_b, B_FROM_A), expected)
     np.testing.assert_array_equal(verify_with_poses(*matches, B_FROM_A), expected)
+    # a point at infinity passes
+    direction = np.array([[0.1, -0.2, 1.0]])
+    in_b = direction @ B_FROM_A.rotation_matrix().T
+    assert in_front_of_both(direction, in_b / in_b[:, 2:], B_FROM_A).all()
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -229,12 +185,6 @@ def test_in_front_agrees_with_the_sign_of_both_depths(seed: int) -> None:
         in_front_of_both(points / points[:, 2:], in_b / in_b[:, 2:], b_from_a),
         (points[:, 2] > 0) & (in_b[:, 2] > 0),
     )
-
-
-def test_a_point_at_infinity_passes() -> None:
-    direction = np.array([[0.1, -0.2, 1.0]])
-    in_b = direction @ B_FROM_A.rotation_matrix().T
-    assert in_front_of_both(direction, in_b / in_b[:, 2:], B_FROM_A).all()
 
 
 def test_cameras_at_one_place_verify_nothing() -> None:
@@ -288,14 +238,20 @@ def test_what_a_fisheye_sees_sideways_or_behind_is_refused() -> None:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_two_views_keep_the_inliers_among_as_many_outliers(camera: Camera, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    points, in_a, in_b = scene(camera, PINHOLE, count=300, seed=seed)
+    _, in_a, in_b = scene(camera, PINHOLE, count=300, seed=seed)
+    few = verify_two_view(in_a[:14], camera, in_b[:14], PINHOLE)
+    assert few.shape == (14,) and not few.any()
+    assert verify_two_view(in_a[:0], camera, in_b[:0], PINHOLE).shape == (0,)
     in_a, in_b = in_a + 0.5 * rng.normal(size=in_a.shape), in_b + 0.5 * rng.normal(size=in_b.shape)
     outlier = np.arange(300) % 2 == 1
     in_b[outlier] = rng.uniform((0, 0), (640, 480), (150, 2))
     good = verify_two_view(in_a, camera, in_b, PINHOLE)
+    np.testing.assert_array_equal(good, verify_two_view(in_a, camera, in_b, PINHOLE))
     assert good[~outlier].mean() > 0.95
     # an outlier passes where it falls on its epipolar line: a band of 8 px in 480, with cheirality
     assert good[outlier].mean() < 0.06
+    options = TwoViewOptions(min_matches=30)  # nothing in common
+    assert not verify_two_view(in_a[:60], camera, in_b[60:120], PINHOLE, options).any()
 
 
 def test_two_views_of_a_plane() -> None:
@@ -306,29 +262,6 @@ def test_two_views_of_a_plane() -> None:
     in_a = project(PINHOLE, RigidTransform.identity(), points)
     in_b = project(PINHOLE, B_FROM_A, points)
     assert verify_two_view(in_a, PINHOLE, in_b, PINHOLE).mean() > 0.95
-
-
-def test_two_views_with_the_same_seed_agree() -> None:
-    rng = np.random.default_rng(3)
-    points, in_a, in_b = scene(PINHOLE, PINHOLE, count=200)
-    in_b[::2] = rng.uniform(0, 480, (100, 2))
-    first = verify_two_view(in_a, PINHOLE, in_b, PINHOLE)
-    np.testing.assert_array_equal(first, verify_two_view(in_a, PINHOLE, in_b, PINHOLE))
-
-
-def test_two_views_without_anything_in_common() -> None:
-    rng = np.random.default_rng(4)
-    a, b = rng.uniform(0, 480, (60, 2)), rng.uniform(0, 480, (60, 2))
-    options = TwoViewOptions(min_matches=30)
-    good = verify_two_view(a, PINHOLE, b, PINHOLE, options)
-    assert good.shape == (60,) and not good.any()
-
-
-@pytest.mark.parametrize("count", [0, 4, 14])
-def test_two_views_with_few_matches(count: int) -> None:
-    points, in_a, in_b = scene(PINHOLE, PINHOLE, count=20)
-    good = verify_two_view(in_a[:count], PINHOLE, in_b[:count], PINHOLE)
-    assert good.shape == (count,) and not good.any()
 
 
 def test_two_views_leave_out_pixels_whose_distortion_cannot_be_undone() -> None:
@@ -347,16 +280,13 @@ CAMERA = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
 OPTIONS = TwoViewOptions(min_matches=5, max_iterations=5000)  # of matches in no order
 
 
-Pixels = NDArray[np.float64]
-
-
-def verified(first: Pixels, second: Pixels) -> tuple[Pixels, Camera, Pixels, Camera, int]:
+def verified(first: Array, second: Array) -> tuple[Array, Camera, Array, Camera, int]:
     """What RANSAC keeps of matches, as ``agree_by_chance`` takes it."""
     kept = verify_two_view(first, CAMERA, second, CAMERA, OPTIONS)
     return first[kept], CAMERA, second[kept], CAMERA, len(first)
 
 
-def of_one_scene(number: int, share: float, seed: int) -> tuple[Pixels, Pixels]:
+def of_one_scene(number: int, share: float, seed: int) -> tuple[Array, Array]:
     """Matches of which a share is of one scene, the others of anything."""
     rng = np.random.default_rng(seed)
     points = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (number, 3))
@@ -377,6 +307,8 @@ def test_random_matches_agree_by_chance(number: int) -> None:
 def test_true_ones_do_not(number: int, share: float) -> None:
     found = verified(*of_one_scene(number, share, seed=1))
     assert not agree_by_chance(*found, OPTIONS), len(found[0])
+    first, _, second, *_ = found
+    assert agree_by_chance(first[:5], CAMERA, second[:5], CAMERA, 5, OPTIONS)  # a bare sample
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -390,8 +322,3 @@ def test_wrong_matches_along_a_shelf(seed: int) -> None:
     found = verified(first, second)
     assert len(found[0]) > 60
     assert agree_by_chance(*found, OPTIONS), len(found[0])
-
-
-def test_a_bare_sample_says_nothing() -> None:
-    first, second = of_one_scene(5, 1.0, seed=0)
-    assert agree_by_chance(first, CAMERA, second, CAMERA, 5, OPTIONS)

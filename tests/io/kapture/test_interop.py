@@ -50,30 +50,29 @@ def a_rotation(seed: int) -> RigidTransform:
 
 def our_data() -> KaptureData:
     camera = Camera("OPENCV", 640, 480, (1 / 3 + 500, 500.5, 320, 240, 1e-17, -0.1, 0, 2.5e-5))
+    small, depth = (
+        Camera("SIMPLE_PINHOLE", 2 * w, 2 * h, (f, w, h)) for f, w, h in ((50, 32, 24), (5, 2, 1.5))
+    )
     return KaptureData(
         sensors={
             "cam0": Sensor.from_camera(camera, name="left"),
-            "cam1": Sensor.from_camera(Camera("SIMPLE_PINHOLE", 64, 48, (50, 32, 24))),
+            "cam1": Sensor.from_camera(small),
             "raw": Sensor("", "camera", ("UNKNOWN_CAMERA", "10", "20")),
-            "deep": Sensor.from_camera(
-                Camera("SIMPLE_PINHOLE", 4, 3, (5, 2, 1.5)), sensor_type="depth"
-            ),
+            "deep": Sensor.from_camera(depth, sensor_type="depth"),
             "gps": Sensor("", "gnss", ("EPSG:4326",)),
         },
         rigs={"rig": {"cam0": a_rotation(0), "cam1": a_rotation(1)}, "car": {"rig": a_rotation(2)}},
         trajectories={(TIME, "rig"): a_rotation(3), (TIME + 1, "cam1"): a_rotation(4)},
-        records_camera={
-            (TIME, "cam0"): IMAGES[0],
-            (TIME, "cam1"): IMAGES[1],
-            (TIME + 1, "cam1"): IMAGES[2],
-        },
+        records_camera=dict(
+            zip([(TIME, "cam0"), (TIME, "cam1"), (TIME + 1, "cam1")], IMAGES, strict=True)
+        ),
         records_depth={(TIME, "deep"): "a.depth"},
     )
 
 
-def assert_same_pose(theirs: kapture.PoseTransform, ours: RigidTransform) -> None:
-    assert tuple(theirs.r_raw) == ours.quat_wxyz
-    assert tuple(theirs.t_raw) == ours.translation
+def raw(pose: kapture.PoseTransform) -> RigidTransform:
+    """A pose of kapture's as it holds it."""
+    return RigidTransform(tuple(pose.r_raw), tuple(pose.t_raw))
 
 
 def assert_same_sensors(theirs: kapture.Kapture, ours: KaptureData) -> None:
@@ -84,18 +83,15 @@ def assert_same_sensors(theirs: kapture.Kapture, ours: KaptureData) -> None:
         assert tuple(str(p) for p in theirs.sensors[sensor_id].sensor_params) == sensor.params
         if sensor_id.startswith("cam"):
             assert tuple(theirs.sensors[sensor_id].camera_params[2:]) == sensor.camera().params
-    assert set(theirs.rigs.key_pairs()) == {(r, s) for r, rig in ours.rigs.items() for s in rig}
-    for rig_id, rig in ours.rigs.items():
-        for sensor_id, pose in rig.items():
-            assert_same_pose(theirs.rigs[rig_id][sensor_id], pose)
-    assert set(theirs.trajectories.key_pairs()) == set(ours.trajectories)
-    for key, pose in ours.trajectories.items():
-        assert_same_pose(theirs.trajectories[key], pose)
-    for their_records, our_records in (
+    found = {rig: {s: raw(pose) for s, pose in theirs.rigs[rig].items()} for rig in theirs.rigs}
+    assert found == ours.rigs
+    poses = theirs.trajectories
+    assert {key: raw(poses[key]) for key in poses.key_pairs()} == ours.trajectories
+    for records, expected in (
         (theirs.records_camera, ours.records_camera),
         (theirs.records_depth, ours.records_depth),
     ):
-        assert {key: their_records[key] for key in their_records.key_pairs()} == our_records
+        assert {key: records[key] for key in records.key_pairs()} == expected
 
 
 def arrays() -> dict[str, dict[str, np.ndarray]]:
@@ -113,13 +109,8 @@ CONFIGS = {
     "global_features": FeatureConfig("netvlad", np.dtype("float64"), 16, None, "L2"),
 }
 POINTS = np.random.default_rng(1).normal(0, 100, (4, 6))
-OBSERVATIONS = Observations(
-    "T",
-    IMAGES,
-    np.array([0, 0, 3]),
-    np.array([2, 0, 1], dtype=np.int32),
-    np.array([4, 0, 2], dtype=np.int32),
-)
+IDS = np.array([[0, 0, 3], [2, 0, 1], [4, 0, 2]], dtype=np.int32)  # points, images, keypoints
+OBSERVATIONS = Observations("T", IMAGES, IDS[0].astype(np.int64), *IDS[1:])
 
 
 def write_ours(root: Path, *, tar: bool) -> None:
@@ -177,16 +168,12 @@ def their_kapture() -> kapture.Kapture:
     }
     theirs.points3d = kapture.Points3d(np.round(POINTS, 10))  # all that its writer keeps
     theirs.observations = kapture.Observations()
-    for point, image, keypoint in zip(*OBSERVATIONS_AS_LISTS, strict=True):
+    for point, image, keypoint in IDS.T.tolist():
         theirs.observations.add(point, "T", IMAGES[image], keypoint)
+    # half a pose is none to us
+    theirs.trajectories[TIME + 2, "cam0"] = kapture.PoseTransform(r=None, t=[1, 2, 3])
+    theirs.trajectories[TIME + 3, "cam0"] = kapture.PoseTransform(r=[1, 0, 0, 0], t=None)
     return theirs
-
-
-OBSERVATIONS_AS_LISTS = (
-    OBSERVATIONS.point_ids.tolist(),
-    OBSERVATIONS.image_ids.tolist(),
-    OBSERVATIONS.keypoint_ids.tolist(),
-)
 
 
 def write_theirs(root: Path, *, tar: bool) -> None:
@@ -232,28 +219,7 @@ def test_we_read_what_kapture_writes(tmp_path: Path, tar: bool) -> None:
     assert np.array_equal(folder.points3d(), np.round(POINTS, 10))
     read = folder.observations()["T"]
     assert read.image_names == IMAGES
-    for array, expected in zip(
-        (read.point_ids, read.image_ids, read.keypoint_ids), OBSERVATIONS_AS_LISTS, strict=True
-    ):
-        assert array.tolist() == expected
-
-
-def test_kapture_reads_our_tar_after_its_own_writer_added_to_it(tmp_path: Path) -> None:
-    write_ours(tmp_path, tar=True)
-    path = tmp_path / "reconstruction/keypoints/T/keypoints.tar"
-    with TarHandler(str(path), "a") as tar:
-        tar.add_array_to_tar("new.jpg.kpt", np.full((1, 3), 7, np.float32))
-    keypoints = KaptureFolder(tmp_path).keypoints("T")
-    assert keypoints.names == sorted([*IMAGES, "new.jpg"])
-    assert np.array_equal(keypoints.read("new.jpg"), np.full((1, 3), 7))
-
-
-def test_partial_poses_of_kapture_are_no_poses(tmp_path: Path) -> None:
-    theirs = their_kapture()
-    theirs.trajectories[TIME + 2, "cam0"] = kapture.PoseTransform(r=None, t=[1, 2, 3])
-    theirs.trajectories[TIME + 3, "cam0"] = kapture.PoseTransform(r=[1, 0, 0, 0], t=None)
-    kapture.io.csv.kapture_to_dir(str(tmp_path), theirs)
-    assert KaptureFolder(tmp_path).read() == our_data()
+    np.testing.assert_array_equal([read.point_ids, read.image_ids, read.keypoint_ids], IDS)
 
 
 def test_to_kapture_gives_the_same_as_kapture_s_reader(tmp_path: Path) -> None:
@@ -279,11 +245,8 @@ def test_kapture_reads_our_pairs(tmp_path: Path) -> None:
         table = kapture.io.csv.table_from_file(file)
     assert [ImagePair(q, m, float(s)) for q, m, s in table] == pairs
     with open(tmp_path / "theirs.txt", "w") as file:
-        kapture.io.csv.table_to_file(
-            file,
-            [[p.query, p.map, p.score] for p in pairs],
-            header="# query_image, map_image, score",
-        )
+        rows = [[p.query, p.map, p.score] for p in pairs]
+        kapture.io.csv.table_to_file(file, rows, header="# query_image, map_image, score")
     assert read_pairs(tmp_path / "theirs.txt") == pairs
 
 
@@ -291,6 +254,7 @@ def test_kapture_and_we_read_the_same_map_of_other_tools(shared_data: Path) -> N
     root = shared_data / "foreign_maps/virtual_gallery/map"
     theirs = kapture.io.csv.kapture_from_dir(str(root))
     folder = KaptureFolder(root)
+    folder.validate(deep=True)
     assert np.array_equal(folder.points3d(), theirs.points3d.as_array())
     ours = folder.observations()["r2d2_500"]
     rows = [
@@ -299,14 +263,15 @@ def test_kapture_and_we_read_the_same_map_of_other_tools(shared_data: Path) -> N
         for image, keypoint in theirs.observations[point, kind]
     ]
     names = np.array(ours.image_names)[ours.image_ids].tolist()
-    assert rows == list(
-        zip(ours.point_ids.tolist(), names, ours.keypoint_ids.tolist(), strict=True)
-    )
+    found = zip(ours.point_ids.tolist(), names, ours.keypoint_ids.tolist(), strict=True)
+    assert rows == list(found) and len(rows) == 3766
     for key, pose in folder.read().trajectories.items():
         assert np.allclose(theirs.trajectories[key].r_raw, pose.quat_wxyz, atol=1e-12)
         assert tuple(theirs.trajectories[key].t_raw) == pose.translation
-    keypoints = folder.keypoints("r2d2_500")
+    keypoints, descriptors = folder.keypoints("r2d2_500"), folder.descriptors("r2d2_500")
     assert set(keypoints.names) == theirs.keypoints["r2d2_500"]
+    assert (keypoints.config.name, descriptors.config.keypoints_type) == ("r2d2", "r2d2_500")
+    assert folder.global_features("AP-GeM-LM18").read(ours.image_names[0]).shape == (2048,)
 
 
 def test_importing_the_store_imports_nothing_heavy() -> None:

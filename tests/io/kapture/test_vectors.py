@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture import (
-    FeatureConfig,
-    FeatureReader,
-    FeatureWriter,
-    KaptureVectors,
-    blobs,
-)
-from megloc_kapture.io.kapture import (
-    vectors as module,
-)
+from megloc_kapture.io.kapture import FeatureConfig, FeatureReader, FeatureWriter, KaptureVectors
+from megloc_kapture.io.kapture import vectors as module
 
 FOLDER = Path("reconstruction/global_features/G")
 NAMES = [f"{camera}/{k:02d}.jpg" for camera in ("left", "right/up") for k in range(20)] + ["x.jpg"]
@@ -63,6 +55,10 @@ def test_rows_are_those_read_one_by_one(tmp_path: Path, tar: bool, dtype: str) -
     expected = np.array([features.read(image) for image in images], dtype=np.float32)
     found = read_vectors(features, images)
     np.testing.assert_array_equal(found, expected)
+    wrong = np.zeros((2, 5), dtype), np.zeros((1, 5), ">f2"), np.zeros((1, 10), dtype)[:, ::2]
+    for rows in wrong:
+        with pytest.raises(ValueError, match="expected contiguous"):
+            features.read_rows(NAMES[:1], rows)
     blocks = KaptureVectors(features, images)
     assert len(blocks) == len(images) and blocks.dimension == 5
     unit = expected / np.linalg.norm(expected, axis=1)[:, None]
@@ -95,26 +91,12 @@ def test_missing_images_are_named(
 @pytest.mark.parametrize("tar", [False, True])
 @pytest.mark.parametrize("change", [-1, 1, 20])
 def test_vectors_of_another_size_are_named(tmp_path: Path, tar: bool, change: int) -> None:
-    other = np.zeros((1, 5), dtype=np.float32).tobytes()
-    if tar:
-        with FeatureWriter(
-            tmp_path, "global_features", "G", FeatureConfig("g", np.dtype("f4"), 5), tar=True
-        ) as writer:
-            writer.write("a.jpg", np.ones(5, dtype=np.float32))
-            writer.put("b.jpg.gfeat", bytes(20 + change))
-    else:
-        write(tmp_path, ["a.jpg", "b.jpg"], vectors(count=2), tar=False)
-        (tmp_path / FOLDER / "b.jpg.gfeat").write_bytes(bytes(len(other) + change))
+    config = FeatureConfig("g", np.dtype("f4"), 5)
+    with FeatureWriter(tmp_path, "global_features", "G", config, tar=tar) as writer:
+        writer.write("a.jpg", np.ones(5, dtype=np.float32))
+        writer.put("b.jpg.gfeat", bytes(20 + change))
     with pytest.raises(DataError, match=rf"b\.jpg\.gfeat.*: {20 + change} bytes are not exactly"):
         read_vectors(reader(tmp_path), ["a.jpg", "b.jpg"])
-
-
-def test_a_tar_cut_after_it_was_indexed(tmp_path: Path) -> None:
-    features = write(tmp_path, NAMES, vectors(), tar=True)
-    path = tmp_path / FOLDER / "global_features.tar"
-    os.truncate(path, 20 * 1024)
-    with pytest.raises(DataError, match=r"global_features\.tar: truncated"):
-        read_vectors(features, NAMES)
 
 
 def unit(count: int = len(NAMES)) -> NDArray[np.float32]:
@@ -128,25 +110,28 @@ def test_unit_rows_of_a_tar_are_not_copied(tmp_path: Path) -> None:
     out = np.zeros((10, 5), dtype=np.float32)
     found = KaptureVectors(features, NAMES).read(7, 17, out=out)
     np.testing.assert_array_equal(found, rows[7:17])
+    every_other = KaptureVectors(features, NAMES[::2]).read(0, 10, out=out)
+    np.testing.assert_array_equal(every_other, rows[:20:2])
     assert not found.flags.writeable and not out.any()
-    every_other = KaptureVectors(features, NAMES[::2])
-    np.testing.assert_array_equal(every_other.read(0, 10, out=out), rows[:20:2])
-    assert not out.any()
     # in another order, or of other lengths, they are copied
-    turned = KaptureVectors(features, NAMES[::-1])
-    assert turned.read(0, 10, out=out) is out
-    np.testing.assert_allclose(out, rows[::-1][:10], atol=1e-6)
-    longer = KaptureVectors(write(tmp_path / "2", NAMES, 2 * rows, tar=True), NAMES)
-    assert longer.read(0, 10, out=out) is out
-    np.testing.assert_allclose(out, rows[:10], atol=1e-6)
+    longer = write(tmp_path / "2", NAMES, 2 * rows, tar=True)
+    for copied, images, expected in (
+        (features, NAMES[::-1], rows[::-1][:10]),
+        (longer, NAMES, rows[:10]),
+    ):
+        assert KaptureVectors(copied, images).read(0, 10, out=out) is out
+        np.testing.assert_allclose(out, expected, atol=1e-6)
 
 
-def test_a_block_beyond_the_end_of_a_cut_tar_is_not_touched(tmp_path: Path) -> None:
+def test_beyond_the_end_of_a_tar_cut_after_it_was_indexed_nothing_is_touched(
+    tmp_path: Path,
+) -> None:
     features = write(tmp_path, NAMES, unit(), tar=True)
     os.truncate(tmp_path / FOLDER / "global_features.tar", 20 * 1024)
     blocks = KaptureVectors(features, NAMES)
-    with pytest.raises(DataError, match=r"global_features\.tar: truncated"):
-        blocks.read(0, len(NAMES))
+    for read in (lambda: read_vectors(features, NAMES), lambda: blocks.read(0, len(NAMES))):
+        with pytest.raises(DataError, match=r"global_features\.tar: truncated"):
+            read()
     np.testing.assert_array_equal(blocks.read(0, 20), unit()[:20])
 
 
@@ -154,9 +139,7 @@ def test_reads_that_stop_short_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyP
     rows = vectors()
     features = {tar: write(tmp_path / str(tar), NAMES, rows, tar=tar) for tar in (False, True)}
     whole = os.preadv
-    monkeypatch.setattr(
-        blobs.os, "preadv", lambda fd, buffers, offset: whole(fd, [buffers[0][:7]], offset)
-    )
+    monkeypatch.setattr(os, "preadv", lambda fd, buffers, at: whole(fd, [buffers[0][:7]], at))
     for tar in (False, True):
         np.testing.assert_array_equal(read_vectors(features[tar], NAMES), rows)
 
@@ -164,25 +147,23 @@ def test_reads_that_stop_short_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_only_plain_files_below_the_folder_are_read(tmp_path: Path) -> None:
     rows = vectors(count=2)
     features = write(tmp_path / "in", ["a.jpg", "b/b.jpg"], rows, tar=False)
-    folder = tmp_path / "in" / FOLDER
-    (folder / "link.jpg.gfeat").symlink_to(folder / "a.jpg.gfeat")
-    (folder / "gone.jpg.gfeat").symlink_to(folder / "nothing")
-    (folder / "folder.jpg.gfeat").mkdir()
-    os.mkfifo(folder / "pipe.jpg.gfeat")
-    outside = tmp_path / "outside"
+    folder, outside = tmp_path / "in" / FOLDER, tmp_path / "outside"
     outside.mkdir()
     (outside / "c.jpg.gfeat").write_bytes(bytes(20))
-    (folder / "out.jpg.gfeat").symlink_to(outside / "c.jpg.gfeat")
-    (folder / "c").symlink_to(outside)
+    (folder / "folder.jpg.gfeat").mkdir()
+    os.mkfifo(folder / "pipe.jpg.gfeat")
+    for link, target in (
+        ("link.jpg.gfeat", folder / "a.jpg.gfeat"),
+        ("gone.jpg.gfeat", folder / "nothing"),
+        ("out.jpg.gfeat", outside / "c.jpg.gfeat"),
+        ("c", outside),
+    ):
+        (folder / link).symlink_to(target)
     np.testing.assert_array_equal(read_vectors(features, ["link.jpg", "a.jpg"]), rows[[0, 0]])
-    for image in ("gone.jpg", "folder.jpg", "pipe.jpg", "a.jpg.gfeat/x.jpg"):
-        with pytest.raises(DataError, match="have no"):
-            read_vectors(features, [image])
-    for image in ("out.jpg", "c/c.jpg"):
-        with pytest.raises(DataError, match="link"):
-            read_vectors(features, [image])
-    for image in ("../a.jpg", "/a.jpg"):
-        with pytest.raises(DataError, match="path"):
+    refused = dict.fromkeys(("gone.jpg", "folder.jpg", "pipe.jpg", "a.jpg.gfeat/x"), "have no")
+    refused |= dict.fromkeys(("out.jpg", "c/c.jpg"), "link")
+    for image, told in (refused | dict.fromkeys(("../a.jpg", "/a.jpg"), "path")).items():
+        with pytest.raises(DataError, match=told):
             read_vectors(features, [image])
 
 
@@ -209,27 +190,8 @@ def test_unit_length_whatever_the_length_was(tmp_path: Path, scale: float) -> No
 def test_many_threads_read_at_once(tmp_path: Path) -> None:
     rows = vectors()
     features = write(tmp_path, NAMES, rows, tar=True)
-    wrong: list[int] = []
-
-    def work(k: int) -> None:
-        for _ in range(20):
-            if not np.array_equal(read_vectors(features, NAMES[k:]), rows[k:]):
-                wrong.append(k)
-
-    threads = [threading.Thread(target=work, args=(k,)) for k in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not wrong
-
-
-def test_rows_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    features = write(tmp_path, NAMES, vectors(), tar=True)
-    for rows in (
-        np.zeros((2, 5), np.float32),
-        np.zeros((1, 5)),
-        np.zeros((1, 10), np.float32)[:, ::2],
-    ):
-        with pytest.raises(ValueError, match="expected contiguous"):
-            features.read_rows(NAMES[:1], rows)
+    starts = [k % 4 for k in range(80)]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda k: read_vectors(features, NAMES[k:]), starts))
+    for k, part in zip(starts, found, strict=True):
+        np.testing.assert_array_equal(part, rows[k:])

@@ -129,52 +129,51 @@ def test_a_whole_file(server: Server, place: Path) -> None:
     assert place.read_bytes() == CONTENT and left(place) == {"net.pth"}
     assert seen == [4, CHUNK, CHUNK, CHUNK, 1234]
     assert server.asked == [(None, None)]
-
-
-def test_without_anything_known(server: Server, place: Path) -> None:
     server.etag, server.length = None, False
     assert fetch(server.url, place) == SHA256
-    assert place.read_bytes() == CONTENT
+    with pytest.raises(OutputError, match="cannot write"):
+        fetch(server.url, place / "below.pth")
 
 
-def test_a_broken_transfer_goes_on(server: Server, place: Path) -> None:
-    server.break_after = 2 * CHUNK + 77
-    with pytest.raises(TransferError) as error:
-        fetch(server.url, place, sha256=SHA256)
-    assert str(error.value) == (
-        f"{server.url}: the transfer broke after {server.break_after} of {len(CONTENT)} bytes; run "
-        "the same command again to go on"
-    )
-    assert partial(place).read_bytes() == CONTENT[: server.break_after] and not place.exists()
+def test_a_transfer_that_breaks_again_and_again_goes_on(server: Server, place: Path) -> None:
+    ends = (10, 2 * CHUNK + 77, 3 * CHUNK)
+    for end in ends:
+        server.break_after = end
+        with pytest.raises(TransferError) as error:
+            fetch(server.url, place, sha256=SHA256)
+        assert str(error.value) == (
+            f"{server.url}: the transfer broke after {end} of {len(CONTENT)} bytes; "
+            "run the same command again to go on"
+        )
+        assert partial(place).read_bytes() == CONTENT[:end] and not place.exists()
     server.break_after = None
     assert fetch(server.url, place, sha256=SHA256) == SHA256
-    assert server.asked == [(None, None), (f"bytes={2 * CHUNK + 77}-", '"one"')]
+    assert server.asked == [(None, None), *((f"bytes={end}-", '"one"') for end in ends)]
     assert place.read_bytes() == CONTENT and left(place) == {"net.pth"}
 
 
-def test_a_transfer_may_break_again_and_again(server: Server, place: Path) -> None:
-    for end in (10, CHUNK, 3 * CHUNK):
-        server.break_after = end
-        with pytest.raises(TransferError, match=f"after {end} of"):
-            fetch(server.url, place, sha256=SHA256)
-    server.break_after = None
-    fetch(server.url, place, sha256=SHA256)
-    assert [asked for asked, _ in server.asked] == [
-        None,
-        "bytes=10-",
-        f"bytes={CHUNK}-",
-        f"bytes={3 * CHUNK}-",
-    ]
-
-
-def test_all_came_but_was_not_put_in_place(server: Server, place: Path) -> None:
-    """Killed between the last byte and the renaming: nothing is asked for again."""
+@pytest.mark.parametrize(
+    ("have", "total", "content", "asked"),
+    [
+        # killed between the last byte and the renaming: nothing is asked for again
+        (CONTENT, len(CONTENT), CONTENT, 0),
+        (CONTENT + b"more", len(CONTENT), CONTENT, 1),
+        # the server has less than before, 416: what has arrived cannot be the beginning of it
+        (b"x" * 2000, 3000, CONTENT[:1000], 2),
+    ],
+    ids=["all", "more", "less"],
+)
+def test_what_a_killed_run_left(
+    server: Server, place: Path, have: bytes, total: int, content: bytes, asked: int
+) -> None:
     place.parent.mkdir()
-    partial(place).write_bytes(CONTENT)
-    state = {"url": server.url, "validator": '"one"', "total": len(CONTENT)}
+    partial(place).write_bytes(have)
+    state = {"url": server.url, "validator": '"one"', "total": total}
     place.with_name(".net.pth.part.json").write_text(json.dumps(state))
-    assert fetch(server.url, place, sha256=SHA256) == SHA256
-    assert server.asked == [] and left(place) == {"net.pth"}
+    server.content = content
+    assert fetch(server.url, place) == hashlib.sha256(content).hexdigest()
+    assert place.read_bytes() == content
+    assert len(server.asked) == asked and left(place) == {"net.pth"}
 
 
 @pytest.mark.parametrize("how", ["no ranges", "no etag", "weak etag", "changed", "other url"])
@@ -191,6 +190,7 @@ def test_begins_anew_where_going_on_is_not_safe(server: Server, place: Path, how
         server.content, server.etag = CONTENT, '"two"'
     assert fetch(server.url, place, sha256=SHA256) == SHA256
     assert place.read_bytes() == CONTENT
+    assert (server.asked[-1][0] is None) == (how in ("no etag", "weak etag", "other url"))
 
 
 def test_another_part_than_asked_for(server: Server, place: Path) -> None:
@@ -201,25 +201,6 @@ def test_another_part_than_asked_for(server: Server, place: Path) -> None:
     with pytest.raises(TransferError, match="sends another part .* to begin anew"):
         fetch(server.url, place)
     assert fetch(server.url, place) == SHA256
-
-
-def test_a_part_longer_than_the_file(server: Server, place: Path) -> None:
-    place.parent.mkdir()
-    partial(place).write_bytes(CONTENT + b"more")
-    state = {"url": server.url, "validator": '"one"', "total": len(CONTENT)}
-    place.with_name(".net.pth.part.json").write_text(json.dumps(state))
-    assert fetch(server.url, place) == SHA256
-    assert place.read_bytes() == CONTENT
-
-
-def test_the_server_has_less_than_before(server: Server, place: Path) -> None:
-    """416: what has arrived cannot be the beginning of it."""
-    place.parent.mkdir()
-    partial(place).write_bytes(b"x" * 2000)
-    state = {"url": server.url, "validator": '"one"', "total": 3000}
-    place.with_name(".net.pth.part.json").write_text(json.dumps(state))
-    server.content = CONTENT[:1000]
-    assert fetch(server.url, place) == hashlib.sha256(CONTENT[:1000]).hexdigest()
 
 
 def test_a_wrong_hash(server: Server, place: Path) -> None:
@@ -242,10 +223,7 @@ def test_a_truncated_file(server: Server, place: Path) -> None:
     with pytest.raises(DataError, match="is not the published file"):
         fetch(server.url, place, size=len(CONTENT), sha256=SHA256)
     assert left(place) == set()
-
-
-def test_a_truncated_file_of_unknown_length(server: Server, place: Path) -> None:
-    server.length, server.break_after = False, CHUNK
+    server.content, server.length, server.break_after = CONTENT, False, CHUNK
     with pytest.raises(TransferError, match=f"broke after {CHUNK} of {len(CONTENT)}"):
         fetch(server.url, place, size=len(CONTENT))
 
@@ -269,26 +247,22 @@ def test_refusals_of_the_server(server: Server, place: Path, status: int) -> Non
     server.status = status
     with pytest.raises(TransferError, match=f"net.pth: the server answers {status} "):
         fetch(server.url, place)
-    assert not place.exists()
-
-
-def test_no_server(place: Path) -> None:
     with pytest.raises(TransferError, match="cannot be reached: .*refused"):
         fetch("http://127.0.0.1:1/net.pth", place)
+    assert not place.exists()
 
 
 def test_redirections(server: Server, place: Path) -> None:
     server.redirect = server.url
     assert fetch(f"{server.address}/elsewhere", place) == SHA256
-    server.redirect = "file:///etc/hostname"
-    with pytest.raises(TransferError, match="file:///etc/hostname' is not allowed"):
-        fetch(f"{server.address}/elsewhere", place)
-    server.redirect = "ftp://127.0.0.1/net.pth"
-    with pytest.raises(TransferError, match="leads to ftp://127.0.0.1/net.pth, which is not safe"):
-        fetch(f"{server.address}/elsewhere", place)
-    server.redirect = f"{server.address}/elsewhere"
-    with pytest.raises(TransferError, match="the server answers 302"):
-        fetch(f"{server.address}/elsewhere", place)
+    for target, told in (
+        ("file:///etc/hostname", "file:///etc/hostname' is not allowed"),
+        ("ftp://127.0.0.1/net.pth", "leads to ftp://127.0.0.1/net.pth, which is not safe"),
+        (f"{server.address}/elsewhere", "the server answers 302"),
+    ):
+        server.redirect = target
+        with pytest.raises(TransferError, match=told):
+            fetch(f"{server.address}/elsewhere", place)
 
 
 def test_no_redirection_from_https_to_http() -> None:
@@ -345,9 +319,3 @@ def test_a_file_larger_than_the_disk_is_not_begun(
     with pytest.raises(OutputError, match=r"No space left on device \(1152921504606846976 bytes, "):
         fetch(server.url, place)
     assert partial(place).stat().st_size == 0
-
-
-def test_nowhere_to_write(server: Server, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("no folder")
-    with pytest.raises(OutputError, match="cannot write"):
-        fetch(server.url, tmp_path / "file" / "net.pth")

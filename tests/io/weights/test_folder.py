@@ -5,19 +5,17 @@ from __future__ import annotations
 import hashlib
 import os
 import pickle
+import re
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
 from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError
-from megloc_kapture.features.global_networks import OpenIbl, OpenIblOptions
 from megloc_kapture.io import weights as weights_module
 from megloc_kapture.io.weights import (
     SOURCE_KEY,
@@ -32,7 +30,7 @@ from megloc_kapture.io.weights import (
     weights_folder,
 )
 from megloc_kapture.io.weights.registry import registry
-from megloc_kapture.nets.global_descriptors import VggNetVlad
+from megloc_kapture.nets.runtime import load_strictly
 from megloc_kapture.pipeline.executors import open_executor
 
 BUNDLE = Path(__file__).parent / "data" / "tensor_bundle"
@@ -100,17 +98,14 @@ def test_the_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert weights_folder() == tmp_path / ".cache" / "megloc-kapture" / "weights"
 
 
-def test_in_the_folder_or_one_below(folder: Path) -> None:
-    deep = write(folder / "a" / "b" / "superpoint_v6_from_tf.pth")
+def test_in_the_folder_or_one_below_under_any_of_its_names(folder: Path) -> None:
+    name = "superpoint_v6_from_tf"
+    write(folder / "a" / "b" / f"{name}.pth")
     with pytest.raises(MissingWeightsError):
-        find_weights("superpoint_v6_from_tf")
-    below = write(folder / "a" / "superpoint_v6_from_tf.pth")
-    assert find_weights("superpoint_v6_from_tf").path == below != deep
-    inside = write(folder / "superpoint_v6_from_tf.pth")
-    assert find_weights("superpoint_v6_from_tf").path == inside
-
-
-def test_other_names_and_converted_files(folder: Path) -> None:
+        find_weights(name)
+    for place in (folder / "a", folder):
+        inside = write(place / f"{name}.pth")
+        assert find_weights(name).path == inside
     save_file({"a": torch.ones(1)}, folder / "aslfeat.safetensors")
     assert read_weights(find_weights("aslfeat")).keys() == {"a"}
     write(folder / "aslfeat.tar")  # the published one goes first
@@ -158,29 +153,23 @@ def test_a_file_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_another_file_under_a_published_name_is_refused(folder: Path) -> None:
     path = write(folder / "superpoint_v1.pth")
-    file = find_weights("superpoint_v1")
-    with pytest.raises(DataError) as error:
+    file, known = find_weights("superpoint_v1"), registry()["superpoint_v1"].files[0].sha256
+    told = f"{path}: is not the published file of superpoint_v1: sha256 {sha256_of(file)} instead"
+    with pytest.raises(DataError, match=re.escape(f"{told} of {known}; ")):
         read_weights(file)
-    known = registry()["superpoint_v1"].files[0].sha256
-    assert str(error.value).startswith(
-        f"{path}: is not the published file of superpoint_v1: sha256 {sha256_of(file)} instead of "
-        f"{known}; "
-    )
 
 
 def test_links_do_not_leave_the_folder(folder: Path, tmp_path: Path) -> None:
-    outside = write(tmp_path / "elsewhere" / "superpoint_v6_from_tf.pth")
-    (folder / "superpoint_v6_from_tf.pth").symlink_to(outside)
-    with pytest.raises(DataError, match="a link that leaves"):
-        find_weights("superpoint_v6_from_tf")
-    (folder / "superpoint_v6_from_tf.pth").unlink()
-    (folder / "net").symlink_to(outside.parent)
-    with pytest.raises(DataError, match="a link that leaves"):
-        find_weights("superpoint_v6_from_tf")
-    (folder / "net").unlink()
-    write(folder / "real.pth").rename(folder / "v6.bin")
-    (folder / "superpoint_v6_from_tf.pth").symlink_to("v6.bin")
-    assert read_weights(find_weights("superpoint_v6_from_tf"))
+    name = "superpoint_v6_from_tf"
+    outside = write(tmp_path / "elsewhere" / f"{name}.pth")
+    for link, target in ((f"{name}.pth", outside), ("net", outside.parent)):
+        (folder / link).symlink_to(target)
+        with pytest.raises(DataError, match="a link that leaves"):
+            find_weights(name)
+        (folder / link).unlink()
+    write(folder / "v6.bin")
+    (folder / f"{name}.pth").symlink_to("v6.bin")
+    assert read_weights(find_weights(name))
 
 
 def test_a_tensorflow_checkpoint_is_all_its_files(folder: Path) -> None:
@@ -207,9 +196,6 @@ def test_looking_for_weights_does_not_import_torch() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-# ------------------------------------------------------------------------------------- adding
-
-
 def test_add_recognises_by_sha256(published: Path, folder: Path, tmp_path: Path) -> None:
     source = tmp_path / "download (1).bin"
     shutil.copyfile(published / "aliked" / "aliked-t16.pth", source)
@@ -220,14 +206,11 @@ def test_add_recognises_by_sha256(published: Path, folder: Path, tmp_path: Path)
     assert [path.name for path in folder.iterdir()] == ["aliked-t16.pth"]
 
 
-def test_add_recognises_by_name(folder: Path, tmp_path: Path) -> None:
+def test_add_recognises_by_name_or_is_told(folder: Path, tmp_path: Path) -> None:
     source = write(tmp_path / "best_deeplabv3plus_resnet101_cityscapes_os16.pth.tar")
     added = add_weights(source)
     assert added.path == folder / "best_deeplabv3plus_resnet101_cityscapes_os16.pth"
     assert find_weights("deeplabv3plus-resnet101") == added and source.is_file()
-
-
-def test_add_by_name_given(folder: Path, tmp_path: Path) -> None:
     source = write(tmp_path / "model_best.pth")
     with pytest.raises(OptionError, match=r"neither its sha256 nor its name is in the reg"):
         add_weights(source)
@@ -240,29 +223,30 @@ def test_add_by_name_given(folder: Path, tmp_path: Path) -> None:
     other = tmp_path / "x.safetensors"
     save_file({"a": torch.ones(1)}, other)
     assert add_weights(other, name="aslfeat").path == folder / "aslfeat.safetensors"
+    for ending in (".index", ".data-00000-of-00001"):
+        shutil.copy(BUNDLE / f"graph.ckpt-7{ending}", tmp_path / f"model.ckpt-9{ending}")
+    added = add_weights(tmp_path / "model.ckpt-9.index", name="aslfeat")
+    assert added.path == folder / "model.ckpt-380000.index"
+    assert read_weights(find_weights("aslfeat"))["global_step"] == -7
 
 
-def test_add_refuses(folder: Path, tmp_path: Path) -> None:
-    wrong = write(tmp_path / "superpoint_v1.pth")
-    with pytest.raises(DataError, match=r"published superpoint_v1\.pth .* instead of 52b67"):
-        add_weights(wrong)
-    broken = tmp_path / "vgg16_netvlad.pth"
-    broken.write_bytes(b"<html>sign in</html>")
-    with pytest.raises(DataError, match="no file of weights that can be read"):
-        add_weights(broken)
-    unknown = tmp_path / "TokyoTM_struct.mat"
-    unknown.write_bytes(b"MATLAB 5.0 MAT-file")
-    with pytest.raises(DataError, match="TokyoTM_struct"):
-        add_weights(unknown)
-    with pytest.raises(DataError, match="no such file"):
-        add_weights(tmp_path / "nowhere.pth")
-    assert list(folder.iterdir()) == []
-
-
-def test_a_file_that_is_not_the_published_one_is_taken_when_asked(
+def test_add_refuses_what_is_broken_and_on_request_takes_another_file(
     folder: Path, tmp_path: Path
 ) -> None:
     own = write(tmp_path / "superpoint_v1.pth", 3.0)
+    broken, unknown = tmp_path / "vgg16_netvlad.pth", tmp_path / "TokyoTM_struct.mat"
+    broken.write_bytes(b"<html>sign in</html>")
+    unknown.write_bytes(b"MATLAB 5.0 MAT-file")
+    for source, unverified, told in (
+        (own, False, r"published superpoint_v1\.pth .* instead of 52b67"),
+        (broken, False, "no file of weights that can be read"),
+        (broken, True, "no file of weights that can be read"),
+        (unknown, False, "TokyoTM_struct"),
+        (tmp_path / "nowhere.pth", False, "no such file"),
+    ):
+        with pytest.raises(DataError, match=told):
+            add_weights(source, unverified=unverified)
+    assert list(folder.iterdir()) == []
     added = add_weights(own, unverified=True)
     assert added.path == folder / "unverified" / "superpoint_v1.pth"
     found = find_weights("superpoint_v1")
@@ -272,10 +256,6 @@ def test_a_file_that_is_not_the_published_one_is_taken_when_asked(
     shutil.copyfile(own, folder / "superpoint_v1.pth")
     with pytest.raises(DataError, match="is not the published file"):
         read_weights(find_weights("superpoint_v1"))
-    broken = tmp_path / "vgg16_netvlad.pth"
-    broken.write_bytes(b"<html>sign in</html>")
-    with pytest.raises(DataError, match="no file of weights that can be read"):
-        add_weights(broken, unverified=True)
 
 
 def test_add_does_not_replace_without_being_asked(folder: Path, tmp_path: Path) -> None:
@@ -287,17 +267,6 @@ def test_add_does_not_replace_without_being_asked(folder: Path, tmp_path: Path) 
     assert place.read_bytes() == before
     add_weights(source, force=True)
     assert place.read_bytes() == source.read_bytes()
-
-
-def test_add_a_tensorflow_checkpoint(folder: Path, tmp_path: Path) -> None:
-    for ending in (".index", ".data-00000-of-00001"):
-        shutil.copy(BUNDLE / f"graph.ckpt-7{ending}", tmp_path / f"model.ckpt-9{ending}")
-    added = add_weights(tmp_path / "model.ckpt-9.index", name="aslfeat")
-    assert added.path == folder / "model.ckpt-380000.index"
-    assert read_weights(find_weights("aslfeat"))["global_step"] == -7
-
-
-# --------------------------------------------------------------------------------- converting
 
 
 def test_convert_keeps_everything_and_is_deterministic(published: Path, tmp_path: Path) -> None:
@@ -320,78 +289,39 @@ def test_convert_keeps_everything_and_is_deterministic(published: Path, tmp_path
         assert opened.metadata() == {SOURCE_KEY: sha256_of(describe("r2d2", source))}
 
 
-def test_convert_views_of_one_memory(tmp_path: Path) -> None:
+def test_convert_views_of_one_memory_and_refuses(tmp_path: Path) -> None:
+    source, place = tmp_path / "x.pth", tmp_path / "x.safetensors"
     whole = torch.arange(6.0)
-    torch.save({"a": whole, "b": whole[2:4], "c": whole.reshape(2, 3).T}, tmp_path / "x.pth")
-    convert_weights(tmp_path / "x.pth", tmp_path / "x.safetensors")
-    found = read_weights(find_weights(str(tmp_path / "x.safetensors")))
+    torch.save({"a": whole, "b": whole[2:4], "c": whole.reshape(2, 3).T}, source)
+    convert_weights(source, place)
+    found = read_weights(find_weights(str(place)))
     assert found["b"].tolist() == [2, 3] and found["c"].tolist() == [[0, 3], [1, 4], [2, 5]]
-
-
-def test_convert_refuses(tmp_path: Path) -> None:
-    source, place = write(tmp_path / "x.pth"), tmp_path / "x.safetensors"
     refusals: list[tuple[Path, Path, type[MeglocError], str]] = [
         (source, tmp_path / "x.npz", OptionError, "must end in .safetensors"),
-        (tmp_path / "y.pth", place, DataError, "no such file"),
+        (tmp_path / "y.pth", tmp_path / "y.safetensors", DataError, "no such file"),
+        (source, place, OutputError, "stands there; -f replaces it"),
     ]
     for wrong, target, kind, message in refusals:
         with pytest.raises(kind, match=message):
             convert_weights(wrong, target)
-    convert_weights(source, place)
-    with pytest.raises(OutputError, match="stands there; -f replaces it"):
-        convert_weights(source, place)
     convert_weights(source, place, force=True)
 
 
-# ------------------------------------------------------ shared by the processes of a machine
-
-CLUSTERS, OUTPUT = 64, 1024
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """OpenIBL's layout with random weights, 190 MB of them."""
-    torch.manual_seed(0)
-    net = VggNetVlad(order="kd", mean_rgb=(0, 0, 0), num_clusters=CLUSTERS, output_size=OUTPUT)
-    path = tmp_path_factory.mktemp("weights") / "openibl.pth"
-    torch.save(net.state_dict(), path)
-    return path
+def _is_mapped(path: Path) -> bool:
+    """True if a network's parameters are pages of the shared file, which the system keeps once."""
+    net = load_strictly(torch.nn.Linear(64, 1), read_weights(describe("own", path)), "own")
+    at, lines = net.weight.data_ptr(), Path("/proc/self/maps").read_text().splitlines()
+    spans = [line.split()[0].split("-") for line in lines if "/weights-" in line]
+    return any(int(first, 16) <= at < int(end, 16) for first, end in spans)
 
 
-def described(path: Path) -> tuple[np.ndarray, int, int]:
-    """A vector; bytes of the process, pages of several divided among them, before and after."""
-    before = _proportional_bytes()
-    image = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
-    options = OpenIblOptions(weights=str(path), max_size_px=32, device="cpu")
-    found = OpenIbl(options).describe(image)
-    time.sleep(1.0)  # the other one has it as well
-    return found, before, _proportional_bytes()
-
-
-def _proportional_bytes() -> int:
-    lines = Path("/proc/self/smaps_rollup").read_text().splitlines()
-    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
-
-
-@pytest.mark.skipif(not Path("/proc/self/smaps_rollup").is_file(), reason="Linux tells it")
-def test_workers_have_one_copy(checkpoint: Path) -> None:
-    alone, _, _ = described(checkpoint)
+@pytest.mark.skipif(not Path("/proc/self/maps").is_file(), reason="Linux tells it")
+def test_workers_have_one_copy(tmp_path: Path) -> None:
+    torch.save(torch.nn.Linear(64, 1).state_dict(), tmp_path / "own.pth")
+    assert not _is_mapped(tmp_path / "own.pth")
     with open_executor("processes", 2) as executor:
         assert executor is not None
-        list(executor.map(_imported, range(8)))
-        results = list(executor.map(described, [checkpoint] * 2))
-    for found, _, _ in results:
-        np.testing.assert_array_equal(found, alone)
-    taken = sum(after - before for _, before, after in results)
-    size = checkpoint.stat().st_size
-    assert taken < 1.9 * size  # with two copies 2.5 times
-
-
-def _imported(_: int) -> None:
-    import megloc_kapture.features.global_networks  # noqa: F401
-
-    torch.ones(64, 64) @ torch.ones(64, 64)
-    time.sleep(0.1)
+        assert all(executor.map(_is_mapped, [tmp_path / "own.pth"] * 4))
 
 
 def test_what_was_read_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -53,33 +53,24 @@ def test_no_file_is_two() -> None:
     assert len(sums) == len(set(sums)) > 20
 
 
-def test_licences_that_forbid_commercial_use_are_marked() -> None:
-    for weights in registry().values():
-        forbids = re.search(r"noncommercial|research|-NC-|unconfirmed", weights.licence)
-        assert weights.commercial == (forbids is None), weights.name
-
-
-def test_hashes_in_the_names_of_torch_hub_are_those_of_the_files() -> None:
-    """torch.hub calls a file by the first eight digits of its sha256."""
+def test_places_licences_and_hashes_fit_the_files() -> None:
     checked = 0
     for weights in registry().values():
+        assert weights.page.startswith("https://")
+        forbids = re.search(r"noncommercial|research|-NC-|unconfirmed", weights.licence)
+        assert weights.commercial == (forbids is None), weights.name
         for file in weights.files:
+            # torch.hub calls a file by the first eight digits of its sha256
             if found := re.search(r"-([0-9a-f]{8})\.pth$", file.name):
                 assert file.sha256 is not None and file.sha256.startswith(found[1])
                 checked += 1
-    assert checked == 3
-
-
-def test_places_are_safe_and_end_in_the_files_names() -> None:
-    for weights in registry().values():
-        assert weights.page.startswith("https://")
-        for file in weights.files:
             if file.url is not None:
                 assert file.url.startswith("https://")
                 # folders of the name may stand anywhere above
                 place = iter(file.url.partition("?")[0].split("/"))
                 assert all(part in place for part in file.name.split("/")), file.url
                 assert next(place, None) is None
+    assert checked == 3
 
 
 def expanded(text: str) -> set[str]:
