@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pytest
@@ -60,20 +60,24 @@ def index(xyz: NDArray[np.float64]) -> MapIndex:
     )
 
 
-def matches(shares: dict[str, int]) -> list[ImageMatches]:
-    """So many of an image's keypoints match the query's of the same number."""
+def matches(shares: Mapping[str, Sequence[int]]) -> list[ImageMatches]:
+    """These of an image's keypoints match the query's of the same number."""
     return [
-        (name, np.stack([np.arange(count)] * 2, axis=1), np.full(count, 0.9))
-        for name, count in shares.items()
+        (name, np.stack([np.array(rows)] * 2, axis=1), np.full(len(rows), 0.9))
+        for name, rows in shares.items()
     ]
 
 
 def view(
-    shares: dict[str, int], cam_from_rig: RigidTransform = ALONE, name: str = "q"
+    shares: Mapping[str, int | Sequence[int]],
+    cam_from_rig: RigidTransform = ALONE,
+    name: str = "q",
 ) -> QueryView:
+    """Of the right place; of an image so many keypoints match, or these."""
+    rows = {n: range(own) if isinstance(own, int) else own for n, own in shares.items()}
     xyz = points()
     seen = project(CAMERA, cam_from_rig @ TRUTH, xyz[:PER_PLACE]).astype(np.float32)
-    return QueryView(name, CAMERA, (TypedMatches(index(xyz), seen, matches(shares)),), cam_from_rig)
+    return QueryView(name, CAMERA, (TypedMatches(index(xyz), seen, matches(rows)),), cam_from_rig)
 
 
 def by_inliers(hypotheses: Sequence[PoseHypothesis]) -> NDArray[np.float64]:
@@ -105,6 +109,9 @@ def test_each_cluster_has_its_pose_and_the_best_is_kept() -> None:
     assert found.matches_of_views == (90,)
     steps = {"correspondences", "estimation", "ranking", "refinement"}
     assert result.covariance is not None and set(result.seconds) == steps
+    # only the clusters with the most matches are tried
+    result = localize(view(SHARES), clusters=PLACES[::-1], max_clusters=1).result
+    assert [cluster.images for cluster in result.clusters] == [PLACES[0]]
 
 
 def test_the_ranker_has_the_last_word() -> None:
@@ -126,23 +133,9 @@ def test_the_ranker_has_the_last_word() -> None:
     assert isinstance(result, Pose) and result.cluster == 0
 
 
-def test_only_the_clusters_with_the_most_matches_are_tried() -> None:
-    result = localize(view(SHARES), clusters=PLACES[::-1], max_clusters=1).result
-    assert isinstance(result, Pose)
-    assert [cluster.images for cluster in result.clusters] == [PLACES[0]]
-
-
 def test_clusters_of_one_place_are_one() -> None:
     """Two images of the right place that share no match with the query, split by a clustering."""
-    xyz = points()
-    seen = project(CAMERA, TRUTH, xyz[:PER_PLACE]).astype(np.float32)
-    rows = np.arange(PER_PLACE)
-
-    def part(name: str, chosen: NDArray[np.int64]) -> ImageMatches:
-        return name, np.stack([chosen, chosen], axis=1), np.full(len(chosen), 0.9)
-
-    halves = [part("right/2", rows[50:]), part("wrong/1", rows[:70]), part("right/1", rows[:50])]
-    query = QueryView("q", CAMERA, (TypedMatches(index(xyz), seen, halves),))
+    query = view({"right/2": range(50, 100), "wrong/1": 70, "right/1": 50})
     split = [("right/2",), ("wrong/1",), ("right/1",)]
     result = localize(query, clusters=split).result
     assert isinstance(result, Pose) and result.num_inliers == 100
@@ -162,17 +155,14 @@ def test_a_failure_is_that_of_the_cluster_that_came_nearest() -> None:
 def test_without_points_there_is_nothing_to_localize_in() -> None:
     empty = np.zeros(0, np.int64)
     bare = MapIndex.build(np.zeros((0, 3)), (), empty, empty, empty)
-    typed = TypedMatches(bare, np.zeros((1, 2), np.float32), matches({"right/1": 1}))
+    typed = TypedMatches(bare, np.zeros((1, 2), np.float32), matches({"right/1": [0]}))
     result = localize(QueryView("q", CAMERA, (typed,))).result
     assert result == Failure("no match is with a point of the map")
-
-
-def test_keypoints_types_are_joined_in_one_pose() -> None:
-    one = view({"right/1": 8}).matches[0]
-    result = localize(QueryView("q", CAMERA, (one, one))).result
+    # of several keypoints types all matches make one pose
+    few = view({"right/1": 8}).matches
+    assert isinstance(localize(QueryView("q", CAMERA, few)).result, Failure)
+    result = localize(QueryView("q", CAMERA, few * 2)).result
     assert isinstance(result, Pose) and result.num_matches == 16
-    alone = localize(QueryView("q", CAMERA, (one,))).result
-    assert isinstance(alone, Failure)
 
 
 SIDE = RigidTransform.from_matrix(
