@@ -175,13 +175,11 @@ def pools(restrictions: Restrictions, queries: list[str]) -> dict[str, list[int]
     }
 
 
-def test_without_tables_everything_is_permitted(tmp_path: Path) -> None:
-    assert pools(UNRESTRICTED, ["q", "r"]) == {"q": [0, 1, 2, 3], "r": [0, 1, 2, 3]}
-    assert pools(Restrictions.read(tmp_path), ["q"]) == {"q": [0, 1, 2, 3]}
-    assert [members.tolist() for members in UNRESTRICTED.frames(IMAGES)] == [[0, 1, 2, 3]]
-
-
 def test_a_prior_names_images_locations_and_frames(tmp_path: Path) -> None:
+    everything = {"free": [0, 1, 2, 3]}
+    assert (
+        pools(UNRESTRICTED, ["free"]) == pools(Restrictions.read(tmp_path), ["free"]) == everything
+    )
     write_groups(tmp_path, GROUPS)
     priors = {
         "by location": ["001/rear"],
@@ -193,6 +191,7 @@ def test_a_prior_names_images_locations_and_frames(tmp_path: Path) -> None:
     write_priors(tmp_path, priors)
     frames = [members.tolist() for members in Restrictions(GROUPS).frames(IMAGES)]
     assert frames == [[3], [0, 1], [2]]
+    assert [members.tolist() for members in UNRESTRICTED.frames(IMAGES)] == [[0, 1, 2, 3]]
     assert pools(Restrictions.read(tmp_path), [*priors, "free"]) == {
         "by location": [0, 2],
         "by frame": [0, 1],

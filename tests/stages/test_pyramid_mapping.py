@@ -23,6 +23,8 @@ from megloc_kapture.stages.guided_pyramid import PyramidFeatures
 from megloc_kapture.stages.pyramid_mapping import MatchSpool, Spooled
 from megloc_kapture.values import Camera
 
+IMAGE = "a/1.png"
+
 
 @pytest.fixture
 def toy(write_features: Any, tmp_path: Path) -> Callable[..., KaptureFolder]:
@@ -41,9 +43,6 @@ def toy(write_features: Any, tmp_path: Path) -> Callable[..., KaptureFolder]:
         return KaptureFolder(root, features_dirs=[root])
 
     return make
-
-
-IMAGE = "a/1.png"
 
 
 def opened(folder: KaptureFolder, name: str = "toy") -> tuple[FeatureReader, FeatureReader]:

@@ -31,6 +31,7 @@ from megloc_kapture.stages.query_poses import (
     localize_from_matches,
     localize_views,
 )
+from megloc_kapture.stages.ranking_scene import KaptureScene
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
@@ -91,6 +92,19 @@ def test_a_ranker_sees_poses_and_images(world: Any, monkeypatch: pytest.MonkeyPa
 def test_an_unknown_ranker_is_refused_before_the_first_query(world: Any) -> None:
     with pytest.raises(PluginError, match="no plugin 'no-such' in megloc_kapture.pose_rankers"):
         world.localized(rank=PluginChoice(name="no-such"))
+
+
+def test_map_points_are_those_that_an_image_observes(world: Any) -> None:
+    folder = world.map()
+    scene, xyz = KaptureScene(folder), folder.points3d()[:, :3]
+    for image in sorted(world.map_poses):
+        seen: set[int] = set()
+        for observed in folder.observations().values():
+            names = np.array(observed.image_names)[observed.image_ids]
+            seen |= set(observed.point_ids[names == image].tolist())
+        assert seen
+        np.testing.assert_array_equal(scene.map_points(image), xyz[sorted(seen)])
+    assert scene.map_points("elsewhere.png").shape == (0, 3)
 
 
 def test_real_photographs_are_localized_within_a_centimetre(
