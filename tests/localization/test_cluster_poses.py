@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pytest
@@ -60,20 +60,24 @@ def index(xyz: NDArray[np.float64]) -> MapIndex:
     )
 
 
-def matches(shares: dict[str, int]) -> list[ImageMatches]:
-    """So many of an image's keypoints match the query's of the same number."""
+def matches(shares: Mapping[str, Sequence[int]]) -> list[ImageMatches]:
+    """These of an image's keypoints match the query's of the same number."""
     return [
-        (name, np.stack([np.arange(count)] * 2, axis=1), np.full(count, 0.9))
-        for name, count in shares.items()
+        (name, np.stack([np.array(rows)] * 2, axis=1), np.full(len(rows), 0.9))
+        for name, rows in shares.items()
     ]
 
 
 def view(
-    shares: dict[str, int], cam_from_rig: RigidTransform = ALONE, name: str = "q"
+    shares: Mapping[str, int | Sequence[int]],
+    cam_from_rig: RigidTransform = ALONE,
+    name: str = "q",
 ) -> QueryView:
+    """Of the right place; of an image so many keypoints match, or these."""
+    rows = {n: range(own) if isinstance(own, int) else own for n, own in shares.items()}
     xyz = points()
     seen = project(CAMERA, cam_from_rig @ TRUTH, xyz[:PER_PLACE]).astype(np.float32)
-    return QueryView(name, CAMERA, (TypedMatches(index(xyz), seen, matches(shares)),), cam_from_rig)
+    return QueryView(name, CAMERA, (TypedMatches(index(xyz), seen, matches(rows)),), cam_from_rig)
 
 
 def by_inliers(hypotheses: Sequence[PoseHypothesis]) -> NDArray[np.float64]:
@@ -103,12 +107,11 @@ def test_each_cluster_has_its_pose_and_the_best_is_kept() -> None:
     # the same view of the other place, 50 m away
     np.testing.assert_allclose(wrong.cam_from_world.center() - TRUTH.center(), FAR, atol=1e-3)
     assert found.matches_of_views == (90,)
-    assert result.covariance is not None and set(result.seconds) == {
-        "correspondences",
-        "estimation",
-        "ranking",
-        "refinement",
-    }
+    steps = {"correspondences", "estimation", "ranking", "refinement"}
+    assert result.covariance is not None and set(result.seconds) == steps
+    # only the clusters with the most matches are tried
+    result = localize(view(SHARES), clusters=PLACES[::-1], max_clusters=1).result
+    assert [cluster.images for cluster in result.clusters] == [PLACES[0]]
 
 
 def test_the_ranker_has_the_last_word() -> None:
@@ -125,30 +128,14 @@ def test_the_ranker_has_the_last_word() -> None:
     assert asked == [PLACES[0], PLACES[1]]
     assert isinstance(result, Pose) and result.cluster == 1
     np.testing.assert_allclose(result.cam_from_world.center() - TRUTH.center(), FAR, atol=1e-5)
-
-
-def test_of_equals_the_first_wins() -> None:
+    # of equals the first
     result = localize(view(SHARES), rank=lambda hypotheses: np.ones(len(hypotheses))).result
     assert isinstance(result, Pose) and result.cluster == 0
 
 
-def test_only_the_clusters_with_the_most_matches_are_tried() -> None:
-    result = localize(view(SHARES), clusters=PLACES[::-1], max_clusters=1).result
-    assert isinstance(result, Pose)
-    assert [cluster.images for cluster in result.clusters] == [PLACES[0]]
-
-
 def test_clusters_of_one_place_are_one() -> None:
     """Two images of the right place that share no match with the query, split by a clustering."""
-    xyz = points()
-    seen = project(CAMERA, TRUTH, xyz[:PER_PLACE]).astype(np.float32)
-    rows = np.arange(PER_PLACE)
-
-    def part(name: str, chosen: NDArray[np.int64]) -> ImageMatches:
-        return name, np.stack([chosen, chosen], axis=1), np.full(len(chosen), 0.9)
-
-    halves = [part("right/2", rows[50:]), part("wrong/1", rows[:70]), part("right/1", rows[:50])]
-    query = QueryView("q", CAMERA, (TypedMatches(index(xyz), seen, halves),))
+    query = view({"right/2": range(50, 100), "wrong/1": 70, "right/1": 50})
     split = [("right/2",), ("wrong/1",), ("right/1",)]
     result = localize(query, clusters=split).result
     assert isinstance(result, Pose) and result.num_inliers == 100
@@ -168,17 +155,14 @@ def test_a_failure_is_that_of_the_cluster_that_came_nearest() -> None:
 def test_without_points_there_is_nothing_to_localize_in() -> None:
     empty = np.zeros(0, np.int64)
     bare = MapIndex.build(np.zeros((0, 3)), (), empty, empty, empty)
-    typed = TypedMatches(bare, np.zeros((1, 2), np.float32), matches({"right/1": 1}))
+    typed = TypedMatches(bare, np.zeros((1, 2), np.float32), matches({"right/1": [0]}))
     result = localize(QueryView("q", CAMERA, (typed,))).result
     assert result == Failure("no match is with a point of the map")
-
-
-def test_keypoints_types_are_joined_in_one_pose() -> None:
-    one = view({"right/1": 8}).matches[0]
-    result = localize(QueryView("q", CAMERA, (one, one))).result
+    # of several keypoints types all matches make one pose
+    few = view({"right/1": 8}).matches
+    assert isinstance(localize(QueryView("q", CAMERA, few)).result, Failure)
+    result = localize(QueryView("q", CAMERA, few * 2)).result
     assert isinstance(result, Pose) and result.num_matches == 16
-    alone = localize(QueryView("q", CAMERA, (one,))).result
-    assert isinstance(alone, Failure)
 
 
 SIDE = RigidTransform.from_matrix(
@@ -186,24 +170,21 @@ SIDE = RigidTransform.from_matrix(
 )
 
 
-@pytest.mark.parametrize("dead", [{}, {"wrong/1": 20}])
-def test_a_rig_is_localized_at_once_and_survives_a_dead_camera(dead: dict[str, int]) -> None:
-    good, other = view({"right/1": 90}), view(dead, SIDE, name="side")
-    found = localize(good, other)
+@pytest.mark.parametrize("of_side", [{}, {"wrong/1": 20}, {"right/2": 30}])
+def test_a_rig_is_localized_at_once_and_survives_a_dead_camera(of_side: dict[str, int]) -> None:
+    views = view({"right/1": 90}), view(of_side, SIDE, name="side")
+    found = localize(*views)
     assert isinstance(found.result, Pose)
     assert np.linalg.norm(found.result.cam_from_world.center() - TRUTH.center()) < 1e-4
-    front, side = poses_of_cameras((good, other), found)
-    assert isinstance(front, Pose) and front.num_inliers == 90
-    assert not side and "no inlier in this camera" in side.reason  # type: ignore[union-attr]
-
-
-def test_cameras_of_a_rig_get_their_own_poses_and_counts() -> None:
-    views = view({"right/1": 90}), view({"right/2": 30}, SIDE, name="side")
-    front, side = poses_of_cameras(views, localize(*views))
-    assert isinstance(front, Pose) and isinstance(side, Pose)
-    assert (front.num_matches, side.num_matches) == (90, 30)
-    assert np.linalg.norm(side.cam_from_world.center() - (SIDE @ TRUTH).center()) < 1e-4
-    assert front.covariance is not None and side.covariance is not None
+    front, side = poses_of_cameras(views, found)
+    assert isinstance(front, Pose) and front.covariance is not None
+    assert front.num_matches == front.num_inliers == 90
+    if "right/2" in of_side:
+        assert isinstance(side, Pose) and side.num_matches == 30
+        assert np.linalg.norm(side.cam_from_world.center() - (SIDE @ TRUTH).center()) < 1e-4
+        assert side.covariance is not None
+    else:
+        assert isinstance(side, Failure) and "no inlier in this camera" in side.reason
 
 
 def test_a_covariance_moves_with_the_camera() -> None:
@@ -241,14 +222,17 @@ def partition(labels: NDArray[np.int64]) -> set[frozenset[int]]:
 
 
 @given(
-    st.lists(st.tuples(*[st.integers(-20, 20)] * 3), min_size=2, max_size=30, unique=True),
+    st.lists(st.tuples(*[st.integers(-20, 20)] * 3), max_size=30, unique=True),
     st.integers(1, 12),
 )
 def test_centres_are_joined_as_by_single_linkage(
     centers: list[tuple[int, int, int]], radius: int
 ) -> None:
-    points = np.array(centers, np.float64)
+    points = np.array(centers, np.float64).reshape(-1, 3)
     labels = cluster_by_centers(points, radius)
+    if len(centers) < 2:
+        assert labels.tolist() == [0] * len(centers)
+        return
     # half a unit off the grid's own distances would change nothing; a radius met exactly joins
     theirs = fcluster(linkage(points, "single"), radius + 1e-9, "distance")
     assert partition(labels) == partition(np.asarray(theirs, np.int64))
@@ -256,20 +240,19 @@ def test_centres_are_joined_as_by_single_linkage(
     assert first_seen == sorted(first_seen)
 
 
-def test_few_centres() -> None:
-    assert cluster_by_centers(np.zeros((0, 3)), 1.0).tolist() == []
-    assert cluster_by_centers(np.zeros((1, 3)), 1.0).tolist() == [0]
-
-
-def test_shared_points_join_from_the_threshold_on() -> None:
-    shared = np.array([[9, 5, 0], [5, 9, 4], [0, 4, 9]])
-    assert cluster_by_shared_points(shared, 5).tolist() == [0, 0, 1]
-    assert cluster_by_shared_points(shared, 4).tolist() == [0, 0, 0]
-    assert cluster_by_shared_points(shared, 6).tolist() == [0, 1, 2]
-
-
-def test_without_any_shared_point_all_are_one() -> None:
-    assert cluster_by_shared_points(np.diag([5, 5, 5]), 1).tolist() == [0, 0, 0]
+@pytest.mark.parametrize(
+    ("shared", "least", "labels"),
+    [
+        ([[9, 5, 0], [5, 9, 4], [0, 4, 9]], 5, [0, 0, 1]),
+        ([[9, 5, 0], [5, 9, 4], [0, 4, 9]], 4, [0, 0, 0]),
+        ([[9, 5, 0], [5, 9, 4], [0, 4, 9]], 6, [0, 1, 2]),
+        ([[5, 0, 0], [0, 5, 0], [0, 0, 5]], 1, [0, 0, 0]),  # none shares any: all are one
+    ],
+)
+def test_shared_points_join_from_the_threshold_on(
+    shared: list[list[int]], least: int, labels: list[int]
+) -> None:
+    assert cluster_by_shared_points(np.array(shared), least).tolist() == labels
 
 
 def small_index() -> MapIndex:
@@ -283,33 +266,30 @@ def small_index() -> MapIndex:
     )
 
 
-def clusters(options: ClusterOptions, frames: str = "xxxx") -> list[tuple[str, ...]]:
-    return cluster_candidates(
-        NAMES, tuple(frames), options, centers=CENTERS, indices=[small_index()]
-    )
+AC, BD = ("a", "c"), ("b", "d")
 
 
-def test_candidates_are_divided_as_asked() -> None:
-    assert clusters(ClusterOptions(by="none")) == [NAMES]
-    assert clusters(ClusterOptions(by="poses", radius=1.0)) == [("a", "c"), ("b",), ("d",)]
-    assert clusters(ClusterOptions(by="poses", radius=1.5)) == [("a", "c", "d"), ("b",)]
-    by = ClusterOptions(by="covisibility", min_shared_points=2)
-    assert clusters(by) == [("a", "c"), ("b", "d")]
-    assert clusters(ClusterOptions(by="covisibility", min_shared_points=1)) == [NAMES]
-
-
-def test_frames_are_never_mixed() -> None:
-    assert clusters(ClusterOptions(by="none"), "xyxy") == [("a", "c"), ("b", "d")]
-    near = ClusterOptions(by="poses", radius=100.0)
-    assert clusters(near, "xxxy") == [("a", "b", "c"), ("d",)]
-
-
-def test_points_shared_in_several_keypoints_types_add_up() -> None:
-    options = ClusterOptions(by="covisibility", min_shared_points=2)
-    found = cluster_candidates(
-        NAMES, ("",) * 4, options, centers=CENTERS, indices=[small_index(), small_index()]
-    )
-    assert found == [NAMES]  # c and d share one point in each
+@pytest.mark.parametrize(
+    ("options", "frames", "types", "expected"),
+    [
+        ({"by": "none"}, "xxxx", 1, [NAMES]),
+        ({"by": "none"}, "xyxy", 1, [AC, BD]),
+        ({"by": "poses", "radius": 1.0}, "xxxx", 1, [AC, ("b",), ("d",)]),
+        ({"by": "poses", "radius": 1.5}, "xxxx", 1, [("a", "c", "d"), ("b",)]),
+        ({"by": "poses", "radius": 100.0}, "xxxy", 1, [("a", "b", "c"), ("d",)]),
+        ({"min_shared_points": 2}, "xxxx", 1, [AC, BD]),
+        ({"min_shared_points": 1}, "xxxx", 1, [NAMES]),
+        # c and d share one point in each of two keypoints types
+        ({"min_shared_points": 2}, "xxxx", 2, [NAMES]),
+    ],
+)
+def test_candidates_are_divided_as_asked_and_frames_never_mixed(
+    options: dict[str, object], frames: str, types: int, expected: list[tuple[str, ...]]
+) -> None:
+    chosen = ClusterOptions.model_validate(options)
+    indices = [small_index()] * types
+    found = cluster_candidates(NAMES, tuple(frames), chosen, centers=CENTERS, indices=indices)
+    assert found == expected
 
 
 def test_poses_need_a_scale() -> None:

@@ -60,13 +60,10 @@ def terms(right: int, wrong: int, **settings: float) -> dict[str, float]:
     return evidence_of(problem, pose, sources, ERROR_PX)
 
 
-def test_every_term_is_there_and_finite() -> None:
+def test_terms_of_known_worth() -> None:
     found = terms(80, 40)
     assert set(found) == set(TERMS)
     assert all(math.isfinite(value) for value in found.values())
-
-
-def test_terms_of_known_worth() -> None:
     found = terms(200, 0, noise_px=1.0)
     # the median length of a normal vector of deviation 1 in two dimensions
     assert found["residual"] == pytest.approx(math.log(1.177 / ERROR_PX), abs=0.15)
@@ -129,22 +126,6 @@ def test_right_and_chance() -> None:
     assert isinstance(with_confidence(problem, pose, sources, ERROR_PX, 0.0), Pose)
 
 
-def test_a_map_without_noise_or_points_in_sight() -> None:
-    problem, pose, sources = scene(50, 10)
-    unknown = replace(sources, noise=np.full((60, 2), np.nan), seen=[np.zeros((0, 3))])
-    found = evidence_of(problem, pose, unknown, ERROR_PX)
-    assert found["misfit"] == 0.0 and found["matched_share"] == 0.0
-
-
-def test_misfit_of_a_map_that_is_better_than_the_query() -> None:
-    problem, pose, sources = scene(200, 0, noise_px=3.0)
-    exact = replace(sources, noise=np.tile([0.3 / 500, 0.3], (200, 1)))
-    expected = math.log(1.177 * 10 / 2.9) * math.log(10)
-    assert evidence_of(problem, pose, sources, ERROR_PX)["misfit"] == 0.0
-    found = evidence_of(problem, pose, exact, ERROR_PX)["misfit"]
-    assert found == pytest.approx(expected, rel=0.1)
-
-
 def test_what_surrounds_keypoints_excuses_their_errors() -> None:
     problem, pose, sources = scene(200, 0, noise_px=3.0)
     exact = replace(sources, noise=np.tile([0.3 / 500, 0.3], (200, 1)))
@@ -153,7 +134,11 @@ def test_what_surrounds_keypoints_excuses_their_errors() -> None:
         asked = replace(exact, displacements_rad=lambda _: np.full(count, displaced_px / 500))
         return evidence_of(problem, pose, asked, ERROR_PX)["misfit"]
 
+    assert evidence_of(problem, pose, sources, ERROR_PX)["misfit"] == 0.0
     by_keypoints = evidence_of(problem, pose, exact, ERROR_PX)["misfit"]
+    # a map that is ten times better than the query
+    expected = math.log(1.177 * 10 / 2.9) * math.log(10)
+    assert by_keypoints == pytest.approx(expected, rel=0.1)
     assert misfit(0.5, 100) == 0.0
     assert misfit(2.0, 100) == pytest.approx(math.log(2.0 / 0.3 / 2.9) * math.log(10))
     # what is displaced by more than the keypoints speaks no more against it, and few say nothing
@@ -219,8 +204,10 @@ def test_the_calibrations_of_the_package() -> None:
     assert calibration_for(["aliked-n16", "xfeat"]) is of_all
 
 
-def test_evidence_needs_inliers_and_covariance() -> None:
+def test_what_is_not_known() -> None:
     problem, pose, sources = scene(50, 10)
-    none: NDArray[np.bool_] | None = None
+    unknown = replace(sources, noise=np.full((60, 2), np.nan), seen=[np.zeros((0, 3))])
+    found = evidence_of(problem, pose, unknown, ERROR_PX)
+    assert found["misfit"] == 0.0 and found["matched_share"] == 0.0
     with pytest.raises(ValueError, match="needs the inliers"):
-        evidence_of(problem, replace(pose, inliers=none), sources, ERROR_PX)
+        evidence_of(problem, replace(pose, inliers=None), sources, ERROR_PX)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import project, px_from_cam
@@ -28,7 +29,9 @@ from megloc_kapture.localization.focal_length import (
 from megloc_kapture.localization.map_index import PoseProblem, View
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
+Floats = NDArray[np.float64]
 ALONE = RigidTransform.identity()
+OPTIONS = AbsolutePoseOptions()
 
 
 def remark(
@@ -37,9 +40,8 @@ def remark(
     """Of a facade with 4 m of relief, 10 m away, by a camera that is said to be that longer."""
     rng = np.random.default_rng(seed)
     true = Camera.pinhole(1600, 1200, 1400.0)
-    pose = RigidTransform((0.98, 0.05, 0.18, 0.02), (0.3, -0.2, 0.5))
-    length = np.linalg.norm(pose.quat_wxyz)
-    pose = RigidTransform(tuple((np.array(pose.quat_wxyz) / length).tolist()), pose.translation)
+    quat = np.array([0.98, 0.05, 0.18, 0.02])
+    pose = RigidTransform(tuple((quat / np.linalg.norm(quat)).tolist()), (0.3, -0.2, 0.5))
     points = rng.uniform((-5, -4, 8.0), (5, 4, 12.0), (400, 3))
     pixels = project(true, pose, points) + rng.normal(0, noise_px, (400, 2))
     pixels[:outliers] = rng.uniform((0, 0), (1600, 1200), (outliers, 2))
@@ -70,12 +72,16 @@ def test_a_right_one_is_left_alone(seed: int, noise_px: float) -> None:
     assert remark(1.01, seed=seed, noise_px=noise_px) is None
 
 
-def test_nothing_is_said_of_a_wall_seen_straight_on() -> None:
+def straight_on() -> tuple[Floats, Floats]:
+    """A wall, 10 m away, by a camera of 1400 px: pixels and points."""
     rng = np.random.default_rng(0)
     points = np.c_[rng.uniform(-4, 4, (200, 2)), np.full(200, 10.0)]
     pixels = project(Camera.pinhole(1600, 1200, 1400.0), ALONE, points)
-    pixels = pixels + rng.normal(0, 1, (200, 2))
-    view = View(Camera.pinhole(1600, 1200, 1700.0), ALONE, pixels, points)
+    return pixels + rng.normal(0, 1, (200, 2)), points
+
+
+def test_nothing_is_said_of_a_wall_seen_straight_on() -> None:
+    view = View(Camera.pinhole(1600, 1200, 1700.0), ALONE, *straight_on())
     pose = Pose(RigidTransform(ALONE.quat_wxyz, (0.0, 0.0, 2.14)), 200, 200, np.ones(200, bool))
     assert focal_remark(PoseProblem.of([view]), pose) is None
 
@@ -87,33 +93,19 @@ def test_few_inliers_and_rigs_say_nothing() -> None:
     assert focal_remark(PoseProblem.of([view, view]), pose) is None
 
 
-def uncertain(
-    given_px: float, deviation: float, *, seed: int = 0, count: int = 400
-) -> tuple[Camera, Pose | Failure, RigidTransform]:
-    """Localize by a camera of 1400 px, off its middle and a little bent, that is said to be other.
-
-    Returns the true camera, the result and the true pose.
-    """
-    rng = np.random.default_rng(seed)
-    true = Camera("SIMPLE_RADIAL", 1600, 1200, (1400.0, 806.0, 595.0, -0.03))
-    rotation = Rotation.from_euler("xyz", [5, 20, 2], degrees=True).as_matrix()
-    pose = RigidTransform.from_matrix(rotation, np.array([0.3, -0.2, 0.5]))
-    points = rng.uniform((-5, -4, 8.0), (5, 4, 12.0), (count, 3))
-    pixels = project(true, pose, points) + rng.normal(0, 1, (count, 2))
-    pixels[: count // 4] = rng.uniform((0, 0), (1600, 1200), (count // 4, 2))
-    camera = Camera("SIMPLE_RADIAL", 1600, 1200, (given_px, 800.0, 600.0, 0.0), deviation)
+def solved(camera: Camera, pixels: Floats, points: Floats) -> Pose | Failure:
+    """The pose by a camera that is not known for certain, with the camera."""
     problem = PoseProblem.of([View(camera, ALONE, pixels, points)])
-    options = AbsolutePoseOptions()
-    problem, estimate = estimate_with_intrinsics(problem, options)
+    problem, estimate = estimate_with_intrinsics(problem, OPTIONS)
     assert isinstance(estimate, PoseEstimate)
-    problem, found = refine_with_intrinsics(problem, estimate, options, camera)
+    problem, found = refine_with_intrinsics(problem, estimate, OPTIONS, camera)
     if isinstance(found, Pose) and found.camera:
         # what is looked at afterwards is of the camera that the pose was found with
         assert problem.views[0].camera.params == found.camera.params
         assert found.inliers is not None
         errors, _ = match_errors(problem, found.cam_from_world)
-        assert ((errors <= options.max_error_px) == found.inliers).all()
-    return true, found, pose
+        assert ((errors <= OPTIONS.max_error_px) == found.inliers).all()
+    return found
 
 
 @pytest.mark.parametrize(
@@ -121,7 +113,16 @@ def uncertain(
 )
 @pytest.mark.parametrize("seed", range(3))
 def test_an_uncertain_camera_is_estimated(given_px: float, deviation: float, seed: int) -> None:
-    true, found, pose = uncertain(given_px, deviation, seed=seed)
+    """By a camera of 1400 px, off its middle and a little bent, that is said to be another."""
+    rng = np.random.default_rng(seed)
+    true = Camera("SIMPLE_RADIAL", 1600, 1200, (1400.0, 806.0, 595.0, -0.03))
+    rotation = Rotation.from_euler("xyz", [5, 20, 2], degrees=True).as_matrix()
+    pose = RigidTransform.from_matrix(rotation, np.array([0.3, -0.2, 0.5]))
+    points = rng.uniform((-5, -4, 8.0), (5, 4, 12.0), (400, 3))
+    pixels = project(true, pose, points) + rng.normal(0, 1, (400, 2))
+    pixels[:100] = rng.uniform((0, 0), (1600, 1200), (100, 2))
+    given = Camera("SIMPLE_RADIAL", 1600, 1200, (given_px, 800.0, 600.0, 0.0), deviation)
+    found = solved(given, pixels, points)
     assert isinstance(found, Pose) and found.camera is not None
     off = found.camera.params[0] / 1400 - 1
     assert abs(off) < min(0.01, 3 * found.camera.focal_deviation)
@@ -135,48 +136,29 @@ def test_very_short_and_very_long_lenses(focal_px: float) -> None:
     rng = np.random.default_rng(1)
     true = Camera.pinhole(1600, 1200, focal_px)
     half = 600 / focal_px
-    points = rng.uniform((-half, -half, 1), (half, half, 1), (300, 3)) * rng.uniform(
-        6, 14, (300, 1)
-    )
+    rays = rng.uniform((-half, -half, 1), (half, half, 1), (300, 3))
+    points = rays * rng.uniform(6, 14, (300, 1))
     pixels = project(true, ALONE, points) + rng.normal(0, 0.5, (300, 2))
-    camera = guessed_camera(1600, 1200)
-    options = AbsolutePoseOptions()
-    problem, estimate = estimate_with_intrinsics(
-        PoseProblem.of([View(camera, ALONE, pixels, points)]), options
-    )
-    assert isinstance(estimate, PoseEstimate)
-    _, found = refine_with_intrinsics(problem, estimate, options, camera)
+    found = solved(guessed_camera(1600, 1200), pixels, points)
     assert isinstance(found, Pose) and found.camera is not None
     assert found.camera.params[0] == pytest.approx(focal_px, rel=0.02)
 
 
 def test_of_a_wall_seen_straight_on_what_was_known_stays() -> None:
-    rng = np.random.default_rng(0)
-    points = np.c_[rng.uniform(-4, 4, (200, 2)), np.full(200, 10.0)]
-    pixels = project(Camera.pinhole(1600, 1200, 1400.0), ALONE, points)
-    pixels = pixels + rng.normal(0, 1, (200, 2))
-    for deviation in (0.1, 0.7):
-        camera = Camera("SIMPLE_RADIAL", 1600, 1200, (1500.0, 800.0, 600.0, 0.0), deviation)
-        options = AbsolutePoseOptions()
-        problem, estimate = estimate_with_intrinsics(
-            PoseProblem.of([View(camera, ALONE, pixels, points)]), options
-        )
-        assert isinstance(estimate, PoseEstimate)
-        _, found = refine_with_intrinsics(problem, estimate, options, camera)
-        if deviation == 0.1:
-            assert isinstance(found, Pose) and found.camera is not None
-            assert 0.05 < found.camera.focal_deviation <= 0.1
-            assert found.covariance is not None
-            # the focal length's uncertainty is the distance's
-            assert center_deviation(found.covariance) == pytest.approx(
-                10.0 * found.camera.focal_deviation, rel=0.3
-            )
-        else:
-            assert isinstance(found, Failure) and "unstable" in found.reason
+    pixels, points = straight_on()
+    known = Camera("SIMPLE_RADIAL", 1600, 1200, (1500.0, 800.0, 600.0, 0.0), 0.1)
+    found = solved(known, pixels, points)
+    assert isinstance(found, Pose) and found.camera is not None
+    assert 0.05 < found.camera.focal_deviation <= 0.1
+    assert found.covariance is not None
+    # the focal length's uncertainty is the distance's
+    deviation = 10.0 * found.camera.focal_deviation
+    assert center_deviation(found.covariance) == pytest.approx(deviation, rel=0.3)
+    unknown = solved(replace(known, focal_deviation=0.7), pixels, points)
+    assert isinstance(unknown, Failure) and "unstable" in unknown.reason
 
 
 TRUE = Camera("SIMPLE_RADIAL", 1536, 1024, (1380.0, 768.0, 512.0, 0.0))
-OPTIONS = AbsolutePoseOptions()
 
 
 def photograph(seed: int, focal: float, deviation: float) -> tuple[Pose, RigidTransform]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from megloc_kapture.localization.map_index import (
     Correspondences,
@@ -55,28 +55,7 @@ def test_observations_of_each_image_ascend(rows: list[tuple[int, int, int]]) -> 
         mine = sorted((k, p) for i, k, p in rows if i == image_id)
         keypoints, points = index.observed(name)
         assert list(zip(keypoints.tolist(), points.tolist(), strict=True)) == mine
-
-
-def test_an_image_that_is_not_in_the_map() -> None:
-    index = build([(0, 1, 2)], ("a.jpg",))
-    assert [len(part) for part in index.observed("z.jpg")] == [0, 0]
-
-
-def test_an_image_without_observations_between_two_that_have_some() -> None:
-    index = build([(0, 1, 2), (2, 5, 3)], ("a.jpg", "b.jpg", "c.jpg"))
-    assert [len(part) for part in index.observed("b.jpg")] == [0, 0]
-    assert [part.tolist() for part in index.observed("c.jpg")] == [[5], [3]]
-
-
-def test_a_map_without_observations() -> None:
-    assert [len(part) for part in build([], ("a.jpg",)).observed("a.jpg")] == [0, 0]
-    assert build([], ()).row_of_image == {}
-
-
-def test_points_keep_all_their_digits() -> None:
-    xyz = np.array([[4.2e6 + 1e-9, 1.7e5, 4.78e6]])
-    empty = np.zeros(0, dtype=np.int64)
-    np.testing.assert_array_equal(MapIndex.build(xyz, (), empty, empty, empty).xyz, xyz)
+    assert [len(part) for part in index.observed("not in the map.jpg")] == [0, 0]
 
 
 @given(observations, st.lists(st.sampled_from("abcdz"), max_size=6))
@@ -127,14 +106,6 @@ def observed(matches: list[tuple[int, int, float, int]]) -> ObservedMatches:
     )
 
 
-def resolve(
-    keypoints: list[int], points: list[int], similarities: list[float]
-) -> tuple[list[int], list[int], list[int]]:
-    images = [0] * len(keypoints)
-    found = observed(list(zip(keypoints, points, similarities, images, strict=True))).resolve()
-    return found.keypoint_ids.tolist(), found.point_ids.tolist(), found.support.tolist()
-
-
 def triples(found: Correspondences) -> list[tuple[int, int, int]]:
     columns = (found.keypoint_ids, found.point_ids, found.support)
     assert all(column.dtype == np.int64 for column in columns)
@@ -142,54 +113,44 @@ def triples(found: Correspondences) -> list[tuple[int, int, int]]:
 
 
 def greedy(matches: list[tuple[int, int, float, int]]) -> list[tuple[int, int, int]]:
+    """What most images say, then the most similar, each keypoint and each point once."""
     support = Counter((k, p) for k, p, _, _ in matches)
-    best = {pair: max(s for k, p, s, _ in matches if (k, p) == pair) for pair in support}
-    left = sorted(support, key=lambda pair: (-support[pair], -best[pair], pair))
+    best: dict[tuple[int, int], float] = {}
+    for k, p, similarity, _ in matches:
+        best[k, p] = max(similarity, best.get((k, p), -np.inf))
+    keypoints: set[int] = set()
+    points: set[int] = set()
     chosen = []
-    while left:
-        keypoint, point = left[0]
-        chosen.append((keypoint, point, support[keypoint, point]))
-        left = [(k, p) for k, p in left if k != keypoint and p != point]
+    for keypoint, point in sorted(support, key=lambda pair: (-support[pair], -best[pair], pair)):
+        if keypoint not in keypoints and point not in points:
+            keypoints.add(keypoint)
+            points.add(point)
+            chosen.append((keypoint, point, support[keypoint, point]))
     return sorted(chosen)
 
 
-def resolve_by_numpy(
-    keypoint_ids: NDArray[np.int64], point_ids: NDArray[np.int64], similarities: NDArray[np.float64]
-) -> list[tuple[int, int, int]]:
-    """How it was done before it was compiled."""
-    pairs, inverse, support = np.unique(
-        np.stack([keypoint_ids, point_ids], axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    best = np.full(len(pairs), -np.inf)
-    np.maximum.at(best, inverse.reshape(-1), similarities)
-    order = np.lexsort((pairs[:, 1], pairs[:, 0], -best, -support))
-    taken_keypoints: set[int] = set()
-    taken_points: set[int] = set()
-    chosen = []
-    for row, (keypoint, point) in zip(order.tolist(), pairs[order].tolist(), strict=True):
-        if keypoint not in taken_keypoints and point not in taken_points:
-            taken_keypoints.add(keypoint)
-            taken_points.add(point)
-            chosen.append(row)
-    return [(*pairs[row].tolist(), int(support[row])) for row in sorted(chosen)]
+@given(st.one_of(rows, wide), st.randoms(use_true_random=False))
+def test_equal_to_a_greedy_loop_whatever_the_order(
+    matches: list[tuple[int, int, float, int]], random: Any
+) -> None:
+    expected = greedy(matches)
+    assert triples(observed(matches).resolve()) == expected
+    random.shuffle(matches)
+    assert triples(observed(matches).resolve()) == expected
 
 
-@given(st.one_of(rows, wide))
-def test_equal_to_a_greedy_loop(matches: list[tuple[int, int, float, int]]) -> None:
-    assert triples(observed(matches).resolve()) == greedy(matches)
-
-
-def test_equal_to_numpy_on_as_many_matches_as_a_query_has() -> None:
-    for seed, num_points in ((0, 500), (1, 3000), (2, 100_000)):
-        rng = np.random.default_rng(seed)
-        keypoints = rng.integers(0, 3000, 8000)
-        points = rng.integers(0, num_points, 8000)
-        again = rng.integers(0, 4000, 4000)  # pairs that several images agree on
-        keypoints[4000:], points[4000:] = keypoints[again], points[again]
-        scores = np.round(rng.normal(size=8000), 1)  # with ties, and of both signs
-        images = rng.integers(0, 20, 8000)
-        mine = ObservedMatches(keypoints, points, scores, images, 20).resolve()
-        assert triples(mine) == resolve_by_numpy(keypoints, points, scores)
+@pytest.mark.parametrize("num_points", [500, 3000, 100_000])
+def test_equal_on_as_many_matches_as_a_query_has(num_points: int) -> None:
+    rng = np.random.default_rng(num_points)
+    keypoints = rng.integers(0, 3000, 8000)
+    points = rng.integers(0, num_points, 8000)
+    again = rng.integers(0, 4000, 4000)  # pairs that several images agree on
+    keypoints[4000:], points[4000:] = keypoints[again], points[again]
+    scores = np.round(rng.normal(size=8000), 1)  # with ties, and of both signs
+    images = rng.integers(0, 20, 8000)
+    mine = ObservedMatches(keypoints, points, scores, images, 20).resolve()
+    columns = (column.tolist() for column in (keypoints, points, scores, images))
+    assert triples(mine) == greedy(list(zip(*columns, strict=True)))
 
 
 @given(rows, st.lists(st.booleans(), min_size=4, max_size=4))
@@ -198,37 +159,6 @@ def test_images_that_are_left_out_have_no_say(
 ) -> None:
     found = observed(matches).resolve(np.array(kept))
     assert triples(found) == greedy([match for match in matches if kept[match[3]]])
-
-
-@given(rows, st.randoms(use_true_random=False))
-def test_every_keypoint_and_point_once_whatever_the_order(
-    matches: list[tuple[int, int, float, int]], random: object
-) -> None:
-    found = observed(matches).resolve()
-    assert len(set(found.keypoint_ids.tolist())) == len(found.keypoint_ids)
-    assert len(set(found.point_ids.tolist())) == len(found.point_ids)
-    assert (np.diff(found.keypoint_ids) > 0).all()
-    random.shuffle(matches)  # type: ignore[attr-defined]
-    assert triples(observed(matches).resolve()) == triples(found)
-
-
-def test_what_most_images_say_wins() -> None:
-    # keypoint 4 meets point 7 in two images and point 8 in one, where it is more similar
-    assert resolve([4, 4, 4], [8, 7, 7], [0.99, 0.6, 0.7]) == ([4], [7], [2])
-
-
-def test_then_the_most_similar_wins() -> None:
-    assert resolve([1, 2], [5, 5], [0.6, 0.8]) == ([2], [5], [1])
-
-
-def test_a_loser_gets_its_second_choice() -> None:
-    found = resolve([1, 1, 2, 2], [5, 5, 5, 6], [0.9, 0.9, 0.8, 0.2])
-    assert found == ([1, 2], [5, 6], [2, 1])
-
-
-def test_nothing_to_resolve() -> None:
-    assert triples(observed([]).resolve()) == []
-    assert triples(observed([(1, 2, 0.5, 0)]).resolve(np.zeros(4, dtype=bool))) == []
 
 
 MAP = MapIndex.build(
@@ -257,11 +187,6 @@ def test_matches_with_map_keypoints_that_observe_a_point() -> None:
     assert found.num_images == 4
     rows = np.array([False, True, True, True])
     assert triples(found.resolve(rows)) == [(13, 2, 1)]
-
-
-def test_no_matches_at_all() -> None:
-    empty = [("a", np.zeros((0, 2), np.int64), np.zeros(0))]
-    for matches in ([], empty):
-        found = observed_matches(MAP, matches)
-        assert found.num_images == len(matches)
-        assert triples(found.resolve()) == []
+    for none in ([], [("a", np.zeros((0, 2), np.int64), np.zeros(0))]):
+        empty = observed_matches(MAP, none)
+        assert empty.num_images == len(none) and triples(empty.resolve()) == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import poselib
@@ -27,23 +28,11 @@ from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, Failure, Pose
 
 Array = NDArray[np.float64]
 F, CX, CY = 500.0, 321.0, 238.5
-PARAMS = {
-    "SIMPLE_PINHOLE": (F, CX, CY),
-    "PINHOLE": (F, 510.0, CX, CY),
-    "SIMPLE_RADIAL": (F, CX, CY, -0.05),
-    "RADIAL": (F, CX, CY, -0.05, 0.01),
-    "OPENCV": (F, 510.0, CX, CY, -0.05, 0.01, 1e-3, -2e-3),
-    "OPENCV_FISHEYE": (F, 510.0, CX, CY, 0.02, -0.01, 3e-3, -1e-3),
-    "FULL_OPENCV": (F, 510.0, CX, CY, -0.05, 0.01, 1e-3, -2e-3, 1e-3, 0.02, -0.01, 1e-3),
-    "FOV": (F, 510.0, CX, CY, 0.9),
-    "SIMPLE_RADIAL_FISHEYE": (F, CX, CY, 0.02),
-    "RADIAL_FISHEYE": (F, CX, CY, 0.02, -0.01),
-    "THIN_PRISM_FISHEYE": (F, 510.0, CX, CY, 0.02, -0.01, 1e-3, -1e-3, 1e-3, 0.0, 1e-3, -1e-3),
-}
-CAMERAS = {model: Camera(model, 640, 480, params) for model, params in PARAMS.items()}
-PINHOLE = CAMERAS["PINHOLE"]
+PINHOLE = Camera("PINHOLE", 640, 480, (F, 510.0, CX, CY))
 AT_ORIGIN = RigidTransform.identity()
 ANY_DEVIATION = AbsolutePoseOptions(max_center_deviation=1e9)
+# points count by all of their covariance
+LOOSE = AbsolutePoseOptions(max_error_px=100, map_noise=1.0)
 
 
 def random_pose(rng: np.random.Generator) -> RigidTransform:
@@ -66,20 +55,29 @@ def error_vector(found: RigidTransform, truth: RigidTransform) -> Array:
     return np.concatenate([vector, true_from_found.translation])
 
 
+def squared_error(pose: Pose, truth: RigidTransform) -> float:
+    """Over the pose's covariance."""
+    assert pose.covariance is not None
+    error = error_vector(pose.cam_from_world, truth)
+    return float(error @ np.linalg.solve(pose.covariance, error))
+
+
 def located(result: Pose | Failure) -> Pose:
     assert isinstance(result, Pose), result
     return result
 
 
-def all_good(views: list[View], pose: RigidTransform) -> PoseEstimate:
-    every = np.ones(sum(len(view.points_px) for view in views), dtype=np.bool_)
-    return PoseEstimate(pose, every, every, np.zeros(len(every)))
-
-
 def refined(
-    views: list[View], estimate: PoseEstimate, options: AbsolutePoseOptions | None = None
+    view: View,
+    start: RigidTransform,
+    options: AbsolutePoseOptions | None = None,
+    usable: NDArray[np.bool_] | None = None,
 ) -> Pose | Failure:
-    return refine_pose(PoseProblem.of(views), estimate, options)
+    """Refined from a start, all matches usable unless told otherwise."""
+    count = len(view.points_px)
+    usable = np.ones(count, dtype=np.bool_) if usable is None else usable
+    estimate = PoseEstimate(start, usable, usable, np.zeros(count))
+    return refine_pose(PoseProblem.of([view]), estimate, options)
 
 
 def six(matrices: Array) -> Array:
@@ -101,17 +99,17 @@ def noisy_view(
     return View(camera, AT_ORIGIN, pixels, world)
 
 
-def test_every_model_that_a_camera_can_have_is_tested() -> None:
-    assert set(CAMERAS) == set(CAMERA_MODEL_NUM_PARAMS)
+def one_projected(camera: Camera, cam_from_world: RigidTransform, point: Array) -> Array:
+    return np.asarray(project(camera, cam_from_world, point[None])[0])
 
 
-@pytest.mark.parametrize("model", CAMERAS)
-def test_derivatives_are_finite_differences(model: str) -> None:
+@pytest.mark.parametrize("model", CAMERA_MODEL_NUM_PARAMS)
+def test_derivatives_are_finite_differences(cameras: dict[str, Camera], model: str) -> None:
     """Of a rig's whitened residuals, written here once more with the adapter's projection."""
     rng = np.random.default_rng(0)
     pose = random_pose(rng)
     views, covariances = [], []
-    for camera in (CAMERAS[model], PINHOLE):
+    for camera in (cameras[model], PINHOLE):
         cam_from_rig = moved(AT_ORIGIN, np.append(rng.normal(size=3), 0.3 * rng.normal(size=3)))
         seen = noisy_view(camera, cam_from_rig @ pose, rng, 8)
         matrices = random_covariances(rng, 8, 0.02)
@@ -139,18 +137,13 @@ def test_derivatives_are_finite_differences(model: str) -> None:
         )
 
     # the whitening factors belong to I + J C J^T, J by finite differences
-    cholesky = np.zeros((16, 2, 2))
-    row = 0
+    spreads = []
     for view, matrices in zip(views, covariances, strict=True):
-        cam_from_world = view.cam_from_rig @ pose
+        seen_at = partial(one_projected, view.camera, view.cam_from_rig @ pose)
         for point, matrix in zip(view.points_world, matrices, strict=True):
-            by_point = approx_fprime(
-                point, lambda p, v=view, c=cam_from_world: project(v.camera, c, p[None])[0], 1e-6
-            )
-            spread = np.eye(2) + by_point @ matrix @ by_point.T
-            cholesky[row] = np.linalg.cholesky(spread)
-            row += 1
-    inverse = np.linalg.inv(cholesky)
+            by_point = approx_fprime(point, seen_at, 1e-6)
+            spreads.append(np.eye(2) + by_point @ matrix @ by_point.T)
+    inverse = np.linalg.inv(np.linalg.cholesky(spreads))
     np.testing.assert_allclose(whitening, inverse[:, [0, 1, 1], [0, 0, 1]], rtol=1e-4, atol=1e-6)
     plain = residuals(np.zeros(6))
     np.testing.assert_allclose(errors, np.linalg.norm(plain, axis=1), rtol=1e-7, atol=1e-9)
@@ -165,31 +158,19 @@ def test_derivatives_are_finite_differences(model: str) -> None:
         return float(0.5 * terms.sum())
 
     gradient, hessian = np.empty(6), np.empty((6, 6))
-    rows = np.arange(16)
-    found = kernels.normal_equations(
-        matches, rows, inverse[:, [0, 1, 1], [0, 0, 1]].copy(), rotation, translation, 4.0,
-        gradient, hessian,
-    )  # fmt: skip
+    given = matches, np.arange(16), inverse[:, [0, 1, 1], [0, 0, 1]].copy(), rotation, translation
+    found = kernels.normal_equations(*given, 4.0, gradient, hessian)
     assert found == pytest.approx(cost(np.zeros(6), 4.0), rel=1e-9)
     steps = 1e-6 * np.eye(6)
     expected = np.array([(cost(s, 4.0) - cost(-s, 4.0)) / 2e-6 for s in steps])
     np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-5 * abs(expected).max())
     # and the normal matrix of plain least squares is J^T J
-    kernels.normal_equations(
-        matches, rows, inverse[:, [0, 1, 1], [0, 0, 1]].copy(), rotation, translation, np.inf,
-        gradient, hessian,
-    )  # fmt: skip
-    jacobian = np.stack(
-        [
-            np.einsum("nij,nj->ni", inverse, residuals(s) - residuals(-s)).ravel() / 2e-6
-            for s in steps
-        ],
-        axis=1,
-    )
-    information = jacobian.T @ jacobian
-    np.testing.assert_allclose(
-        hessian, np.triu(information), rtol=1e-5, atol=1e-6 * information.max()
-    )
+    kernels.normal_equations(*given, np.inf, gradient, hessian)
+    slopes = np.array([residuals(s) - residuals(-s) for s in steps]) / 2e-6
+    columns = np.einsum("nij,knj->kni", inverse, slopes).reshape(6, -1)
+    information = columns @ columns.T
+    within = 1e-6 * information.max()
+    np.testing.assert_allclose(hessian, np.triu(information), rtol=1e-5, atol=within)
 
 
 def refined_by_poselib(view: View, start: RigidTransform) -> RigidTransform:
@@ -201,17 +182,13 @@ def refined_by_poselib(view: View, start: RigidTransform) -> RigidTransform:
     found.q, found.t = np.array(start.quat_wxyz), np.array(start.translation)
     pose = start
     for _ in range(2):
-        errors = np.linalg.norm(
-            project(view.camera, pose, view.points_world) - view.points_px, axis=1
-        )
+        residuals = project(view.camera, pose, view.points_world) - view.points_px
+        errors = np.linalg.norm(residuals, axis=1)
         near = errors <= 12.0
-        sigma = max(float(np.median(errors[near])) / 1.1774, 0.1)
+        loss_scale = 2.385 * max(float(np.median(errors[near])) / 1.1774, 0.1)
+        loss = {"loss_type": "CAUCHY", "loss_scale": loss_scale}
         found, _ = poselib.refine_absolute_pose(
-            undistorted[near],
-            view.points_world[near],
-            found,
-            pinhole,
-            {"loss_type": "CAUCHY", "loss_scale": 2.385 * sigma},
+            undistorted[near], view.points_world[near], found, pinhole, loss
         )
         pose = RigidTransform.from_matrix(found.R, found.t)
     return pose
@@ -227,72 +204,46 @@ def test_without_covariances_it_is_poselibs_refinement(sigma_px: float) -> None:
         view = noisy_view(square, truth, rng, 100, sigma_px)
         view.points_px[:10] += 8.0 * rng.normal(size=(10, 2))
         start = moved(truth, 2e-3 * sigma_px * rng.normal(size=6))
-        theirs = refined_by_poselib(view, start)
-        ours = located(refined([view], all_good([view], start)))
-        assert ours.covariance is not None
-        apart = error_vector(ours.cam_from_world, theirs)
         # in standard deviations of the pose
-        assert np.sqrt(apart @ np.linalg.solve(ours.covariance, apart)) < 0.01
+        off = squared_error(located(refined(view, start)), refined_by_poselib(view, start))
+        assert np.sqrt(off) < 0.01
 
 
-@given(st.sampled_from(sorted(CAMERAS)), st.integers(0, 2**32 - 1), st.sampled_from([1e-3, 1, 1e3]))
+@given(
+    st.sampled_from(sorted(CAMERA_MODEL_NUM_PARAMS)),
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([1e-3, 1, 1e3]),
+)
 @settings(max_examples=30, deadline=None)
 def test_the_minimum_is_found_from_nearby_under_any_model(
-    model: str, seed: int, unit: float
+    cameras: dict[str, Camera], model: str, seed: int, unit: float
 ) -> None:
     rng = np.random.default_rng(seed)
     truth = random_pose(rng)
-    view = noisy_view(CAMERAS[model], truth, rng, 40, 0.0)
+    view = noisy_view(cameras[model], truth, rng, 40, 0.0)
     start = moved(truth, 0.01 * rng.normal(size=6))
     scaled = replace(view, points_world=unit * view.points_world)
-    grown = in_unit(start, unit)
-    pose = located(
-        refined(
-            [scaled],
-            all_good([scaled], grown),
-            AbsolutePoseOptions(max_error_px=100, map_noise=1.0),
-        )
-    )
+    pose = located(refined(scaled, in_unit(start, unit), LOOSE))
     apart = error_vector(pose.cam_from_world, in_unit(truth, unit))
     assert np.abs(apart[:3]).max() < 1e-9 and np.abs(apart[3:]).max() < 1e-8 * unit
     assert pose.num_inliers == 40
-
-
-def normalised_errors(
-    rng: np.random.Generator, size: float, sigma_px: float, known: bool, runs: int = 200
-) -> Array:
-    """Squared errors of poses over their covariance, of points that are wrong by theirs."""
-    truth = random_pose(rng)
-    squared = []
-    for _ in range(runs):
-        view = noisy_view(PINHOLE, truth, rng, 80, sigma_px)
-        matrices = random_covariances(rng, 80, size)
-        offsets = np.einsum(
-            "nij,nj->ni", np.linalg.cholesky(matrices), sigma_px * rng.normal(size=(80, 3))
-        )
-        view = replace(
-            view,
-            points_world=view.points_world + offsets,
-            point_covariances=six(matrices) if known else None,
-        )
-        pose = located(
-            refined(
-                [view],
-                all_good([view], truth),
-                AbsolutePoseOptions(max_error_px=100, map_noise=1.0),
-            )
-        )
-        assert pose.covariance is not None
-        error = error_vector(pose.cam_from_world, truth)
-        squared.append(float(error @ np.linalg.solve(pose.covariance, error)))
-    return np.array(squared)
 
 
 @pytest.mark.parametrize("sigma_px", [0.4, 2.0])
 @pytest.mark.parametrize("size", [1e-9, 0.02])
 def test_the_covariance_is_that_of_repeated_estimates(size: float, sigma_px: float) -> None:
     """Errors over their covariance follow chi-squared with six degrees of freedom."""
-    squared = normalised_errors(np.random.default_rng(2), size, sigma_px, known=True)
+    rng = np.random.default_rng(2)
+    truth = random_pose(rng)
+    drawn = []
+    for _ in range(200):
+        view = noisy_view(PINHOLE, truth, rng, 80, sigma_px)
+        matrices = random_covariances(rng, 80, size)
+        drawn_m = sigma_px * rng.normal(size=(80, 3))
+        world = view.points_world + np.einsum("nij,nj->ni", np.linalg.cholesky(matrices), drawn_m)
+        told = replace(view, points_world=world, point_covariances=six(matrices))
+        drawn.append(squared_error(located(refined(told, truth, LOOSE)), truth))
+    squared = np.array(drawn)
     assert 5.2 < squared.mean() < 7.2
     assert (squared < chi2.ppf(0.95, 6)).mean() > 0.9
     assert (squared < chi2.ppf(0.5, 6)).mean() < 0.62
@@ -306,37 +257,8 @@ def test_wrong_matches_among_the_inliers_do_not_inflate_the_covariance() -> None
     for _ in range(200):
         view = noisy_view(PINHOLE, truth, rng, 100)
         view.points_px[:10] += rng.uniform(-8, 8, (10, 2))
-        pose = located(refined([view], all_good([view], truth)))
-        assert pose.covariance is not None
-        error = error_vector(pose.cam_from_world, truth)
-        squared.append(float(error @ np.linalg.solve(pose.covariance, error)))
+        squared.append(squared_error(located(refined(view, truth)), truth))
     assert 5.0 < np.mean(squared) < 7.2
-
-
-def test_weighting_by_uncertainty_brings_the_pose_closer() -> None:
-    """Paired over random problems: points known well, and points known badly along one axis."""
-    rng = np.random.default_rng(4)
-    with_weights, without = [], []
-    for _ in range(200):
-        truth = random_pose(rng)
-        view = noisy_view(PINHOLE, truth, rng, 60)
-        matrices = random_covariances(rng, 60, 0.03)
-        matrices[::3] *= 1e-4
-        offsets = np.einsum("nij,nj->ni", np.linalg.cholesky(matrices), rng.normal(size=(60, 3)))
-        view = replace(view, points_world=view.points_world + offsets)
-        known = replace(view, point_covariances=six(matrices))
-        for views, distances in (([known], with_weights), ([view], without)):
-            pose = located(
-                refined(
-                    views,
-                    all_good(views, truth),
-                    AbsolutePoseOptions(max_error_px=100, map_noise=1.0),
-                )
-            )
-            distances.append(float(np.linalg.norm(pose.cam_from_world.center() - truth.center())))
-    better = np.array(with_weights) < np.array(without)
-    assert better.mean() > 0.6
-    assert np.mean(with_weights) < 0.75 * np.mean(without)
 
 
 def test_points_count_by_the_noise_of_the_map() -> None:
@@ -348,31 +270,38 @@ def test_points_count_by_the_noise_of_the_map() -> None:
 
     def pose(of: View, map_noise: float) -> RigidTransform:
         options = AbsolutePoseOptions(map_noise=map_noise)
-        return located(refined([of], all_good([of], truth), options)).cam_from_world
+        return located(refined(of, truth, options)).cam_from_world
 
     known = replace(view, point_covariances=covariances)
     quarter = replace(view, point_covariances=covariances / 4)
     assert pose(known, 0.5) == pose(quarter, 1.0) != pose(known, 1.0)
     assert pose(known, 0.0) == pose(view, 1.0)
+    # also in one call
+    given = view.points_px, view.points_world, PINHOLE
+    plain, weighted = (
+        located(absolute_pose(*given, point_covariances=told)).cam_from_world
+        for told in (None, covariances)
+    )
+    assert plain != weighted
 
 
 def test_an_unknown_covariance_counts_as_none() -> None:
     rng = np.random.default_rng(5)
     truth = random_pose(rng)
     view = noisy_view(PINHOLE, truth, rng, 60)
-    plain = located(refined([view], all_good([view], truth)))
+
+    def pose(covariances: Array | None) -> Pose:
+        return located(refined(replace(view, point_covariances=covariances), truth))
+
+    plain = pose(None)
     for unknown in (np.nan, np.inf, 0.0):
-        other = replace(view, point_covariances=np.full((60, 6), unknown))
-        same = located(refined([other], all_good([other], truth)))
+        same = pose(np.full((60, 6), unknown))
         assert same.cam_from_world == plain.cam_from_world
         np.testing.assert_array_equal(same.covariance, plain.covariance)
     mixed = np.zeros((60, 6))
     mixed[:, [0, 3, 5]] = 1e-3
     mixed[::2] = np.nan
-    half = replace(view, point_covariances=mixed)
-    zero = replace(view, point_covariances=np.nan_to_num(mixed))
-    first = located(refined([half], all_good([half], truth)))
-    second = located(refined([zero], all_good([zero], truth)))
+    first, second = pose(mixed), pose(np.nan_to_num(mixed))
     assert first.cam_from_world == second.cam_from_world != plain.cam_from_world
 
 
@@ -383,10 +312,9 @@ def test_inliers_are_counted_in_pixels_whatever_the_uncertainty() -> None:
     view.points_px[:5] += 20.0
     vague = np.zeros((80, 6))
     vague[:, [0, 3, 5]] = 0.05
-    pose = located(refined([replace(view, point_covariances=vague)], all_good([view], truth)))
-    errors = np.linalg.norm(
-        project(PINHOLE, pose.cam_from_world, view.points_world) - view.points_px, axis=1
-    )
+    pose = located(refined(replace(view, point_covariances=vague), truth))
+    seen = project(PINHOLE, pose.cam_from_world, view.points_world)
+    errors = np.linalg.norm(seen - view.points_px, axis=1)
     np.testing.assert_array_equal(pose.inliers, errors <= 12.0)
     assert pose.num_inliers == 75
 
@@ -395,10 +323,9 @@ def test_what_is_not_usable_takes_no_part() -> None:
     rng = np.random.default_rng(7)
     truth = random_pose(rng)
     view = noisy_view(PINHOLE, truth, rng, 60)
-    usable = np.arange(60) >= 20
     some = replace(view, points_px=view.points_px[20:], points_world=view.points_world[20:])
-    first = located(refined([view], PoseEstimate(truth, usable, usable, np.zeros(60))))
-    second = located(refined([some], all_good([some], truth)))
+    first = located(refined(view, truth, usable=np.arange(60) >= 20))
+    second = located(refined(some, truth))
     assert np.abs(error_vector(first.cam_from_world, second.cam_from_world)).max() < 1e-9
     assert first.inliers is not None and not first.inliers[:20].any()
 
@@ -412,21 +339,20 @@ def test_an_unstable_pose_is_a_failure_that_says_so() -> None:
     world = truth.inverse().apply(in_cam)
     pixels = px_from_cam(PINHOLE, in_cam) + rng.normal(size=(30, 2))
     view = View(PINHOLE, AT_ORIGIN, pixels, world)
-    result = refined([view], all_good([view], truth))
+    result = refined(view, truth)
     assert isinstance(result, Failure)
     assert result.reason.startswith("the pose is unstable: its centre's standard deviation is ")
     assert result.num_matches == result.num_inliers == 30
-    pose = located(refined([view], all_good([view], truth), ANY_DEVIATION))
+    pose = located(refined(view, truth, ANY_DEVIATION))
     assert pose.covariance is not None
     # the criterion: the centre's deviation over the median depth, whatever the unit
     deviation = np.sqrt(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1])
     depth = np.median(pose.cam_from_world.apply(world)[:, 2])
     for unit in (1.0, 1e-3, 1e3):
         scaled = replace(view, points_world=unit * world)
-        estimate = all_good([scaled], in_unit(truth, unit))
         for factor, stable in ((0.99, False), (1.01, True)):
             options = AbsolutePoseOptions(max_center_deviation=factor * deviation / depth)
-            assert bool(refined([scaled], estimate, options)) == stable
+            assert bool(refined(scaled, in_unit(truth, unit), options)) == stable
 
 
 def test_too_few_inliers_after_refinement_say_so() -> None:
@@ -434,18 +360,7 @@ def test_too_few_inliers_after_refinement_say_so() -> None:
     truth = random_pose(rng)
     view = noisy_view(PINHOLE, truth, rng, 20)
     view.points_px[:9] += 30.0
-    result = refined([view], all_good([view], truth))
+    result = refined(view, truth)
     assert isinstance(result, Failure)
     assert result.reason == "11 of 20 2D-3D matches agree, at least 12 are needed"
     assert (result.num_matches, result.num_inliers) == (20, 11)
-
-
-def test_one_call_uses_the_covariances() -> None:
-    rng = np.random.default_rng(10)
-    view = noisy_view(PINHOLE, random_pose(rng), rng, 60)
-    covariances = six(random_covariances(rng, 60, 0.02))
-    plain = located(absolute_pose(view.points_px, view.points_world, PINHOLE))
-    weighted = located(
-        absolute_pose(view.points_px, view.points_world, PINHOLE, point_covariances=covariances)
-    )
-    assert plain.cam_from_world != weighted.cam_from_world

@@ -2,30 +2,47 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
 import numpy as np
 import pycolmap
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from megloc_kapture.geometry.cameras import project
-from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose, rig_pose
+from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.cameras import bearing_rays, project
+from megloc_kapture.geometry.poses import movement
+from megloc_kapture.localization.absolute_pose import (
+    AbsolutePoseOptions,
+    PoseEstimate,
+    estimate_pose,
+    rig_pose,
+)
 from megloc_kapture.localization.map_index import PoseProblem, View
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 PINHOLE = Camera("PINHOLE", 640, 480, (500.0, 510.0, 320.5, 239.0))
 FISHEYE = Camera("OPENCV_FISHEYE", 640, 480, (400.0, 410.0, 320.0, 240.0, 0.02, -0.01, 0.0, 0.0))
 STRONG = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
+AT_ORIGIN = RigidTransform.identity()
 
 
-def transform(vector: list[float], translation: list[float]) -> RigidTransform:
+def transform(vector: NDArray[np.float64] | list[float], translation: object) -> RigidTransform:
     return RigidTransform.from_matrix(
         Rotation.from_rotvec(vector).as_matrix(), np.array(translation)
     )
 
 
-def rig(count: int, seed: int = 0, shift: float = 0.0) -> tuple[RigidTransform, list[View]]:
-    """``rig_from_world`` and three different cameras that look to different sides."""
+def rig(
+    count: int, seed: int = 0, *, shift: float = 0.0, noise_px: float = 0.0, wrong: bool = False
+) -> tuple[RigidTransform, list[View]]:
+    """``rig_from_world`` and three different cameras that look to different sides.
+
+    ``wrong``: every second match is.
+    """
     rng = np.random.default_rng(seed)
     rig_from_world = transform([0.3, -1.2, 0.4], [3.0, -2.0, 1.0]) @ RigidTransform(
         (1.0, 0.0, 0.0, 0.0), (-shift, -shift, shift)
@@ -33,11 +50,17 @@ def rig(count: int, seed: int = 0, shift: float = 0.0) -> tuple[RigidTransform, 
     views = []
     for k, camera in enumerate((PINHOLE, FISHEYE, STRONG)):
         cam_from_rig = transform([0.05 * k, 1.5 * k, 0.1], [0.4 * k, 0.1, -0.2 * k])
-        in_cam = rng.uniform((-2, -1.5, 4), (2, 1.5, 9), (count, 3))
         cam_from_world = cam_from_rig @ rig_from_world
-        world = cam_from_world.inverse().apply(in_cam)
-        views.append(View(camera, cam_from_rig, project(camera, cam_from_world, world), world))
+        world = cam_from_world.inverse().apply(rng.uniform((-2, -1.5, 4), (2, 1.5, 9), (count, 3)))
+        pixels = project(camera, cam_from_world, world) + noise_px * rng.normal(size=(count, 2))
+        if wrong:
+            pixels[::2] = rng.uniform((0, 0), (640, 480), pixels[::2].shape)
+        views.append(View(camera, cam_from_rig, pixels, world))
     return rig_from_world, views
+
+
+def without_matches(view: View) -> View:
+    return replace(view, points_px=np.zeros((0, 2)), points_world=np.zeros((0, 3)))
 
 
 def located(result: Pose | Failure) -> Pose:
@@ -45,126 +68,110 @@ def located(result: Pose | Failure) -> Pose:
     return result
 
 
-def difference(found: Pose | Failure, truth: RigidTransform) -> tuple[float, float]:
-    pose = located(found).cam_from_world
-    angle = Rotation.from_matrix((pose @ truth.inverse()).rotation_matrix()).magnitude()
-    centers = pose.center() - truth.center()
-    return float(np.linalg.norm(centers)), float(angle)
+def exact(found: Pose | Failure, truth: RigidTransform, within: float = 1e-7) -> bool:
+    distance, angle_deg = movement(located(found).cam_from_world, truth)
+    return distance < within and np.radians(angle_deg) < 1e-8
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_exact_matches_give_the_exact_pose(seed: int) -> None:
-    truth, views = rig(30, seed)
+@pytest.mark.parametrize(
+    ("count", "seed", "shift", "within"),
+    [(30, 0, 0, 1e-7), (30, 1, 0, 1e-7), (30, 2, 0, 1e-7), (30, 0, 4.5e6, 1e-5), (8, 0, 0, 1e-7)],
+)
+def test_exact_matches_give_the_exact_pose(
+    count: int, seed: int, shift: float, within: float
+) -> None:
+    """Also far from the origin, and of cameras that have too few to be located alone."""
+    truth, views = rig(count, seed, shift=shift)
     found = rig_pose(views)
-    distance, angle = difference(found, truth)
-    assert distance < 1e-7 and angle < 1e-8
-    assert found.num_inliers == found.num_matches == 90
+    assert exact(found, truth, within)
+    assert found.num_inliers == found.num_matches == 3 * count
 
 
-def test_cameras_that_could_not_be_located_alone_help_each_other() -> None:
-    truth, views = rig(8)  # each below the twelve inliers that are needed
-    distance, angle = difference(rig_pose(views), truth)
-    assert distance < 1e-7 and angle < 1e-8
-
-
-def test_half_of_the_matches_may_be_wrong() -> None:
-    rng = np.random.default_rng(1)
-    truth, views = rig(80)
-    for view in views:
-        view.points_px[::2] = rng.uniform((0, 0), (640, 480), (40, 2))
-        view.points_px[1::2] += 0.5 * rng.normal(size=(40, 2))
-    found = rig_pose(views)
-    distance, angle = difference(found, truth)
-    assert distance < 0.03 and np.degrees(angle) < 0.2
-    assert isinstance(found, Pose) and found.inliers is not None
-    good = found.inliers.reshape(3, 80)
-    assert good[:, 1::2].mean() > 0.98 and good[:, ::2].mean() < 0.05
-
-
-@pytest.mark.parametrize("used", [0, 1, 2])
-def test_one_camera_with_matches_is_enough(used: int) -> None:
-    truth, views = rig(30)
-    for k, view in enumerate(views):
-        if k != used:
-            views[k] = View(view.camera, view.cam_from_rig, np.zeros((0, 2)), np.zeros((0, 3)))
-    distance, angle = difference(rig_pose(views), truth)
-    assert distance < 1e-7 and angle < 1e-8
-
-
-def test_a_world_far_from_its_origin() -> None:
-    truth, views = rig(30, shift=4.5e6)
-    distance, angle = difference(rig_pose(views), truth)
-    assert distance < 1e-5 and angle < 1e-8
+@pytest.mark.parametrize("used", [[0], [1], [2], [0, 1], [0, 1, 2]])
+def test_any_of_a_rigs_cameras_may_have_the_matches(used: list[int]) -> None:
+    truth, views = rig(80, noise_px=1.0, wrong=True)
+    some = [view if k in used else without_matches(view) for k, view in enumerate(views)]
+    problem = PoseProblem.of(some)
+    estimate = estimate_pose(problem)
+    assert isinstance(estimate, PoseEstimate)
+    assert movement(estimate.rig_from_world, truth)[0] < 0.05
+    assert estimate.num_inliers == estimate.inliers.sum() <= estimate.usable.sum()
+    found = located(rig_pose(some))
+    distance, angle_deg = movement(found.cam_from_world, truth)
+    assert distance < 0.03 and angle_deg < 0.2
+    for mask in (estimate.inliers, found.inliers):
+        for k, inliers in enumerate(problem.split(mask)):
+            if k in used:
+                assert inliers[1::2].all() and inliers[::2].mean() < 0.1
+            else:
+                assert len(inliers) == 0
 
 
 def test_values_that_cannot_be_used_are_left_out() -> None:
     truth, views = rig(30)
-    views[0].points_world[2] = np.nan
+    views[0].points_world[2:4, 1] = np.nan, np.inf
+    views[0].points_px[4, 0] = np.nan
     # no rays under this distortion: the second one is 5 px past the last that has one
     views[2].points_px[5] = (0.0, 0.0)
     cam_from_world = views[2].cam_from_rig @ truth
     views[2].points_px[6] = (320 + 0.8 * 356, 240 + 0.6 * 356)
     views[2].points_world[6] = cam_from_world.inverse().apply(np.array([[4.2, 3.15, 5.0]]))[0]
-    found = rig_pose(views)
-    distance, angle = difference(found, truth)
-    assert distance < 1e-7 and angle < 1e-8
-    assert isinstance(found, Pose) and found.inliers is not None
-    assert np.flatnonzero(~found.inliers).tolist() == [2, 65, 66]
+    seen = project(STRONG, cam_from_world, views[2].points_world[6:7])
+    assert np.linalg.norm(seen - views[2].points_px[6]) < 6
+    assert np.isnan(bearing_rays(STRONG, views[2].points_px[5:7])).any(axis=1).all()
+    found = located(rig_pose(views))
+    assert exact(found, truth)
+    assert found.inliers is not None
+    assert np.flatnonzero(~found.inliers).tolist() == [2, 3, 4, 65, 66]
+    # those of a camera alone
+    alone = located(rig_pose(views[2:]))
+    assert exact(alone, truth) and alone.inliers is not None
+    assert np.flatnonzero(~alone.inliers).tolist() == [5, 6]
 
 
 def test_failures_say_why() -> None:
-    truth, views = rig(3)
-    few = rig_pose(views)
-    assert isinstance(few, Failure) and few.reason == "9 2D-3D matches, at least 12 are needed"
-    assert isinstance(rig_pose([]), Failure)
-    truth, views = rig(30)
+    _, views = rig(30)
     rng = np.random.default_rng(2)
-    mixed = [
-        View(v.camera, v.cam_from_rig, rng.permutation(v.points_px), v.points_world) for v in views
-    ]
-    failed = rig_pose(mixed)
-    assert isinstance(failed, Failure) and "of 90 2D-3D matches agree" in failed.reason
-    broken = [View(v.camera, v.cam_from_rig, v.points_px, np.nan * v.points_world) for v in views]
-    assert isinstance(rig_pose(broken), Failure)
+    mixed = [replace(view, points_px=rng.permutation(view.points_px)) for view in views]
+    nan = [replace(view, points_world=np.nan * view.points_world) for view in views]
+    for matched, reason in (
+        ([], "0 2D-3D matches, at least 12 are needed"),
+        (rig(3)[1], "9 2D-3D matches, at least 12 are needed"),
+        (nan, "0 of 90 2D-3D matches can be used, at least 12 are needed"),
+        (mixed, "of 90 2D-3D matches agree"),
+    ):
+        failed = rig_pose(matched)
+        assert isinstance(failed, Failure) and reason in failed.reason
+        assert failed.num_matches == sum(len(view.points_px) for view in matched)
+        assert 0 <= failed.num_inliers < 12
 
 
-def test_the_same_seed_gives_the_same_bits() -> None:
-    _, views = rig(40)
-    rng = np.random.default_rng(3)
-    for view in views:
-        view.points_px[::2] = rng.uniform(0, 480, (20, 2))
-    poses = {located(rig_pose(views)).cam_from_world for _ in range(5)}
-    assert len(poses) == 1
+def test_the_same_bits_from_many_threads_at_once() -> None:
+    """GP3P draws from a generator that all threads share."""
+    problems = [PoseProblem.of(rig(30, seed, noise_px=1.0, wrong=True)[1]) for seed in range(4)]
+    problems.append(PoseProblem.of(problems[0].views[:1]))
+
+    def estimated(problem: PoseProblem) -> RigidTransform:
+        estimate = estimate_pose(problem)
+        assert isinstance(estimate, PoseEstimate)
+        return estimate.rig_from_world
+
+    expected = list(map(estimated, problems))
+    with ThreadPoolExecutor(4) as executor:
+        assert list(executor.map(estimated, problems * 15)) == expected * 15
 
 
 @pytest.mark.parametrize("wrong", [0, 1, 2])
 def test_a_camera_full_of_wrong_matches_is_survived(wrong: int) -> None:
     rng = np.random.default_rng(4)
-    truth, views = rig(60)
-    for k, view in enumerate(views):
-        if k == wrong:
-            view.points_world[:] = rng.permutation(view.points_world)
-        view.points_px[:] += rng.normal(size=(60, 2))
+    truth, views = rig(60, noise_px=1.0)
+    views[wrong].points_world[:] = rng.permutation(views[wrong].points_world)
     found = located(rig_pose(views))
-    distance, angle = difference(found, truth)
-    assert distance < 0.02 and np.degrees(angle) < 0.2
+    distance, angle_deg = movement(found.cam_from_world, truth)
+    assert distance < 0.02 and angle_deg < 0.2
     assert found.inliers is not None
     for k, inliers in enumerate(PoseProblem.of(views).split(found.inliers)):
         assert inliers.mean() < 0.1 if k == wrong else inliers.all()
-
-
-def test_a_rig_of_one_camera_is_that_camera() -> None:
-    rng = np.random.default_rng(5)
-    _, views = rig(60)
-    view = views[1]
-    view.points_px[:] += rng.normal(size=(60, 2))
-    alone = located(absolute_pose(view.points_px, view.points_world, view.camera))
-    within = located(rig_pose([view]))
-    distance, angle = difference(
-        Pose(view.cam_from_rig @ within.cam_from_world, 60, 60), alone.cam_from_world
-    )
-    assert distance < 1e-5 and angle < 1e-6
-    np.testing.assert_array_equal(alone.inliers, within.inliers)
 
 
 def colmap_rigid(transform: RigidTransform) -> pycolmap.Rigid3d:
@@ -186,10 +193,8 @@ def colmaps(views: list[View]) -> RigidTransform:
         np.repeat(np.arange(len(views)), [len(view.points_px) for view in views]).tolist(),
         [colmap_rigid(view.cam_from_rig) for view in views],
         [
-            pycolmap.Camera(
-                model=v.camera.model, width=640, height=480, params=list(v.camera.params)
-            )
-            for v in views
+            pycolmap.Camera(model=c.model, width=640, height=480, params=list(c.params))
+            for c in (PINHOLE, FISHEYE, STRONG)
         ],
         ransac,
         refinement,
@@ -199,18 +204,24 @@ def colmaps(views: list[View]) -> RigidTransform:
     return RigidTransform.from_matrix(matrix[:, :3], matrix[:, 3])
 
 
+def residuals(views: list[View], rig_from_world: RigidTransform) -> NDArray[np.float64]:
+    return np.concatenate(
+        [
+            project(v.camera, v.cam_from_rig @ rig_from_world, v.points_world) - v.points_px
+            for v in views
+        ]
+    )
+
+
 def test_the_covariance_is_that_of_all_cameras_together() -> None:
     """The inverse normal matrix, by finite differences of every camera's projection."""
     truth, views = rig(30)
 
-    def pixels(vector: np.ndarray) -> np.ndarray:
-        moved = transform(list(vector[:3]), list(vector[3:])) @ truth
-        return np.concatenate(
-            [project(v.camera, v.cam_from_rig @ moved, v.points_world) for v in views]
-        ).ravel()
+    def moved(step: NDArray[np.float64]) -> NDArray[np.float64]:
+        return residuals(views, transform(step[:3], step[3:]) @ truth).ravel()
 
     steps = 1e-6 * np.eye(6)
-    jacobian = np.stack([(pixels(step) - pixels(-step)) / 2e-6 for step in steps], axis=1)
+    jacobian = np.stack([(moved(step) - moved(-step)) / 2e-6 for step in steps], axis=1)
     found = located(rig_pose(views)).covariance
     # without any residual a tenth of a pixel is taken
     expected = 0.1**2 * np.linalg.inv(jacobian.T @ jacobian)
@@ -221,27 +232,18 @@ def test_the_covariance_is_that_of_all_cameras_together() -> None:
 def test_no_worse_a_minimum_than_colmaps(seed: int) -> None:
     """Not in the poses' distance: COLMAP's refinement sometimes stops some deviations away."""
     rng = np.random.default_rng(seed)
-    _, views = rig(60)
+    views = rig(60, seed, noise_px=1.0)[1]
     for view in views:
-        view.points_px[:] += rng.normal(size=(60, 2))
         view.points_px[:10] = rng.uniform(0, 480, (10, 2))
     ours, theirs = located(rig_pose(views)), colmaps(views)
 
     def cost(pose: RigidTransform) -> float:
-        residuals = np.concatenate(
-            [project(v.camera, v.cam_from_rig @ pose, v.points_world) - v.points_px for v in views]
-        )[ours.inliers]
-        return float(np.log1p((residuals**2).sum(axis=1) / 2.385**2).sum())
+        squared = (residuals(views, pose)[ours.inliers] ** 2).sum(axis=1)
+        return float(np.log1p(squared / 2.385**2).sum())
 
-    distance, angle = difference(ours, theirs)
-    assert distance < 0.01 and np.degrees(angle) < 0.1
+    distance, angle_deg = movement(ours.cam_from_world, theirs)
+    assert distance < 0.01 and angle_deg < 0.1
     assert cost(ours.cam_from_world) < 1.001 * cost(theirs)
-
-
-def error_vector(found: RigidTransform, truth: RigidTransform) -> np.ndarray:
-    true_from_found = truth @ found.inverse()
-    vector = Rotation.from_matrix(true_from_found.rotation_matrix()).as_rotvec()
-    return np.concatenate([vector, true_from_found.translation])
 
 
 def test_the_covariance_is_that_of_repeated_estimates() -> None:
@@ -251,27 +253,48 @@ def test_the_covariance_is_that_of_repeated_estimates() -> None:
     options = AbsolutePoseOptions(min_iterations=10, max_iterations=50)
     squared = []
     for _ in range(150):
-        noisy = [
-            View(v.camera, v.cam_from_rig, v.points_px + rng.normal(size=(30, 2)), v.points_world)
-            for v in views
-        ]
+        noise = rng.normal(size=(3, 30, 2))
+        noisy = [replace(v, points_px=v.points_px + n) for v, n in zip(views, noise, strict=True)]
         pose = located(rig_pose(noisy, options))
-        assert pose.covariance is not None
-        error = error_vector(pose.cam_from_world, truth)
+        off = truth @ pose.cam_from_world.inverse()
+        turn = Rotation.from_matrix(off.rotation_matrix()).as_rotvec()
+        error = np.concatenate([turn, off.translation])
         squared.append(float(error @ np.linalg.solve(pose.covariance, error)))
     assert 5.2 < np.mean(squared) < 7.2
     assert (np.array(squared) < chi2.ppf(0.95, 6)).mean() > 0.9
 
 
-def test_a_rig_is_located_better_than_its_best_camera() -> None:
-    rng = np.random.default_rng(8)
-    truth, views = rig(30)
-    of_rig, of_camera = [], []
-    for _ in range(30):
-        noisy = [
-            View(v.camera, v.cam_from_rig, v.points_px + rng.normal(size=(30, 2)), v.points_world)
-            for v in views
-        ]
-        of_rig.append(difference(located(rig_pose(noisy)), truth)[0])
-        of_camera.append(min(difference(located(rig_pose([v])), truth)[0] for v in noisy))
-    assert np.mean(of_rig) < 0.8 * np.mean(of_camera)
+# ---------------------------------------------------------------------------------- the problem
+
+
+@pytest.mark.parametrize(
+    "pixels, points, covariances",
+    [((3, 3), (3, 3), None), ((3, 2), (4, 3), None), ((3, 2), (3, 2), None), ((3, 2), (3, 3), 5)],
+)
+def test_arrays_that_do_not_belong_together_are_refused(
+    pixels: tuple[int, int], points: tuple[int, int], covariances: int | None
+) -> None:
+    known = None if covariances is None else np.zeros((3, covariances))
+    with pytest.raises(DataError):
+        View(PINHOLE, AT_ORIGIN, np.zeros(pixels), np.zeros(points), known)
+
+
+def test_views_are_stacked_and_taken_apart() -> None:
+    points = np.arange(6.0).reshape(2, 3)
+    covariances = np.arange(12.0).reshape(2, 6)
+    known = View(PINHOLE, AT_ORIGIN, np.zeros((2, 2)), points, covariances)
+    unknown = View(PINHOLE, AT_ORIGIN, np.zeros((1, 2)), np.zeros((1, 3)))
+    stacked = PoseProblem.of([unknown, without_matches(unknown), known])
+    np.testing.assert_array_equal(stacked.covariances, [[0] * 6, *covariances])
+    np.testing.assert_array_equal(stacked.points[1:] + stacked.offset, points)
+    assert len(PoseProblem.of([unknown]).covariances) == 0
+    parts = stacked.split(np.array([True, False, True]))
+    assert [part.tolist() for part in parts] == [[True], [], [False, True]]
+
+
+def test_points_that_are_not_finite_do_not_move_the_origin() -> None:
+    points = np.full((200, 3), 5e6)
+    points[::2] = np.nan
+    points[3] = 1e300
+    view = View(PINHOLE, AT_ORIGIN, np.zeros((200, 2)), points)
+    assert np.abs(PoseProblem.of([view]).offset).max() <= 5e6

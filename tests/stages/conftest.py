@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,20 +18,33 @@ from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.kapture import (
+    FeatureConfig,
+    FeatureWriter,
+    ImagePair,
+    KaptureData,
+    KaptureFolder,
+    Sensor,
+    write_sensors,
+)
+from megloc_kapture.io.kapture.features import ArrayKind
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
 from megloc_kapture.stages.global_features import extract_vlad
 from megloc_kapture.stages.image_pairs import MappingPairsOptions, pair_map_images, pair_queries
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import match_pairs
+from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
 from megloc_kapture.stages.triangulation import triangulate_map
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.stages.work import HERE
+from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 EXTRACTOR = RootSift(RootSiftOptions(max_keypoints=800))
 VLAD = VladOptions(num_clusters=8, training_descriptors=2000)
+BY_VLAD = Retrieval(("vlad_rootsift",))
 
 MAP_POSES = {
     "left/0.png": pose_at((-1.5, 0.0, 0.0), -4, 1),
@@ -65,6 +80,21 @@ class World:
     def map(self) -> KaptureFolder:
         return KaptureFolder(self.root / "map", features_dirs=[self.features_dir])
 
+    def query_pairs(self) -> list[ImagePair]:
+        return pair_queries(self.mapping(), self.query(), QueryPairsOptions(), retrieval=BY_VLAD)
+
+    def localized(
+        self, pairs: list[ImagePair] | None = None, **options: Any
+    ) -> list[tuple[str, Pose | Failure]]:
+        """The queries, from the matches that are stored."""
+        work = options.pop("work", HERE)
+        chosen = LocalizationOptions(**options)
+        found = localize_from_matches(
+            self.map(), self.query(), self.with_matches("query"), pairs or self.query_pairs(),
+            ["rootsift"], chosen, work=work,
+        )  # fmt: skip
+        return list(found)
+
     def with_matches(self, kind: str) -> KaptureFolder:
         return KaptureFolder(self.root / "mapping", features_dirs=[self.root / "matches" / kind])
 
@@ -85,26 +115,60 @@ def world(images_only: World) -> World:
     with single_threaded():
         extract_local_features([it.mapping(), it.query()], EXTRACTOR, it.features_dir)
         extract_vlad(it.mapping(), [it.mapping(), it.query()], "rootsift", it.features_dir, VLAD)
-        map_pairs = pair_map_images(
-            it.mapping(), MappingPairsOptions(), retrieval=Retrieval(("vlad_rootsift",))
-        )
-        query_pairs = pair_queries(
-            it.mapping(), it.query(), QueryPairsOptions(), retrieval=Retrieval(("vlad_rootsift",))
-        )
-        matcher = NearestNeighbours()
-        match_pairs(
-            it.mapping(), it.mapping(), map_pairs, "rootsift", matcher, KnownPoseOptions(),
-            it.root / "matches" / "mapping",
-        )  # fmt: skip
-        match_pairs(
-            it.query(), it.mapping(), query_pairs, "rootsift", matcher, TwoViewOptions(),
-            it.root / "matches" / "query",
-        )  # fmt: skip
+        pairs = pair_map_images(it.mapping(), MappingPairsOptions(), retrieval=BY_VLAD)
+        for first, some, how, name in (
+            (it.mapping(), pairs, KnownPoseOptions(), "mapping"),
+            (it.query(), it.query_pairs(), TwoViewOptions(), "query"),
+        ):
+            output = it.root / "matches" / name
+            match_pairs(first, it.mapping(), some, "rootsift", NearestNeighbours(), how, output)
         triangulate_map(
             it.mapping(), it.with_matches("mapping"), "rootsift", it.root / "map",
             TriangulationOptions(),
         )  # fmt: skip
     return it
+
+
+@pytest.fixture(scope="session")
+def make_map() -> Callable[[KaptureFolder, LocalFeatureExtractor, Path], KaptureFolder]:
+    """Makes a map of posed images by an extractor: every two of them are matched."""
+
+    def make(images: KaptureFolder, extractor: LocalFeatureExtractor, root: Path) -> KaptureFolder:
+        folder, name = images.with_features([root]), extractor.name
+        pairs = [ImagePair(a, b, 1.0) for a, b in combinations(images.read().image_names(), 2)]
+        with single_threaded():
+            extract_local_features([folder], extractor, root)
+            folder, how = images.with_features([root]), KnownPoseOptions()
+            match_pairs(folder, folder, pairs, name, NearestNeighbours(), how, root / "matches")
+            matches = images.with_features([root / "matches"])
+            triangulate_map(folder, matches, name, root / "map", TriangulationOptions())
+        return KaptureFolder(root / "map")
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def write_features() -> Callable[..., None]:
+    """Writes arrays by image as features of a type, which they are all like."""
+
+    def write(
+        root: Path,
+        kind: ArrayKind,
+        name: str,
+        arrays: Mapping[str, NDArray[Any]],
+        *,
+        orphan: bool = True,
+        tar: bool = False,
+    ) -> None:
+        like = next(iter(arrays.values()))
+        keypoints_type = name if kind == "descriptors" else None
+        metric = None if kind == "keypoints" else "L2"
+        config = FeatureConfig(name, like.dtype, like.shape[-1], keypoints_type, metric)
+        with FeatureWriter(root, kind, name, config, orphan=orphan, tar=tar) as writer:
+            for image, array in arrays.items():
+                writer.write(image, array)
+
+    return write
 
 
 @pytest.fixture(scope="session")

@@ -13,8 +13,6 @@ from hypothesis import strategies as st
 
 from megloc_kapture.io.dataset_tables import ImageGroup, write_groups, write_priors
 from megloc_kapture.io.kapture import (
-    FeatureConfig,
-    FeatureWriter,
     KaptureData,
     KaptureFolder,
     write_sensors,
@@ -33,24 +31,21 @@ from megloc_kapture.stages.image_pairs import MappingPairsOptions, pair_map_imag
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import RigidTransform
 
+Folders = tuple[KaptureFolder, KaptureFolder]
 SIZES = {"short": 3, "long": 8}
 
 
 @pytest.fixture
-def folders(world: Any, tmp_path: Path) -> tuple[KaptureFolder, KaptureFolder]:
+def folders(world: Any, write_features: Any, tmp_path: Path) -> Folders:
     rng = np.random.default_rng(4)
+    images = [*sorted(world.map_poses), *sorted(world.query_poses)]
     for name, size in SIZES.items():
-        config = FeatureConfig(name, np.dtype("float32"), size, None, "L2")
-        with FeatureWriter(tmp_path, "global_features", name, config, orphan=True) as writer:
-            for image in [*sorted(world.map_poses), *sorted(world.query_poses)]:
-                writer.write(image, rng.normal(size=size).astype(np.float32))
-    return (
-        KaptureFolder(world.mapping().root, features_dirs=[tmp_path]),
-        KaptureFolder(world.query().root, features_dirs=[tmp_path]),
-    )
+        vectors = {image: rng.normal(size=size).astype(np.float32) for image in images}
+        write_features(tmp_path, "global_features", name, vectors)
+    return world.mapping().with_features([tmp_path]), world.query().with_features([tmp_path])
 
 
-def cosines(folders: tuple[KaptureFolder, KaptureFolder], name: str) -> np.ndarray:
+def cosines(folders: Folders, name: str) -> np.ndarray:
     def rows(folder: KaptureFolder) -> np.ndarray:
         reader = folder.global_features(name)
         found = np.stack([reader.read(i).reshape(-1) for i in folder.read().image_names()])
@@ -63,7 +58,7 @@ def cosines(folders: tuple[KaptureFolder, KaptureFolder], name: str) -> np.ndarr
 @pytest.mark.parametrize("method", ["ghm", "mean", "minimum", "power", "early"])
 @pytest.mark.parametrize("weights", [(), (1.0, 3.0)])
 def test_fused_pairs_are_those_of_the_fused_similarities(
-    folders: tuple[KaptureFolder, KaptureFolder], method: Any, weights: tuple[float, ...]
+    folders: Folders, method: Any, weights: tuple[float, ...]
 ) -> None:
     fusion = FusionOptions(method=method)
     retrieval = Retrieval(("short", "long"), weights, fusion)
@@ -80,7 +75,7 @@ def test_fused_pairs_are_those_of_the_fused_similarities(
 
 
 def test_few_queries_at_a_time_give_the_same(
-    folders: tuple[KaptureFolder, KaptureFolder], monkeypatch: pytest.MonkeyPatch
+    folders: Folders, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     retrieval = Retrieval(("short", "long"))
     options = MappingPairsOptions(top_k=2)
@@ -110,14 +105,13 @@ def test_diversity_spreads_over_places_and_keeps_the_scores_order() -> None:
 
 
 @pytest.fixture
-def two_types(tmp_path: Path) -> KaptureFolder:
+def two_types(write_features: Any, tmp_path: Path) -> KaptureFolder:
     """300 images, described by two types."""
     rng = np.random.default_rng(7)
     for name, width in (("one", 8), ("two", 5)):
-        config = FeatureConfig(name, np.dtype("float32"), width, None, "L2")
-        with FeatureWriter(tmp_path, "global_features", name, config, orphan=True) as writer:
-            for image in range(300):
-                writer.write(f"{image:03}.jpg", rng.normal(size=width).astype(np.float32))
+        rows = rng.normal(size=(300, width)).astype(np.float32)
+        vectors = {f"{image:03}.jpg": row for image, row in enumerate(rows)}
+        write_features(tmp_path, "global_features", name, vectors)
     write_sensors(tmp_path / "map", KaptureData())
     return KaptureFolder(tmp_path / "map", features_dirs=[tmp_path])
 
@@ -181,13 +175,11 @@ def pools(restrictions: Restrictions, queries: list[str]) -> dict[str, list[int]
     }
 
 
-def test_without_tables_everything_is_permitted(tmp_path: Path) -> None:
-    assert pools(UNRESTRICTED, ["q", "r"]) == {"q": [0, 1, 2, 3], "r": [0, 1, 2, 3]}
-    assert pools(Restrictions.read(tmp_path), ["q"]) == {"q": [0, 1, 2, 3]}
-    assert [members.tolist() for members in UNRESTRICTED.frames(IMAGES)] == [[0, 1, 2, 3]]
-
-
 def test_a_prior_names_images_locations_and_frames(tmp_path: Path) -> None:
+    everything = {"free": [0, 1, 2, 3]}
+    assert (
+        pools(UNRESTRICTED, ["free"]) == pools(Restrictions.read(tmp_path), ["free"]) == everything
+    )
     write_groups(tmp_path, GROUPS)
     priors = {
         "by location": ["001/rear"],
@@ -197,6 +189,9 @@ def test_a_prior_names_images_locations_and_frames(tmp_path: Path) -> None:
         "by nothing": ["099/rear"],
     }
     write_priors(tmp_path, priors)
+    frames = [members.tolist() for members in Restrictions(GROUPS).frames(IMAGES)]
+    assert frames == [[3], [0, 1], [2]]
+    assert [members.tolist() for members in UNRESTRICTED.frames(IMAGES)] == [[0, 1, 2, 3]]
     assert pools(Restrictions.read(tmp_path), [*priors, "free"]) == {
         "by location": [0, 2],
         "by frame": [0, 1],
@@ -205,11 +200,6 @@ def test_a_prior_names_images_locations_and_frames(tmp_path: Path) -> None:
         "by nothing": [],
         "free": [0, 1, 2, 3],
     }
-
-
-def test_frames_part_the_images() -> None:
-    frames = [members.tolist() for members in Restrictions(GROUPS).frames(IMAGES)]
-    assert frames == [[3], [0, 1], [2]]
 
 
 @given(st.lists(st.sampled_from(["", "x", "y"]), max_size=12), st.data())

@@ -6,7 +6,6 @@ import base64
 import json
 import re
 import shutil
-from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,6 @@ from megloc_kapture.evaluation.report.scene import render_view, scene_of
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.warping import scaled_camera
-from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureFolder, read_point_covariances, write_sensors
 from megloc_kapture.io.tables import read_depth_rows
 from megloc_kapture.localization.map_index import observed_matches
@@ -82,7 +80,7 @@ def test_kapture_reads_the_depth_and_it_is_right(densified: KaptureFolder) -> No
 
 
 def test_points_of_the_map_stay_and_lifted_ones_lie_on_the_walls(
-    world: Any, densified: KaptureFolder, distance_to_walls: Callable[..., Any]
+    world: Any, densified: KaptureFolder, distance_to_walls: Any
 ) -> None:
     before, after = world.map().points3d(), densified.points3d()
     np.testing.assert_array_equal(after[: len(before)], before)
@@ -116,23 +114,21 @@ def test_depth_is_as_sure_and_as_fine_as_the_poses(
     draw = np.random.default_rng(0)
     turns = {key: draw.normal(0, 0.004, 3) for key in data.trajectories}
     truth = data.poses()
-    data.trajectories = {
-        key: RigidTransform.from_matrix(Rotation.from_rotvec(turn).as_matrix(), np.zeros(3)) @ pose
-        for (key, turn), pose in zip(turns.items(), data.trajectories.values(), strict=True)
-    }
+    for key, turn in turns.items():
+        rotation = Rotation.from_rotvec(turn).as_matrix()
+        turned = RigidTransform.from_matrix(rotation, np.zeros(3)) @ data.trajectories[key]
+        data.trajectories[key] = turned
     write_sensors(doubtful, data)
     source = KaptureFolder(doubtful, features_dirs=[world.features_dir])
     fitted, error_px = fitted_to_poses(source, options)
     # the median distance between observations and points that the turned cameras see elsewhere
-    distances = []
-    for seen in source.observations().values():
-        for row, image in enumerate(seen.image_names):
-            own = seen.image_ids == row
-            at = project(
-                CAMERA, source.read().poses()[image], source.points3d()[seen.point_ids[own], :3]
-            )
-            keypoints = source.keypoints("rootsift").read(image)[seen.keypoint_ids[own], :2]
-            distances.append(np.linalg.norm(at - keypoints, axis=1))
+    distances, seen = [], source.observations()["rootsift"]
+    for row, image in enumerate(seen.image_names):
+        own = seen.image_ids == row
+        points = source.points3d()[seen.point_ids[own], :3]
+        keypoints = source.keypoints("rootsift").read(image)[seen.keypoint_ids[own], :2]
+        at = project(CAMERA, source.read().poses()[image], points)
+        distances.append(np.linalg.norm(at - keypoints, axis=1))
     median = np.median(np.concatenate(distances))
     assert median > 1
     assert fitted.max_size_px == pytest.approx(400 * 0.5 / np.sqrt(median**2 - 0.09), abs=2)
@@ -164,21 +160,15 @@ def test_a_lifted_point_does_not_displace_a_triangulated_one(densified: KaptureF
     rows, points = index.observed(other)
     lifted = rows[index.seen_once[points]][0]
     # both say the same query keypoint, the lifted one with the better score
-    matches = [
-        (image, np.array([[7, triangulated]]), np.array([0.5])),
-        (other, np.array([[7, lifted]]), np.array([0.9])),
-    ]
+    said = ((image, triangulated, 0.5), (other, lifted, 0.9))
+    matches = [(name, np.array([[7, row]]), np.array([score])) for name, row, score in said]
     found = observed_matches(index, matches).resolve()
     assert found.keypoint_ids.tolist() == [7]
     assert not index.seen_once[found.point_ids[0]]
 
 
 def test_the_same_bytes_whatever_the_executor(
-    world: Any,
-    densified: KaptureFolder,
-    two_processes: Executor,
-    folder_bytes: Callable[[Path], dict[str, bytes]],
-    tmp_path: Path,
+    world: Any, densified: KaptureFolder, two_processes: Executor, folder_bytes: Any, tmp_path: Path
 ) -> None:
     densify_map(world.map(), tmp_path / "again", OPTIONS, work=Work(two_processes))
     assert folder_bytes(tmp_path / "again") == folder_bytes(densified.root)
@@ -198,9 +188,9 @@ def test_images_that_have_depth_keep_it(densified: KaptureFolder, tmp_path: Path
     kept = tmp_path / "kept"
     shutil.copytree(densified.root, kept)
     # a map with a depth sensor of its own that saw one of the images
-    shutil.move(kept / "sensors/records_data/mvs" / f"{first}.depth", kept / "own.depth")
-    shutil.rmtree(kept / "sensors/records_data/mvs")
-    shutil.move(kept / "own.depth", kept / "sensors/records_data/own.depth")
+    records = kept / "sensors" / "records_data"
+    shutil.move(records / "mvs" / f"{first}.depth", records / "own.depth")
+    shutil.rmtree(records / "mvs")
     sensor = next(key[1] for key, name in data.records_depth.items() if name == path)
     camera = sensor[: -len("_mvs")]
     data.sensors["sensor"] = data.sensors.pop(sensor)
@@ -214,13 +204,9 @@ def test_images_that_have_depth_keep_it(densified: KaptureFolder, tmp_path: Path
     assert counts["images_with_depth"] == 4
     rows = {row.image: row for row in read_depth_rows(tmp_path / "out" / DEPTH_FILE)}
     assert rows[first].reason == "has depth of its own"
-    found = depth_records(KaptureFolder(tmp_path / "out").read())[first]
-    assert found.path == "own.depth"
-    read_depth_map(
-        KaptureFolder(tmp_path / "out").depth_path("own.depth"),
-        width=found.camera.width,
-        height=found.camera.height,
-    )
+    out = KaptureFolder(tmp_path / "out")
+    found = depth_records(out.read())[first]
+    assert found.path == "own.depth" and read_depth(out, found).any()
 
 
 def test_what_cannot_be_densified_is_refused_with_its_name(
@@ -258,61 +244,51 @@ def panels_of(own: Pictures) -> list[np.ndarray]:
     found = []
     for panel in own.panels:
         address = re.search(r'src="data:image/jpeg;base64,([^"]+)"', str(panel.element))
-        assert address is not None
         content = np.frombuffer(base64.b64decode(address[1]), np.uint8)
         found.append(cv2.imdecode(content, cv2.IMREAD_COLOR)[:, :, ::-1].astype(int))
     return found
 
 
-def test_pictures_show_the_depth_that_is_there(densified: KaptureFolder) -> None:
+def shown_of(densified: KaptureFolder) -> tuple[str, dict[str, Pictures]]:
+    """What is told of the depth of a map, and the pictures by image."""
     told, _, *shown = depth_blocks(ResultContext(mapping=densified))
-    assert isinstance(told, Paragraph) and told.text.startswith("5 of 5 map images with depth")
+    assert isinstance(told, Paragraph)
+    return told.text, {own.name: own for own in shown if isinstance(own, Pictures)}
+
+
+def test_pictures_show_the_depth_that_is_there(
+    densified: KaptureFolder, world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told, shown = shown_of(densified)
     poses = densified.read().poses()
-    assert [own.name for own in shown if isinstance(own, Pictures)] == sorted(poses)
-    for own in shown:
-        assert isinstance(own, Pictures)
+    assert told.startswith("5 of 5 map images with depth") and list(shown) == sorted(poses)
+    for name, own in shown.items():
         image, depth, sigma, normals = panels_of(own)
-        assert image.shape[:2] == (192, 256) and depth.shape == sigma.shape == normals.shape
-        exact = depth_m(poses[own.name])[::2, ::2]
-        assert depth.shape[:2] == exact.shape
-        dark = np.abs(depth - [46, 50, 58]).sum(axis=2) < 30
-        assert (
-            0.02 < dark.mean() < 0.6
-            and (dark == (np.abs(normals - [46, 50, 58]).sum(2) < 30)).mean() > 0.9
-        )
+        exact = depth_m(poses[name])[::2, ::2]
+        assert image.shape[:2] == (192, 256)
+        assert depth.shape == sigma.shape == normals.shape == (*exact.shape, 3)
+        dark, without = (np.abs(one - [46, 50, 58]).sum(axis=2) < 30 for one in (depth, normals))
+        assert 0.02 < dark.mean() < 0.6 and (dark == without).mean() > 0.9
         # yellow is near: green rises along the scale, and with what is near
         known = ~dark & (exact > 0)
         assert np.corrcoef(depth[..., 1][known], 1 / exact[known])[0, 1] > 0.8
         # what is seen faces the camera
         assert np.median(normals[..., 2][known]) > 150
-
-
-def test_many_images_are_shown_in_part_and_broken_ones_left_out(
-    densified: KaptureFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    # many are shown in part, and broken ones left out
     monkeypatch.setattr(panels, "MAX_IMAGES", 3)
-    told, _, *shown = depth_blocks(ResultContext(mapping=densified))
-    assert isinstance(told, Paragraph) and told.text.endswith(" 3 are shown.")
-    names = sorted(densified.read().poses())
-    assert [own.name for own in shown if isinstance(own, Pictures)] == [
-        names[at] for at in (0, 2, 4)
-    ]
-    root = tmp_path / "map"
-    shutil.copytree(densified.root, root, symlinks=True)
-    side_file(root, names[0], "sigma").write_bytes(b"no array")
-    broken = depth_blocks(ResultContext(mapping=KaptureFolder(root)))
-    assert len(broken) == 2 + 2
-    (root / DEPTH_FILE).write_text("not a table")
-    assert depth_blocks(ResultContext(mapping=KaptureFolder(root))) == ()
-
-
-def test_a_map_without_stereo_has_no_such_section(world: Any) -> None:
-    assert depth_blocks(ResultContext(mapping=world.map())) == ()
+    told, some = shown_of(densified)
+    assert told.endswith(" 3 are shown.") and list(some) == sorted(poses)[::2]
+    broken = KaptureFolder(shutil.copytree(densified.root, tmp_path / "map", symlinks=True))
+    side_file(broken.root, min(poses), "sigma").write_bytes(b"no array")
+    assert len(depth_blocks(ResultContext(mapping=broken))) == 2 + 2
+    (broken.root / DEPTH_FILE).write_text("not a table")
+    for context in (ResultContext(mapping=broken), ResultContext(mapping=world.map())):
+        assert depth_blocks(context) == ()
     assert depth_blocks(ResultContext()) == ()
 
 
 def test_the_view_shows_the_cloud_on_the_walls(
-    world: Any, densified: KaptureFolder, distance_to_walls: Callable[..., Any]
+    world: Any, densified: KaptureFolder, distance_to_walls: Any
 ) -> None:
     scene = scene_of("corner", StoredInliers(ResultContext(mapping=densified)))
     assert scene is not None and scene.num_dense > 3000
@@ -324,7 +300,7 @@ def test_the_view_shows_the_cloud_on_the_walls(
     again = scene_of("corner", StoredInliers(ResultContext(mapping=KaptureFolder(densified.root))))
     assert again is not None and render_view(again) == page
     assert 'id="show-dense"' in page and f"{scene.num_dense:,} of depth by stereo" in page
-    data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])  # type: ignore[index]
+    data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])
     assert data["numDense"] == scene.num_dense
     assert len(base64.b64decode(data["points"])) == 12 * len(scene.points)
     bare = scene_of("corner", StoredInliers(ResultContext(mapping=world.map())))

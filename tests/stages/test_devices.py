@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -16,10 +17,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from megloc_kapture.errors import OptionError, PluginError
-from megloc_kapture.features.xfeat import XFeat, XFeatOptions
+from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import ImagePair
-from megloc_kapture.matching.lightglue import LighterGlue, LighterGlueOptions
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import TwoViewOptions
 from megloc_kapture.nets.aslfeat import AslFeatNet
@@ -32,7 +32,7 @@ from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, PluginChoice
 from megloc_kapture.stages import devices
 from megloc_kapture.stages import work as work_module
-from megloc_kapture.stages.devices import DeviceMemoryError, placed, unheeded
+from megloc_kapture.stages.devices import DeviceMemoryError, in_batches, placed, unheeded
 from megloc_kapture.stages.local_features import (
     ExtractLocalFeatures,
     extract_all,
@@ -74,22 +74,6 @@ def random_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def xfeat(shared_data: Path) -> XFeatOptions:
-    weights = str(shared_data / "weights" / "xfeat" / "xfeat.onnx")
-    return XFeatOptions(weights=weights, max_keypoints=300, device="cpu")
-
-
-def nearly_same(a: LocalFeatures, b: LocalFeatures) -> None:
-    """All keypoints but those whose score is at the threshold by a last bit."""
-    distance, row = cKDTree(a.keypoints_px[:, :2]).query(b.keypoints_px[:, :2])
-    near = distance < 0.01
-    assert near.sum() >= 0.99 * max(len(a.scores), len(b.scores))
-    np.testing.assert_allclose(a.scores[row[near]], b.scores[near], atol=1e-4)
-    np.testing.assert_allclose(a.descriptors[row[near]], b.descriptors[near], atol=5e-3)
-    assert a.num_masked == pytest.approx(b.num_masked, abs=2)
-
-
 @pytest.mark.parametrize("name", ["aliked", "xfeat", "r2d2", "superpoint", "aslfeat"])
 def test_features_of_a_batch(
     shared_data: Path, random_weights: Path, frames: Any, name: str
@@ -104,28 +88,43 @@ def test_features_of_a_batch(
     assert min(len(found.scores) for found in alone) > 20
     together = extractor.extract_many(*map(list, zip(*frames, strict=True)))
     for a, b in zip(alone, together, strict=True):
-        nearly_same(a, b)
+        # all keypoints but those whose score is at the threshold by a last bit
+        distance, row = cKDTree(a.keypoints_px[:, :2]).query(b.keypoints_px[:, :2])
+        near = distance < 0.01
+        assert near.sum() >= 0.99 * max(len(a.scores), len(b.scores))
+        np.testing.assert_allclose(a.scores[row[near]], b.scores[near], atol=1e-4)
+        np.testing.assert_allclose(a.descriptors[row[near]], b.descriptors[near], atol=5e-3)
+        assert a.num_masked == pytest.approx(b.num_masked, abs=2)
     # on a processor each runs alone: the same bytes, whatever it comes with
     for a, b in zip(alone, extract_all(extractor, frames, NAMES), strict=True):
         assert a.keypoints_px.tobytes() == b.keypoints_px.tobytes()
         assert a.descriptors.tobytes() == b.descriptors.tobytes()
 
 
-class Limited(XFeat):
-    """A device that has memory for so many images."""
+class Limited:
+    """A plugin whose device has memory for so many items; it gives each back."""
 
-    def __init__(self, options: XFeatOptions, most: int) -> None:
-        super().__init__(options)
+    options = SimpleNamespace(device="cpu")
+    name = "limited"
+
+    def __init__(self, most: int) -> None:
         self.most = most
         self.seen: list[int] = []
-        self.threads: set[int] = set()
 
-    def extract_many(self, images: Any, masks: Any) -> list[LocalFeatures]:
-        self.seen.append(len(images))
-        self.threads.add(threading.get_ident())
-        if len(images) > self.most:
+    def extract(self, image: Any, mask: Any = None) -> Any:
+        return self.extract_many([image], [mask])[0]
+
+    def match(self, a: Any, b: Any) -> Any:
+        return self.match_many(a, [b])[0]
+
+    def extract_many(self, images: Any, masks: Any) -> Any:
+        return self.match_many(masks, images)
+
+    def match_many(self, _: Any, items: Sequence[Any]) -> Any:
+        self.seen.append(len(items))
+        if len(items) > self.most:
             raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB.")
-        return super().extract_many(images, masks)
+        return list(items)
 
 
 @pytest.fixture
@@ -134,41 +133,33 @@ def eight_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(devices.MOST_AT_ONCE, "cpu", 8)
 
 
-def test_memory_that_runs_out_halves_the_batch(
-    eight_at_once: None, xfeat: XFeatOptions, frames: Any
-) -> None:
-    extractor = Limited(xfeat, most=2)
-    plain = XFeat(xfeat)
+def batched(plugin: Any, run: Any) -> list[str]:
+    return in_batches(plugin, "match_many", run, NAMES, size=len, name=str)
+
+
+def test_memory_that_runs_out_halves_the_batch(eight_at_once: None, frames: Any) -> None:
+    plugin = Limited(most=2)
     for sizes in ([5, 2, 2, 1], [2, 2, 1]):  # what is known stays known
-        found = extract_all(extractor, frames, NAMES)
-        assert extractor.seen == sizes
-        extractor.seen.clear()
-        for a, b in zip(found, (plain.extract(*frame) for frame in frames), strict=True):
-            nearly_same(a, b)
-
-
-def test_an_image_that_does_not_fit_alone_is_named(
-    eight_at_once: None, xfeat: XFeatOptions, frames: Any
-) -> None:
+        assert batched(plugin, lambda items: plugin.match_many(None, items)) == NAMES
+        assert plugin.seen == sizes
+        plugin.seen.clear()
+    none = Limited(most=0)
     with pytest.raises(DeviceMemoryError, match=r"image 0\.jpg: there is not enough memory"):
-        extract_all(Limited(xfeat, most=0), frames, NAMES)
+        extract_all(none, frames, NAMES)
+    image = ImageFeatures(np.zeros((3, 2), np.float32), np.zeros((3, 4), np.float32), 8, 8)
+    with pytest.raises(DeviceMemoryError, match="pair 0, 1: there is not enough memory"):
+        match_all(none, image, [image] * 3, ["pair 0, 1", "pair 0, 2", "pair 0, 3"])
+    assert none.seen == [5, 2, 1, 2, 1]
 
 
-def test_errors_of_another_kind_come_through(xfeat: XFeatOptions, frames: Any) -> None:
-    class Broken(XFeat):
-        def extract(self, image: Any, mask: Any = None) -> LocalFeatures:
-            raise RuntimeError("sizes do not agree")
-
-    class Few(XFeat):
-        def extract_many(self, images: Any, masks: Any) -> list[LocalFeatures]:
-            return []
+def test_errors_of_another_kind_come_through(eight_at_once: None) -> None:
+    def broken(_: Any) -> Any:
+        raise RuntimeError("sizes do not agree")
 
     with pytest.raises(RuntimeError, match="sizes do not agree"):
-        extract_all(Broken(xfeat), frames, NAMES)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(devices.MOST_AT_ONCE, "cpu", 8)
-        with pytest.raises(PluginError, match="extract_many of .*Few gave 0 for 5 items"):
-            extract_all(Few(xfeat), frames, NAMES)
+        batched(Limited(9), broken)
+    with pytest.raises(PluginError, match="match_many of Limited gave 0 for 5 items"):
+        batched(Limited(9), lambda _: [])
 
 
 def test_a_budget_is_what_is_free() -> None:
@@ -206,64 +197,48 @@ def test_matches_of_a_batch(
         assert ours[1].tobytes() == theirs[1].tobytes()
 
 
-def test_a_pair_that_does_not_fit_is_named(
-    eight_at_once: None, shared_data: Path, xfeat: XFeatOptions, frames: Any
-) -> None:
-    class LimitedPairs(LighterGlue):
-        most = 2
-        seen: list[int] = []
+class ManySift(RootSift):
+    """Takes several images at once."""
 
-        def match_many(self, a: ImageFeatures, others: Sequence[ImageFeatures]) -> list[Any]:
-            self.seen.append(len(others))
-            if len(others) > self.most:
-                raise torch.OutOfMemoryError("CUDA out of memory.")
-            return super().match_many(a, others)
+    def __init__(self) -> None:
+        super().__init__(RootSiftOptions(max_keypoints=300))
+        self.seen: list[int] = []
+        self.threads: set[int] = set()
 
-    images = []
-    for image, _ in frames:
-        found = XFeat(xfeat).extract(image)
-        images.append(ImageFeatures(found.keypoints_px, found.descriptors, 192, 128))
-    weights = str(shared_data / "weights" / "lighterglue" / "lighterglue_L3.onnx")
-    matcher = LimitedPairs(LighterGlueOptions(weights=weights, device="cpu"))
-    names = [f"pair 0, {k}" for k in range(1, 5)]
-    found_pairs = match_all(matcher, images[0], images[1:], names)
-    assert matcher.seen == [4, 2, 2] and min(len(m) for m, _ in found_pairs) > 10
-    matcher.most = 0
-    with pytest.raises(DeviceMemoryError, match="pair 0, 1: there is not enough memory"):
-        match_all(matcher, images[0], images[1:], names)
+    def extract_many(self, images: Any, masks: Any) -> list[LocalFeatures]:
+        self.seen.append(len(images))
+        self.threads.add(threading.get_ident())
+        return [self.extract(*each) for each in zip(images, masks, strict=True)]
 
 
 def test_one_process_has_the_gpu(
     world: Any,
     tmp_path: Path,
     two_processes: Executor,
-    xfeat: XFeatOptions,
-    folder_bytes: Callable[[Path], dict[str, bytes]],
+    folder_bytes: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """What runs where a GPU is: here with a processor in its place."""
     folders = [world.mapping(), world.query()]
     pairs = [ImagePair(q, m, 1.0) for q in world.query_poses for m in world.map_poses]
 
-    def run(output: Path, work: Work) -> Limited:
-        extractor = Limited(xfeat, most=99)
+    def run(output: Path, work: Work) -> ManySift:
+        extractor, matcher = ManySift(), NearestNeighbours()
         extract_local_features(folders, extractor, output, work=work)
         query, mapping = (folder.with_features([output]) for folder in reversed(folders))
-        verification = TwoViewOptions()
-        match_pairs(
-            query, mapping, pairs, "xfeat", NearestNeighbours(), verification, output, work=work
-        )
+        how = TwoViewOptions()
+        match_pairs(query, mapping, pairs, extractor.name, matcher, how, output, work=work)
         return extractor
 
     monkeypatch.setattr(devices, "_limits", {})
-    monkeypatch.setitem(devices.MOST_AT_ONCE, "cpu", 3)
+    monkeypatch.setattr(devices, "BATCH", 3)
     run(tmp_path / "here", Work())
     monkeypatch.setattr(
-        work_module, "on_gpu", lambda plugin: isinstance(plugin, XFeat | NearestNeighbours)
+        work_module, "on_gpu", lambda plugin: isinstance(plugin, RootSift | NearestNeighbours)
     )
     there = run(tmp_path / "there", Work(two_processes))
     assert folder_bytes(tmp_path / "here") == folder_bytes(tmp_path / "there")
-    assert there.seen == [3, 3, 1]
+    assert there.seen == [3, 3]  # and one alone
     assert len(there.threads) == 1 and threading.get_ident() not in there.threads
 
 
@@ -291,18 +266,14 @@ def test_networks_are_told_and_those_that_say_so_themselves_stay() -> None:
     assert "device" not in options.localization.rank.options
 
 
-def test_where_it_was_done_is_no_part_of_what_was_done() -> None:
-    settings = [
-        [
-            stage(options_of_preset("megloc", assignments=changes)).settings
-            for stage in (ExtractLocalFeatures, MatchQueries)
-        ]
+def test_where_it_was_done_is_no_part_of_what_was_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    stages = ExtractLocalFeatures, MatchQueries
+    for stage in stages:
+        monkeypatch.setattr(stage, "plugins", lambda _: ())
+    plain, here, half = (
+        [stage(options_of_preset("megloc", assignments=changes)).settings() for stage in stages]
         for changes in ({}, {"device": "cpu"}, {"precision": "half"})
-    ]
-    with pytest.MonkeyPatch.context() as patch:
-        for stage in (ExtractLocalFeatures, MatchQueries):
-            patch.setattr(stage, "plugins", lambda _: ())
-        plain, here, half = [[of_stage() for of_stage in both] for both in settings]
+    )
     assert plain == here != half
 
 
@@ -340,9 +311,8 @@ def test_a_localizer_is_told(world: Any) -> None:
     assert told.device == "cpu" and told.local_features[0].options["half_precision"] is True
     changes = {"global_features": ["netvlad"], "device": "cpu"}
     options = options_of_preset("classic", assignments=changes)
-    assert Localizer(opened, options=options).options.global_features[0].options == {
-        "device": "cpu"
-    }
+    chosen = Localizer(opened, options=options).options.global_features[0]
+    assert chosen.options == {"device": "cpu"}
     with pytest.raises(OptionError, match="give the device and the precision in the options"):
         Localizer(opened, options=options, device="cuda")
     with pytest.raises(OptionError, match="device changes nothing: no network is chosen"):

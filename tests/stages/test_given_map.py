@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from kapture.io.csv import kapture_from_dir
-from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.colmap_sift import ColmapSift, ColmapSiftOptions
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
-from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import (
     FeatureConfig,
@@ -28,8 +26,6 @@ from megloc_kapture.io.kapture import (
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
-from megloc_kapture.matching.verification import KnownPoseOptions
 from megloc_kapture.stages.given_map import (
     given_map,
     given_type,
@@ -38,14 +34,10 @@ from megloc_kapture.stages.given_map import (
     rows_at_their_places,
     rows_found_again,
 )
-from megloc_kapture.stages.image_pairs import MappingPairsOptions, pair_map_images
 from megloc_kapture.stages.local_features import extract_local_features
-from megloc_kapture.stages.matches import match_pairs
-from megloc_kapture.stages.triangulation import triangulate_map
 from megloc_kapture.values import RigidTransform
 
 TYPE = "rootsift"
-Bytes = Callable[[Path], dict[str, bytes]]
 
 
 def published(source: KaptureFolder, root: Path, *, shift_px: float = 0.0) -> KaptureFolder:
@@ -74,18 +66,17 @@ def published(source: KaptureFolder, root: Path, *, shift_px: float = 0.0) -> Ka
 def triples(folder: KaptureFolder, local_type: str = TYPE) -> set[tuple[int, str, int]]:
     """Point, image, keypoint of every observation."""
     seen = folder.observations()[local_type]
-    images = [seen.image_names[row] for row in seen.image_ids.tolist()]
-    return set(zip(seen.point_ids.tolist(), images, seen.keypoint_ids.tolist(), strict=True))
+    columns = np.stack([seen.point_ids, seen.image_ids, seen.keypoint_ids], axis=1)
+    return {(point, seen.image_names[row], keypoint) for point, row, keypoint in columns.tolist()}
 
 
-def stored(folder: Path, kind: str, folder_bytes: Bytes) -> dict[str, bytes]:
-    return folder_bytes(folder / "reconstruction" / kind)
+def place(folder: KaptureFolder, image: str, keypoint: int) -> tuple[float, ...]:
+    """Where a keypoint is."""
+    return tuple(folder.keypoints(TYPE).read(image)[keypoint].tolist())
 
 
-def test_a_map_with_descriptors_is_taken_as_it_is(
-    world, tmp_path: Path, folder_bytes: Bytes
-) -> None:
-    reference = KaptureFolder(world.root / "map")
+def test_a_map_with_descriptors_is_taken_as_it_is(world, tmp_path: Path, folder_bytes: Any) -> None:
+    reference = world.map()
     assert given_type(reference) == TYPE
     assert has_descriptors(reference)
     counts = given_map(reference, world.mapping(), tmp_path / "map")
@@ -102,9 +93,9 @@ def test_a_map_with_descriptors_is_taken_as_it_is(
 
 
 def test_without_descriptors_the_observations_move_to_the_features_extracted_anew(
-    world, tmp_path: Path, folder_bytes: Bytes
+    world, tmp_path: Path, folder_bytes: Any
 ) -> None:
-    truth = KaptureFolder(world.root / "map")
+    truth = world.map()
     reference = published(truth, tmp_path / "reference")
     assert not has_descriptors(reference)
     counts = given_map(reference, world.mapping(), tmp_path / "map")
@@ -112,9 +103,10 @@ def test_without_descriptors_the_observations_move_to_the_features_extracted_ane
     made = KaptureFolder(tmp_path / "map")
     made.validate()
     assert has_descriptors(made)
-    assert stored(made.root, "global_features", folder_bytes) == stored(
-        truth.root, "global_features", folder_bytes
+    theirs, ours = (
+        folder_bytes(folder.root / "reconstruction" / "global_features") for folder in (truth, made)
     )
+    assert theirs == ours
     np.testing.assert_array_equal(made.points3d(), truth.points3d())
     # the features that see points, as they were extracted: each one's number there
     number: dict[tuple[str, int], int] = {}
@@ -130,66 +122,52 @@ def test_without_descriptors_the_observations_move_to_the_features_extracted_ane
     found = {(point, image, number[image, keypoint]) for point, image, keypoint in triples(made)}
     assert expected <= found
     # what is more are other orientations of the same places
-    where: dict[tuple[int, str], list[NDArray[np.float32]]] = {}
+    where: dict[tuple[int, str], list[tuple[float, ...]]] = {}
     for point, image, keypoint in expected:
-        place = truth.keypoints(TYPE).read(image)[keypoint]
-        where.setdefault((point, image), []).append(place)
+        where.setdefault((point, image), []).append(place(truth, image, keypoint))
     extra = found - expected
     assert 0 < len(extra) < 0.5 * len(expected)
     for point, image, keypoint in extra:
-        place = truth.keypoints(TYPE).read(image)[keypoint]
-        assert np.linalg.norm(where[point, image] - place, axis=1).min() < 0.1
+        off = np.array(where[point, image]) - place(truth, image, keypoint)
+        assert np.linalg.norm(off, axis=1).min() < 0.1
 
 
 def test_another_implementation_may_find_them_some_tenths_of_a_pixel_away(
-    world, tmp_path: Path
+    world: Any, tmp_path: Path
 ) -> None:
-    truth = KaptureFolder(world.root / "map")
+    truth = world.map()
     reference = published(truth, tmp_path / "reference", shift_px=0.3)
     assert given_map(reference, world.mapping(), tmp_path / "map")["found_again"] == 1.0
-    made = KaptureFolder(tmp_path / "map")
     expected, found = (
         {
-            (point, image, tuple(folder.keypoints(TYPE).read(image)[keypoint].tolist()))
+            (point, image, place(folder, image, keypoint))
             for point, image, keypoint in triples(folder)
         }
-        for folder in (truth, made)
+        for folder in (truth, KaptureFolder(tmp_path / "map"))
     )
     assert len(expected - found) < 0.05 * len(expected)
 
 
-@dataclass(frozen=True)
-class Fewer:
+def fewer(world: Any, root: Path, max_keypoints: int) -> KaptureFolder:
     """The mapping images with fewer features than the map was made of."""
-
-    folder: KaptureFolder
-    kept: dict[str, set[tuple[float, float]]]
-
-
-def fewer(world, root: Path, max_keypoints: int) -> Fewer:
     extractor = RootSift(RootSiftOptions(max_keypoints=max_keypoints))
-    extract_local_features([KaptureFolder(world.root / "mapping")], extractor, root)
-    folder = KaptureFolder(world.root / "mapping", features_dirs=[root])
-    keypoints = folder.keypoints(TYPE)
-    places = {name: {tuple(xy) for xy in keypoints.read(name).tolist()} for name in keypoints.names}
-    return Fewer(folder, places)
+    extract_local_features([world.mapping()], extractor, root)
+    return world.mapping().with_features([root])
 
 
-def test_what_is_not_found_again_is_left_out(world, tmp_path: Path) -> None:
-    truth = KaptureFolder(world.root / "map")
+def test_what_is_not_found_again_is_left_out(world: Any, tmp_path: Path) -> None:
+    truth = world.map()
     reference = published(truth, tmp_path / "reference")
     some = fewer(world, tmp_path / "features", 450)
-    counts = given_map(reference, some.folder, tmp_path / "map")
+    counts = given_map(reference, some, tmp_path / "map")
     made = KaptureFolder(tmp_path / "map")
     made.validate()
-    there = [
-        (point, image)
-        for point, image, keypoint in triples(truth)
-        if tuple(truth.keypoints(TYPE).read(image)[keypoint].tolist()) in some.kept[image]
-    ]
-    total = len(triples(truth))
+    keypoints = some.keypoints(TYPE)
+    kept = {name: set(map(tuple, keypoints.read(name).tolist())) for name in keypoints.names}
+    seen = triples(truth)
+    there = [(p, image) for p, image, k in seen if place(truth, image, k) in kept[image]]
     assert 0.5 < counts["found_again"] < 1
-    assert counts["found_again"] == pytest.approx(len(there) / total, abs=0.02)
+    assert counts["found_again"] == pytest.approx(len(there) / len(seen), abs=0.02)
     # points are numbered anew, without those that nothing sees any more
     points = made.points3d()
     assert counts["points"] == len(points) < len(truth.points3d())
@@ -201,57 +179,43 @@ def test_what_is_not_found_again_is_left_out(world, tmp_path: Path) -> None:
     assert len(found) < 1.05 * len(expected)
 
 
-def test_a_map_of_other_features_is_refused(world, tmp_path: Path) -> None:
-    reference = published(KaptureFolder(world.root / "map"), tmp_path / "reference")
+def test_a_map_of_other_features_is_refused(world: Any, tmp_path: Path) -> None:
+    reference = published(world.map(), tmp_path / "reference")
     some = fewer(world, tmp_path / "features", 100)
     with pytest.raises(DataError, match=r"only \d+% have a keypoint that extracting rootsift"):
-        given_map(reference, some.folder, tmp_path / "map")
+        given_map(reference, some, tmp_path / "map")
     assert not (tmp_path / "map").exists()
     bare = KaptureFolder(world.root / "mapping")
     with pytest.raises(DataError, match="have not been extracted again"):
         given_map(reference, bare, tmp_path / "map")
 
 
-def test_what_is_no_map_to_localize_in_is_refused(world, tmp_path: Path) -> None:
+def test_what_is_no_map_to_localize_in_is_refused(world: Any, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no given map.*import_options.reference_model=true"):
         given_type(world.mapping())
     shutil.copytree(world.root / "map", tmp_path / "two", symlinks=True)
-    seen = KaptureFolder(world.root / "map").observations()[TYPE]
-    renamed = Observations(
-        "other", seen.image_names, seen.point_ids, seen.image_ids, seen.keypoint_ids
+    seen = world.map().observations()[TYPE]
+    write_observations(
+        tmp_path / "two", {TYPE: seen, "other": replace(seen, keypoints_type="other")}
     )
-    write_observations(tmp_path / "two", {TYPE: seen, "other": renamed})
     with pytest.raises(DataError, match="of one keypoints type, found: other, rootsift"):
         given_type(KaptureFolder(tmp_path / "two"))
+
+
+@pytest.fixture(scope="module")
+def sift_map(world: Any, make_map: Any, tmp_path_factory: pytest.TempPathFactory) -> KaptureFolder:
+    """A map of the same images by COLMAP's SIFT."""
+    extractor = ColmapSift(ColmapSiftOptions(first_octave=0))
+    return make_map(world.mapping(), extractor, tmp_path_factory.mktemp("sift"))
 
 
 # ---------------------------------------------------------------------------------- two maps in one
 
 
-@pytest.fixture(scope="module")
-def sift_map(world, tmp_path_factory: pytest.TempPathFactory) -> KaptureFolder:
-    """A map of the same images by COLMAP's SIFT."""
-    root = tmp_path_factory.mktemp("sift")
-    mapping = KaptureFolder(world.root / "mapping", features_dirs=[root])
-    extract_local_features([mapping], ColmapSift(ColmapSiftOptions(first_octave=0)), root)
-    mapping = KaptureFolder(world.root / "mapping", features_dirs=[root])
-    pairs = pair_map_images(mapping, MappingPairsOptions(by=("exhaustive",)), retrieval=None)
-    match_pairs(
-        mapping, mapping, pairs, "sift", NearestNeighbours(), KnownPoseOptions(), root / "matches"
-    )
-    matches = KaptureFolder(world.root / "mapping", features_dirs=[root / "matches"])
-    triangulate_map(mapping, matches, "sift", root / "map", TriangulationOptions())
-    return KaptureFolder(root / "map")
-
-
 def test_two_maps_become_one(
-    world,
-    sift_map: KaptureFolder,
-    tmp_path: Path,
-    folder_bytes: Bytes,
-    distance_to_walls: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    world, sift_map: KaptureFolder, tmp_path: Path, folder_bytes: Any, distance_to_walls: Any
 ) -> None:
-    own = KaptureFolder(world.root / "map")
+    own = world.map()
     counts = join_maps(sift_map, own, tmp_path / "both")
     both = KaptureFolder(tmp_path / "both")
     both.validate(deep=True)
@@ -275,25 +239,19 @@ def test_two_maps_become_one(
     assert triples(both, "sift") == triples(sift_map, "sift")
     for source, local_type in ((sift_map, "sift"), (own, TYPE)):
         for kind in ("keypoints", "descriptors"):
-            place = Path("reconstruction") / kind / local_type
-            assert folder_bytes(both.root / place) == folder_bytes(source.root / place)
+            files = Path("reconstruction") / kind / local_type
+            assert folder_bytes(both.root / files) == folder_bytes(source.root / files)
     # global features of either
     assert both.types("global_features") == own.types("global_features") != []
-
-
-def test_points_keep_the_errors_of_their_map(
-    world, sift_map: KaptureFolder, tmp_path: Path
-) -> None:
-    """The order of the maps is that of the points; the other order gives the other."""
-    own = KaptureFolder(world.root / "map")
-    join_maps(own, sift_map, tmp_path / "both")
-    points = KaptureFolder(tmp_path / "both").points3d()
-    np.testing.assert_array_equal(points[: len(own.points3d())], own.points3d())
-    assert triples(KaptureFolder(tmp_path / "both")) == triples(own)
+    # the order of the maps is that of the points
+    join_maps(own, sift_map, tmp_path / "other order")
+    other = KaptureFolder(tmp_path / "other order")
+    np.testing.assert_array_equal(other.points3d()[:num_second], own.points3d())
+    assert triples(other) == triples(own)
 
 
 def test_maps_that_do_not_fit_are_refused(world, sift_map: KaptureFolder, tmp_path: Path) -> None:
-    own = KaptureFolder(world.root / "map")
+    own = world.map()
     with pytest.raises(DataError, match="both maps have points of keypoints type rootsift"):
         join_maps(own, own, tmp_path / "both")
     data = sift_map.read()
@@ -320,48 +278,41 @@ def test_maps_that_do_not_fit_are_refused(world, sift_map: KaptureFolder, tmp_pa
 # ---------------------------------------------------------------------------- keypoints by place
 
 
-def points(*xy: tuple[float, float]) -> np.ndarray:
-    return np.array(xy, dtype=np.float32).reshape(-1, 2)
+NOWHERE = np.zeros((0, 2), np.float32)
 
 
-def test_rows_are_found_by_place() -> None:
-    stored = points((1, 1), (5, 5), (9, 9))
-    extracted = points((9, 9.01), (1, 1), (7, 7), (20, 20))
-    assert rows_found_again(stored, extracted).tolist() == [1, -1, 0]
-    assert rows_found_again(stored, stored).tolist() == [0, 1, 2]
+@pytest.mark.parametrize(
+    ("stored", "extracted", "rows"),
+    [
+        ([(1, 1), (5, 5), (9, 9)], [(9, 9.01), (1, 1), (7, 7), (20, 20)], [1, -1, 0]),
+        ([(1, 1), (5, 5)], [(1, 1), (5, 5)], [0, 1]),
+        # those at one place are joined in order
+        ([(1, 1), (1, 1), (2, 2), (1, 1)], [(2, 2), (1, 1), (3, 3), (1, 1)], [1, 3, 0, -1]),
+        ([(1, 1)], NOWHERE, [-1]),
+        (NOWHERE, [(1, 1)], []),
+        (NOWHERE, NOWHERE, []),
+    ],
+)
+def test_rows_are_found_by_place(stored: Any, extracted: Any, rows: list[int]) -> None:
+    found = rows_found_again(*(np.array(one, np.float32) for one in (stored, extracted)))
+    assert found.dtype == np.int64 and found.tolist() == rows
 
 
-def test_keypoints_at_one_place_are_joined_in_order() -> None:
-    stored = points((1, 1), (1, 1), (2, 2), (1, 1))
-    extracted = points((2, 2), (1, 1), (3, 3), (1, 1))
-    assert rows_found_again(stored, extracted).tolist() == [1, 3, 0, -1]
-
-
-def test_nothing_to_find() -> None:
-    empty = points()
-    assert rows_found_again(points((1, 1)), empty).tolist() == [-1]
-    assert rows_found_again(empty, points((1, 1))).shape == (0,)
-    assert rows_found_again(empty, empty).dtype == np.int64
-
-
-def at_places(stored: np.ndarray, extracted: np.ndarray, shift: float) -> list[tuple[int, int]]:
-    of, rows = rows_at_their_places(stored, extracted, shift)
+def at_places(stored: Any, extracted: Any, shift: float) -> list[tuple[int, int]]:
+    arrays = (np.array(one, np.float32) for one in (stored, extracted))
+    of, rows = rows_at_their_places(*arrays, shift)
     assert of.dtype == rows.dtype == np.int64
     return list(zip(of.tolist(), rows.tolist(), strict=True))
 
 
 def test_all_orientations_of_the_nearest_place_are_found() -> None:
-    stored = points((1, 1), (30, 30), (9, 9))
-    extracted = points((9, 9), (1.3, 1), (9.05, 9), (1.9, 1), (1.3, 1.02))
+    stored = [(1, 1), (30, 30), (9, 9)]
+    extracted = [(9, 9), (1.3, 1), (9.05, 9), (1.9, 1), (1.3, 1.02)]
     # (1.9, 1) is near enough, but another place
     assert at_places(stored, extracted, 1.0) == [(0, 1), (0, 4), (2, 0), (2, 2)]
     assert at_places(stored, extracted, 0.2) == [(2, 0), (2, 2)]
-    assert at_places(points((30, 30)), extracted, 0.2) == []
-
-
-def test_no_place_has_no_keypoint() -> None:
-    assert at_places(points(), points((1, 1)), 1.0) == []
-    assert at_places(points((1, 1)), points(), 1.0) == []
+    assert at_places([(30, 30)], extracted, 0.2) == []
+    assert at_places(NOWHERE, [(1, 1)], 1.0) == at_places([(1, 1)], NOWHERE, 1.0) == []
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.floats(0, 0.4))

@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import Executor
-from functools import partial
+from dataclasses import replace
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
+import corner
 import cv2
 import numpy as np
 import pytest
+from kapture.io.csv import kapture_from_dir
+from kapture.io.features import image_keypoints_from_file
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import project
+from megloc_kapture.geometry.cameras import bearing_rays, project
+from megloc_kapture.geometry.poses import movement
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.io.csv_table import read_csv_table
 from megloc_kapture.io.images import read_image_rgb, write_image
-from megloc_kapture.io.kapture import (
-    ImagePair,
-    KaptureData,
-    KaptureFolder,
-    Sensor,
-    write_sensors,
-)
+from megloc_kapture.io.kapture import ImagePair, KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, ImageVariant
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
@@ -56,9 +55,14 @@ class Upright:
     name = "upright"
     metric = "L2"
 
+    def __init__(self, most: int = 1000) -> None:
+        self.calls, self.most = 0, most
+
     def extract(
         self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
     ) -> LocalFeatures:
+        self.calls += 1
+        assert self.calls <= self.most, "extracted again, although no pair asks for it"
         if min(image.shape[:2]) < 100:
             raise ValueError("smaller than 100 pixels")
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -72,22 +76,7 @@ class Upright:
         return LocalFeatures(xy + np.float32(0.5), np.ones(len(xy), np.float32), values)
 
 
-class Forbidden(Upright):
-    """An extractor that nobody may call."""
-
-    def extract(self, image: Any, mask: Any = None) -> LocalFeatures:
-        raise AssertionError("extracted again, although all pairs are easy")
-
-
-class Counting(Upright):
-    """Counts how often it is called."""
-
-    def __init__(self) -> None:
-        self.calls = 0
-
-    def extract(self, image: Any, mask: Any = None) -> LocalFeatures:
-        self.calls += 1
-        return super().extract(image, mask)
+NEVER = Upright(most=0)
 
 
 class Scene:
@@ -96,63 +85,57 @@ class Scene:
     def __init__(self, root: Path, world: Any) -> None:
         self.root, self.world = root, world
 
-    def mapping(self, *more: str) -> KaptureFolder:
-        folders = [self.root / name for name in ("features", "mapping_matches", *more)]
-        return KaptureFolder(self.root / "mapping", features_dirs=folders)
-
-    def query(self, name: str, *more: str) -> KaptureFolder:
+    def folder(self, name: str, *more: str) -> KaptureFolder:
         folders = [self.root / each for each in ("features", f"{name}_matches", *more)]
         return KaptureFolder(self.root / name, features_dirs=folders)
 
-    def mapping_pairs(self) -> list[ImagePair]:
-        return [ImagePair(a, b, 1.0) for a in MAP_IMAGES for b in MAP_IMAGES if a < b]
+    def mapping(self) -> KaptureFolder:
+        return self.folder("mapping")
 
-    def query_pairs(self, name: str) -> list[ImagePair]:
-        return [
-            ImagePair(query, image, 1.0)
-            for query in self.query(name).read().image_names()
-            for image in MAP_IMAGES
-        ]
+    def larger(self, name: str) -> KaptureFolder:
+        """With what all variants added."""
+        return KaptureFolder(self.root / name, features_dirs=[self.root / f"{name}_all"])
 
-    def retry_queries(
+    def pairs(self, name: str) -> list[ImagePair]:
+        """Of the mapping images, or of queries with them."""
+        if name == "mapping":
+            return [ImagePair(*pair, 1.0) for pair in combinations(MAP_IMAGES, 2)]
+        queries = self.folder(name).read().image_names()
+        return [ImagePair(*pair, 1.0) for pair in product(queries, MAP_IMAGES)]
+
+    def retry(
         self,
         name: str,
         output: Path,
         *,
         mapping: KaptureFolder | None = None,
+        query: KaptureFolder | None = None,
+        pairs: list[ImagePair] | None = None,
         work: Work = HERE,
         **more: Any,
     ) -> dict[str, float]:
+        mapping, pairs = mapping or self.mapping(), pairs or self.pairs(name)
         with single_threaded():
-            return pyramid_queries(
-                self.query(name), mapping or self.mapping(), self.query_pairs(name), "upright",
-                method(**more), output, work=work,
-            )  # fmt: skip
-
-    def retry_mapping(self, output: Path, *, work: Work = HERE, **more: Any) -> dict[str, float]:
-        how = method(verification=KnownPoseOptions(), **more)
-        with single_threaded():
-            return pyramid_mapping(
-                self.mapping(), self.mapping_pairs(), "upright", how, output, work=work
-            )
+            if name == "mapping":
+                how = method(verification=KnownPoseOptions(), **more)
+                return pyramid_mapping(mapping, pairs, "upright", how, output, work=work)
+            query = query or self.folder(name)
+            how = method(**more)
+            return pyramid_queries(query, mapping, pairs, "upright", how, output, work=work)
 
 
-def method(
-    extractor: Any = None, matcher: Any = None, options: GuidedPyramidOptions = ALL, **more: Any
-) -> PyramidMethod:
+def method(**more: Any) -> PyramidMethod:
     """How pairs are tried again: by upright features, unless another extractor is given."""
-    verification = more.pop("verification", TwoViewOptions())
-    return PyramidMethod(
-        extractor or Upright(), matcher or NearestNeighbours(), verification, options, **more
-    )
+    how = {"extractor": Upright(), "matcher": NearestNeighbours()}
+    return PyramidMethod(**how | {"verification": TwoViewOptions(), "options": ALL} | more)
 
 
 def write_images(
     root: Path,
     source: KaptureFolder,
     poses: dict[str, RigidTransform],
-    turned: set[str],
-    **names: str,
+    turned: Collection[str],
+    prefix: str = "",
 ) -> None:
     """Images of ``source``, some of them turned, as a kapture of their own."""
     data = KaptureData()
@@ -164,7 +147,7 @@ def write_images(
             camera = Camera("PINHOLE", camera.height, camera.width, (fy, fx, cy, camera.width - cx))
             pixels = ImageVariant(1.0, 90).of_image(pixels)
             pose = TURN @ pose
-        name = names.get("prefix", "") + image
+        name = prefix + image
         data.sensors[f"cam{number}"] = Sensor.from_camera(camera)
         data.records_camera[number, f"cam{number}"] = name
         data.trajectories[number, f"cam{number}"] = pose
@@ -179,22 +162,19 @@ def scene(images_only: Any, tmp_path_factory: pytest.TempPathFactory) -> Scene:
     map_poses = {image: images_only.map_poses[image] for image in MAP_IMAGES}
     write_images(root / "mapping", images_only.mapping(), map_poses, {"right/3.png"})
     queries = images_only.query_poses
-    write_images(root / "turned", images_only.query(), queries, set(queries), prefix="turned_")
+    write_images(root / "turned", images_only.query(), queries, queries, "turned_")
     write_images(root / "easy", images_only.query(), queries, set())
     with single_threaded():
-        folders = [made.mapping(), made.query("turned"), made.query("easy")]
+        folders = [made.mapping(), made.folder("turned"), made.folder("easy")]
         extract_local_features(folders, Upright(), root / "features")
-        match_pairs(
-            made.mapping(), made.mapping(), made.mapping_pairs(), "upright", NearestNeighbours(),
-            KnownPoseOptions(), root / "mapping_matches",
-        )  # fmt: skip
-        for name in ("turned", "easy"):
+        for name in ("mapping", "turned", "easy"):
+            how = KnownPoseOptions() if name == "mapping" else TwoViewOptions()
             match_pairs(
-                made.query(name), made.mapping(), made.query_pairs(name), "upright",
-                NearestNeighbours(), TwoViewOptions(), root / f"{name}_matches",
+                made.folder(name), made.mapping(), made.pairs(name), "upright",
+                NearestNeighbours(), how, root / f"{name}_matches",
             )  # fmt: skip
-        made.retry_queries("turned", root / "turned_all")
-        made.retry_mapping(root / "mapping_all")
+    for name in ("turned", "mapping"):
+        made.retry(name, root / f"{name}_all")
     return made
 
 
@@ -204,15 +184,13 @@ def rows(folder: Path) -> Iterator[dict[str, str]]:
 
 def recall(map_folder: KaptureFolder, query: KaptureFolder) -> float:
     """Share of the queries that the map's upright images localize."""
-    images = query.read().image_names()
-    pairs = [ImagePair(image, other, 1.0) for image in images for other in MAP_IMAGES[:2]]
+    truth = query.read().poses()
+    pairs = [ImagePair(image, other, 1.0) for image in truth for other in MAP_IMAGES[:2]]
     types, options = ["upright-pyramid"], LocalizationOptions()
     with single_threaded():
         results = list(localize_from_matches(map_folder, query, query, pairs, types, options))
-    truth = query.read().poses()
     near = [
-        isinstance(found, Pose)
-        and np.linalg.norm(found.cam_from_world.center() - truth[image].center()) < 0.2
+        isinstance(found, Pose) and movement(truth[image], found.cam_from_world)[0] < 0.2
         for image, found in results
     ]
     return float(np.mean(near))
@@ -222,14 +200,13 @@ def recall(map_folder: KaptureFolder, query: KaptureFolder) -> float:
 
 
 def test_turned_queries_gain_and_are_localized(scene: Scene, tmp_path: Path) -> None:
+    # observed are keypoints of the pyramid, matched are those of the base: it begins with them
+    mapping = scene.larger("mapping")
     with single_threaded():
-        # observed are keypoints of the pyramid, matched are those of the base: it begins with them
-        mapping = KaptureFolder(scene.mapping().root, features_dirs=[scene.root / "mapping_all"])
-        triangulate_map(
-            mapping, mapping, "upright-pyramid", tmp_path / "map", TriangulationOptions()
-        )
-        off = scene.retry_queries("turned", tmp_path / "off", options=GuidedPyramidOptions())
-        more = scene.retry_queries("turned", tmp_path / "max", options=MAX)
+        how, made = TriangulationOptions(), tmp_path / "map"
+        triangulate_map(mapping, mapping, "upright-pyramid", made, how)
+        off = scene.retry("turned", tmp_path / "off", options=GuidedPyramidOptions())
+        more = scene.retry("turned", tmp_path / "max", options=MAX)
     assert off["pairs_tried"] == off["images_extracted_again"] == 0
     for folder in (scene.root / "turned_all", tmp_path / "max"):
         tried = list(rows(folder))
@@ -249,28 +226,18 @@ def test_turned_queries_gain_and_are_localized(scene: Scene, tmp_path: Path) -> 
 
 def test_added_keypoints_are_where_the_scene_is(scene: Scene) -> None:
     # matched keypoints of a turned query and a map image see one point of the walls
-    query = KaptureFolder(scene.root / "turned", features_dirs=[scene.root / "turned_all"])
-    matches = query.matches("upright-pyramid")
-    keypoints = query.keypoints("upright-pyramid")
-    poses, map_poses = query.read().poses(), scene.mapping().read().poses()
+    query = scene.larger("turned")
+    other = "right/2.png"
+    camera, pose = scene.mapping().read().camera_of(other), scene.mapping().read().poses()[other]
     for image in query.read().image_names():
-        indices, _ = matches.read(image, "right/2.png")
-        px = keypoints.read(image)[indices[:, 0]]
-        other_px = scene.mapping().keypoints("upright").read("right/2.png")[indices[:, 1]]
-        camera = scene.mapping().read().camera_of("right/2.png")
-        fx, fy, cx, cy = camera.params
-        rays = np.column_stack([(other_px - (cx, cy)) / (fx, fy), np.ones(len(other_px))])
-        pose = map_poses["right/2.png"]
-        directions = rays @ pose.rotation_matrix()
-        center = pose.center()
-        # on the wall z = 6, or on the other one, which begins at x = 2
-        depth = (6.0 - center[2]) / directions[:, 2]
-        normal = np.array([0.8, 0.0, 0.6])
-        slanted = ((np.array([2.0, 0.0, 6.0]) - center) @ normal) / (directions @ normal)
-        depth = np.where((center + directions * depth[:, None])[:, 0] > 2.0, slanted, depth)
-        seen = project(
-            query.read().camera_of(image), poses[image], center + directions * depth[:, None]
-        )
+        rows, _ = query.matches("upright-pyramid").read(image, other)
+        px = query.keypoints("upright-pyramid").read(image)[rows[:, 0]]
+        other_px = scene.mapping().keypoints("upright").read(other)[rows[:, 1]]
+        column, line = other_px.T.astype(int)
+        in_cam = bearing_rays(camera, other_px)
+        in_cam *= (corner.depth_m(pose)[line, column] / in_cam[:, 2])[:, None]
+        points = pose.inverse().apply(in_cam)
+        seen = project(query.read().camera_of(image), query.read().poses()[image], points)
         distance = np.linalg.norm(seen - px, axis=1)
         assert np.median(distance) < 1.0
         assert (distance < 6.0).mean() > 0.85  # a two-view model knows lines, not points
@@ -284,13 +251,11 @@ def test_mapping_adds_to_both_images_and_gives_points(scene: Scene, tmp_path: Pa
         # all variants of the image, and those of the other one that are not merely turned
         assert int(row["variants_tried"]) == 5 + 3
     assert any(int(row["added_to_other"]) for row in tried.values())
-    larger = KaptureFolder(scene.root / "mapping", features_dirs=[scene.root / "mapping_all"])
+    larger = scene.larger("mapping")
     with single_threaded():
-        before = triangulate_map(
-            scene.mapping(), scene.mapping(), "upright", tmp_path / "a", TriangulationOptions()
-        )
-        after = triangulate_map(
-            larger, larger, "upright-pyramid", tmp_path / "b", TriangulationOptions()
+        before, after = (
+            triangulate_map(folder, folder, name, tmp_path / name, TriangulationOptions())
+            for folder, name in ((scene.mapping(), "upright"), (larger, "upright-pyramid"))
         )
     assert after["observations"] > before["observations"] + 100
     assert after["mean_reprojection_error_px"] < 1.0
@@ -299,7 +264,7 @@ def test_mapping_adds_to_both_images_and_gives_points(scene: Scene, tmp_path: Pa
 def test_queries_meet_the_keypoints_that_were_added_to_the_map(
     scene: Scene, tmp_path: Path
 ) -> None:
-    larger = scene.mapping("mapping_all")
+    larger = scene.folder("mapping", "mapping_all")
     seen: set[int] = set()
 
     class Watched(NearestNeighbours):
@@ -307,7 +272,7 @@ def test_queries_meet_the_keypoints_that_were_added_to_the_map(
             seen.add(len(b.descriptors))
             return super().match(a, b)
 
-    counts = scene.retry_queries("turned", tmp_path / "out", mapping=larger, matcher=Watched())
+    counts = scene.retry("turned", tmp_path / "out", mapping=larger, matcher=Watched())
     assert counts["pairs_gained"] >= 4
     keypoints = larger.keypoints("upright-pyramid")
     assert seen <= {keypoints.length(image) for image in MAP_IMAGES}
@@ -321,8 +286,7 @@ def test_queries_meet_the_keypoints_that_were_added_to_the_map(
 
 @pytest.mark.parametrize("kind", ["turned", "mapping"])
 def test_every_index_of_the_base_type_is_one_of_the_pyramid(scene: Scene, kind: str) -> None:
-    base = scene.mapping() if kind == "mapping" else scene.query(kind)
-    larger = KaptureFolder(base.root, features_dirs=[scene.root / f"{kind}_all"])
+    base, larger = scene.folder(kind), scene.larger(kind)
     extended = 0
     for image in base.read().image_names():
         for read in (KaptureFolder.keypoints, KaptureFolder.descriptors):
@@ -348,9 +312,6 @@ def test_every_index_of_the_base_type_is_one_of_the_pyramid(scene: Scene, kind: 
 
 
 def test_kaptures_own_reader_opens_the_type(scene: Scene) -> None:
-    from kapture.io.csv import kapture_from_dir
-    from kapture.io.features import image_keypoints_from_file
-
     place = scene.root / "as_kapture"
     shutil.copytree(scene.root / "mapping" / "sensors", place / "sensors")
     for kind in ("keypoints", "descriptors", "matches"):
@@ -361,206 +322,107 @@ def test_kaptures_own_reader_opens_the_type(scene: Scene) -> None:
     read = kapture_from_dir(str(place))
     assert set(read.keypoints["upright-pyramid"]) == set(MAP_IMAGES)
     assert read.descriptors["upright-pyramid"].keypoints_type == "upright-pyramid"
-    expected = KaptureFolder(place).keypoints("upright-pyramid")
+    expected, stored = KaptureFolder(place).keypoints("upright-pyramid"), read.keypoints
     for image in MAP_IMAGES:
-        keypoints = image_keypoints_from_file(
-            str(place / "reconstruction/keypoints/upright-pyramid" / f"{image}.kpt"),
-            read.keypoints["upright-pyramid"].dtype,
-            read.keypoints["upright-pyramid"].dsize,
-        )
-        np.testing.assert_array_equal(keypoints, expected.read(image))
-    assert set(read.matches["upright-pyramid"]) == {
-        (pair.query, pair.map) for pair in scene.mapping_pairs()
-    }
-
-
-@pytest.mark.parametrize("kind", ["turned", "mapping"])
-def test_workers_write_the_same_bytes(
-    scene: Scene,
-    kind: str,
-    two_processes: Executor,
-    tmp_path: Path,
-    folder_bytes: Callable[[Path], dict[str, bytes]],
-) -> None:
-    if kind == "mapping":
-        counts = scene.retry_mapping(tmp_path / "there", work=Work(two_processes))
-    else:
-        counts = scene.retry_queries(kind, tmp_path / "there", work=Work(two_processes))
-    assert counts["pairs_gained"] > 0
-    written = folder_bytes(tmp_path / "there")
-    assert written == folder_bytes(scene.root / f"{kind}_all")
-    images = len(scene.query(kind).read().image_names()) if kind == "turned" else len(MAP_IMAGES)
-    pairs = len(scene.query_pairs(kind)) if kind == "turned" else 3
-    assert len(written) == 2 * images + 2 + pairs + 1  # two configurations and the table
+        file = str(place / "reconstruction/keypoints/upright-pyramid" / f"{image}.kpt")
+        like = stored["upright-pyramid"].dtype, stored["upright-pyramid"].dsize
+        np.testing.assert_array_equal(image_keypoints_from_file(file, *like), expected.read(image))
+    assert set(read.matches["upright-pyramid"]) == set(combinations(MAP_IMAGES, 2))
 
 
 # ---------------------------------------------------------------------------- when it runs
 
 
-def test_easy_pairs_are_never_extracted_again(scene: Scene, tmp_path: Path) -> None:
-    options = GuidedPyramidOptions(mode="all", min_matches=40)
-    pairs = [pair for pair in scene.query_pairs("easy") if pair.map != "right/3.png"]
-    counts = pyramid_queries(
-        scene.query("easy"), scene.mapping(), pairs, "upright",
-        method(Forbidden(), options=options), tmp_path / "out",
-    )  # fmt: skip
-    assert counts["pairs"] == 4 and counts["pairs_tried"] == 0
-    assert counts["seconds_per_tried_pair"] == 0 and list(rows(tmp_path / "out")) == []
-    found = KaptureFolder(scene.root / "easy", features_dirs=[tmp_path / "out"])
-    for image in QUERIES:
-        np.testing.assert_array_equal(
-            found.keypoints("upright-pyramid").read(image),
-            scene.query("easy").keypoints("upright").read(image),
-        )
-
-
-def test_an_image_is_extracted_once_for_all_its_pairs(scene: Scene, tmp_path: Path) -> None:
-    counting = Counting()
-    counts = scene.retry_queries("turned", tmp_path / "a", extractor=counting)
-    assert counts["pairs_tried"] >= 4
-    assert counting.calls == 2 * 5 == 5 * counts["images_extracted_again"]
-    counting = Counting()
-    scene.retry_mapping(tmp_path / "b", extractor=counting)
-    # two images as the first of a pair, one as the second, of which only scales are new
-    assert counting.calls == 5 + 5 + 3
-
-
-def test_a_variant_that_is_too_small_is_skipped_with_its_reason(
-    scene: Scene, tmp_path: Path
+@pytest.mark.parametrize("kind", ["turned", "mapping"])
+def test_workers_write_the_same_bytes_and_extract_an_image_once(
+    scene: Scene, kind: str, two_processes: Executor, tmp_path: Path, folder_bytes: Any
 ) -> None:
-    options = GuidedPyramidOptions(mode="all", scales=(0.2, 1.0), rotations_deg=TURNS)
-    counts = scene.retry_queries("turned", tmp_path / "out", options=options)
-    assert counts["pairs_gained"] >= 4
-    skipped = {row["skipped"] for row in rows(tmp_path / "out")}
-    assert skipped == {"image 0.2@0 0.2@90 0.2@270: ValueError: smaller than 100 pixels"}
+    there, counting = tmp_path / "there", Upright()
+    counts = scene.retry(kind, there, work=Work(two_processes))
+    assert counts["pairs_gained"] > 0
+    written = folder_bytes(there)
+    assert written == folder_bytes(scene.root / f"{kind}_all")
+    images = 2 if kind == "turned" else len(MAP_IMAGES)
+    # two configurations and the table
+    assert len(written) == 2 * images + 2 + len(scene.pairs(kind)) + 1
+    counts = scene.retry(kind, tmp_path / "here", extractor=counting)
+    if kind == "turned":
+        assert counts["pairs_tried"] >= 4
+        assert counting.calls == 2 * 5 == 5 * counts["images_extracted_again"]
+    else:
+        # two images as the first of a pair, one as the second, of which only scales are new
+        assert counting.calls == 5 + 5 + 3
 
 
 def test_the_mask_goes_with_the_image(scene: Scene, tmp_path: Path) -> None:
     root = tmp_path / "masked"
-    write_images(root, scene.world.query(), scene.world.query_poses, set(QUERIES), prefix="turned_")
-    masks = root / "sensors" / "masks"
-    for image in scene.query("turned").read().image_names():
+    write_images(root, scene.world.query(), scene.world.query_poses, QUERIES, "turned_")
+    for image in scene.folder("turned").read().image_names():
         mask = np.full((400, 300), 255, np.uint8)
         mask[:, :100] = 0
-        write_image(masks / f"{image}.png", mask)
-    query = KaptureFolder(root, features_dirs=scene.query("turned").features_dirs)
-    with single_threaded():
-        pyramid_queries(
-            query, scene.mapping(), scene.query_pairs("turned"), "upright",
-            method(mask_margin_px=10.0), tmp_path / "out",
-        )  # fmt: skip
+        write_image(root / "sensors" / "masks" / f"{image}.png", mask)
+    query = KaptureFolder(root, features_dirs=scene.folder("turned").features_dirs)
+    # and what is too small is skipped with its reason
+    options = GuidedPyramidOptions(mode="all", scales=(0.2, 0.5, 1.0), rotations_deg=TURNS)
+    scene.retry("turned", tmp_path / "out", query=query, mask_margin_px=10.0, options=options)
     larger = KaptureFolder(root, features_dirs=[tmp_path / "out"]).keypoints("upright-pyramid")
     for image in query.read().image_names():
         added = larger.read(image)[query.keypoints("upright").length(image) :]
         assert len(added) > 20
         assert (added[:, 0] >= 110).all()
+    skipped = {row["skipped"] for row in rows(tmp_path / "out")}
+    assert skipped == {"image 0.2@0 0.2@90 0.2@270: ValueError: smaller than 100 pixels"}
 
 
-def test_pairs_without_a_pose_are_not_tried(scene: Scene, tmp_path: Path) -> None:
-    # such a pair has no matches by known poses, and never will have
-    data = scene.mapping().read()
-    posed = {key: pose for key, pose in data.trajectories.items()}
-    lost = next(key for key in posed if data.records_camera[key] == "right/3.png")
-    del posed[lost]
-    root = tmp_path / "mapping"
-    write_sensors(
-        root,
-        KaptureData(sensors=data.sensors, trajectories=posed, records_camera=data.records_camera),
-    )
-    mapping = KaptureFolder(root, features_dirs=scene.mapping().features_dirs)
-    counts = pyramid_mapping(
-        mapping, scene.mapping_pairs(), "upright",
-        method(Forbidden(), verification=KnownPoseOptions()), tmp_path / "out",
-    )  # fmt: skip
-    assert counts["pairs"] == 3 and counts["pairs_tried"] == 0
-
-
-def test_matches_that_are_missing_are_named(scene: Scene, tmp_path: Path) -> None:
+def test_what_is_not_tried(scene: Scene, tmp_path: Path) -> None:
+    """Neither easy pairs, nor those without a pose or that look away from each other."""
+    options = GuidedPyramidOptions(mode="all", min_matches=40)
+    pairs = [pair for pair in scene.pairs("easy") if pair.map != "right/3.png"]
+    easy = scene.retry("easy", tmp_path / "easy", pairs=pairs, extractor=NEVER, options=options)
+    assert easy["pairs"] == 4 and easy["pairs_tried"] == 0
+    assert easy["seconds_per_tried_pair"] == 0 and list(rows(tmp_path / "easy")) == []
+    found = KaptureFolder(scene.root / "easy", features_dirs=[tmp_path / "easy"])
+    before, after = scene.folder("easy").keypoints("upright"), found.keypoints("upright-pyramid")
+    for image in QUERIES:
+        np.testing.assert_array_equal(after.read(image), before.read(image))
+    given = scene.mapping().read()
+    key = given.record_of("right/3.png")
+    behind = RigidTransform.from_matrix(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
+    posed = {other: pose for other, pose in given.trajectories.items() if other != key}
+    away = {**posed, key: behind @ given.trajectories[key]}
+    for name, trajectories in (("no pose", posed), ("away", away)):
+        write_sensors(tmp_path / name, replace(given, trajectories=trajectories))
+        folder = KaptureFolder(tmp_path / name, features_dirs=scene.mapping().features_dirs)
+        counts = scene.retry("mapping", tmp_path / f"{name} out", mapping=folder, extractor=NEVER)
+        assert counts["pairs"] == 3
+        assert counts["pairs_tried"] == counts["images_extracted_again"] == 0
     pairs = [ImagePair("query/a.png", "left/0.png", 1.0)]
     with pytest.raises(DataError, match=r"no matches .* 'query/a.png' and 'left/0.png'"):
-        pyramid_queries(
-            scene.query("easy"), scene.mapping(), pairs, "upright", method(), tmp_path / "out"
-        )  # fmt: skip
-
-
-def test_one_query_alone_gives_what_the_stage_gives(scene: Scene) -> None:
-    query, mapping = scene.query("turned"), scene.mapping()
-    image = query.read().image_names()[0]
-
-    def features(folder: KaptureFolder, name: str) -> Features:
-        return Features.of(
-            folder.read().camera_of(name),
-            folder.keypoints("upright").read(name),
-            folder.descriptors("upright").read(name),
-        )
-
-    base = [(other, *query.matches("upright").read(image, other)) for other in MAP_IMAGES]
-    with single_threaded():
-        found = retry_query(
-            features(query, image), base, lambda name: features(mapping, name),
-            method(),
-            lambda: (read_image_rgb(query.image_path(image)), None),
-        )  # fmt: skip
-    stored = KaptureFolder(query.root, features_dirs=[scene.root / "turned_all"])
-    for kind, added in (("keypoints", found.added_px), ("descriptors", found.added_descriptors)):
-        before = getattr(query, kind)("upright").read(image)
-        after = getattr(stored, kind)("upright-pyramid").read(image)
-        np.testing.assert_array_equal(np.concatenate([before, added]), after)
-    assert [other for other, _, _ in found.matches] == list(MAP_IMAGES)
-    for other, matches, scores in found.matches:
-        expected, expected_scores = stored.matches("upright-pyramid").read(image, other)
-        np.testing.assert_array_equal(matches, expected)
-        np.testing.assert_allclose(scores, expected_scores)
+        scene.retry("easy", tmp_path / "missing", pairs=pairs)
 
 
 def test_one_query_whose_pairs_are_easy_is_never_read(scene: Scene) -> None:
-    def never() -> Any:
+    def never(*_: str) -> Any:
         raise AssertionError("read, although all pairs are easy")
 
-    query = scene.query("easy")
-    camera = query.read().camera_of("query/a.png")
-    own = Features.of(
-        camera,
-        query.keypoints("upright").read("query/a.png"),
-        query.descriptors("upright").read("query/a.png"),
-    )
+    query, image = scene.folder("easy"), "query/a.png"
+    read = (kind("upright").read(image) for kind in (query.keypoints, query.descriptors))
+    own = Features.of(query.read().camera_of(image), *read)
     rows = np.stack([np.arange(100)] * 2, axis=1)
     for options in (ALL, GuidedPyramidOptions(min_matches=1000)):
-        how = method(Forbidden(), options=options)
+        how = method(extractor=NEVER, options=options)
         found = retry_query(own, [("left/1.png", rows, np.ones(100))], never, how, never)
         assert len(found.added_px) == len(found.added_descriptors) == len(found.rows) == 0
-        assert [(other, len(matches)) for other, matches, _ in found.matches] == [
-            ("left/1.png", 100)
-        ]
+        assert [(other, len(own)) for other, own, _ in found.matches] == [("left/1.png", 100)]
 
 
-@pytest.mark.parametrize("kind", ["mapping", "queries"])
+@pytest.mark.parametrize("kind", ["mapping", "easy"])
 @pytest.mark.parametrize(("more", "tried"), [(0, False), (1, True)])
 def test_a_pair_with_as_many_matches_as_asked_for_is_left(
     scene: Scene, tmp_path: Path, kind: str, more: int, tried: bool
 ) -> None:
     """Fewer than so many, MegLoc says: with exactly so many nothing is tried again."""
-    folder, pairs = scene.mapping(), scene.mapping_pairs()
-    if kind != "mapping":
-        folder, pairs = scene.query("easy"), scene.query_pairs("easy")
-    matches = folder.matches("upright")
-    counts = {(p.query, p.map): len(matches.read(p.query, p.map)[0]) for p in pairs}
-    least = min(counts.values())
+    matches = scene.folder(kind).matches("upright")
+    least = min(len(matches.read(p.query, p.map)[0]) for p in scene.pairs(kind))
     options = ALL.model_copy(update={"min_matches": least + more})
-    retry = scene.retry_mapping if kind == "mapping" else partial(scene.retry_queries, "easy")
-    assert bool(retry(tmp_path / "out", options=options)["pairs_tried"]) == tried
-
-
-def test_images_that_look_away_from_each_other_are_not_tried(scene: Scene, tmp_path: Path) -> None:
-    data = scene.mapping().read()
-    away = data.record_of("right/3.png")
-    behind = RigidTransform.from_matrix(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
-    data.trajectories[away] = behind @ data.trajectories[away]
-    write_sensors(tmp_path / "mapping", data)
-    turned = Scene(scene.root, scene.world)
-    turned.mapping = lambda *more: KaptureFolder(  # type: ignore[method-assign]
-        tmp_path / "mapping", features_dirs=scene.mapping(*more).features_dirs
-    )
-    counts = turned.retry_mapping(tmp_path / "out")
-    assert counts["pairs_tried"] == counts["images_extracted_again"] == 0
-    assert scene.retry_mapping(tmp_path / "again")["pairs_tried"] == 2
+    assert bool(scene.retry(kind, tmp_path, options=options)["pairs_tried"]) == tried

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
@@ -32,46 +31,31 @@ def noise(height: int = 120, width: int = 160, seed: int = 0) -> Image:
 
 def test_what_is_stored_is_what_was_extracted(world: Any) -> None:
     for folder, poses in ((world.mapping(), world.map_poses), (world.query(), world.query_poses)):
+        keypoints, descriptors = folder.keypoints("rootsift"), folder.descriptors("rootsift")
         for image in poses:
             expected = EXTRACTOR.extract(read_image_rgb(folder.image_path(image)))
-            np.testing.assert_array_equal(
-                folder.keypoints("rootsift").read(image), expected.keypoints_px
-            )
-            np.testing.assert_array_equal(
-                folder.descriptors("rootsift").read(image), expected.descriptors
-            )
+            np.testing.assert_array_equal(keypoints.read(image), expected.keypoints_px)
+            np.testing.assert_array_equal(descriptors.read(image), expected.descriptors)
             assert len(expected.scores) > 300
 
 
 def test_kapture_reads_it(world: Any, tmp_path: Path) -> None:
     """The orphan layout is kapture's own once it is linked to its place, as its tools do."""
-    proxy = tmp_path / "proxy"
-    (proxy / "sensors").mkdir(parents=True)
-    for name in ("sensors.txt", "records_camera.txt", "trajectories.txt"):
-        (proxy / "sensors" / name).symlink_to(world.root / "mapping" / "sensors" / name)
-    (proxy / "sensors" / "records_data").symlink_to(world.mapping().root / "sensors/records_data")
+    (tmp_path / "sensors").symlink_to(world.root / "mapping" / "sensors")
     for kind in ("keypoints", "descriptors"):
-        (proxy / "reconstruction" / kind).mkdir(parents=True)
-        place = world.features_dir / "local_features" / "rootsift" / kind
-        (proxy / "reconstruction" / kind / "rootsift").symlink_to(place)
-    theirs = kapture.io.csv.kapture_from_dir(str(proxy))
+        place = tmp_path / "reconstruction" / kind / "rootsift"
+        place.parent.mkdir(parents=True)
+        place.symlink_to(world.features_dir / "local_features" / "rootsift" / kind)
+    theirs = kapture.io.csv.kapture_from_dir(str(tmp_path))
     keypoints = theirs.keypoints["rootsift"]
     assert set(keypoints) == set(world.map_poses)
     assert (keypoints.type_name, keypoints.dtype, keypoints.dsize) == ("rootsift", np.float32, 2)
-    descriptors = theirs.descriptors["rootsift"]
-    assert (descriptors.dsize, descriptors.keypoints_type, descriptors.metric_type) == (
-        128,
-        "rootsift",
-        "L2",
-    )
+    found = theirs.descriptors["rootsift"]
+    assert (found.dsize, found.keypoints_type, found.metric_type) == (128, "rootsift", "L2")
 
 
 def test_workers_write_the_same_bytes(
-    images_only: Any,
-    world: Any,
-    two_processes: Executor,
-    tmp_path: Path,
-    folder_bytes: Callable[[Path], dict[str, bytes]],
+    images_only: Any, world: Any, two_processes: Executor, tmp_path: Path, folder_bytes: Any
 ) -> None:
     folders = [images_only.mapping(), images_only.query()]
     counts = extract_local_features(folders, EXTRACTOR, tmp_path, work=Work(two_processes))
@@ -81,13 +65,10 @@ def test_workers_write_the_same_bytes(
     assert ours == folder_bytes(world.features_dir / "local_features")
 
 
-def test_masks_beside_the_images_are_obeyed(
-    small_kapture: Callable[..., KaptureFolder], tmp_path: Path
-) -> None:
+def test_masks_beside_the_images_are_obeyed(small_kapture: Any, tmp_path: Path) -> None:
     folder = small_kapture({"a.png": noise(), "b.png": noise()})
     mask = np.zeros((120, 160, 3), dtype=np.uint8)
     mask[:, 80:] = 255
-    (folder.root / "sensors" / "masks").mkdir()
     write_image(folder.root / "sensors" / "masks" / "a.png.png", mask)
     output = tmp_path / "features"
     counts = extract_local_features([folder], EXTRACTOR, output)
@@ -108,57 +89,27 @@ def test_masks_beside_the_images_are_obeyed(
     np.testing.assert_array_equal(strict.read("a.png"), masked[~near])
 
 
-def test_a_mask_of_another_size_is_refused(
-    small_kapture: Callable[..., KaptureFolder], tmp_path: Path
-) -> None:
+def test_broken_inputs_are_refused(small_kapture: Any, tmp_path: Path) -> None:
+    def refused(message: str, *folders: KaptureFolder) -> DataError:
+        with pytest.raises(DataError, match=message) as caught:
+            extract_local_features(folders, EXTRACTOR, tmp_path / "features")
+        assert not (tmp_path / "features").exists()
+        return caught.value
+
     folder = small_kapture({"a.png": noise()})
-    (folder.root / "sensors" / "masks").mkdir()
-    place = folder.root / "sensors" / "masks" / "a.png.png"
-    write_image(place, np.zeros((60, 80, 3), dtype=np.uint8))
-    with pytest.raises(DataError, match="mask is 80x60, its image 160x120") as caught:
-        extract_local_features([folder], EXTRACTOR, tmp_path / "features")
-    assert caught.value.path == place
-
-
-def test_an_image_of_another_size_than_its_camera_is_refused(
-    small_kapture: Callable[..., KaptureFolder], tmp_path: Path
-) -> None:
-    camera = Camera("SIMPLE_PINHOLE", 320, 240, (300.0, 160.0, 120.0))
-    folder = small_kapture({"a.png": noise()}, camera=camera)
-    with pytest.raises(DataError, match=r"a.png: the image is 160x120, its camera says 320x240"):
-        extract_local_features([folder], EXTRACTOR, tmp_path / "features")
-
-
-def test_an_image_that_is_none_is_refused(
-    small_kapture: Callable[..., KaptureFolder], tmp_path: Path
-) -> None:
-    folder = small_kapture({"a.png": noise()})
+    other = small_kapture({"a.png": noise()}, name="other")
+    refused(r"image a\.png stands in two kapture folders", folder, other)
+    mask = folder.root / "sensors" / "masks" / "a.png.png"
+    write_image(mask, np.zeros((60, 80, 3), dtype=np.uint8))
+    assert refused("mask is 80x60, its image 160x120", folder).path == mask
+    mask.unlink()
     folder.image_path("a.png").write_text("no image")
-    with pytest.raises(DataError, match=r"a\.png"):
-        extract_local_features([folder], EXTRACTOR, tmp_path / "features")
+    refused(r"a\.png", folder)
     folder.image_path("a.png").unlink()
-    with pytest.raises(DataError, match=r"a\.png"):
-        extract_local_features([folder], EXTRACTOR, tmp_path / "features")
-
-
-def test_one_name_in_two_folders_is_refused(
-    small_kapture: Callable[..., KaptureFolder], tmp_path: Path
-) -> None:
-    folders = [small_kapture({"a.png": noise()}, name=name) for name in ("one", "two")]
-    with pytest.raises(DataError, match=r"image a\.png stands in two kapture folders"):
-        extract_local_features(folders, EXTRACTOR, tmp_path / "features")
-    assert not (tmp_path / "features").exists()
-
-
-def test_an_image_without_features_is_stored_as_having_none(
-    small_kapture: Callable[..., KaptureFolder], tmp_path: Path
-) -> None:
-    gray = np.full((120, 160, 3), 90, dtype=np.uint8)
-    folder = small_kapture({"a.png": gray, "b.png": noise()})
-    extract_local_features([folder], EXTRACTOR, tmp_path / "features")
-    assert folder.keypoints("rootsift").read("a.png").shape == (0, 2)
-    assert folder.descriptors("rootsift").read("a.png").shape == (0, 128)
-    assert folder.keypoints("rootsift").length("b.png") > 0
+    refused(r"a\.png", folder)
+    camera = Camera("SIMPLE_PINHOLE", 320, 240, (300.0, 160.0, 120.0))
+    larger = small_kapture({"a.png": noise()}, name="larger", camera=camera)
+    refused(r"a.png: the image is 160x120, its camera says 320x240", larger)
 
 
 def features(count: int = 3, **changes: Any) -> LocalFeatures:
@@ -195,17 +146,15 @@ class Returning:
     ],
 )
 def test_what_a_plugin_must_not_return(
-    small_kapture: Callable[..., KaptureFolder], tmp_path: Path, value: Any, message: str
+    small_kapture: Any, tmp_path: Path, value: Any, message: str
 ) -> None:
     folder = small_kapture({"a.png": noise()})
     with pytest.raises(PluginError, match=rf"plugin 'returning' on image a\.png: .*{message}"):
         extract_local_features([folder], Returning(value), tmp_path / "features")
 
 
-def test_a_plugins_own_dtypes_and_columns_are_kept(
-    small_kapture: Callable[..., KaptureFolder], tmp_path: Path
-) -> None:
-    folder = small_kapture({"a.png": noise()})
+def test_a_plugins_own_dtypes_and_columns_are_kept(small_kapture: Any, tmp_path: Path) -> None:
+    folder = small_kapture({"a.png": noise(), "gray.png": np.full((120, 160, 3), 90, np.uint8)})
     value = features(
         keypoints_px=np.arange(12, dtype=np.float32).reshape(3, 4),
         descriptors=np.arange(96, dtype=np.uint8).reshape(3, 32),
@@ -215,3 +164,8 @@ def test_a_plugins_own_dtypes_and_columns_are_kept(
     stored = folder.descriptors("returning").read("a.png")
     np.testing.assert_array_equal(stored, value.descriptors)
     assert stored.dtype == np.uint8
+    # an image without features is stored as having none
+    extract_local_features([folder], EXTRACTOR, tmp_path / "features")
+    assert folder.keypoints("rootsift").read("gray.png").shape == (0, 2)
+    assert folder.descriptors("rootsift").read("gray.png").shape == (0, 128)
+    assert folder.keypoints("rootsift").length("a.png") > 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.localization.ranking import DistinctiveInliers, InlierCount
-from megloc_kapture.localization.structure import StructureDistance
 from megloc_kapture.plugins import DepthView, HypothesisView, PoseHypothesis, PoseRanker
-from megloc_kapture.stages import perceptual_ranking
 from megloc_kapture.stages.perceptual_ranking import (
     AlignedViewOptions,
     PerceptualRanker,
@@ -26,18 +24,6 @@ from megloc_kapture.values import Camera, RigidTransform
 CAMERA = Camera("SIMPLE_PINHOLE", 160, 120, (120.0, 80.0, 60.0))
 WALL_M = 3.0
 APART_M = 20.0  # between rooms
-
-
-@pytest.fixture(autouse=True)
-def distances(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The distance as it is registered, wherever this is installed."""
-    known = {"structure": StructureDistance}
-
-    def load(group: str, name: str, options: dict[str, object]) -> StructureDistance:
-        assert group == "megloc_kapture.image_distances"
-        return known[name](StructureDistance.Options.model_validate(options))
-
-    monkeypatch.setattr(perceptual_ranking, "load_plugin", load)
 
 
 def stripes(seed: int, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -70,17 +56,19 @@ def photograph(room: int, pose: RigidTransform) -> NDArray[np.uint8]:
 
 @dataclass
 class Scene:
-    """Rooms with two map images each; some without depth."""
+    """Rooms with two map images each; some without depth, and from a column on without it."""
 
     query: NDArray[np.uint8]
     without_depth: tuple[str, ...] = ()
+    unknown: dict[str, slice] = field(default_factory=dict)
     mask: NDArray[np.bool_] | None = None
     asked: list[str] = field(default_factory=list)
+    # where a numbered image stands before the wall: beside the middle, and ahead
+    stands: Callable[[int], tuple[float, float]] = lambda number: ((-0.4, 0.5)[number], -0.2)
 
-    @staticmethod
-    def place(name: str) -> tuple[int, RigidTransform]:
+    def place(self, name: str) -> tuple[int, RigidTransform]:
         room, number = (int(part) for part in name.removesuffix(".jpg").split("_"))
-        return room, standing(room, (-0.4, 0.5)[number], -0.2)
+        return room, standing(room, *self.stands(number))
 
     def query_image(self, name: str) -> NDArray[np.uint8]:
         self.asked.append(name)
@@ -88,9 +76,6 @@ class Scene:
 
     def query_mask(self, name: str) -> NDArray[np.bool_] | None:
         return self.mask
-
-    def query_depth(self, name: str) -> None:
-        return None
 
     def map_image(self, name: str) -> NDArray[np.uint8]:
         self.asked.append(name)
@@ -103,10 +88,9 @@ class Scene:
         if name in self.without_depth:
             return None
         depth = np.full((CAMERA.height, CAMERA.width), WALL_M + 0.2, np.float32)
+        if name in self.unknown:
+            depth[:, self.unknown[name]] = 0
         return DepthView(CAMERA, depth, RigidTransform.identity())
-
-    def map_points(self, name: str) -> NDArray[np.float64]:
-        raise AssertionError
 
     def map_camera(self, name: str) -> Camera:
         return CAMERA
@@ -115,22 +99,15 @@ class Scene:
         return self.place(name)[1]
 
 
-def hypothesis(room: int, inliers: int, views: Sequence[str] = ("q",)) -> PoseHypothesis:
+def hypothesis(room: int, inliers: int, views: int = 1) -> PoseHypothesis:
     """The query's pose as one room explains it, with so many inliers of what all rooms share."""
     rng = np.random.default_rng(0)
     pose = standing(room)
     points = rng.uniform((-1.5, -1.0, WALL_M), (0.1, 1.0, WALL_M + 1e-9), (300, 3))[:inliers]
     world = points + (APART_M * room, 0.0, 0.0)
-    posed = HypothesisView(
-        name="q",
-        camera=CAMERA,
-        cam_from_world=pose,
-        points_px=project(CAMERA, pose, world),
-        points_world=world,
-        errors_px=np.zeros(inliers),
-        inliers=np.ones(inliers, bool),
-    )
-    return PoseHypothesis((f"{room}_0.jpg", f"{room}_1.jpg"), (posed,) * len(views), 4.0)
+    pixels, every = project(CAMERA, pose, world), np.ones(inliers, bool)
+    posed = HypothesisView("q", CAMERA, pose, pixels, world, np.zeros(inliers), every)
+    return PoseHypothesis((f"{room}_0.jpg", f"{room}_1.jpg"), (posed,) * views, 4.0)
 
 
 def ranker(**options: object) -> PerceptualRanker:
@@ -155,6 +132,19 @@ def test_the_room_that_looks_like_the_query_wins(scene: Scene) -> None:
     assert np.argmax(scores) == 2
     assert scores[2] - np.delete(scores, 2).max() > 0.05
     assert len(scene.asked) == len(set(scene.asked)) == 1 + 8  # every picture is read once
+    again = pickle.loads(pickle.dumps(ranker()))
+    np.testing.assert_array_equal(again.score(HYPOTHESES, scene), scores)
+    # the views of a rig count together
+    both, alone = (
+        ranker().score([hypothesis(0, 300, views), hypothesis(RIGHT, 120, views)], scene)
+        for views in (2, 1)
+    )
+    np.testing.assert_allclose(both, alone, atol=1e-9)
+    # one hypothesis or none
+    scene.asked.clear()
+    assert ranker().score([], scene).shape == (0,)
+    np.testing.assert_array_equal(ranker().score(HYPOTHESES[:1], scene), [0.0])
+    assert scene.asked == []
 
 
 def test_scores_follow_the_hypotheses(scene: Scene) -> None:
@@ -170,41 +160,24 @@ def test_scores_follow_the_hypotheses(scene: Scene) -> None:
 def test_pictures_are_compared_where_both_rooms_show_something(scene: Scene) -> None:
     # a wrong room of which only the part that all have in common is known: nothing against it
     narrow = PoseHypothesis(("0_0.jpg",), HYPOTHESES[0].views, 4.0)
-    poor = Scene(scene.query)
-    original = poor.map_depth
-
-    def depth(name: str) -> DepthView | None:
-        view = original(name)
-        if name == "0_0.jpg" and view is not None:
-            view.depth_m[:, 60:] = 0
-        return view
-
-    poor.map_depth = depth  # type: ignore[method-assign]
+    scene.unknown["0_0.jpg"] = slice(60, None)
     # and noise on the query where the right room is known as well
-    noise = np.random.default_rng(0).normal(0, 12, poor.query.shape)
-    poor.query = (poor.query + noise).clip(0, 255).astype(np.uint8)
-    poor.query[:, 100:] = poor.query[:, 100:] // 2 + np.random.default_rng(1).integers(
-        0, 60, poor.query[:, 100:].shape, dtype=np.uint8
-    )
+    noise = np.random.default_rng(0).normal(0, 12, scene.query.shape)
+    scene.query = (scene.query + noise).clip(0, 255).astype(np.uint8)
+    right = scene.query[:, 100:]
+    more = np.random.default_rng(1).integers(0, 60, right.shape, dtype=np.uint8)
+    scene.query[:, 100:] = right // 2 + more
     pair = [narrow, hypothesis(RIGHT, 120)]
-    alone = ranker(finalists=1).score(pair, poor)
-    together = ranker().score(pair, poor)
+    alone = ranker(finalists=1).score(pair, scene)
+    together = ranker().score(pair, scene)
     assert alone[0] > alone[1] + 0.05
     assert abs(together[0] - together[1]) < 0.3 * (alone[0] - alone[1])
 
 
 def test_rooms_that_show_nothing_in_common_are_told_by_their_own_distances(scene: Scene) -> None:
     # of the wrong room the poster is known, of the right one the wall beside it
-    original = scene.map_depth
-
-    def depth(name: str) -> DepthView | None:
-        view = original(name)
-        if view is not None:
-            unknown = slice(70, None) if name.startswith(f"{RIGHT}_") else slice(90)
-            view.depth_m[:, unknown] = 0
-        return view
-
-    scene.map_depth = depth  # type: ignore[method-assign]
+    for room, unknown in ((0, slice(90)), (RIGHT, slice(70, None))):
+        scene.unknown |= {f"{room}_{number}.jpg": unknown for number in (0, 1)}
     for order in (1, -1):
         pair = [hypothesis(0, 300), hypothesis(RIGHT, 120)][::order]
         for hypotheses in (pair, [PoseHypothesis(h.images[:1], h.views, 4.0) for h in pair]):
@@ -213,20 +186,17 @@ def test_rooms_that_show_nothing_in_common_are_told_by_their_own_distances(scene
             assert scores.sum() == pytest.approx(0.0)
 
 
-def test_hopeless_clusters_are_not_looked_at(scene: Scene) -> None:
+def test_what_cannot_be_told(scene: Scene) -> None:
+    # hopeless clusters are not looked at
     scores = ranker(min_inlier_share=0.5).score(HYPOTHESES, scene)
     assert np.argmin(scores) == 2  # 120 of 300
     assert not any(name.startswith("2_") for name in scene.asked)
-
-
-def test_what_cannot_be_told_stands_last(scene: Scene) -> None:
+    # what has no depth stands last
     scene.without_depth = ("3_0.jpg", "3_1.jpg")
     scores = ranker().score(HYPOTHESES, scene)
     assert np.argmax(scores) == 2 and np.argmin(scores) == 3
     assert np.isfinite(scores).all()
-
-
-def test_where_the_best_by_inliers_cannot_be_told_inliers_decide(scene: Scene) -> None:
+    # where it is the best by inliers, or the query is masked, inliers decide
     expected = DistinctiveInliers().score(HYPOTHESES, scene)
     scene.without_depth = ("0_0.jpg", "0_1.jpg")
     np.testing.assert_array_equal(ranker().score(HYPOTHESES, scene), expected)
@@ -249,31 +219,13 @@ def test_masked_parts_of_the_query_do_not_count(scene: Scene) -> None:
     assert plain[2] > 0
 
 
-def test_the_views_of_a_rig_count_together(scene: Scene) -> None:
-    both = [hypothesis(room, count, ("q", "q")) for room, count in ((0, 300), (RIGHT, 120))]
-    alone = [hypothesis(room, count) for room, count in ((0, 300), (RIGHT, 120))]
-    np.testing.assert_allclose(ranker().score(both, scene), ranker().score(alone, scene), atol=1e-9)
-
-
-def test_one_hypothesis_or_none(scene: Scene) -> None:
-    assert ranker().score([], scene).shape == (0,)
-    np.testing.assert_array_equal(ranker().score(HYPOTHESES[:1], scene), [0.0])
-    assert scene.asked == []
-
-
-def test_it_can_be_sent_to_another_process(scene: Scene) -> None:
-    again = pickle.loads(pickle.dumps(ranker()))
-    np.testing.assert_array_equal(again.score(HYPOTHESES, scene), ranker().score(HYPOTHESES, scene))
-
-
 def test_an_aligned_view_is_what_the_query_would_see(scene: Scene) -> None:
     view = aligned_view(CAMERA, standing(RIGHT), ["2_0.jpg", "2_1.jpg"], scene)
     assert view.valid.mean() > 0.95
     difference = np.abs(view.image.astype(int) - scene.query)[view.valid]
     assert difference.mean() < 3
-    small = aligned_view(
-        CAMERA, standing(RIGHT), ["2_0.jpg"], scene, AlignedViewOptions(long_side=80)
-    )
+    half = AlignedViewOptions(long_side=80)
+    small = aligned_view(CAMERA, standing(RIGHT), ["2_0.jpg"], scene, half)
     assert small.image.shape == (60, 80, 3)
     reduced = query_at_size(scene.query, 80, 60)
     assert np.abs(small.image.astype(int) - reduced)[small.valid].mean() < 4
@@ -290,18 +242,12 @@ def test_the_nearest_references_with_depth_are_taken(scene: Scene) -> None:
     assert not aligned_view(CAMERA, near, [], scene).valid.any()
 
 
-class Filmed(Scene):
-    """A room in which one place was photographed again and again."""
-
-    @staticmethod
-    def place(name: str) -> tuple[int, RigidTransform]:
-        room, number = (int(part) for part in name.removesuffix(".jpg").split("_"))
-        x = 0.9 if number == 9 else -0.5 + 0.001 * number
-        return room, standing(room, x, 0.5)
-
-
 def test_repeated_photographs_wait_until_the_others_are_taken() -> None:
-    room = Filmed(photograph(RIGHT, standing(RIGHT)))
+    # one place was photographed again and again
+    room = Scene(
+        photograph(RIGHT, standing(RIGHT)),
+        stands=lambda number: (0.9 if number == 9 else -0.5 + 0.001 * number, 0.5),
+    )
     film = [f"2_{number}.jpg" for number in range(4)]
     two = AlignedViewOptions(references=2)
     view = aligned_view(CAMERA, standing(RIGHT), [*film, "2_9.jpg"], room, two)

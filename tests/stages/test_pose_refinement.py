@@ -37,10 +37,8 @@ SHIFT = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.25))
 class Shift:
     """Moves every pose by 0.25 along the axis, of one image it does not."""
 
-    name = "shift"
-
-    def __init__(self, stays: str = "") -> None:
-        self.stays = stays
+    def __init__(self, stays: str = "", name: str = "shift") -> None:
+        self.stays, self.name = stays, name
         self.asked: dict[str, list[str]] = {}
 
     def refine(
@@ -50,12 +48,31 @@ class Shift:
         cam_from_world: RigidTransform,
         references: Sequence[str],
         scene: Any,
-    ) -> PoseRefinement:
+    ) -> Any:
         self.asked[query] = list(references)
         assert scene.query_image(query).shape[:2] == (camera.height, camera.width)
+        if self.name == "wrong":
+            return None
         if query == self.stays:
             return PoseRefinement(cam_from_world, "nothing overlaps", {"overlap": 0.125})
         return PoseRefinement(SHIFT @ cam_from_world, measures={"overlap": 0.5})
+
+
+class Sure(Shift):
+    """The same, where held out map images say that it may, which their frames decide."""
+
+    def __init__(self, require_consistent_map: bool = True) -> None:
+        super().__init__(name="sure")
+        self.require_consistent_map = require_consistent_map
+
+    def hold_out(self, image: str, images: Any, scene: Any) -> Displacement | None:
+        assert scene.map_pose(image) is not None and image in images.names
+        off = FRAMES["good" if int(image.removesuffix(".png")) < 6 else "bad"]
+        return Displacement(0.02, 0.2, 3.0, 0.001, 0.01, off)
+
+
+# frame of a map image, and how far from consistent it is
+FRAMES = {"good": 1.0, "bad": 1e4}
 
 
 class Chosen(PoseRefinementOptions):
@@ -78,13 +95,12 @@ def localized(world: Any, tmp_path: Path) -> KaptureFolder:
 
 
 def test_poses_move_by_each_refiner_in_turn_and_failures_stay(
-    world: Any, localized: KaptureFolder, tmp_path: Path
+    world: Any, localized: KaptureFolder, tmp_path: Path, folder_bytes: Any
 ) -> None:
     first, second = sorted(world.query_poses)
-    refiners = (Shift(), Shift(stays=first), Shift())
-    counts = refine_poses(
-        world.mapping(), world.query(), localized, tmp_path / "out", Chosen(refiners=refiners)
-    )
+    options = Chosen(refiners=(Shift(), Shift(stays=first), Shift()))
+    arguments = world.mapping(), world.query(), localized
+    counts = refine_poses(*arguments, tmp_path / "out", options)
     assert counts["queries"] == 1
     refined = KaptureFolder(tmp_path / "out").read().poses()
     expected = SHIFT @ SHIFT @ world.query_poses[first]
@@ -100,17 +116,9 @@ def test_poses_move_by_each_refiner_in_turn_and_failures_stay(
     assert rows[1].measures == ("overlap=0.125",)
     # what was localized is as it was
     assert localized.read().poses()[first] == world.query_poses[first]
-
-
-def test_threads_write_the_same_bytes(
-    world: Any, localized: KaptureFolder, tmp_path: Path, folder_bytes: Any
-) -> None:
-    options = Chosen(refiners=(Shift(),))
-    arguments = (world.mapping(), world.query(), localized)
-    refine_poses(*arguments, tmp_path / "here", options)
     with ThreadPoolExecutor(2) as executor:
-        refine_poses(*arguments, tmp_path / "there", options, work=Work(executor))
-    assert folder_bytes(tmp_path / "here") == folder_bytes(tmp_path / "there")
+        refine_poses(*arguments, tmp_path / "threads", options, work=Work(executor))
+    assert folder_bytes(tmp_path / "out") == folder_bytes(tmp_path / "threads")
 
 
 def test_references_look_the_same_way_and_are_of_one_frame(
@@ -121,31 +129,20 @@ def test_references_look_the_same_way_and_are_of_one_frame(
     groups = {image: ImageGroup(frame="a" if k < 3 else "b") for k, image in enumerate(images)}
     refiner = Shift()
     refine_poses(
-        world.mapping(),
-        world.query(),
-        localized,
-        tmp_path / "out",
-        Chosen(refiners=(refiner,)),
+        world.mapping(), world.query(), localized, tmp_path / "out", Chosen(refiners=(refiner,)),
         restrictions=Restrictions(groups=groups),
-    )
+    )  # fmt: skip
     assert set(refiner.asked[first]) <= set(images[:3])
     # the image that the pose comes from is among them
     assert images[0] in refiner.asked[first]
 
 
-def test_a_refiner_that_returns_something_else_is_refused(
-    world: Any, localized: KaptureFolder, tmp_path: Path
-) -> None:
-    class Wrong(Shift):
-        name = "wrong"
-
-        def refine(self, *arguments: Any, **more: Any) -> Any:
-            return None
-
+def test_wrong_refiners_are_refused(world: Any, localized: KaptureFolder, tmp_path: Path) -> None:
+    wrong = Chosen(refiners=(Shift(name="wrong"),))
     with pytest.raises(PluginError, match="'wrong' on image .*: refine returned NoneType"):
-        refine_poses(
-            world.mapping(), world.query(), localized, tmp_path, Chosen(refiners=(Wrong(),))
-        )
+        refine_poses(world.mapping(), world.query(), localized, tmp_path, wrong)
+    with pytest.raises(PluginError, match="no plugin 'better'"):
+        PoseRefinementOptions(by=(PluginChoice(name="better"),)).make_refiners()
 
 
 def test_every_registered_refiner_says_why_a_query_without_depth_stays(
@@ -163,35 +160,7 @@ def test_every_registered_refiner_says_why_a_query_without_depth_stays(
         assert poses[first] == localized.read().poses()[first]
 
 
-def test_no_such_refiner() -> None:
-    with pytest.raises(PluginError, match="no plugin 'better'"):
-        PoseRefinementOptions(by=(PluginChoice(name="better"),)).make_refiners()
-
-
 # -------------------------------------------------------------------------------- map consistency
-
-
-# frame of a map image, and how far from consistent it is
-FRAMES = {"good": 1.0, "bad": 1e4}
-
-
-class Sure:
-    """Moves every pose, and map images by what their frame says."""
-
-    name = "sure"
-
-    def __init__(self, require_consistent_map: bool = True) -> None:
-        self.require_consistent_map = require_consistent_map
-
-    def hold_out(self, image: str, images: Any, scene: Any) -> Displacement | None:
-        assert scene.map_pose(image) is not None and image in images.names
-        off = FRAMES["good" if int(image.removesuffix(".png")) < 6 else "bad"]
-        return Displacement(0.02, 0.2, 3.0, 0.001, 0.01, off)
-
-    def refine(
-        self, query: str, camera: Any, pose: RigidTransform, references: Sequence[str], scene: Any
-    ) -> PoseRefinement:
-        return PoseRefinement(SHIFT @ pose)
 
 
 @pytest.fixture
@@ -218,9 +187,7 @@ RESTRICTIONS = Restrictions(
 )
 
 
-def test_each_coordinate_frame_is_judged_by_itself(
-    folders: tuple[KaptureFolder, ...], tmp_path: Path
-) -> None:
+def test_each_coordinate_frame_is_judged_by_itself(folders: Any, tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = Chosen(refiners=(Sure(),))
     counts = refine_poses(*folders, out, options, restrictions=RESTRICTIONS)
@@ -249,9 +216,7 @@ def test_each_coordinate_frame_is_judged_by_itself(
     shutil.rmtree(out)
 
 
-def test_a_refiner_that_does_not_ask_is_used_everywhere(
-    folders: tuple[KaptureFolder, ...], tmp_path: Path
-) -> None:
+def test_a_refiner_that_does_not_ask_is_used_everywhere(folders: Any, tmp_path: Path) -> None:
     options = Chosen(refiners=(Sure(require_consistent_map=False),))
     counts = refine_poses(*folders, tmp_path / "out", options, restrictions=RESTRICTIONS)
     assert counts == {"queries": 2, "accepted_by_sure": 2}
