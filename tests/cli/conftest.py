@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -77,17 +79,19 @@ def workspace(finished: Path, tmp_path: Path) -> Path:
     return copy_of(finished, tmp_path / "workspace")
 
 
+@pytest.fixture(scope="session")
+def virtual_gallery(shared_data: Path) -> Path:
+    """The foreign map: map/, query/ and query_gt/; not to be written into."""
+    return shared_data / "foreign_maps" / "virtual_gallery"
+
+
 @pytest.fixture
-def gallery(shared_data: Path, tmp_path: Path) -> Path:
+def gallery(virtual_gallery: Path, tmp_path: Path) -> Path:
     """A copy of the foreign map and its queries whose images are links; to be spoilt."""
-    original = shared_data / "foreign_maps" / "virtual_gallery"
+    no_images = shutil.ignore_patterns("records_data")
     for part in ("map", "query", "query_gt"):
-        shutil.copytree(
-            original / part,
-            tmp_path / "gallery" / part,
-            ignore=shutil.ignore_patterns("records_data"),
-        )
-        images = original / part / "sensors" / "records_data"
+        shutil.copytree(virtual_gallery / part, tmp_path / "gallery" / part, ignore=no_images)
+        images = virtual_gallery / part / "sensors" / "records_data"
         if images.is_dir():
             (tmp_path / "gallery" / part / "sensors" / "records_data").symlink_to(images.resolve())
     return tmp_path / "gallery"
@@ -111,5 +115,18 @@ def contents() -> Callable[[Path], dict[str, bytes]]:
             elif path.is_file():
                 found[str(path.relative_to(root))] = path.read_bytes()
         return found
+
+    return read
+
+
+@pytest.fixture(scope="session")
+def data_of() -> Callable[[Path], dict[str, Any]]:
+    """Function: what a page of ``megloc view`` shows."""
+
+    def read(page: Path) -> dict[str, Any]:
+        found = re.search(r'id="data">(.*?)</script>', page.read_text(), re.DOTALL)
+        assert found is not None
+        data: dict[str, Any] = json.loads(found[1])
+        return data
 
     return read

@@ -121,24 +121,19 @@ def localize(gallery: Path) -> list[str | Path]:
 
 
 @pytest.mark.parametrize(("spoil", "message"), MAPS.values(), ids=MAPS)
-def test_localize_refuses_a_bad_map(
+def test_localize_refuses_a_bad_map_and_info_finds_the_same_fault(
     megloc: Any, gallery: Path, contents: Contents, spoil: Spoil, message: str
 ) -> None:
     spoil(gallery / "map")
     before = contents(gallery)
     megloc(*localize(gallery)).refused(message)
     assert not (gallery.parent / "new").exists()
-    assert contents(gallery) == before
-
-
-@pytest.mark.parametrize(("spoil", "message"), MAPS.values(), ids=MAPS)
-def test_info_finds_the_same_faults(megloc: Any, gallery: Path, spoil: Spoil, message: str) -> None:
-    spoil(gallery / "map")
     done = megloc("info", gallery / "map")
     assert done.status == 2
     if "no keypoints" in message:
         message = r"rgb_00223\.jpg\.desc: image .* has descriptors but no keypoints"
     assert re.fullmatch(f"megloc: .*{message}.*\n", done.err)
+    assert contents(gallery) == before
 
 
 QUERIES: dict[str, tuple[Spoil, str]] = {
@@ -165,34 +160,6 @@ def test_localize_refuses_bad_queries(
     assert not (gallery.parent / "new").exists()
 
 
-BROKEN_FEATURES: dict[str, tuple[Spoil, str]] = {
-    "keypoints cut": (cut(f"{KEYPOINTS}/{QUERY}.kpt"), r"rgb_00267\.jpg\.kpt: .*truncated"),
-    "descriptors cut": (cut(f"{DESCRIPTORS}/{QUERY}.desc"), r"rgb_00267\.jpg\.desc: .*truncated"),
-    "global cut": (cut(f"{GLOBAL}/{QUERY}.gfeat"), r"rgb_00267\.jpg\.gfeat: .*truncated"),
-    "lengths differ": (
-        cut(f"{KEYPOINTS}/{QUERY}.kpt", 3 * 4 * 400),
-        r"rgb_00267\.jpg\.desc: 500 descriptors for 400 keypoints",
-    ),
-}
-
-
-@pytest.mark.parametrize(("spoil", "message"), BROKEN_FEATURES.values(), ids=BROKEN_FEATURES)
-def test_broken_features_of_one_query_fail_that_query(
-    megloc: Any, gallery: Path, spoil: Spoil, message: str
-) -> None:
-    spoil(gallery / "query")
-    done = megloc(*localize(gallery))
-    assert (done.status, done.out[:6]) == (0, "3 of 4")
-    failed = read_status(gallery.parent / "new/localized/status.csv")[QUERY]
-    assert re.search(message, failed.reason)
-
-
-def without_descriptors(root: Path) -> None:
-    for path in (root / DESCRIPTORS).rglob("*.*"):
-        if path.is_file():
-            path.unlink()
-
-
 def of_unknown_type(root: Path) -> None:
     """The type of the keypoints becomes one that no extractor makes."""
     for kind in (KEYPOINTS, DESCRIPTORS):
@@ -208,17 +175,14 @@ def of_unknown_type(root: Path) -> None:
 def test_features_that_nobody_can_extract(megloc: Any, gallery: Path) -> None:
     for part in ("map", "query"):
         of_unknown_type(gallery / part)
-    megloc("info", gallery / "map").out.index("must be given in kapture: no extractor for orb_500")
-    (gallery / "query" / "reconstruction" / "keypoints" / "orb_500" / f"{QUERY}.kpt").unlink()
+    told = megloc("info", gallery / "map").out
+    assert "must be given in kapture: no extractor for orb_500" in told
+    keypoints = gallery / "query" / "reconstruction" / "keypoints" / "orb_500" / f"{QUERY}.kpt"
+    keypoints.unlink()
     message = r"image '.*rgb_00267\.jpg': features of type 'orb_500' are missing and no extractor"
     megloc(*localize(gallery)).refused(message)
-    assert not (gallery.parent / "new").exists()
-
-
-def test_descriptors_that_nobody_can_extract_again(megloc: Any, gallery: Path) -> None:
-    without_descriptors(gallery / "map")
-    for part in ("map", "query"):
-        of_unknown_type(gallery / part)
+    # nor those of the map again
+    shutil.rmtree(gallery / "map" / "reconstruction" / "descriptors")
     megloc(*localize(gallery)).refused(r"/map: .*'orb_500'", "no extractor")
     assert not (gallery.parent / "new").exists()
     told = megloc("info", gallery / "map").out
@@ -241,12 +205,10 @@ SPECIAL: dict[str, tuple[list[str], str]] = {
     "no queries": (["--query", "{}/nowhere"], r"/nowhere: no such kapture folder"),
     "no features folder": (["--features-dir", "{}/nowhere"], r"/nowhere: no such folder"),
     "no pairs": (["--pairs", "{}/nowhere"], r"/nowhere: "),
+    "strange pairs": (["--pairs", "{}/pairs.txt"], r"nowhere\.jpg, which is no image of the map"),
     "not a map": (["-i", "{}/query"], r"/query: no map to localize in"),
     "no such type": (["--keypoints-type", "sift"], r"'sift'; there are: r2d2_500"),
-    "no such option": (["--set", "localisation.x=1"], r"option localisation"),
     "bad value": (["--set", "localization.fallback=guess"], r"option localization\.fallback"),
-    "no value": (["--set", "localization"], r"--set takes key=value"),
-    "no such preset": (["--preset", "best"], r"unknown preset 'best'; known: classic"),
     "no workers": (["--workers", "0"], r"0 workers"),
 }
 
@@ -255,15 +217,9 @@ SPECIAL: dict[str, tuple[list[str], str]] = {
 def test_arguments_that_cannot_be(
     megloc: Any, gallery: Path, change: list[str], message: str
 ) -> None:
+    header = "# query_image, map_image, score\n"
+    (gallery / "pairs.txt").write_text(f"{header}{QUERY}, nowhere.jpg, 1.0\n")
     megloc(*localize(gallery), *(text.format(gallery) for text in change)).refused(message)
-    assert not (gallery.parent / "new").exists()
-
-
-def test_pairs_with_an_image_that_is_not_in_the_map(megloc: Any, gallery: Path) -> None:
-    pairs = gallery.parent / "pairs.txt"
-    pairs.write_text(f"# query_image, map_image, score\n{QUERY}, nowhere.jpg, 1.0\n")
-    message = r"nowhere\.jpg, which is no image of the map"
-    megloc(*localize(gallery), "--pairs", pairs).refused(message)
     assert not (gallery.parent / "new").exists()
 
 
@@ -284,25 +240,25 @@ def test_localize_leaves_what_others_wrote(megloc: Any, gallery: Path, kind: str
 # ------------------------------------------------------------------ megloc eval kapture
 
 
+def eval_of(dataset: Path, run: Path) -> list[str | Path]:
+    flags = ["--executor", "inline", "--quiet"]
+    return ["eval", "kapture", "--root", dataset, "--workspace", run, *flags]
+
+
+IMAGE = "mapping/sensors/records_data/0005.jpg"
+
+
 def not_an_image(root: Path) -> None:
-    (root / "mapping/sensors/records_data/0005.jpg").write_text("GIF? no.\n")
+    (root / IMAGE).write_text("GIF? no.\n")
 
 
 def other_size(root: Path) -> None:
-    place = root / "mapping/sensors/records_data/0005.jpg"
-    write_image(place, np.zeros((100, 200, 3), np.uint8))
-
-
-def no_poses(root: Path) -> None:
-    (root / "mapping" / TIMES).unlink()
+    write_image(root / IMAGE, np.zeros((100, 200, 3), np.uint8))
 
 
 DATASETS: dict[str, tuple[Spoil, str]] = {
     "no query": (remove("query/sensors/sensors.txt"), r"dataset: query/sensors/sensors\.txt"),
-    "image missing": (
-        remove("mapping/sensors/records_data/0005.jpg"),
-        r"mapping/sensors/records_data/0005\.jpg: ",
-    ),
+    "image missing": (remove(IMAGE), r"mapping/sensors/records_data/0005\.jpg: "),
     "not an image": (not_an_image, r"records_data/0005\.jpg: not an image"),
     "other size": (other_size, r"records_data/0005\.jpg: .*200x100.*400x300"),
     "pose column": (line(f"mapping/{TIMES}", 4, NO_COLUMN), r"mapping/.*trajectories\.txt:4: "),
@@ -320,7 +276,7 @@ DATASETS: dict[str, tuple[Spoil, str]] = {
         line(f"query/{RECORDS}", 3, fields(lambda f: [*f[:2], "a/../../" + f[2]])),
         r"records_camera\.txt:3: .*'\.\.'",
     ),
-    "no poses": (no_poses, r"mapping: no mapping image has a pose"),
+    "no poses": (remove(f"mapping/{TIMES}"), r"mapping: no mapping image has a pose"),
 }
 
 
@@ -333,7 +289,7 @@ def test_a_bad_dataset_is_refused(
     before = contents(dataset)
     new = dataset.parent / "new"
     arguments = {
-        "eval": ["eval", "kapture", "--root", dataset, "--workspace", new / "run", "--quiet"],
+        "eval": eval_of(dataset, new / "run"),
         "import": ["import", "kapture", dataset, "-o", new / "imported"],
     }[command]
     megloc(*arguments).refused(message)
@@ -344,13 +300,9 @@ def test_a_bad_dataset_is_refused(
 def test_a_truncated_image_of_the_map_stops_the_run_where_it_is_read(
     megloc: Any, dataset: Path
 ) -> None:
-    cut("mapping/sensors/records_data/0005.jpg", 20_000)(dataset)
+    cut(IMAGE, 20_000)(dataset)
     run = dataset.parent / "run"
-    done = megloc(
-        *("eval", "kapture", "--root", dataset, "--workspace", run),
-        *("--executor", "inline", "--quiet"),
-    )
-    done.refused(r"records_data/0005\.jpg: .*(broken|truncated)")
+    megloc(*eval_of(dataset, run)).refused(r"records_data/0005\.jpg: .*(broken|truncated)")
     assert not (run / "local_features").exists()
     assert [path.name for path in (run / "stages").glob("[a-z]*.json")] == ["import.json"]
 
@@ -361,10 +313,7 @@ def test_broken_images_of_queries_fail_these_queries(megloc: Any, dataset: Path)
     write_image(images / "0007.jpg", np.zeros((100, 200, 3), np.uint8))
     (images / "0010.jpg").unlink()
     run = dataset.parent / "run"
-    megloc(
-        *("eval", "kapture", "--root", dataset, "--workspace", run),
-        *("--executor", "inline", "--quiet"),
-    )
+    megloc(*eval_of(dataset, run))
     statuses = read_status(run / "localized" / "status.csv")
     reasons = {name: one.reason for name, one in statuses.items() if one.status == "failed"}
     assert set(statuses) - set(reasons) == {"0001.jpg"} and set(reasons) == {
@@ -381,41 +330,34 @@ def test_broken_images_of_queries_fail_these_queries(megloc: Any, dataset: Path)
         if image.name != "0001.jpg":
             image.write_bytes(b"")
     (images / "0001.jpg").write_bytes(b"")
-    megloc(
-        *("eval", "kapture", "--root", dataset, "--workspace", dataset.parent / "other"), "--quiet"
-    ).refused(r"records_data/0001\.jpg: empty file")
+    megloc(*eval_of(dataset, dataset.parent / "other")).refused(
+        r"records_data/0001\.jpg: empty file"
+    )
 
 
 EVALUATION: dict[str, tuple[list[str], str]] = {
-    "no root": (["eval", "kapture"], r"dataset kapture needs --root"),
-    "no such root": (["eval", "kapture", "--root", "{}/nowhere"], r"/nowhere: no such folder"),
-    "no such dataset": (["eval", "venice"], r"unknown dataset 'venice'; known: kapture"),
-    "no such stage": (["eval", "kapture", "--root", "{}", "--from", "lunch"], r"no stage 'lunch'"),
-    "not done": (
-        ["eval", "kapture", "--root", "{}", "--from", "localization"],
-        r"needs stage import, which has not run",
-    ),
-    "backwards": (
-        ["eval", "kapture", "--root", "{}", "--from", "localization", "--until", "import"],
-        r"--until import stands before --from localization",
-    ),
+    "no root": (["kapture"], r"dataset kapture needs --root"),
+    "no such root": (["kapture", "--root", "{}/nowhere"], r"/nowhere: no such folder"),
+    "no such dataset": (["venice"], r"unknown dataset 'venice'; known: kapture"),
+    "no such stage": (["--from", "lunch"], r"no stage 'lunch'"),
+    "not done": (["--from", "localization"], r"needs stage import, which has not run"),
     "no such plugin": (
-        ["eval", "kapture", "--root", "{}", "--set", "local_features.name=orb"],
+        ["--set", "local_features.name=orb"],
         r"no plugin 'orb' .*registered: .*rootsift",
     ),
     "plugin's option": (
-        ["eval", "kapture", "--root", "{}", "--set", "local_features.options.max_keypoints=many"],
+        ["--set", "local_features.options.max_keypoints=many"],
         r"'rootsift' refuses its options: .*max_keypoints",
     ),
-    "no config": (["eval", "kapture", "--root", "{}", "--config", "{}/x"], r"/x: "),
-    "threshold": (["eval", "kapture", "--root", "{}", "--thresholds", "near"], r"'near'"),
-    "share": (["eval", "kapture", "--root", "{}", "--fail-below", "60"], r"between 0 and 1"),
+    "no config": (["--config", "{}/x"], r"/x: "),
+    "threshold": (["--thresholds", "near"], r"'near'"),
+    "share": (["--fail-below", "60"], r"between 0 and 1"),
     "never judged": (
-        ["eval", "kapture", "--root", "{}", "--fail-below", "0.5", "--until", "import"],
+        ["--fail-below", "0.5", "--until", "import"],
         r"--fail-below needs stage evaluation",
     ),
-    "prefix": (["eval", "kapture", "--root", "{}", "--query-prefix", "../up"], r"'\.\.'"),
-    "workers": (["eval", "kapture", "--root", "{}", "--workers", "-1"], r"-1 workers"),
+    "prefix": (["--query-prefix", "../up"], r"'\.\.'"),
+    "workers": (["--workers", "-1"], r"-1 workers"),
 }
 
 
@@ -423,8 +365,9 @@ EVALUATION: dict[str, tuple[list[str], str]] = {
 def test_eval_that_cannot_be(
     megloc: Any, scene: Path, tmp_path: Path, arguments: list[str], message: str
 ) -> None:
-    given = [argument.format(scene) for argument in arguments]
-    megloc(*given, "--workspace", tmp_path / "a" / "b", "--quiet").refused(message)
+    of_scene = ["kapture", "--root", "{}"] if arguments[0].startswith("--") else []
+    given = [argument.format(scene) for argument in (*of_scene, *arguments)]
+    megloc("eval", *given, "--workspace", tmp_path / "a" / "b", "--quiet").refused(message)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -437,25 +380,23 @@ def test_fail_below_without_truth_is_refused_before_the_work(megloc: Any, datase
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    "command",
     [
-        ["evaluate", "--gt", "{}/nowhere", "-i", "{}/query_gt"],
-        ["evaluate", "--gt", "{}/query_gt", "-i", "{}/nowhere"],
-        ["submit", "kapture", "-i", "{}/nowhere", "-o", "{}/new/poses.txt"],
-        ["extract-local", "-i", "{}/nowhere", "-o", "{}/new"],
-        ["extract-global", "-i", "{}/nowhere", "-o", "{}/new"],
-        ["pairs-mapping", "-i", "{}/nowhere", "-o", "{}/new/pairs.txt"],
-        ["pairs-query", "-i", "{}/mapping", "--query", "{}/nowhere", "-o", "{}/new/pairs.txt"],
-        ["match", "-i", "{}/nowhere", "--pairs", "{}/pairs.txt", "-o", "{}/new"],
-        ["triangulate", "-i", "{}/nowhere", "-o", "{}/new"],
-        ["info", "{}/nowhere"],
+        "evaluate --gt {}/nowhere -i {}/query_gt",
+        "evaluate --gt {}/query_gt -i {}/nowhere",
+        "submit kapture -i {}/nowhere -o {}/new/poses.txt",
+        "extract-local -i {}/nowhere -o {}/new",
+        "extract-global -i {}/nowhere -o {}/new",
+        "pairs-mapping -i {}/nowhere -o {}/new/pairs.txt",
+        "pairs-query -i {}/mapping --query {}/nowhere -o {}/new/pairs.txt",
+        "match -i {}/nowhere --pairs {}/pairs.txt -o {}/new",
+        "triangulate -i {}/nowhere -o {}/new",
+        "info {}/nowhere",
     ],
-    ids=lambda arguments: arguments[0],
 )
-def test_every_command_names_what_is_missing(
-    megloc: Any, dataset: Path, arguments: list[str]
-) -> None:
-    megloc(*(argument.format(dataset) for argument in arguments)).refused("/nowhere|/mapping")
+def test_every_command_names_what_is_missing(megloc: Any, dataset: Path, command: str) -> None:
+    words = [word.replace("{}", str(dataset)) for word in command.split()]
+    megloc(*words).refused("/nowhere|/mapping")
     assert not (dataset / "new").exists()
 
 

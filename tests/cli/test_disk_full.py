@@ -14,22 +14,17 @@ import pytest
 PROGRAM = str(Path(sys.executable).with_name("megloc"))
 
 
-def mounted(place: Path, size: str, *options: str) -> None:
-    place.mkdir(exist_ok=True)
-    flags = ",".join([f"size={size}", *options])
-    subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", flags, "tmpfs", str(place)], check=True, capture_output=True
-    )
-
-
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Callable[..., Path]]:
     """Function that makes a disk of a size, and changes it; needs the right to mount."""
     place = tmp_path / "disk"
 
     def make(size: str, *options: str) -> Path:
+        place.mkdir(exist_ok=True)
+        flags = ",".join([f"size={size}", *options])
+        mount = ["mount", "-t", "tmpfs", "-o", flags, "tmpfs", str(place)]
         try:
-            mounted(place, size, *options)
+            subprocess.run(mount, check=True, capture_output=True)
         except (OSError, subprocess.CalledProcessError) as error:
             pytest.skip(f"no right to mount a small disk: {error}")
         return place
@@ -62,10 +57,8 @@ def test_localize_leaves_nothing(
     megloc: Any, gallery: Path, small_disk: Callable[..., Path], pages: int
 ) -> None:
     disk = small_disk(f"{4 * pages}k")
-    done = megloc(
-        *("localize", "-i", gallery / "map", "--query", gallery / "query"),
-        *("-o", disk / "new" / "localized"),
-    )
+    places = ("-i", gallery / "map", "--query", gallery / "query", "-o", disk / "new" / "localized")
+    done = megloc("localize", *places)
     done.refused(f"{disk}/new/localized.*: cannot write: No space left on device")
     assert list(disk.iterdir()) == []
 
@@ -74,18 +67,10 @@ def test_localize_leaves_nothing_where_files_may_not_grow(gallery: Path, tmp_pat
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200))
 
-    done = subprocess.run(
-        [
-            *(PROGRAM, "localize", "-i", str(gallery / "map"), "--query", str(gallery / "query")),
-            *("-o", str(tmp_path / "new" / "localized"), "--quiet"),
-        ],
-        preexec_fn=limit,
-        capture_output=True,
-        text=True,
-    )
+    command = [PROGRAM, "localize", "-i", str(gallery / "map"), "--query", str(gallery / "query")]
+    command += ["-o", str(tmp_path / "new" / "localized"), "--quiet"]
+    done = subprocess.run(command, preexec_fn=limit, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (2, "")
-    lines = done.stderr.splitlines()
-    assert len(lines) == 1
-    assert lines[0].startswith(f"megloc: {tmp_path}/new/localized/")
-    assert "cannot write" in lines[0]
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"megloc: {tmp_path}/new/localized/") and "cannot write" in line
     assert not (tmp_path / "new").exists()

@@ -23,17 +23,8 @@ from megloc_kapture.values import RigidTransform
 Contents = Callable[[Path], dict[str, bytes]]
 
 STAGES = (
-    "import",
-    "local_features",
-    "global_features",
-    "mapping_pairs",
-    "mapping_matches",
-    "map",
-    "query_pairs",
-    "query_matches",
-    "localization",
-    "submission",
-    "evaluation",
+    *("import", "local_features", "global_features", "mapping_pairs", "mapping_matches", "map"),
+    *("query_pairs", "query_matches", "localization", "submission", "evaluation"),
 )
 POSES = "submissions/kapture_eval_megloc-classic.txt"
 # dates and durations stand in these, and nowhere else
@@ -85,6 +76,13 @@ def lasting(found: dict[str, bytes], *but: str) -> dict[str, bytes]:
     return {n: c for n, c in found.items() if not n.startswith((*DATED, *but))}
 
 
+def recall(workspace: Path) -> list[float]:
+    """Of all queries, at each threshold."""
+    rows = json.loads((workspace / "evaluation" / "recall.json").read_text())["rows"]
+    (row,) = (row for row in rows if row["name"] == "all")
+    return [at["recall"] for at in row["recall"]]
+
+
 # ------------------------------------------------------------------ what is there at the end
 
 
@@ -114,18 +112,14 @@ def test_the_pose_file_of_each_result_is_among_the_submissions(
     assert done.out.splitlines()[-2] == f"pose file  {Path('mine') / first.name}"
     (run / POSES).unlink()
     assert megloc(*command, *same, "--workspace", run).status == 0  # nobody asked for a copy
-
-
-def test_until_the_submission_the_pose_file_is_said(
-    evaluate: Any, scene: Path, workspace: Path
-) -> None:
-    folder = workspace.parent / "kept"
-    done = evaluate(scene, workspace, "--until", "submission", "--submissions", folder)
-    assert done.out == f"pose file  {folder / Path(POSES).name}\n"
+    # without the evaluation it is said as well
+    places = ("--workspace", run, "--submissions", "kept", "--until", "submission")
+    done = megloc(*command, *same, *places)
+    assert done.out == f"pose file  {Path('kept') / first.name}\n"
     assert not done.err.count("evaluation")
 
 
-def test_the_workspace_has_what_is_promised(finished: Path) -> None:
+def test_the_workspace_has_what_is_promised(finished: Path, scene: Path) -> None:
     for place in (
         *("mapping", "query", "query_gt", "megloc/protocol.json", "map", "localized"),
         *("local_features/rootsift/keypoints/keypoints.txt", "pairs/mapping.txt"),
@@ -141,30 +135,20 @@ def test_the_workspace_has_what_is_promised(finished: Path) -> None:
     ):
         assert (finished / place).exists(), place
     assert list((finished / ".partial").iterdir()) == []
-
-
-def test_images_are_links_to_the_dataset(finished: Path, scene: Path) -> None:
+    # images are links to the dataset
     for part in ("mapping", "query"):
         link = finished / part / "sensors" / "records_data"
         assert link.readlink() == scene.resolve() / part / "sensors" / "records_data"
-    images = [p for p in finished.rglob("*.jpg") if not p.is_symlink() and p.is_file()]
-    assert images == []
-
-
-def test_all_queries_are_localized_well(finished: Path) -> None:
-    rows = json.loads((finished / "evaluation" / "recall.json").read_text())["rows"]
-    (row,) = (row for row in rows if row["name"] == "all")
-    assert [at["recall"] for at in row["recall"]] == [1.0] * 4
+    assert [p for p in finished.rglob("*.jpg") if not p.is_symlink() and p.is_file()] == []
+    # all queries are localized well
+    assert recall(finished) == [1.0] * 4
     statuses = read_status(finished / "localized" / "status.csv")
     assert len(statuses) == 4
     assert all(s.status == "localized" and s.fallback == "none" for s in statuses.values())
-
-
-def test_a_manifest_says_what_was_done(finished: Path) -> None:
+    # a manifest says what was done
     manifest = json.loads((finished / "stages" / "local_features.json").read_text())
-    assert manifest["options"]["local_features"] == [
-        {"name": "rootsift", "options": {"max_keypoints": 800}}
-    ]
+    choice = {"name": "rootsift", "options": {"max_keypoints": 800}}
+    assert manifest["options"]["local_features"] == [choice]
     assert manifest["counts"]["images"] == 11
     code = "code of megloc_kapture.features.rootsift.RootSift"
     assert set(manifest["inputs"]) == {"import", code}
@@ -179,6 +163,7 @@ def test_where_query_poses_are_given_no_stage_sees_them(
     )
     evaluate(dataset, dataset.parent / "run", "--until", "import")
     assert KaptureFolder(dataset.parent / "run" / "query").read().poses() == {}
+    assert not (dataset.parent / "run" / "local_features").exists()
 
 
 # ------------------------------------------------------------------ again
@@ -213,19 +198,19 @@ def test_an_option_of_localization_reruns_what_follows_only(
     assert reasons(done.err)["evaluation"] == "localization changed"
     # and back again
     assert ran(evaluate(scene, workspace).err) == ["localization", "submission", "evaluation"]
-
-
-def test_thresholds_are_an_option_of_the_import(
-    evaluate: Any, scene: Path, workspace: Path
-) -> None:
+    # thresholds are one of the import
     done = evaluate(scene, workspace, "--thresholds", "0.001,1", "0.5,5", "--until", "import")
     assert reasons(done.err) == {"import": "options changed: protocol.thresholds"}
 
 
-def test_a_changed_image_reruns_everything(evaluate: Any, dataset: Path) -> None:
-    run = dataset.parent / "run"
+def test_a_changed_image_reruns_everything_and_a_touched_one_nothing(
+    evaluate: Any, dataset: Path
+) -> None:
+    run, image = dataset.parent / "run", dataset / "mapping/sensors/records_data/0005.jpg"
     evaluate(dataset, run)
-    with open(dataset / "mapping/sensors/records_data/0005.jpg", "ab") as file:
+    image.touch()
+    assert "nothing to do" in evaluate(dataset, run).err
+    with open(image, "ab") as file:
         file.write(b"\0")
     done = evaluate(dataset, run)
     assert ran(done.err) == list(STAGES)
@@ -234,56 +219,7 @@ def test_a_changed_image_reruns_everything(evaluate: Any, dataset: Path) -> None
     assert "100.0 / 100.0 / 100.0 / 100.0" in done.out
 
 
-def test_a_touched_image_reruns_nothing(evaluate: Any, dataset: Path) -> None:
-    run = dataset.parent / "run"
-    evaluate(dataset, run, "--until", "import")
-    (dataset / "mapping/sensors/records_data/0005.jpg").touch()
-    assert "nothing to do" in evaluate(dataset, run, "--until", "import").err
-
-
-@pytest.mark.parametrize(
-    ("output", "stage"),
-    [
-        ("map", "map"),
-        ("pairs/query.txt", "query_pairs"),
-        ("localized", "localization"),
-        ("submissions", "submission"),
-        ("evaluation", "evaluation"),
-    ],
-)
-def test_a_deleted_output_is_made_again(
-    evaluate: Any, scene: Path, workspace: Path, contents: Contents, output: str, stage: str
-) -> None:
-    before = contents(workspace)
-    place = workspace / output
-    shutil.rmtree(place) if place.is_dir() else place.unlink()
-    done = evaluate(scene, workspace)
-    assert ran(done.err) == [stage]
-    assert reasons(done.err)[stage] == f"{output} is gone"
-    assert lasting(contents(workspace)) == lasting(before)
-
-
-def test_a_broken_manifest_counts_as_none(evaluate: Any, scene: Path, workspace: Path) -> None:
-    (workspace / "stages" / "submission.json").write_text('{"stage": "submi')
-    done = evaluate(scene, workspace)
-    assert ran(done.err) == ["submission"]
-    assert reasons(done.err)["submission"] == "starting"
-
-
 # ------------------------------------------------------------------ parts of a run
-
-
-def test_a_dry_run_says_what_would_run_and_why(
-    evaluate: Any, scene: Path, workspace: Path, contents: Contents
-) -> None:
-    before = contents(workspace)
-    done = evaluate(scene, workspace, "--dry-run", "--set", "query_pairs.top_k=3")
-    assert done.out == ""
-    told = states(done.err)
-    assert told["map"] == "up to date"
-    assert told["query_pairs"] == "would run (options changed: query_pairs.top_k)"
-    assert told["localization"].startswith("would run (")
-    assert contents(workspace) == before
 
 
 def test_queries_with_depth_are_refined_and_others_are_not(
@@ -310,26 +246,6 @@ def test_queries_with_depth_are_refined_and_others_are_not(
     assert "refine_poses" not in off.err
 
 
-def test_until_stops_behind_a_stage(evaluate: Any, scene: Path, tmp_path: Path) -> None:
-    done = evaluate(scene, tmp_path / "run", "--until", "mapping_pairs")
-    assert ran(done.err) == list(STAGES[:4])
-    assert not (tmp_path / "run" / "map").exists()
-    assert done.out == ""
-    assert ran(evaluate(scene, tmp_path / "run", "--until", "mapping_matches").err) == [STAGES[4]]
-
-
-def test_from_runs_a_stage_and_what_reads_its_output(
-    evaluate: Any, scene: Path, workspace: Path, contents: Contents
-) -> None:
-    before = contents(workspace)
-    done = evaluate(scene, workspace, "--from", "query_pairs")
-    assert ran(done.err) == list(STAGES[6:])
-    assert set(map(states(done.err).get, STAGES[:6])) == {"taken as it is"}
-    assert reasons(done.err)["query_pairs"] == "asked for"
-    assert reasons(done.err)["query_matches"] == "follows query_pairs"
-    assert lasting(contents(workspace)) == lasting(before)
-
-
 def test_from_takes_what_another_tool_put_there(
     evaluate: Any, scene: Path, workspace: Path
 ) -> None:
@@ -339,17 +255,11 @@ def test_from_takes_what_another_tool_put_there(
     (workspace / "pairs" / "query.txt").write_text("".join(rows))
     done = evaluate(scene, workspace, "--from", "query_matches")
     assert ran(done.err) == list(STAGES[7:])
+    assert set(map(states(done.err).get, STAGES[:6])) == {"taken as it is"}
     statuses = read_status(workspace / "localized" / "status.csv")
     assert {q: s.candidates for q, s in statuses.items()} == {
         query: (image,) for query, image in nearest.items()
     }
-
-
-def test_from_is_not_forgotten_when_it_is_cut_short(
-    evaluate: Any, scene: Path, workspace: Path
-) -> None:
-    evaluate(scene, workspace, "--from", "query_pairs", "--until", "query_pairs")
-    assert ran(evaluate(scene, workspace).err) == list(STAGES[7:])
 
 
 # ------------------------------------------------------------------ whose workspace it is
@@ -369,26 +279,20 @@ def test_a_folder_of_somebody_else_is_refused_and_untouched(
     evaluate(scene, place, "--until", "import")
 
 
-def test_a_refused_run_does_not_make_a_folder_ours(
-    megloc: Any, dataset: Path, tmp_path: Path
+def test_a_refused_run_changes_nothing(
+    megloc: Any, dataset: Path, workspace: Path, contents: Contents, tmp_path: Path
 ) -> None:
-    place = tmp_path / "home"
+    place, before = tmp_path / "home", contents(workspace)
     place.mkdir()
     (place / "thesis.txt").write_text("mine")
-    (dataset / "mapping/sensors/records_data/0005.jpg").unlink()
-    megloc("eval", "kapture", "--root", dataset, "--workspace", place, "-f").refused("0005")
-    assert [path.name for path in place.iterdir()] == ["thesis.txt"]
-
-
-def test_two_runs_at_once_are_refused(
-    megloc: Any, scene: Path, workspace: Path, contents: Contents
-) -> None:
-    before = contents(workspace)
     with Workspace(workspace).lock():
-        megloc("eval", "kapture", "--root", scene, "--workspace", workspace).refused(
+        megloc("eval", "kapture", "--root", dataset, "--workspace", workspace).refused(
             f"{workspace}: another run is using this workspace"
         )
     assert contents(workspace) == before
+    (dataset / "mapping/sensors/records_data/0005.jpg").unlink()
+    megloc("eval", "kapture", "--root", dataset, "--workspace", place, "-f").refused("0005")
+    assert [path.name for path in place.iterdir()] == ["thesis.txt"]
 
 
 # ------------------------------------------------------------------ the same bytes
@@ -405,13 +309,6 @@ def test_processes_give_the_same_bytes(
 
 
 # ------------------------------------------------------------------ results
-
-
-@pytest.mark.parametrize("share", ["0", "1"])
-def test_recall_that_is_high_enough(
-    evaluate: Any, scene: Path, workspace: Path, share: str
-) -> None:
-    evaluate(scene, workspace, "--fail-below", share, status=0)
 
 
 def blacken(dataset: Path, names: Sequence[str]) -> None:
@@ -440,8 +337,7 @@ def test_no_query_localized_is_no_error(evaluate: Any, dataset: Path) -> None:
     done = evaluate(dataset, run)
     assert "warning: no query was localized; reasons are in localized/status.csv" in done.err
     assert (run / POSES).read_text() == ""
-    rows = json.loads((run / "evaluation" / "recall.json").read_text())["rows"]
-    assert [at["recall"] for at in rows[-1]["recall"]] == [0.0] * 4
+    assert recall(run) == [0.0] * 4
     # no fallback unless it is asked for, and then it is marked
     done = evaluate(dataset, run, "--set", "localization.fallback=retrieval")
     assert ran(done.err) == ["localization", "submission", "evaluation"]
@@ -456,9 +352,8 @@ def test_no_query_localized_is_no_error(evaluate: Any, dataset: Path) -> None:
 
 def rename_queries(dataset: Path) -> dict[str, str]:
     """Give the queries names that map images have: new name to old."""
-    names = dict(
-        zip(("0000.jpg", "0002.jpg", "0003.jpg", "0005.jpg"), _queries(dataset), strict=True)
-    )
+    old_names = KaptureFolder(dataset / "query").read().image_names()
+    names = dict(zip(("0000.jpg", "0002.jpg", "0003.jpg", "0005.jpg"), old_names, strict=True))
     for part in ("query", "query_gt"):
         records = dataset / part / "sensors" / "records_camera.txt"
         text = records.read_text()
@@ -471,10 +366,6 @@ def rename_queries(dataset: Path) -> dict[str, str]:
     for new, old in names.items():
         (images / f"x{old}").rename(images / new)
     return names
-
-
-def _queries(dataset: Path) -> list[str]:
-    return KaptureFolder(dataset / "query").read().image_names()
 
 
 def test_equal_names_in_map_and_query(
@@ -494,8 +385,7 @@ def test_equal_names_in_map_and_query(
     for new, old in names.items():
         pose = np.array(found[f"queries/{new}"].split(), float)
         np.testing.assert_allclose(pose, np.array(expected[old].split(), float), atol=2e-2)
-    rows = json.loads((run / "evaluation" / "recall.json").read_text())["rows"]
-    assert [at["recall"] for at in rows[-1]["recall"]] == [1.0] * 4
+    assert recall(run) == [1.0] * 4
 
 
 def test_verify_finds_what_size_and_time_do_not_show(

@@ -34,14 +34,24 @@ MAPPED = {
 def write_kapture(root: Path, images: list[str], poses: dict[str, RigidTransform]) -> Path:
     camera = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0)))
     records = {(number, "cam"): image for number, image in enumerate(images)}
-    data = KaptureData(
-        sensors={"cam": camera},
-        rigs={},
-        trajectories={key: poses[image] for key, image in records.items() if image in poses},
-        records_camera=records,
-    )
-    write_sensors(root, data)
+    posed = {key: poses[image] for key, image in records.items() if image in poses}
+    write_sensors(root, KaptureData({"cam": camera}, {}, posed, records))
     return root
+
+
+def write_candidates(result: Path, number: int) -> None:
+    """The best candidate of every query: that of its place, or of the ``number`` first of them."""
+    rows = [
+        QueryStatus(
+            image=image,
+            status="localized",
+            num_matches=99,
+            num_inliers=50,
+            candidates=(f"map/{min(i // 2, number - 1)}.jpg",),
+        )
+        for i, image in enumerate(IMAGES)
+    ]
+    write_status(result / "status.csv", rows)
 
 
 def poses_off(by_m: float, num_lost: int = 0) -> dict[str, RigidTransform]:
@@ -60,49 +70,33 @@ def runs(tmp_path: Path) -> Path:
         write_kapture(workspace / "query_gt", IMAGES, poses_off(0.0))
         write_kapture(workspace / "mapping", list(MAPPED), MAPPED)
         write_kapture(workspace / "localized", IMAGES, poses_off(by_m, num_lost))
-        write_status(
-            workspace / "localized/status.csv",
-            [
-                QueryStatus(
-                    image=image,
-                    status="localized",
-                    num_matches=99,
-                    num_inliers=50,
-                    candidates=(f"map/{i // 2}.jpg",),
-                )
-                for i, image in enumerate(IMAGES)
-            ],
-        )
+        write_candidates(workspace / "localized", len(MAPPED))
         write_protocol(workspace / "megloc", protocol_of("aachen"))
-        write_groups(
-            workspace / "megloc",
-            {image: ImageGroup(condition=image.split("/")[1]) for image in IMAGES},
-        )
+        groups = {image: ImageGroup(condition=image.split("/")[1]) for image in IMAGES}
+        write_groups(workspace / "megloc", groups)
     return tmp_path
+
+
+def results(runs: Path, *names: str) -> list[str | Path]:
+    return ["evaluate", *(word for name in names for word in ("-i", runs / name / "localized"))]
 
 
 def test_one_result(megloc: Any, runs: Path) -> None:
     out = runs / "out"
-    done = megloc("evaluate", "-i", runs / "a/localized", "--gt", runs / "a/query_gt", "-o", out)
+    done = megloc(*results(runs, "a"), "--gt", runs / "a/query_gt", "-o", out)
     assert done.status == 0
     assert "95.0 / 95.0 / 95.0" in done.out  # all but the two lost ones
     interval = json.loads((out / "recall.json").read_text())["rows"][-1]["recall"][0]
     assert (interval["low"], interval["high"]) == pytest.approx((0.8308, 0.9939), abs=1e-4)
-    assert sorted(p.name for p in out.iterdir() if p.suffix) == [
-        "per_query.csv",
-        "recall.json",
-        "recall.txt",
-        "report.html",
-        "view.html",
-    ]
+    files = {"per_query.csv", "recall.json", "recall.txt", "report.html", "view.html"}
+    assert {path.name for path in out.iterdir() if path.suffix} == files
     # the map of the workspace is on the page
     assert "map cameras" in (out / "report.html").read_text()
 
 
 def test_two_results_are_compared(megloc: Any, runs: Path) -> None:
     out = runs / "out"
-    both = ("-i", runs / "a/localized", "-i", runs / "b/localized")
-    done = megloc("evaluate", *both, "--gt", runs / "a/query_gt", "-o", out)
+    done = megloc(*results(runs, "a", "b"), "--gt", runs / "a/query_gt", "-o", out)
     assert done.status == 0
     flat = " ".join(done.out.split())
     assert (
@@ -113,19 +107,16 @@ def test_two_results_are_compared(megloc: Any, runs: Path) -> None:
     assert comparison["tests"][0]["only_first"] == sorted(IMAGES[2:14])
     assert (out / "differences.csv").read_text().count("\n") == 1 + 3 * 12
     assert (out / "recall.txt").read_text() == done.out.removesuffix("\n")
-
-
-def test_pose_files_and_folders_mix(megloc: Any, runs: Path) -> None:
+    # a pose file may be one of them
     poses = runs / "poses.txt"
     write_pose_file(poses, poses_off(0.01, 2), names="basename")
-    done = megloc("evaluate", "-i", runs / "a/localized", "-i", poses, "--gt", runs / "a/query_gt")
+    done = megloc(*results(runs, "a"), "-i", poses, "--gt", runs / "a/query_gt")
     assert "a/localized and poses.txt find the same 38 queries" in " ".join(done.out.split())
 
 
 def test_seeds(megloc: Any, runs: Path) -> None:
-    arguments = [item for name in "abc" for item in ("-i", runs / name / "localized")]
     out = runs / "out"
-    done = megloc("evaluate", *arguments, "--seeds", "--gt", runs / "a/query_gt", "-o", out)
+    done = megloc(*results(runs, *"abc"), "--seeds", "--gt", runs / "a/query_gt", "-o", out)
     recalls = [100 * (40 - lost) / 40 for lost in (2, 14, 3)]
     expected = f"{np.mean(recalls):.1f} +- {np.std(recalls, ddof=1):.1f}"
     assert done.out.startswith("3 runs of one method: a, b, c")
@@ -150,8 +141,7 @@ def test_a_datasets_protocol_by_name(megloc: Any, runs: Path) -> None:
 
 def test_without_truth(megloc: Any, runs: Path) -> None:
     out = runs / "out"
-    both = ("-i", runs / "a/localized", "-i", runs / "b/localized")
-    done = megloc("evaluate", *both, "-o", out)
+    done = megloc(*results(runs, "a", "b"), "-o", out)
     assert done.status == 0
     assert "No recall: The true poses of the queries are not published" in done.out
     found = json.loads((out / "agreement.json").read_text())
@@ -168,49 +158,40 @@ def test_without_truth(megloc: Any, runs: Path) -> None:
 
 def test_the_map_may_be_given(megloc: Any, runs: Path) -> None:
     alone = write_kapture(runs / "x/y/z/alone", IMAGES, poses_off(0.0))
-    write_status(
-        alone / "status.csv",
-        [
-            QueryStatus(image=image, status="localized", candidates=("map/0.jpg",))
-            for image in IMAGES
-        ],
-    )
+    write_candidates(alone, 1)
     assert "no map or no ranked candidates are known" in megloc("evaluate", "-i", alone).out
     with_map = megloc("evaluate", "-i", alone, "--map", runs / "a/mapping")
     assert "of 40 localized queries with candidates" in " ".join(with_map.out.split())
 
 
 def test_the_same_bytes_twice(megloc: Any, runs: Path, contents: Any) -> None:
-    both = ("-i", runs / "a/localized", "-i", runs / "b/localized")
-    for arguments in ((*both, "--gt", runs / "a/query_gt"), both):
+    for truth in (("--gt", runs / "a/query_gt"), ()):
         for place in ("one", "two"):
-            assert megloc("evaluate", *arguments, "-o", runs / place, "-f").status == 0
+            command = results(runs, "a", "b")
+            assert megloc(*command, *truth, "-o", runs / place, "-f").status == 0
         assert contents(runs / "one") == contents(runs / "two")
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ((), "no result given; use -i"),
-        (("-i", "{}/a/localized", "-i", "{}/a/../a/localized"), "is given twice"),
-        (("-i", "{}/a/localized", "--seeds"), "--seeds needs at least two results"),
-        (
-            ("-i", "{}/a/localized", "-i", "{}/b/localized", "--seeds"),
-            r"--seeds needs true poses \(--gt\)",
-        ),
-        (("-i", "{}/a/localized", "--dataset", "cmu"), "unknown dataset 'cmu'; known: aachen"),
-        (("-i", "{}/a/localized", "--map", "{}/nowhere"), "nowhere"),
-        (("-i", "{}/nowhere"), "nowhere"),
-        (("-i", "{}/a/localized", "--gt", "{}/nowhere"), "nowhere"),
-        (("-i", "{}/a/localized", "--gt", "{}/a/query_gt", "--thresholds", "x"), "METRES,DEGREES"),
-        (("-i", "{}/a/localized", "--gt", "{}/a/query_gt", "-o", "{}/a"), "is not empty"),
+        ("", "no result given; use -i"),
+        ("-i {}/a/localized -i {}/a/../a/localized", "is given twice"),
+        ("-i {}/a/localized --seeds", "--seeds needs at least two results"),
+        ("-i {}/a/localized -i {}/b/localized --seeds", r"--seeds needs true poses \(--gt\)"),
+        ("-i {}/a/localized --dataset cmu", "unknown dataset 'cmu'; known: aachen"),
+        ("-i {}/a/localized --map {}/nowhere", "nowhere"),
+        ("-i {}/nowhere", "nowhere"),
+        ("-i {}/a/localized --gt {}/nowhere", "nowhere"),
+        ("-i {}/a/localized --gt {}/a/query_gt --thresholds x", "METRES,DEGREES"),
+        ("-i {}/a/localized --gt {}/a/query_gt -o {}/a", "is not empty"),
     ],
 )
 def test_what_cannot_be_done_is_said_in_one_line(
-    megloc: Any, runs: Path, arguments: tuple[str, ...], said: str
+    megloc: Any, runs: Path, arguments: str, said: str
 ) -> None:
     before = sorted(runs.rglob("*"))
-    megloc("evaluate", *(argument.format(runs) for argument in arguments)).refused(said)
+    megloc("evaluate", *(word.replace("{}", str(runs)) for word in arguments.split())).refused(said)
     assert sorted(runs.rglob("*")) == before
 
 
@@ -274,7 +255,6 @@ def test_what_submit_refuses(megloc: Any, imported: Path, tmp_path: Path) -> Non
 
 def test_mlad_goes_to_a_folder(megloc: Any, imported: Path, tmp_path: Path) -> None:
     write_protocol(imported / "megloc", Protocol(dataset="4seasons", pose_file="mlad"))
-    mapping = KaptureFolder(imported / "mapping").read()
     for part in ("mapping", "query", "localized"):
         data = KaptureFolder(imported / part).read()
         data.records_camera = {
@@ -283,19 +263,15 @@ def test_mlad_goes_to_a_folder(megloc: Any, imported: Path, tmp_path: Path) -> N
         }
         write_sensors(imported / part, data)
     (imported / "localized" / "status.csv").unlink()
-    reference = KaptureFolder(imported / "mapping").read().image_names()[0]
+    reference, *_ = KaptureFolder(imported / "mapping").read().image_names()
     queries = KaptureFolder(imported / "query").read().image_names()
-    assert len(mapping.records_camera) == 7
     pairs = [RelocalizationPair("a_to_b.txt", reference, query) for query in queries]
     write_relocalization(imported / "megloc", pairs)
     place = tmp_path / "submission"
     command = ["submit", "4seasons", "-i", imported / "localized", "-o", place]
     done = megloc(*command)
     assert done.out == f"3 poses of 4 queries, 1 missing, dummies in their place: {place}\n"
-    assert sorted(path.name for path in tmp_path.glob("submission*")) == [
-        "submission",
-        "submission.json",
-    ]
+    assert {path.name for path in tmp_path.glob("submission*")} == {place.name, "submission.json"}
     assert [path.name for path in place.iterdir()] == ["a_to_b.txt"]
     megloc(*command).refused("exists; -f")
     assert megloc(*command, "-f").status == 0
@@ -303,9 +279,19 @@ def test_mlad_goes_to_a_folder(megloc: Any, imported: Path, tmp_path: Path) -> N
     megloc(*command[:-1], tmp_path / "file").refused("a folder, one file per relocalization file")
 
 
+Poses = dict[str, RigidTransform]
+
+
 @pytest.fixture
-def poses(scene: Path) -> dict[str, RigidTransform]:
+def poses(scene: Path) -> Poses:
     return KaptureFolder(scene / "query_gt").read().poses()
+
+
+@pytest.fixture
+def place(poses: Poses, tmp_path: Path) -> Path:
+    """A right pose file."""
+    write_pose_file(tmp_path / "poses.txt", poses)
+    return tmp_path / "poses.txt"
 
 
 @pytest.fixture
@@ -319,11 +305,7 @@ def aachen(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
     return root
 
 
-def test_a_right_file(
-    megloc: Any, aachen: Path, poses: dict[str, RigidTransform], tmp_path: Path
-) -> None:
-    place = tmp_path / "poses.txt"
-    write_pose_file(place, poses)
+def test_a_right_file(megloc: Any, aachen: Path, place: Path) -> None:
     done = megloc("check", "aachen", place)
     assert (done.status, done.out) == (0, "4 poses of 4 queries: no problem found\n")
     assert done.err == "compared with runs/aachen-classic\n"
@@ -331,10 +313,7 @@ def test_a_right_file(
     assert megloc("check", "synthetic-aachen", place, "--data", aachen).status == 0
 
 
-def test_a_wrong_file(
-    megloc: Any, aachen: Path, poses: dict[str, RigidTransform], tmp_path: Path
-) -> None:
-    place = tmp_path / "poses.txt"
+def test_a_wrong_file(megloc: Any, aachen: Path, poses: Poses, place: Path) -> None:
     write_pose_file(place, {name: pose.inverse() for name, pose in poses.items()})
     with place.open("a") as file:
         file.write("stranger.jpg 1 0 0\n0001.png 1 1 0 0 0 0 0\n")
@@ -353,21 +332,15 @@ def test_a_wrong_file(
     assert content["findings"][0]["kind"] == "inverted"
 
 
-def test_without_data_the_file_alone_is_checked(
-    megloc: Any, aachen: Path, poses: dict[str, RigidTransform], tmp_path: Path
-) -> None:
-    place = tmp_path / "poses.txt"
-    write_pose_file(place, poses)
+def test_without_data_the_file_alone_is_checked(megloc: Any, aachen: Path, place: Path) -> None:
     done = megloc("check", "inloc", place)
     assert done.status == 2 and "not ending in .JPG" in done.out
     assert "the poses are not checked" in done.out
     done = megloc("check", "kapture", place)
     assert done.status == 0 and done.out.endswith("4 poses: no problem found\n")
     # a twin's run is none of the rendered world
-    write_sensors(
-        tmp_path / "runs" / "synthetic-aachen-classic" / "mapping",
-        KaptureFolder(aachen / "mapping").read(),
-    )
+    mapping = KaptureFolder(aachen / "mapping").read()
+    write_sensors(aachen.parent / "synthetic-aachen-classic" / "mapping", mapping)
     assert "compared" not in megloc("check", "synthetic", place).err
     (aachen.parent / "aachen-megloc").mkdir()
     (aachen / "mapping").rename(aachen.parent / "aachen-megloc" / "mapping")
@@ -376,12 +349,8 @@ def test_without_data_the_file_alone_is_checked(
     assert done.err.startswith("compared with none of runs/aachen-classic, runs/aachen-megloc")
 
 
-def test_what_check_refuses(
-    megloc: Any, aachen: Path, poses: dict[str, RigidTransform], tmp_path: Path
-) -> None:
-    place = tmp_path / "poses.txt"
-    megloc("check", "aachen", place).refused(r"poses\.txt: no such file")
-    write_pose_file(place, poses)
+def test_what_check_refuses(megloc: Any, aachen: Path, place: Path, tmp_path: Path) -> None:
+    megloc("check", "aachen", tmp_path / "x.txt").refused(r"x\.txt: no such file")
     megloc("check", "aahcen", place).refused("unknown dataset 'aahcen'")
     megloc("check", "robotcar", place, "--data", aachen).refused("is of dataset aachen")
     megloc("check", "aachen", place, "--data", tmp_path).refused("no imported dataset")

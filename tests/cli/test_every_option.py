@@ -48,7 +48,8 @@ class Case:
     context : other options, without which it has nothing to act on.
     scene : a fixture of this module.
     refused : what ``megloc eval`` says instead of running.
-    localize : what ``megloc localize`` says instead of running; empty: its result changes.
+    localize : what ``megloc localize`` says instead of running, of options that it uses; empty: its
+        result changes.
     localize_value : for ``megloc localize``, where that takes another change.
     also : what has to be set with it.
     """
@@ -64,9 +65,20 @@ class Case:
 
 
 OF_MAPS = "nothing here uses it"
+# options of maps that are made: megloc localize refuses all of them
+MAKING = ("map", "given_features", "triangulation", "lifting", "refinement", "mvs", "stages")
 TOO_FEW = "map images are too few for product quantisation"
 OF_FOLDERS = "are for folders of images"
 PYRAMID = ("guided_pyramid.mode=all", "guided_pyramid.min_matches=200")
+BY_POSES, BY_SEQUENCE = (f'mapping_pairs.by=["{by}"]' for by in ("poses", "sequence"))
+CLUSTERED = ("localization.clusters={by='poses',radius=0.01}",)
+ONE_CLUSTER = ("localization.clusters.max_clusters=1",)
+
+
+def few_places(number: int, radius: float) -> tuple[str, ...]:
+    diversity = f"query_pairs.diversity={{max_per_place={number},radius={radius}}}"
+    return ("query_pairs.top_k=3", diversity)
+
 
 NO_NETWORK = "no network is chosen that has it"
 
@@ -105,62 +117,34 @@ CASES: dict[str, Case] = {
     "fusion.alpha": Case("1.0", "pairs/", (*FUSED, "fusion.method=min_and_max")),
     "fusion.rank_constant": Case("0.01", "pairs/", (*FUSED, "fusion.method=reciprocal_rank")),
     "fusion.list_length": Case("4", "pairs/", (*FUSED, "fusion.method=borda"), localize_value="1"),
-    "mapping_pairs.by": Case('["exhaustive"]', "pairs/mapping.txt", localize=OF_MAPS),
-    "mapping_pairs.top_k": Case("2", "pairs/mapping.txt", localize=OF_MAPS),
-    "mapping_pairs.poses.num_neighbours": Case(
-        "1", "pairs/mapping.txt", ('mapping_pairs.by=["poses"]',), localize=OF_MAPS
-    ),
-    "mapping_pairs.poses.max_distance": Case(
-        "0.5", "pairs/mapping.txt", ('mapping_pairs.by=["poses"]',), localize=OF_MAPS
-    ),
-    "mapping_pairs.poses.max_angle_deg": Case(
-        "2.0", "pairs/mapping.txt", ('mapping_pairs.by=["poses"]',), localize=OF_MAPS
-    ),
+    "mapping_pairs.by": Case('["exhaustive"]', "pairs/mapping.txt"),
+    "mapping_pairs.top_k": Case("2", "pairs/mapping.txt"),
+    "mapping_pairs.poses.num_neighbours": Case("1", "pairs/mapping.txt", (BY_POSES,)),
+    "mapping_pairs.poses.max_distance": Case("0.5", "pairs/mapping.txt", (BY_POSES,)),
+    "mapping_pairs.poses.max_angle_deg": Case("2.0", "pairs/mapping.txt", (BY_POSES,)),
     "mapping_pairs.poses.min_overlap": Case(
-        "0.5",
-        context=('mapping_pairs.by=["poses"]',),
-        refused="comes with no model",
-        localize=OF_MAPS,
+        "0.5", context=(BY_POSES,), refused="comes with no model"
     ),
-    "mapping_pairs.covisibility.top_k": Case(
-        "2", context=('mapping_pairs.by=["poses"]',), refused="is not in", localize=OF_MAPS
-    ),
+    "mapping_pairs.covisibility.top_k": Case("2", context=(BY_POSES,), refused="is not in"),
     "mapping_pairs.covisibility.min_shared_points": Case(
-        "2", context=('mapping_pairs.by=["poses"]',), refused="is not in", localize=OF_MAPS
+        "2", context=(BY_POSES,), refused="is not in"
     ),
-    "mapping_pairs.sequence.window": Case(
-        "1", "pairs/mapping.txt", ('mapping_pairs.by=["sequence"]',), localize=OF_MAPS
-    ),
+    "mapping_pairs.sequence.window": Case("1", "pairs/mapping.txt", (BY_SEQUENCE,)),
     "mapping_pairs.sequence.loop": Case(
-        "true",
-        "pairs/mapping.txt",
-        ('mapping_pairs.by=["sequence"]', "mapping_pairs.sequence.window=1"),
-        localize=OF_MAPS,
+        "true", "pairs/mapping.txt", (BY_SEQUENCE, "mapping_pairs.sequence.window=1")
     ),
     "query_pairs.by": Case('"exhaustive"', "pairs/query.txt"),
     "query_pairs.top_k": Case("2", "pairs/query.txt"),
     "query_pairs.quantized_above": Case("2", refused=TOO_FEW, localize=TOO_FEW),
-    "query_pairs.diversity.max_per_place": Case(
-        "1",
-        "pairs/query.txt",
-        ("query_pairs.top_k=3", "query_pairs.diversity={max_per_place=3,radius=0.8}"),
-    ),
-    "query_pairs.diversity.radius": Case(
-        "0.9",
-        "pairs/query.txt",
-        ("query_pairs.top_k=3", "query_pairs.diversity={max_per_place=1,radius=0.1}"),
-    ),
-    "query_pairs.diversity.angle_deg": Case(
-        "0.5",
-        "pairs/query.txt",
-        ("query_pairs.top_k=3", "query_pairs.diversity={max_per_place=1,radius=0.9}"),
-    ),
+    "query_pairs.diversity.max_per_place": Case("1", "pairs/query.txt", few_places(3, 0.8)),
+    "query_pairs.diversity.radius": Case("0.9", "pairs/query.txt", few_places(1, 0.1)),
+    "query_pairs.diversity.angle_deg": Case("0.5", "pairs/query.txt", few_places(1, 0.9)),
     "reranking.by": Case('"verified"', "pairs/query.txt", also=("reranking.keep=3",)),
     "reranking.keep": Case("2", "pairs/query.txt", ("reranking.by=coverage",)),
     "matching": Case('{name="nn",options={max_ratio=0.6}}', "matches/"),
     "verification": Case('"none"', "matches/"),
-    "mapping_verification.max_error_px": Case("0.3", "matches/mapping", localize=OF_MAPS),
-    "mapping_verification.min_matches": Case("150", "matches/mapping", localize=OF_MAPS),
+    "mapping_verification.max_error_px": Case("0.3", "matches/mapping"),
+    "mapping_verification.min_matches": Case("150", "matches/mapping"),
     "query_verification.max_error_px": Case("0.3", "matches/query"),
     "query_verification.min_matches": Case("150", "matches/query"),
     "query_verification.max_iterations": Case("1", "matches/query", LOOSE),
@@ -184,68 +168,53 @@ CASES: dict[str, Case] = {
     "guided_pyramid.probe_matches": Case(
         "1000", "pyramid/", (*PYRAMID, "guided_pyramid.probed_pairs=1")
     ),
-    "map": Case('"lift"', "map/", scene="with_depth", localize=OF_MAPS),
-    "given_features": Case('"rootsift"', refused="takes no given model", localize=OF_MAPS),
-    "triangulation.max_reprojection_error_px": Case("0.2", "map/", localize=OF_MAPS),
-    "triangulation.min_angle_deg": Case("8.0", "map/", localize=OF_MAPS),
-    "triangulation.two_view_tracks": Case("true", "map/", localize=OF_MAPS),
-    "lifting.max_jump": Case(
-        "0.00001", "map/", ("map=lift",), scene="with_depth", localize=OF_MAPS
-    ),
-    "refinement.depth.max_sigmas": Case("0.01", "map/", scene="with_depth", localize=OF_MAPS),
+    "map": Case('"lift"', "map/", scene="with_depth"),
+    "given_features": Case('"rootsift"', refused="takes no given model"),
+    "triangulation.max_reprojection_error_px": Case("0.2", "map/"),
+    "triangulation.min_angle_deg": Case("8.0", "map/"),
+    "triangulation.two_view_tracks": Case("true", "map/"),
+    "lifting.max_jump": Case("0.00001", "map/", ("map=lift",), scene="with_depth"),
+    "refinement.depth.max_sigmas": Case("0.01", "map/", scene="with_depth"),
     "refinement.depth.noise": Case(
         "[0.0000001,0.0,0.0]",
         "map/",
         ("refinement.depth.keypoint_noise_px=0.001",),
         scene="with_depth",
-        localize=OF_MAPS,
     ),
     "refinement.depth.keypoint_noise_px": Case(
-        "0.001",
-        "map/",
-        ("refinement.depth.noise=[0.0000001,0.0,0.0]",),
-        scene="with_depth",
-        localize=OF_MAPS,
+        "0.001", "map/", ("refinement.depth.noise=[0.0000001,0.0,0.0]",), scene="with_depth"
     ),
     "refinement.depth.window_px": Case(
-        "31", "map/", ("refinement.depth.max_sigmas=0.1",), scene="with_depth", localize=OF_MAPS
+        "31", "map/", ("refinement.depth.max_sigmas=0.1",), scene="with_depth"
     ),
-    "refinement.consistency.max_reprojection_error_px": Case("0.2", "map/", localize=OF_MAPS),
-    "refinement.consistency.min_angle_deg": Case("8.0", "map/", localize=OF_MAPS),
-    "refinement.consistency.min_track_length": Case("5", "map/", localize=OF_MAPS),
-    "refinement.uncertainty.max_deviation": Case("0.02", "map/", localize=OF_MAPS),
-    "refinement.uncertainty.max_relative_deviation": Case("0.003", "map/", localize=OF_MAPS),
-    "refinement.uncertainty.keep_quantile": Case("0.5", "map/", localize=OF_MAPS),
-    "refinement.uncertainty.max_robust_sigmas": Case("0.5", "map/", localize=OF_MAPS),
+    "refinement.consistency.max_reprojection_error_px": Case("0.2", "map/"),
+    "refinement.consistency.min_angle_deg": Case("8.0", "map/"),
+    "refinement.consistency.min_track_length": Case("5", "map/"),
+    "refinement.uncertainty.max_deviation": Case("0.02", "map/"),
+    "refinement.uncertainty.max_relative_deviation": Case("0.003", "map/"),
+    "refinement.uncertainty.keep_quantile": Case("0.5", "map/"),
+    "refinement.uncertainty.max_robust_sigmas": Case("0.5", "map/"),
     "refinement.min_observations": Case(
-        "4", "map/", ("refinement.consistency.max_reprojection_error_px=0.5",), localize=OF_MAPS
+        "4", "map/", ("refinement.consistency.max_reprojection_error_px=0.5",)
     ),
-    "refinement.ply": Case("true", "map/reconstruction/refinement_kept.ply", localize=OF_MAPS),
-    "mvs.mode": Case("points", "map/", STEREO, localize=OF_MAPS),
-    "mvs.estimator": Case('{name="sweep",options={passes=1}}', "map/", STEREO, localize=OF_MAPS),
-    "mvs.num_sources": Case("1", "map/", STEREO, localize=OF_MAPS),
-    "mvs.max_size_px": Case("80", "map/", STEREO, localize=OF_MAPS),
-    "mvs.agreement.min_views": Case("2", "map/", STEREO, localize=OF_MAPS),
-    "mvs.agreement.max_error_px": Case("0.1", "map/", STEREO, localize=OF_MAPS),
-    "mvs.agreement.max_relative_error": Case("0.0005", "map/", STEREO, localize=OF_MAPS),
-    "mvs.agreement.max_relative_sigma": Case("0.003", "map/", STEREO, localize=OF_MAPS),
+    "refinement.ply": Case("true", "map/reconstruction/refinement_kept.ply"),
+    "mvs.mode": Case("points", "map/", STEREO),
+    "mvs.estimator": Case('{name="sweep",options={passes=1}}', "map/", STEREO),
+    "mvs.num_sources": Case("1", "map/", STEREO),
+    "mvs.max_size_px": Case("80", "map/", STEREO),
+    "mvs.agreement.min_views": Case("2", "map/", STEREO),
+    "mvs.agreement.max_error_px": Case("0.1", "map/", STEREO),
+    "mvs.agreement.max_relative_error": Case("0.0005", "map/", STEREO),
+    "mvs.agreement.max_relative_sigma": Case("0.003", "map/", STEREO),
     "localization.clusters.by": Case(
-        '"poses"',
-        context=("localization.clusters.max_clusters=1",),
-        also=("localization.clusters.radius=0.01",),
+        '"poses"', context=ONE_CLUSTER, also=("localization.clusters.radius=0.01",)
     ),
     "localization.clusters.radius": Case(
         "0.01", context=("localization.clusters={by='poses',radius=100.0,max_clusters=1}",)
     ),
-    "localization.clusters.min_shared_points": Case(
-        "100000", context=("localization.clusters.max_clusters=1",)
-    ),
-    "localization.clusters.max_clusters": Case(
-        "1", context=("localization.clusters={by='poses',radius=0.01}",)
-    ),
-    "localization.rank": Case(
-        '"reprojection"', context=("localization.clusters={by='poses',radius=0.01}",)
-    ),
+    "localization.clusters.min_shared_points": Case("100000", context=ONE_CLUSTER),
+    "localization.clusters.max_clusters": Case("1", context=CLUSTERED),
+    "localization.rank": Case('"reprojection"', context=CLUSTERED),
     "localization.pose.max_error_px": Case("0.5"),
     "localization.pose.min_inliers": Case("100000"),
     "localization.pose.max_center_deviation": Case("0.0000001"),
@@ -265,9 +234,7 @@ CASES: dict[str, Case] = {
         scene="with_depth",
         localize_value='["icp"]',  # this dataset's file has icp
     ),
-    "stages": Case(
-        "{nothing={}}", refused="no plugin 'nothing' in megloc_kapture.stages", localize=OF_MAPS
-    ),
+    "stages": Case("{nothing={}}", refused="no plugin 'nothing' in megloc_kapture.stages"),
     "pose_refinement.max_references": Case(
         "1", context=('pose_refinement.by=["rendering"]',), scene="with_depth"
     ),
@@ -300,16 +267,16 @@ def test_every_option_has_a_case() -> None:
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("plain")
-    write_scene(root)
-    shutil.rmtree(root / "query_gt")
-    return root
+    return without_truth(tmp_path_factory.mktemp("plain"))
 
 
 @pytest.fixture(scope="module")
 def with_depth(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("with_depth")
-    write_scene(root, with_depth=True)
+    return without_truth(tmp_path_factory.mktemp("with_depth"), with_depth=True)
+
+
+def without_truth(root: Path, *, with_depth: bool = False) -> Path:
+    write_scene(root, with_depth=with_depth)
     shutil.rmtree(root / "query_gt")
     return root
 
@@ -419,21 +386,19 @@ def test_eval(
     option: str, megloc: Any, base: Base, masks: Path, tmp_path: Path,
     request: pytest.FixtureRequest,
 ) -> None:  # fmt: skip
-    case = CASES[option]
+    case, workspace = CASES[option], tmp_path / "workspace"
     root = request.getfixturevalue(case.scene)
-    changed = (
-        f"{option}={case.value.format(masks=masks) if '{masks}' in case.value else case.value}"
-    )
-    arguments = ["eval", "kapture", "--root", root, "--executor", "inline", "-q"]
-    sets = flags((*context_of(case), *case.also, changed))
+    changed = f"{option}={case.value.replace('{masks}', str(masks))}"
+    arguments = ["eval", "kapture", "--root", root, "--executor", "inline", "-q", "-w", workspace]
+    arguments += flags((*context_of(case), *case.also, changed))
     if case.refused:
-        megloc(*arguments, "-w", tmp_path / "workspace", *sets).refused(case.refused)
+        megloc(*arguments).refused(case.refused)
         return
     before = base(case.scene, context_of(case))
-    shutil.copytree(before, tmp_path / "workspace", symlinks=True)
-    done = megloc(*arguments, "-w", tmp_path / "workspace", *sets)
+    shutil.copytree(before, workspace, symlinks=True)
+    done = megloc(*arguments)
     assert done.status == 0, done
-    old, new = written(before), written(tmp_path / "workspace")
+    old, new = written(before), written(workspace)
     different = {path for path in old.keys() | new.keys() if old.get(path) != new.get(path)}
     assert any(path.startswith(case.changes) for path in different), sorted(different)[:5]
 
@@ -444,17 +409,16 @@ def test_localize(
 ) -> None:
     case = CASES[option]
     scene = request.getfixturevalue(case.scene)
-    value = case.localize_value or case.value
-    if case.localize:
-        workspace = base("plain", (FEW,))
-        arguments = ["localize", "-i", workspace / "map", "--query", scene / "query"]
-        refused = megloc(*arguments, "-o", tmp_path / "new", "--set", f"{option}={value}")
-        refused.refused(case.localize)
+    changed = f"{option}={case.localize_value or case.value}"
+    refused = OF_MAPS if option.startswith(MAKING) else case.localize
+    if refused:
+        arguments = ["localize", "-i", base("plain", (FEW,)) / "map", "--query", scene / "query"]
+        megloc(*arguments, "-o", tmp_path / "new", "--set", changed).refused(refused)
         return
     workspace = base(case.scene, context_of(case))
     arguments = ["localize", "-i", workspace / "map", "--query", scene / "query", "-q"]
     results = []
-    for name, more in (("old", ()), ("new", (*case.also, f"{option}={value}"))):
+    for name, more in (("old", ()), ("new", (*case.also, changed))):
         done = megloc(*arguments, "-o", tmp_path / name, *flags((*context_of(case), *more)))
         assert done.status == 0, done
         results.append(written(tmp_path / name))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+from kapture import flatten
 from kapture.io.csv import kapture_from_dir
 from scipy.spatial.transform import Rotation
 
@@ -20,9 +21,7 @@ def poses(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """World_from_cam by image, as kapture reads them: rotation (3, 3) and centre (3,)."""
     data = kapture_from_dir(str(folder))
     found = {}
-    for timestamp, sensor, image in (
-        (t, s, i) for t, records in data.records_camera.items() for s, i in records.items()
-    ):
+    for timestamp, sensor, image in flatten(data.records_camera):
         if (timestamp, sensor) in data.trajectories:
             pose = data.trajectories[timestamp, sensor].inverse()
             w, x, y, z = pose.r_raw
@@ -49,10 +48,8 @@ def test_colmap_reads_the_model(megloc: Any, finished: Path, tmp_path: Path) -> 
     ordered = [model.points3D[i] for i in sorted(model.points3D)]
     xyz = np.array([point.xyz for point in ordered])
     np.testing.assert_array_equal(xyz, np.asarray(given.points3d)[:, :3])
-    observations = sum(
-        len(seen) for by_type in given.observations.values() for seen in by_type.values()
-    )
-    assert model.compute_num_observations() == observations
+    seen = [rows for of_type in given.observations.values() for rows in of_type.values()]
+    assert model.compute_num_observations() == sum(map(len, seen))
     # keypoints, observations and cameras fit each other
     assert model.compute_mean_reprojection_error() < 1.0
 
@@ -66,16 +63,12 @@ def test_evo_formats(megloc: Any, finished: Path, tmp_path: Path) -> None:
     assert rows.shape == (len(truth), 8)
     by_time = dict(zip(rows[:, 0].astype(int).tolist(), rows[:, 1:], strict=True))
     data = kapture_from_dir(str(finished / "localized"))
-    for timestamp, records in data.records_camera.items():
-        for image in records.values():
-            if image not in truth:
-                continue
-            rotation, centre = truth[image]
-            row = by_time[timestamp]
-            np.testing.assert_allclose(row[:3], centre, atol=1e-12)
-            np.testing.assert_allclose(
-                Rotation.from_quat(row[3:]).as_matrix(), rotation, atol=1e-12
-            )
+    for timestamp, _, image in flatten(data.records_camera):
+        rotation, centre = truth[image]
+        row = by_time[timestamp]
+        np.testing.assert_allclose(row[:3], centre, atol=1e-12)
+        own = Rotation.from_quat(row[3:]).as_matrix()
+        np.testing.assert_allclose(own, rotation, atol=1e-12)
     names = Path(f"{kitti}.names.txt").read_text().split()
     for name, row in zip(names, np.loadtxt(kitti, ndmin=2), strict=True):
         rotation, centre = truth[name]
@@ -126,14 +119,19 @@ def test_ply_has_points_and_frusta(megloc: Any, finished: Path, tmp_path: Path) 
 
 def test_what_cannot_be_is_refused(megloc: Any, finished: Path, tmp_path: Path) -> None:
     out, query = tmp_path / "out", ("--query", finished / "localized")
-    megloc("export", "tum", "-o", out).refused("give a map, or localized queries")
-    megloc("export", "geojson", *query, "-o", out).refused("--geo-origin")
-    for text in ("48", "48,2,3,4", "north"):
-        megloc("export", "geojson", *query, "-o", out, "--geo-origin", text).refused("latitude")
-    megloc("export", "geojson", *query, "-o", out, "--geo-origin", "99,2").refused("no latitude")
-    megloc("export", "tum", *query, "-o", out, "--geo-origin", "48,2").refused("nothing else does")
-    megloc("export", "tum", *query, "-o", out, "--sensor", "back").refused("of camera 'back'")
-    megloc("export", "colmap", *query, "-i", finished / "localized", "-o", out).refused("both have")
+    for name, arguments, words in (
+        ("tum", (), "give a map, or localized queries"),
+        ("geojson", query, "--geo-origin"),
+        *(
+            ("geojson", (*query, "--geo-origin", text), "latitude")
+            for text in ("48", "48,2,3,4", "north")
+        ),
+        ("geojson", (*query, "--geo-origin", "99,2"), "no latitude"),
+        ("tum", (*query, "--geo-origin", "48,2"), "nothing else does"),
+        ("tum", (*query, "--sensor", "back"), "of camera 'back'"),
+        ("colmap", (*query, "-i", finished / "localized"), "both have"),
+    ):
+        megloc("export", name, *arguments, "-o", out).refused(words)
     assert not out.exists()
     out.write_text("mine")
     megloc("export", "tum", *query, "-o", out).refused("is there already; --force")

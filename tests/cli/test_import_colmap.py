@@ -18,7 +18,7 @@ import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.
 
 def check(result: Path, scene: Path) -> None:
     row = evaluate(result, scene / "query_gt").row()
-    assert row.num_localized == row.num_queries == 4
+    assert row.num_localized == row.num_queries > 0
     assert row.median_position_m is not None and row.median_position_m < 0.01
 
 
@@ -59,30 +59,22 @@ def test_images_and_database_can_be_given(megloc: Any, colmap_room: Path, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("words", "told"),
     [
-        (
-            ("colmap", "{colmap_room}", "--allow-missing"),
-            "--allow-missing changes nothing of a COLMAP",
-        ),
-        (("colmap", "{colmap_room}", "--set", "a=1"), "--set changes nothing of a COLMAP model"),
-        (("colmap", "{colmap_room}", "--query-prefix", "q"), "--query-prefix changes nothing"),
-        (("kapture", "{scene}", "--images", "."), "--images and --database are of colmap"),
-        (("kapture", "{scene}", "--database", "d"), "--images and --database are of colmap"),
-        (("colmap", "{colmap_room}/images"), "images: no COLMAP model: neither images.bin nor"),
-        (("colmap", "{colmap_room}", "--images", "none"), "none: no such folder of images"),
+        ("colmap {room} --allow-missing", "--allow-missing changes nothing of a COLMAP"),
+        ("colmap {room} --set a=1", "--set changes nothing of a COLMAP model"),
+        ("colmap {room} --query-prefix q", "--query-prefix changes nothing"),
+        ("kapture {scene} --images .", "--images and --database are of colmap"),
+        ("kapture {scene} --database d", "--images and --database are of colmap"),
+        ("colmap {room}/images", "images: no COLMAP model: neither images.bin nor"),
+        ("colmap {room} --images none", "none: no such folder of images"),
     ],
 )
 def test_what_changes_nothing_is_refused(
-    megloc: Any,
-    colmap_room: Path,
-    scene: Path,
-    tmp_path: Path,
-    arguments: tuple[str, ...],
-    told: str,
+    megloc: Any, colmap_room: Path, scene: Path, tmp_path: Path, words: str, told: str
 ) -> None:
-    words = [word.format(colmap_room=colmap_room, scene=scene) for word in arguments]
-    megloc("import", *words, "-o", tmp_path / "map").refused(told)
+    arguments = (word.format(room=colmap_room, scene=scene) for word in words.split())
+    megloc("import", *arguments, "-o", tmp_path / "map").refused(told)
     assert not (tmp_path / "map").exists()
 
 
@@ -91,13 +83,9 @@ def test_what_changes_nothing_is_refused(
     ("kind", "local_type"), [(None, "sift"), ("ALIKED_N16ROT", "aliked-n16rot")]
 )
 def test_photographs(
-    megloc: Any,
-    shared_data: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    kind: str | None,
-    local_type: str,
-) -> None:
+    megloc: Any, shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    kind: str | None, local_type: str,
+) -> None:  # fmt: skip
     """Surveyed poses, COLMAP's points: of its SIFT, and of the networks whose features it has."""
     scene = shared_data / "scenes" / "fountain_p11"
     monkeypatch.setenv("MEGLOC_WEIGHTS", str(shared_data / "weights"))
@@ -112,6 +100,4 @@ def test_photographs(
     places = ("-i", tmp_path / "map", "--query", scene / "query", "-o", tmp_path / "localized")
     done = megloc("localize", *places)
     assert f"localizing with {local_type}" in done.err
-    row = evaluate(tmp_path / "localized", scene / "query_gt").row()
-    assert row.num_localized == row.num_queries
-    assert row.median_position_m is not None and row.median_position_m < 0.01
+    check(tmp_path / "localized", scene)

@@ -11,6 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -19,13 +20,7 @@ Contents = Callable[[Path], dict[str, bytes]]
 
 # the dates of these tell nothing about poses
 DATED = ("stages/", "timing.csv")
-
-
 ON = "run the same command again to go on"
-
-
-def _obey_interrupts() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def left_behind(workspace: Path, *pids: int) -> list[Path]:
@@ -42,14 +37,12 @@ def left_behind(workspace: Path, *pids: int) -> list[Path]:
 
 def wait_until_it_hears(run: subprocess.Popen[str]) -> None:
     """Wait for its handler of SIGTERM: what the interpreter does before is not ours."""
-    while not int(_status(run.pid, "SigCgt"), 16) & 1 << (signal.SIGTERM - 1):
+    caught = 0
+    while not caught & 1 << (signal.SIGTERM - 1):
         assert run.poll() is None
         time.sleep(0.001)
-
-
-def _status(pid: int, key: str) -> str:
-    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    return next(line.partition(":")[2] for line in lines if line.startswith(key)).strip()
+        lines = Path(f"/proc/{run.pid}/status").read_text().splitlines()
+        caught = next(int(line.split()[1], 16) for line in lines if line.startswith("SigCgt"))
 
 
 @pytest.fixture(autouse=True)
@@ -62,19 +55,26 @@ def temporary(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def start(scene: Path, workspace: Path) -> subprocess.Popen[str]:
     """Start a run with two worker processes in a session of its own."""
+    program = str(Path(sys.executable).with_name("megloc"))
+    places = ["--root", str(scene), "--workspace", str(workspace)]
+    few = ["--set", "local_features.options.max_keypoints=800", "--workers", "2"]
     return subprocess.Popen(
-        [
-            *(str(Path(sys.executable).with_name("megloc")), "eval", "kapture"),
-            *("--root", str(scene), "--workspace", str(workspace), "--workers", "2"),
-            *("--set", "local_features.options.max_keypoints=800"),
-        ],
+        [program, "eval", "kapture", *places, *few],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
         # a shell ignores SIGINT for what it starts in the background, and that is inherited
-        preexec_fn=_obey_interrupts,
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
     )
+
+
+def finish(scene: Path, workspace: Path) -> tuple[subprocess.Popen[str], str]:
+    """A run that nobody kills, and what it told."""
+    run = start(scene, workspace)
+    _, told = run.communicate()
+    assert run.returncode == 0, told
+    return run, told
 
 
 def wait_for(run: subprocess.Popen[str], text: str) -> None:
@@ -187,9 +187,7 @@ def test_items_that_are_done_when_a_run_is_killed_are_not_done_again(
                 time.sleep(0.002)
             os.killpg(run.pid, signal.SIGKILL)
             run.communicate()
-    last = start(scene, workspace)
-    _, told = last.communicate()
-    assert last.returncode == 0, told
+    last, told = finish(scene, workspace)
     kept = [int(n) for n in re.findall(r"mapping_matches: .* ([0-9]+) of 21 kept", told)]
     assert len(kept) == 1 and kept[0] >= max(counts)
     assert left_behind(workspace, last.pid) == [] and not any(workspace.glob(".partial/*"))
@@ -224,9 +222,7 @@ def test_runs_killed_at_random_moments_end_in_the_same_bytes(
         pids.append(run.pid)
     # the last stage may have been faster
     assert ends.count(-signal.SIGKILL) >= kills - 1
-    last = start(scene, workspace)
-    _, told = last.communicate()
-    assert last.returncode == 0, told
+    last, _ = finish(scene, workspace)
     assert left_behind(workspace, last.pid, *pids) == []
     found = undated(contents(workspace))
     assert found == undated(contents(finished))

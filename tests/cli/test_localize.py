@@ -21,7 +21,6 @@ from megloc_kapture.io.kapture import (
     ImagePair,
     KaptureFolder,
     write_pairs,
-    write_sensors,
 )
 from megloc_kapture.io.tables import read_status
 
@@ -45,6 +44,11 @@ def state(root: Path) -> dict[str, tuple[str, int]]:
         for path in sorted(root.rglob("*"))
         if path.is_file()
     }
+
+
+def queries_of(root: Path, output: Path) -> list[str | Path]:
+    """Arguments: localize the queries of a folder in the map beside them."""
+    return ["localize", "-i", root / "map", "--query", root / "query", "-o", output]
 
 
 @pytest.fixture
@@ -73,7 +77,7 @@ def foreign(finished: Path, scene: Path, tmp_path: Path) -> Path:
 def test_a_map_of_another_tool_stays_as_it_is(megloc: Any, foreign: Path, scene: Path) -> None:
     before = state(foreign)
     result = foreign.parent / "localized"
-    done = megloc("localize", "-i", foreign / "map", "--query", foreign / "query", "-o", result)
+    done = megloc(*queries_of(foreign, result))
     assert done.out.startswith("4 of 4 queries localized in "), done
     share, median_m, median_deg = medians(result, scene / "query_gt")
     assert share == 1.0 and median_m < 0.01 and median_deg < 0.05
@@ -81,18 +85,17 @@ def test_a_map_of_another_tool_stays_as_it_is(megloc: Any, foreign: Path, scene:
     assert "no extractor for orb_800" in megloc("info", foreign / "map").out
 
 
-def test_the_foreign_map(megloc: Any, shared_data: Path, tmp_path: Path) -> None:
-    place = shared_data / "foreign_maps" / "virtual_gallery"
-    before = state(place)
+def test_the_foreign_map(megloc: Any, virtual_gallery: Path, tmp_path: Path) -> None:
+    before = state(virtual_gallery)
     result = tmp_path / "localized"
-    done = megloc("localize", "-i", place / "map", "--query", place / "query", "-o", result)
+    done = megloc(*queries_of(virtual_gallery, result))
     assert done.status == 0
     assert done.out.startswith("4 of 4 queries localized in ")
     assert "pixel origin: centre" in done.err
-    share, median_m, median_deg = medians(result, place / "query_gt")
+    share, median_m, median_deg = medians(result, virtual_gallery / "query_gt")
     assert share == 1.0
     assert median_m <= 0.010 and median_deg <= 0.16
-    assert state(place) == before
+    assert state(virtual_gallery) == before
     # what is written is kapture
     theirs = kapture_from_dir(str(result))
     ours = KaptureFolder(result).read()
@@ -111,16 +114,15 @@ def test_the_foreign_map(megloc: Any, shared_data: Path, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("preset", ["modern", "megloc"])
 def test_the_foreign_map_needs_no_weights_of_ours(
-    megloc: Any, shared_data: Path, tmp_path: Path, preset: str
+    megloc: Any, virtual_gallery: Path, tmp_path: Path, preset: str
 ) -> None:
     """It brings its own R2D2 and AP-GeM, and so do its queries."""
-    place = shared_data / "foreign_maps" / "virtual_gallery"
     result = tmp_path / "localized"
-    places = ("-i", place / "map", "--query", place / "query", "-o", result)
-    done = megloc("localize", *places, "--preset", preset)
+    command = [*queries_of(virtual_gallery, result), "--preset", preset]
+    done = megloc(*command)
     assert done.out.startswith("4 of 4 queries localized in ")
     assert "localizing with r2d2_500" in done.err
-    _, median_m, median_deg = medians(result, place / "query_gt")
+    _, median_m, median_deg = medians(result, virtual_gallery / "query_gt")
     assert median_m <= 0.010 and median_deg <= 0.16
     # what could not be done is said: pairs with few matches would be extracted again
     remarks = {status.remarks for status in read_status(result / "status.csv").values()}
@@ -133,105 +135,79 @@ def test_the_foreign_map_needs_no_weights_of_ours(
     else:
         assert remarks == {""}
     # who asks for it by name is refused instead
-    refused = megloc("localize", *places, "-f", "--set", "guided_pyramid.mode=all")
+    refused = megloc(*command, "-f", "--set", "guided_pyramid.mode=all")
     refused.refused("--set guided_pyramid changes nothing: the weights that extract r2d2_500")
 
 
 def test_proxy_folders_of_kapture_localization(
-    megloc: Any, shared_data: Path, tmp_path: Path
+    megloc: Any, virtual_gallery: Path, tmp_path: Path
 ) -> None:
     """Its normal intermediate: a kapture folder whose parts are links."""
     symlink = pytest.importorskip("kapture_localization.utils.symlink")
-    place = shared_data / "foreign_maps" / "virtual_gallery"
+    local, vectors = ["r2d2_500"], ["AP-GeM-LM18"]
     for part in ("map", "query"):
-        data = place / part / "reconstruction"
-        symlink.create_kapture_proxy(
-            str(tmp_path / part),
-            str(place / part),
-            [str(data / "keypoints" / "r2d2_500")],
-            [str(data / "descriptors" / "r2d2_500")],
-            [str(data / "global_features" / "AP-GeM-LM18")],
-            None,
-            ["r2d2_500"],
-            ["r2d2_500"],
-            ["AP-GeM-LM18"],
-            force=True,
-        )
+        data = virtual_gallery / part / "reconstruction"
+        parts = ("keypoints/r2d2_500", "descriptors/r2d2_500", "global_features/AP-GeM-LM18")
+        folders = [str(tmp_path / part), str(virtual_gallery / part)]
+        linked = [[str(data / name)] for name in parts]
+        symlink.create_kapture_proxy(*folders, *linked, None, local, local, vectors, force=True)
     for points in ("points3d.txt", "observations.txt"):
         link = tmp_path / "map" / "reconstruction" / points
-        link.symlink_to((place / "map" / "reconstruction" / points).resolve())
-    places = ("-i", tmp_path / "map", "--query", tmp_path / "query", "-o", tmp_path / "localized")
+        link.symlink_to((virtual_gallery / "map" / "reconstruction" / points).resolve())
+    command = queries_of(tmp_path, tmp_path / "localized")
     # links lead only where the user lets them
-    megloc("localize", *places).refused("lies behind a link that leaves .*--allow-links-below")
+    megloc(*command).refused("lies behind a link that leaves .*--allow-links-below")
     elsewhere = ("--allow-links-below", tmp_path)
-    megloc("localize", *places, *elsewhere).refused("lies behind a link that leaves")
-    allowed = ("--allow-links-below", place)
-    done = megloc("localize", *places, *allowed)
+    megloc(*command, *elsewhere).refused("lies behind a link that leaves")
+    allowed = ("--allow-links-below", virtual_gallery)
+    done = megloc(*command, *allowed)
     assert done.out.startswith("4 of 4"), done
-    as_it_is = ("-i", place / "map", "--query", place / "query", "-o", tmp_path / "expected")
-    assert megloc("localize", *as_it_is).status == 0
+    assert megloc(*queries_of(virtual_gallery, tmp_path / "expected")).status == 0
     for name in ("status.csv", "sensors/trajectories.txt"):
         expected = (tmp_path / "expected" / name).read_bytes()
         assert (tmp_path / "localized" / name).read_bytes() == expected
-    assert described(megloc("info", tmp_path / "map", *allowed).out)["points"] == "630"
+    assert re.search("^points +630$", megloc("info", tmp_path / "map", *allowed).out, re.MULTILINE)
 
 
-def test_without_output_it_goes_to_localized(
-    megloc: Any, shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_our_own_output_is_written_anew(
+    megloc: Any, gallery: Path, contents: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place = (shared_data / "foreign_maps" / "virtual_gallery").resolve()
-    monkeypatch.chdir(tmp_path)
-    done = megloc("localize", "-i", place / "map", "--query", place / "query")
-    assert done.status == 0
-    assert "in localized" in done.out
-    assert len(KaptureFolder(tmp_path / "localized").read().poses()) == 4
-
-
-def test_our_own_output_is_written_anew(megloc: Any, gallery: Path, contents: Any) -> None:
-    places = ["-i", gallery / "map", "--query", gallery / "query", "-o", gallery / "localized"]
-    assert megloc("localize", *places).status == 0
+    monkeypatch.chdir(gallery)
+    done = megloc("localize", "-i", "map", "--query", "query")
+    assert done.status == 0 and "in localized" in done.out
     expected = contents(gallery / "localized")
-    assert megloc("localize", *places, "--workers", "1").status == 0
+    assert len(KaptureFolder(gallery / "localized").read().poses()) == 4
+    again = queries_of(gallery, gallery / "localized")
+    assert megloc(*again, "--workers", "1").status == 0
     assert contents(gallery / "localized") == expected
 
 
 def test_given_pairs_take_the_place_of_retrieval(megloc: Any, gallery: Path) -> None:
     names = KaptureFolder(gallery / "query").read().image_names()
     chosen = [f"{IMAGES}{n}.jpg" for n in (226, 224, 223)]
-    pairs = [
-        ImagePair(query, image, 1.0 - 0.1 * rank)
-        for query in names[1:]
-        for rank, image in enumerate(chosen)
-    ]
+    ranked = [(image, 1.0 - 0.1 * rank) for rank, image in enumerate(chosen)]
+    pairs = [ImagePair(query, *one) for query in names[1:] for one in ranked]
     write_pairs(gallery / "pairs.txt", pairs)
-    places = ["-i", gallery / "map", "--query", gallery / "query", "-o", gallery / "localized"]
-    options = ["--pairs", gallery / "pairs.txt"]
-    megloc("localize", *places, *options, "--set", "query_pairs.top_k=1").refused(
+    command = [*queries_of(gallery, gallery / "localized"), "--pairs", gallery / "pairs.txt"]
+    megloc(*command, "--set", "query_pairs.top_k=1").refused(
         "--set query_pairs changes nothing: --pairs gives the candidates"
     )
-    assert megloc("localize", *places, *options).status == 0
+    assert megloc(*command).status == 0
     statuses = read_status(gallery / "localized" / "status.csv")
     assert statuses[names[0]].reason == "no map image is a candidate"
     for name in names[1:]:
         assert set(statuses[name].candidates) <= set(chosen)
     assert max(len(s.candidates) for s in statuses.values()) > 1
-
-
-def test_pairs_may_name_map_images_without_a_pose(megloc: Any, gallery: Path) -> None:
+    # they may name map images without a pose, which are left out
     trajectories = gallery / "map" / "sensors" / "trajectories.txt"
     rows = trajectories.read_text().splitlines(keepends=True)
     trajectories.write_text("".join(row for row in rows if not re.match(r" *1, cam_00001", row)))
-    names = KaptureFolder(gallery / "query").read().image_names()
     images = KaptureFolder(gallery / "map").read().image_names()
     pairs = [ImagePair(query, image, 1.0) for query in names for image in images]
     write_pairs(gallery / "pairs.txt", pairs)
-    places = ["-i", gallery / "map", "--query", gallery / "query", "-o", gallery / "localized"]
-    assert megloc("localize", *places, "--pairs", gallery / "pairs.txt").out.startswith("4 of 4")
-    used = {
-        image
-        for status in read_status(gallery / "localized" / "status.csv").values()
-        for image in status.candidates
-    }
+    assert megloc(*command).out.startswith("4 of 4")
+    statuses = read_status(gallery / "localized" / "status.csv")
+    used = {image for status in statuses.values() for image in status.candidates}
     assert used == set(images) - {f"{IMAGES}223.jpg"}
 
 
@@ -239,34 +215,12 @@ def test_pairs_may_name_map_images_without_a_pose(megloc: Any, gallery: Path) ->
 def test_retrieval_by_what_both_bring_else_by_our_own(megloc: Any, gallery: Path, by: str) -> None:
     if by.startswith("VLAD"):
         shutil.rmtree(gallery / "query" / "reconstruction" / "global_features")
-    places = ["-i", gallery / "map", "--query", gallery / "query", "-o", gallery / "localized"]
-    done = megloc("localize", *places, "--set", "query_pairs.top_k=5")
+    command = queries_of(gallery, gallery / "localized")
+    done = megloc(*command, "--set", "query_pairs.top_k=5")
     assert done.out.startswith("4 of 4")
     assert re.search(rf"^candidates: (global features )?{by}$", done.err, re.MULTILINE)
     statuses = read_status(gallery / "localized" / "status.csv")
     assert {len(s.candidates) for s in statuses.values()} == {5}
-
-
-def test_features_are_extracted_where_there_is_an_extractor(
-    megloc: Any, finished: Path, scene: Path, tmp_path: Path
-) -> None:
-    options = ["--set", "local_features.options.max_keypoints=800"]
-    places = ["-i", finished / "map", "--query", scene / "query", "-o", tmp_path / "localized"]
-    done = megloc("localize", *places, *options)
-    assert done.out.startswith("4 of 4"), done
-    share, median_m, median_deg = medians(tmp_path / "localized", scene / "query_gt")
-    assert median_m < 0.01 and median_deg < 0.05
-
-
-def test_map_images_localize_in_their_own_map(
-    megloc: Any, finished: Path, scene: Path, tmp_path: Path
-) -> None:
-    # equal names in map and query do no harm here: results are named by query alone
-    places = ["-i", finished / "map", "--query", scene / "mapping", "-o", tmp_path / "localized"]
-    done = megloc("localize", *places, "--features-dir", finished)
-    assert done.out.startswith("7 of 7"), done
-    _, median_m, _ = medians(tmp_path / "localized", scene / "mapping")
-    assert median_m < 0.01
 
 
 def not_finite(content: bytes) -> bytes:
@@ -403,87 +357,6 @@ def test_no_query_localized_is_no_error_and_a_fallback_is_marked(
     assert len(poses) == 4 and all(pose in map_poses for pose in poses.values())
 
 
-# ------------------------------------------------------------------ megloc info
-
-
-def described(out: str) -> dict[str, str]:
-    """First column to the rest, of the lines that have one."""
-    return dict(re.findall(r"^(\w[\w ]*?)  +(.*)$", out, re.MULTILINE))
-
-
-def test_info_says_what_the_foreign_map_allows(megloc: Any, shared_data: Path) -> None:
-    done = megloc("info", shared_data / "foreign_maps" / "virtual_gallery" / "map")
-    assert (done.status, done.err) == (0, "")
-    told = described(done.out)
-    assert told["images"] == "12 (12 PINHOLE), 12 with a pose"
-    assert told["points"] == "630"
-    assert told["pixel origin"].startswith("centre: ")
-    assert told["map descriptors"] == "there"
-    # R2D2 has an extractor, whose weights are not there
-    assert told["query features"].startswith("must be given in kapture; plugin r2d2 could extract")
-    assert "megloc weights fetch r2d2_WASF_N16" in told["query features"]
-    # so few that all are matched; vectors without the weights that make a query's
-    assert told["retrieval"] == "all 12 map images, not ranked"
-    assert (
-        "where queries bring AP-GeM-LM18: all 12 map images, ranked by global features AP-GeM-LM18"
-    ) in done.out
-    errors = re.search(r"origin: corner ([\d.]+) px, centre ([\d.]+) px", done.out)
-    assert errors is not None
-    assert float(errors[2]) < 0.9 * float(errors[1])
-
-
-def test_info_of_our_own_map(megloc: Any, finished: Path) -> None:
-    told = described(megloc("info", finished / "map", "--deep").out)
-    assert told["checked"] == "everything, image by image"
-    assert told["pixel origin"].startswith("corner: ")
-    assert told["query features"].startswith("extracted by plugin rootsift")
-    assert told["map descriptors"] == "there"
-
-
-def test_info_says_what_ranks_many_images(megloc: Any, finished: Path, tmp_path: Path) -> None:
-    root = Path(shutil.copytree(finished / "map", tmp_path / "map", symlinks=True))
-    of_vlad = root / "reconstruction" / "global_features"
-    assert described(megloc("info", root).out)["retrieval"] == (
-        "all 7 map images, ranked by VLAD over the map's descriptors"
-    )
-    shutil.rmtree(of_vlad)
-    assert described(megloc("info", root).out)["retrieval"] == "all 7 map images, not ranked"
-    # sixty images more, of one camera and place
-    folder = KaptureFolder(root)
-    data, (local_type,) = folder.read(), folder.types("keypoints")
-    name = data.image_names()[0]
-    timestamp, sensor = data.record_of(name)
-    places = [folder.keypoints(local_type), folder.descriptors(local_type)]
-    for number in range(60):
-        data.records_camera[10_000 + number, sensor] = f"more/{number}.png"
-        data.trajectories[10_000 + number, sensor] = data.trajectories[timestamp, sensor]
-        for reader in places:
-            stored = Path(reader.where(name))
-            copy = stored.parents[len(Path(name).parts) - 1] / f"more/{number}.png{stored.suffix}"
-            copy.parent.mkdir(exist_ok=True)
-            shutil.copyfile(stored, copy)
-    write_sensors(root, data)
-    assert described(megloc("info", root).out)["retrieval"] == (
-        "the 50 of 67 map images that are most similar by VLAD over the map's descriptors"
-    )
-
-
-def test_info_of_a_folder_that_is_no_map(megloc: Any, scene: Path) -> None:
-    told = described(megloc("info", scene / "query").out)
-    assert told["images"] == "4 (4 PINHOLE), 0 with a pose"
-    assert told["localizing"] == "not possible: no points3d and observations"
-
-
-def test_info_of_a_map_whose_descriptors_are_missing(megloc: Any, gallery: Path) -> None:
-    shutil.rmtree(gallery / "map" / "reconstruction" / "descriptors")
-    told = described(megloc("info", gallery / "map").out)
-    assert told["map descriptors"] == "missing; will be extracted again by plugin r2d2"
-    assert told["retrieval"] == "all 12 map images, not ranked"
-    (gallery / "map" / "sensors" / "records_data").rename(gallery / "away")
-    told = described(megloc("info", gallery / "map").out)
-    assert told["retrieval"] == "not possible without the map's descriptors"
-
-
 def test_a_map_that_contradicts_itself_is_not_localized_in_silently(
     megloc: Any, foreign: Path, scene: Path, tmp_path: Path
 ) -> None:
@@ -491,14 +364,14 @@ def test_a_map_that_contradicts_itself_is_not_localized_in_silently(
     table = np.loadtxt(path, delimiter=",")
     table[:, [1, 2]] = table[:, [2, 1]]
     np.savetxt(path, table, delimiter=", ", header="X, Y, Z, R, G, B")
-    inputs = ("-i", foreign / "map", "--query", foreign / "query", "-o", tmp_path / "localized")
-    text = megloc("localize", *inputs).refused("the points do not fit the keypoints")
+    command = queries_of(foreign, tmp_path / "localized")
+    text = megloc(*command).refused("the points do not fit the keypoints")
     assert "points read as (x, z, y)" in text and "--force" in text
     assert not (tmp_path / "localized").exists()
     out = megloc("info", foreign / "map").out
     assert re.search(r"FAULT +the points do not fit .* with points read as \(x, z, y\)", out)
     # who insists gets poses that are right in that world, or reasons
-    assert megloc("localize", *inputs, "-f").status == 0
+    assert megloc(*command, "-f").status == 0
     assert len(read_status(tmp_path / "localized" / "status.csv")) == 4
 
 
@@ -508,15 +381,12 @@ def test_strangers_are_refused_and_that_is_right(
     """A query that shows nothing of the map: refused, counted as right, with every pose wanted."""
     query = dataset / "query"
     data = KaptureFolder(query).read()
-    first = data.image_names()[0]
-    camera = data.camera_of(first)
-    rng = np.random.default_rng(0)
-    coarse = rng.integers(0, 255, (camera.height // 8, camera.width // 8, 3), dtype=np.uint8)
-    noise = np.kron(coarse, np.ones((8, 8, 1), np.uint8))
-    time, sensor = data.record_of(first)
-    pixels = np.zeros((camera.height, camera.width, 3), np.uint8)
-    pixels[: noise.shape[0], : noise.shape[1]] = noise
-    write_image(query / "sensors" / "records_data" / "stranger.png", pixels)
+    camera = data.camera_of(data.image_names()[0])
+    time, sensor = data.record_of(data.image_names()[0])
+    size = (camera.height // 8 + 1, camera.width // 8 + 1, 3)
+    coarse = np.random.default_rng(0).integers(0, 255, size, dtype=np.uint8)
+    noise = np.kron(coarse, np.ones((8, 8, 1), np.uint8))[: camera.height, : camera.width]
+    write_image(query / "sensors" / "records_data" / "stranger.png", noise)
     with (query / "sensors" / "records_camera.txt").open("a") as file:
         file.write(f"{int(time) + 1000}, {sensor}, stranger.png\n")
     (dataset / "query_gt" / "nowhere.txt").write_text("stranger.png\n")

@@ -105,16 +105,15 @@ def rows_of(text: str) -> dict[str, tuple[int, int]]:
 
 
 def test_a_foreign_map_is_refined_and_localized_in(
-    megloc: Any,
-    shared_data: Path,
-    tmp_path: Path,
-    contents: Callable[[Path], dict[str, bytes]],
+    megloc: Any, virtual_gallery: Path, tmp_path: Path, contents: Callable[[Path], Any]
 ) -> None:
-    place = shared_data / "foreign_maps" / "virtual_gallery"
+    place = virtual_gallery
     before = contents(place)
     out = tmp_path / "refined"
     keep = ("--set", "refinement.uncertainty.keep_quantile=0.9")
     close = ("--set", "refinement.consistency.max_reprojection_error_px=3")
+    told = megloc("info", place / "map").out
+    assert "refinement" not in told and "uncertainty" not in told
     done = megloc("refine-map", "-i", place / "map", "-o", out, *keep, *close, "--ply")
     assert done.status == 0
     assert contents(place) == before
@@ -140,14 +139,6 @@ def test_a_foreign_map_is_refined_and_localized_in(
     assert localized.out.startswith("4 of 4 queries localized in ")
 
 
-def test_info_of_a_map_that_was_not_refined_says_nothing_of_it(
-    megloc: Any, shared_data: Path
-) -> None:
-    told = megloc("info", shared_data / "foreign_maps" / "virtual_gallery" / "map").out
-    assert "refinement" not in told
-    assert "uncertainty" not in told
-
-
 def test_what_cannot_be_refined_is_refused(megloc: Any, gallery: Path, tmp_path: Path) -> None:
     out = tmp_path / "refined"
     query = megloc("refine-map", "-i", gallery / "query", "-o", out)
@@ -161,56 +152,44 @@ def test_what_cannot_be_refined_is_refused(megloc: Any, gallery: Path, tmp_path:
     (gallery / "full").mkdir()
     (gallery / "full" / "file").touch()
     megloc("refine-map", "-i", gallery / "map", "-o", gallery / "full").refused("is not empty")
-
-
-def test_a_broken_report_is_named(megloc: Any, gallery: Path) -> None:
     report = gallery / "map" / "reconstruction" / "refinement.json"
     report.write_text('{"points_before": "many"}')
     done = megloc("info", gallery / "map")
-    assert done.status == 2
-    assert "refinement.json" in done.err
+    assert done.status == 2 and "refinement.json" in done.err
 
 
-INLINE = ("--executor", "inline")
-
-
-def command(finished: Path, output: Path) -> list[Any]:
-    return [
-        *("refine-poses", "-i", finished / "map", "--query", finished / "query"),
-        *("--poses", finished / "localized", "-o", output, *INLINE),
-    ]
+def refine_poses(finished: Path, poses: Path, output: Path) -> list[Any]:
+    places = ["-i", finished / "map", "--query", finished / "query", "--poses", poses]
+    return ["refine-poses", *places, "-o", output, "--executor", "inline"]
 
 
 def test_poses_without_depth_stay_and_say_so(megloc: Any, finished: Path, tmp_path: Path) -> None:
-    out = tmp_path / "refined"
-    done = megloc(*command(finished, out), "--by", "icp", "-q")
+    out, poses = tmp_path / "refined", finished / "localized"
+    done = megloc(*refine_poses(finished, poses, out), "--by", "icp", "-q")
     assert (done.status, done.err) == (0, "")
     assert done.out.startswith("4 poses, 0 accepted by icp; status.csv and refinement.csv in")
-    before, after = (KaptureFolder(place).read().poses() for place in (finished / "localized", out))
+    before, after = (KaptureFolder(place).read().poses() for place in (poses, out))
     assert before == after
     for status in read_status(out / "status.csv").values():
         assert status.status == "localized"
         assert status.refinement.startswith("icp: ") and "depth" in status.refinement
-    # the result is one to evaluate and to refine again
-    again = megloc(*command(finished, tmp_path / "again")[:5], "--poses", out, "-o", tmp_path / "b")
-    again.refused("no pose refiner is chosen; --by takes: field, icp, rendering")
-
-
-def test_refiners_work_one_after_another(megloc: Any, finished: Path, tmp_path: Path) -> None:
-    out = tmp_path / "refined"
-    done = megloc(*command(finished, out), "--by", "icp", "--by", "rendering", "-q")
+    # the result is one to refine again, by one refiner after another
+    both = ("--by", "icp", "--by", "rendering")
+    done = megloc(*refine_poses(finished, out, tmp_path / "again"), *both, "-q")
     assert done.out.startswith("4 poses, 0 accepted by icp, 0 accepted by rendering;")
-    for status in read_status(out / "status.csv").values():
-        first, second = status.refinement.split("; ")
+    for status in read_status(tmp_path / "again" / "status.csv").values():
+        first, second = status.refinement.split("; ")[-2:]
         assert first.startswith("icp: ") and second.startswith("rendering: ")
-
-
-def test_what_is_refused(megloc: Any, finished: Path, tmp_path: Path) -> None:
-    megloc(*command(finished, tmp_path / "out"), "--by", "magic").refused(
-        "no plugin 'magic' in megloc_kapture.pose_refiners; registered: field, icp, rendering"
-    )
-    megloc(*command(finished, tmp_path / "out"), "--by", "field").refused("train-field")
-    bare = [*command(finished, tmp_path / "out")]
-    bare[bare.index("--poses") + 1] = finished / "query"
+    command = refine_poses(finished, poses, tmp_path / "none")
+    for by, words in (
+        ((), "no pose refiner is chosen; --by takes: field, icp, rendering"),
+        (
+            ("--by", "magic"),
+            "no plugin 'magic' in megloc_kapture.pose_refiners; registered: field, icp, rendering",
+        ),
+        (("--by", "field"), "train-field"),
+    ):
+        megloc(*command, *by).refused(words)
+    bare = refine_poses(finished, finished / "query", tmp_path / "none")
     megloc(*bare, "--by", "icp").refused(r"status\.csv")
-    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "none").exists()

@@ -12,6 +12,7 @@ import pytest
 from kapture.io.csv import kapture_from_dir
 from PIL import Image
 
+from megloc_kapture.cli.main import main
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.geometry.cameras import focal_px, scale_focal
 from megloc_kapture.io.images import image_size, read_image_rgb, write_image
@@ -63,12 +64,11 @@ def test_photographs(megloc: Any, finished: Path, scene: Path, tmp_path: Path) -
     (place / "empty.jpg").touch()
     (place / "phone.HEIC").write_bytes(b"x")
     write_image(place / "grey.png", np.full((300, 400), 128, np.uint8))
-    writer = cv2.VideoWriter(
-        str(place / "walk.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (400, 298)
-    )
+    size, film = (400, 298), str(place / "walk.avi")
+    writer = cv2.VideoWriter(film, cv2.VideoWriter.fourcc(*"MJPG"), 10, size)
     for name in query.read().image_names():
         for _ in range(4):
-            writer.write(cv2.resize(cv2.imread(str(query.image_path(name))), (400, 298)))
+            writer.write(cv2.resize(cv2.imread(str(query.image_path(name))), size))
     writer.release()
 
     out = tmp_path / "out"
@@ -79,9 +79,8 @@ def test_photographs(megloc: Any, finished: Path, scene: Path, tmp_path: Path) -
     reasons = {name: row.reason for name, row in statuses.items() if row.status == "failed"}
     assert set(reasons) == {"cut.jpg", "empty.jpg", "phone.HEIC", "grey.png"}
     assert "broken" in reasons["cut.jpg"] and ".HEIC cannot be read" in reasons["phone.HEIC"]
-    assert all(
-        "focal length estimated" in row.remarks for row in statuses.values() if row.num_inliers
-    )
+    found = [row for row in statuses.values() if row.num_inliers]
+    assert all("focal length estimated" in row.remarks for row in found)
 
     # what is written is kapture with upright images, and the cameras that the poses go with
     theirs = kapture_from_dir(str(out))
@@ -94,8 +93,7 @@ def test_photographs(megloc: Any, finished: Path, scene: Path, tmp_path: Path) -
         camera = ours.camera_of(name)
         assert camera.params[0] == pytest.approx(300, rel=0.015)
         assert image_size(KaptureFolder(out).image_path(name)) == (camera.width, camera.height)
-        link = KaptureFolder(out).image_path(name)
-        assert link.is_symlink() == (orientation == 1)
+        assert KaptureFolder(out).image_path(name).is_symlink() == (orientation == 1)
     # so that it can be localized again, by its own cameras
     names = [name for name in ours.image_names() if name in poses]
     again = tmp_path / "again"
@@ -122,17 +120,21 @@ def test_a_given_camera(megloc: Any, finished: Path, scene: Path, tmp_path: Path
 
 def test_refused(megloc: Any, finished: Path, scene: Path, tmp_path: Path) -> None:
     command = ("localize", "-i", finished / "map", "-o", tmp_path / "out")
-    image = KaptureFolder(scene / "query").image_path("0004.jpg")
-    megloc(*command).refused("either --query, .*, or --images")
-    megloc(*command, "--query", scene / "query", "--images", image).refused("either --query")
-    megloc(*command, "--query", scene / "query", "--every", "2").refused("--every changes nothing")
-    megloc(*command, "--query", scene / "query", "--camera", "x").refused(
-        "--camera changes nothing"
-    )
-    megloc(*command, "--images", image, "--every", "2").refused("there is no video")
-    megloc(*command, "--images", tmp_path / "nowhere").refused("nowhere: no such file or folder")
-    for text in ("PINHOLE,400,300", "PINHOLE", "X,1,2,3", "PINHOLE,4,3,a,b,c,d"):
-        megloc(*command, "--images", image, "--camera", text).refused("give MODEL,WIDTH,HEIGHT")
+    images = ("--images", KaptureFolder(scene / "query").image_path("0004.jpg"))
+    query = ("--query", scene / "query")
+    for arguments, words in (
+        ((), "either --query, .*, or --images"),
+        ((*query, *images), "either --query"),
+        ((*query, "--every", "2"), "--every changes nothing"),
+        ((*query, "--camera", "x"), "--camera changes nothing"),
+        ((*images, "--every", "2"), "there is no video"),
+        (("--images", tmp_path / "nowhere"), "nowhere: no such file or folder"),
+        *(
+            ((*images, "--camera", text), "give MODEL,WIDTH,HEIGHT")
+            for text in ("PINHOLE,400,300", "PINHOLE", "X,1,2,3", "PINHOLE,4,3,a,b,c,d")
+        ),
+    ):
+        megloc(*command, *arguments).refused(words)
     assert not (tmp_path / "out").exists()
 
 
@@ -144,8 +146,6 @@ def facade(
     request: pytest.FixtureRequest, shared_data: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Path]:
     """A scene with surveyed poses, and a map of it."""
-    from megloc_kapture.cli.main import main
-
     scene = shared_data / "scenes" / request.param
     workspace = tmp_path_factory.mktemp("facade") / "workspace"
     command = ["eval", "kapture", "--root", str(scene), "--workspace", str(workspace)]

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from megloc_kapture.cli.main import main
 from megloc_kapture.cli.preprocess import Preprocess
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.images import image_size, read_image_rgb, write_image
@@ -99,27 +98,27 @@ def test_images_are_resized_and_masked(
     assert [p.name for p in sorted(out.iterdir())] == [".megloc", "sensors"]
 
 
-def test_nothing_to_do_links(megloc: Any, scene: Path, tmp_path: Path) -> None:
-    done = megloc("preprocess", "-i", scene / "query", "-o", tmp_path / "new", *INLINE)
+def test_nothing_to_do_links_and_an_unknown_camera_is_remarked(
+    megloc: Any, scene: Path, tmp_path: Path
+) -> None:
+    place = ("-i", scene / "query", "-o", tmp_path / "new")
+    done = megloc("preprocess", *place, "--bottom-share", "rear=0.1", *INLINE)
     assert done.status == 0
     assert "4 images, 0 of them changed" in done.err
+    assert "remark: a fixed mask fits no image: rear" in done.err
     assert (tmp_path / "new" / "sensors" / "records_data").is_symlink()
 
 
 def test_a_mask_brought_along(megloc: Any, scene: Path, tmp_path: Path) -> None:
-    image = images_of(scene)[0]
+    name = f"masks/{images_of(scene)[0]}.png"
     mask = np.full((300, 400), 255, np.uint8)
     mask[:, :384] = 0
-    write_image(tmp_path / "masks" / f"{image}.png", mask)
-    out = tmp_path / "new"
-    done = megloc(
-        *("preprocess", "-i", scene / "query", "-o", out),
-        *("--user-masks", tmp_path / "masks", "--quiet"),
-    )
+    write_image(tmp_path / name, mask)
+    places = ("-i", scene / "query", "-o", tmp_path / "new", "--user-masks", tmp_path / "masks")
+    done = megloc("preprocess", *places, "--quiet")
     assert (done.status, done.err) == (0, "")
-    np.testing.assert_array_equal(
-        read_image_rgb(out / "sensors" / "masks" / f"{image}.png")[..., 0], mask
-    )
+    written = read_image_rgb(tmp_path / "new" / "sensors" / name)[..., 0]
+    np.testing.assert_array_equal(written, mask)
 
 
 def test_what_cannot_be_done_is_said_in_a_line(
@@ -127,29 +126,17 @@ def test_what_cannot_be_done_is_said_in_a_line(
 ) -> None:
     out = tmp_path / "new"
     command = ("preprocess", "-i", scene / "query", "-o", out, *INLINE)
-    megloc(*command, "--segmenter", "nobody").refused("no plugin 'nobody'", "segmenters")
+    none = tmp_path / "none"
+    for flag, value, words in (
+        ("--segmenter", "nobody", "no plugin 'nobody' .*segmenters"),
+        ("--mask-file", f"{camera}={tmp_path}/x.png", r"x\.png: no such mask"),
+        ("--user-masks", none, "none: no such folder of masks"),
+        ("--sequence", none, "none: no such folder"),
+        ("--dynamic", "car", "no segmenter"),
+    ):
+        megloc(*command, flag, value).refused(words)
     megloc(*command, "--unchanging").refused("it has 4 images, and at least 10")
-    megloc(*command, "--mask-file", f"{camera}={tmp_path}/x.png").refused(r"x\.png: no such mask")
-    megloc(*command, "--user-masks", tmp_path / "none").refused("none: no such folder of masks")
-    megloc(*command, "--sequence", tmp_path / "none").refused("none: no such folder")
-    megloc(*command, "--dynamic", "car").refused("no segmenter")
     assert not out.exists()
     inside = scene / "query" / "new"
     megloc(*command[:4], inside).refused("lies in the kapture that is read")
     assert not inside.exists()
-
-
-def test_an_unknown_camera_is_remarked(megloc: Any, scene: Path, tmp_path: Path) -> None:
-    place = ("-i", scene / "query", "-o", tmp_path / "new")
-    done = megloc("preprocess", *place, "--bottom-share", "rear=0.1", *INLINE)
-    assert done.status == 0
-    assert "remark: a fixed mask fits no image: rear" in done.err
-
-
-def test_help_names_the_flags(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as end:
-        main(["preprocess", "--help"])
-    assert end.value.code == 0
-    told = capsys.readouterr().out
-    for flag in ("--resize", "--undistort", "--segmenter", "--bottom-share", "--unchanging"):
-        assert flag in told

@@ -19,11 +19,6 @@ def nothing_is_served(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "serve", lambda *_, **__: pytest.fail("it is served"))
 
 
-@pytest.fixture
-def token(tmp_path: Path) -> Path:
-    return tmp_path / "token.txt"
-
-
 @pytest.mark.parametrize(
     "arguments, words",
     [
@@ -59,11 +54,12 @@ def test_no_map_is_no_map(megloc: Any, scene: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text", ["", "short", "two words in\ntwo lines, long", "ü" * 20, "\0" * 20]
 )
-def test_a_token_is_one_line(megloc: Any, finished: Path, token: Path, text: str) -> None:
-    arguments = ("--port", "0", "--token-file", token)
-    megloc("serve", finished / "map", *arguments).refused("token.txt: .*missing")
+def test_a_token_is_one_line(megloc: Any, finished: Path, tmp_path: Path, text: str) -> None:
+    token = tmp_path / "token.txt"
+    command = ("serve", finished / "map", "--port", "0", "--token-file", token)
+    megloc(*command).refused("token.txt: .*missing")
     token.write_text(text)
-    megloc("serve", finished / "map", *arguments).refused("token.txt")
+    megloc(*command).refused("token.txt")
 
 
 def test_a_port_that_is_taken_is_told_before_the_map_is_read(megloc: Any, tmp_path: Path) -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -36,29 +37,24 @@ class Made:
 @pytest.fixture
 def made(megloc: Any, scene: Path, tmp_path: Path) -> Made:
     """Every stage up to the map and the matches of the queries, each by its own command."""
-    features, vlad = tmp_path / "features", tmp_path / "vlad"
-    mapping_pairs, query_pairs = tmp_path / "pairs" / "mapping.txt", tmp_path / "query.txt"
-    mapping_matches, query_matches = tmp_path / "mapping_matches", tmp_path / "query_matches"
-    mapping, query, result = scene / "mapping", scene / "query", tmp_path / "map"
-    local, both = ["--features-dir", features], ["--features-dir", features, "--features-dir", vlad]
+    made = Made(*(tmp_path / field.name for field in fields(Made)))
+    mapping, query = scene / "mapping", scene / "query"
+    local = ["--features-dir", made.features]
+    both = [*local, "--features-dir", made.vlad]
+    match = ["match", "-i", mapping, *local, *INLINE, "--pairs"]
+    triangulate = ["triangulate", "-i", mapping, *both, "--features-dir", made.mapping_matches]
     for command in (
-        ["extract-local", "-i", mapping, "-i", query, "-o", features, *OPTIONS, *INLINE],
-        ["extract-global", "-i", mapping, "--query", query, "-o", vlad, *local, *INLINE],
-        ["pairs-mapping", "-i", mapping, "-o", mapping_pairs, *both],
-        ["pairs-query", "-i", mapping, "--query", query, "-o", query_pairs, *both],
-        ["match", "-i", mapping, "--pairs", mapping_pairs, "-o", mapping_matches, *local, *INLINE],
-        [
-            *("match", "-i", mapping, "--query", query, "--pairs", query_pairs),
-            *("-o", query_matches, *local, *INLINE),
-        ],
-        [
-            *("triangulate", "-i", mapping, "--pairs", mapping_pairs, "-o", result, *both),
-            *("--features-dir", mapping_matches),
-        ],
+        ["extract-local", "-i", mapping, "-i", query, "-o", made.features, *OPTIONS, *INLINE],
+        ["extract-global", "-i", mapping, "--query", query, "-o", made.vlad, *local, *INLINE],
+        ["pairs-mapping", "-i", mapping, "-o", made.mapping_pairs, *both],
+        ["pairs-query", "-i", mapping, "--query", query, "-o", made.query_pairs, *both],
+        [*match, made.mapping_pairs, "-o", made.mapping_matches],
+        [*match, made.query_pairs, "--query", query, "-o", made.query_matches],
+        [*triangulate, "--pairs", made.mapping_pairs, "-o", made.map],
     ):
         done = megloc(*command, "--quiet")
         assert (done.status, done.err) == (0, ""), command[0]
-    return Made(features, vlad, mapping_pairs, query_pairs, mapping_matches, query_matches, result)
+    return made
 
 
 def test_stages_one_by_one_make_the_same_bytes(
@@ -119,28 +115,20 @@ def test_reranking_keeps_the_best_matched_and_their_matches(
     by = ("--rerank", "2", "--rerank-by", "verified")
     done = megloc(*command, *both, *by, "--matches-dir", matches, *INLINE, "-q")
     assert (done.status, done.err) == (0, "")
-    counts = {
-        (count.image, count.other): count.verified
-        for count in read_match_counts(matches, "rootsift")
-    }
+    counted = read_match_counts(matches, "rootsift")
+    counts = {(count.image, count.other): count.verified for count in counted}
     # all candidates were matched, and the matches are those that a later step makes
     assert counts.keys() == {(pair.query, pair.map) for pair in read_pairs(made.query_pairs)}
     kept = read_pairs(pairs)
     for query in {pair.query for pair in kept}:
         best = sorted((n for (q, _), n in counts.items() if q == query), reverse=True)[:2]
         assert [counts[pair.query, pair.map] for pair in kept if pair.query == query] == best
-    for name in ("matches", "match_counts.csv"):
-        ours, later = (
-            f / "local_features" / "rootsift" / name for f in (matches, made.query_matches)
-        )
-        assert ours.exists() and later.exists()
-    found = KaptureFolder(scene / "query", features_dirs=[matches]).matches("rootsift")
-    again = KaptureFolder(scene / "query", features_dirs=[made.query_matches]).matches("rootsift")
-    for pair in kept:
-        assert (
-            found.read(pair.query, pair.map)[0].tolist()
-            == again.read(pair.query, pair.map)[0].tolist()
-        )
+    found, again = (
+        KaptureFolder(scene / "query", features_dirs=[folder]).matches("rootsift")
+        for folder in (matches, made.query_matches)
+    )
+    for pair in ((pair.query, pair.map) for pair in kept):
+        np.testing.assert_array_equal(found.read(*pair)[0], again.read(*pair)[0])
     refused = megloc(*command, *both, "--rerank", "2", "-f")
     refused.refused("--rerank N and --matches-dir DIR go together")
     megloc(*command, *both).refused(r"reranked\.txt exists; -f")
@@ -179,13 +167,6 @@ def test_several_global_features_are_fused(
         assert score == pytest.approx((found["hard"][pair] + found["soft"][pair]) / 2, abs=1e-6)
 
 
-def test_unknown_global_features_are_refused(megloc: Any, scene: Path, tmp_path: Path) -> None:
-    command = ["extract-global", "-i", scene / "mapping", "-o", tmp_path / "out"]
-    megloc(*command, "--features", "nothing").refused(
-        "unknown global features 'nothing'; known: vlad, apgem, delg"
-    )
-
-
 @pytest.mark.parametrize(
     "command",
     ["densify", "refine-map", "refine-poses", "triangulate", "pairs-mapping", "pairs-query"],
@@ -220,7 +201,11 @@ def test_output_of_another_kind_is_refused(megloc: Any, made: Made, scene: Path)
     assert KaptureFolder(scene / "query", features_dirs=[made.vlad]).types("keypoints")
 
 
-def test_the_same_image_twice_is_refused(megloc: Any, scene: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_extracted_is_refused(megloc: Any, scene: Path, tmp_path: Path) -> None:
+    described = ["extract-global", "-i", scene / "mapping", "-o", tmp_path / "out"]
+    megloc(*described, "--features", "nothing").refused(
+        "unknown global features 'nothing'; known: vlad, apgem, delg"
+    )
     command = ["extract-local", "-i", scene / "query", "-i", scene / "query"]
     done = megloc(*command, "-o", tmp_path / "features", "-q")
     done.refused(r"image 0001\.jpg stands in two kapture folders at once")
@@ -228,42 +213,36 @@ def test_the_same_image_twice_is_refused(megloc: Any, scene: Path, tmp_path: Pat
 
 
 def test_ways_to_pair(megloc: Any, finished: Path, tmp_path: Path) -> None:
-    mapping, pairs = finished / "mapping", tmp_path / "pairs.txt"
+    mapping, points, pairs = finished / "mapping", finished / "map", tmp_path / "pairs.txt"
+    command = ("pairs-mapping", "-i", mapping, "-o", pairs, "--by")
 
     def count(*arguments: str | Path) -> int:
-        done = megloc("pairs-mapping", "-i", mapping, "-o", pairs, "-f", "-q", *arguments)
+        done = megloc(*command, *arguments, "-f", "-q")
         assert done.status == 0, done.err
         return len(read_pairs(pairs))
 
-    assert count("--by", "exhaustive") == 21
-    nearest = count("--by", "retrieval", "--topk", "1", "--features-dir", finished)
+    assert count("exhaustive") == 21
+    one = ("--topk", "1", "--features-dir", finished)
+    nearest = count("retrieval", *one)
     assert 4 <= nearest <= 7
-    both = count(
-        *("--by", "retrieval", "poses", "--topk", "1", "--features-dir", finished),
-    )
-    assert nearest <= both <= 21
+    assert nearest <= count("retrieval", "poses", *one) <= 21
     # the images stand in the order in which they were taken
     window = ("--set", "mapping_pairs.sequence.window=1")
-    assert count("--by", "sequence", *window) == 6
-    assert count("--by", "sequence", *window, "--set", "mapping_pairs.sequence.loop=true") == 7
-    shared = count("--by", "covisibility", "--covisibility-map", finished / "map")
+    assert count("sequence", *window) == 6
+    assert count("sequence", *window, "--set", "mapping_pairs.sequence.loop=true") == 7
+    shared = count("covisibility", "--covisibility-map", points)
     assert 0 < shared <= 21
-    together = count("--by", "covisibility", "sequence", "--covisibility-map", finished / "map")
-    assert max(shared, 6) <= together <= 21
-    own = megloc("pairs-mapping", "-i", finished / "map", "-o", pairs, "--by", "covisibility", "-f")
+    both = count("covisibility", "sequence", "--covisibility-map", points)
+    assert max(shared, 6) <= both <= 21
+    own = megloc("pairs-mapping", "-i", points, "-o", pairs, "--by", "covisibility", "-f")
     assert own.err == f"{shared} pairs\n"
-    megloc("pairs-mapping", "-i", mapping, "-o", pairs, "--by", "covisibility", "-f").refused(
-        "mapping: co-visibility and overlap need a map's points"
-    )
-    place = ("--covisibility-map", finished / "map")
-    megloc("pairs-mapping", "-i", mapping, "-o", pairs, "--by", "sequence", *place, "-f").refused(
-        "--covisibility-map is for --by covisibility"
-    )
-    done = megloc("pairs-mapping", "-i", mapping, "-o", pairs, "--by", "exhaustive")
-    done.refused(r"pairs\.txt exists; -f overwrites it")
-    megloc("pairs-mapping", "-i", mapping, "-o", tmp_path / "new.txt").refused(
-        r"mapping: no global_features; give their folder with --features-dir"
-    )
+    for arguments, words in (
+        (("covisibility", "-f"), "mapping: co-visibility and overlap need a map's points"),
+        (("sequence", "--covisibility-map", points, "-f"), "--covisibility-map is for --by covis"),
+        (("exhaustive",), r"pairs\.txt exists; -f overwrites it"),
+        (("retrieval", "-f"), "mapping: no global_features; give their folder with --features-dir"),
+    ):
+        megloc(*command, *arguments).refused(words)
     query = ["pairs-query", "-i", mapping, "--query", finished / "query", "--exhaustive", "-q"]
     assert megloc(*query, "-o", tmp_path / "query.txt").status == 0
     assert len(read_pairs(tmp_path / "query.txt")) == 28
@@ -274,13 +253,11 @@ def test_a_map_of_two_types_of_features(megloc: Any, scene: Path, tmp_path: Path
     place = ("-i", mapping, "--features-dir", features)
     few = ("--set", "local_features.rootsift.options.max_keypoints=500")
     both = ("--features", "rootsift", "sift")
+    match = ["match", *place, "--pairs", pairs, "-o", features, *INLINE, "--features"]
     commands = [
         ["extract-local", "-i", mapping, "-o", features, *both, *few, *INLINE],
         ["pairs-mapping", "-i", mapping, "-o", pairs, "--by", "sequence"],
-        *(
-            ["match", *place, "--pairs", pairs, "-o", features, "--features", name, *INLINE]
-            for name in ("rootsift", "sift")
-        ),
+        *([*match, name] for name in ("rootsift", "sift")),
     ]
     for command in commands:
         done = megloc(*command, "-q")
@@ -297,24 +274,17 @@ def test_a_map_of_two_types_of_features(megloc: Any, scene: Path, tmp_path: Path
     assert int(lines[2][0]) == len(folder.points3d())
 
 
-def test_pairs_of_images_that_are_not_there(megloc: Any, finished: Path, tmp_path: Path) -> None:
-    pairs = tmp_path / "pairs.txt"
+def test_what_cannot_be_matched_is_refused(megloc: Any, workspace: Path, tmp_path: Path) -> None:
+    pairs, output = tmp_path / "pairs.txt", ("-o", tmp_path / "new", *INLINE)
     pairs.write_text("0000.jpg, 0002.jpg, 1.0\n0000.jpg, 0001.jpg, 1.0\n")
-    places = ["-i", finished / "mapping", "--pairs", pairs, "--features-dir", finished]
+    command = ["match", "-i", workspace / "mapping", "--features-dir", workspace, *output]
     message = r"pairs\.txt: no image 0001\.jpg in .*/mapping"
-    megloc("match", *places, "-o", tmp_path / "new", "-q").refused(message)
-    assert not (tmp_path / "new").exists()
-
-
-def test_match_compares_the_numbers_of_keypoints_and_descriptors(
-    megloc: Any, workspace: Path, tmp_path: Path
-) -> None:
+    megloc(*command, "--pairs", pairs).refused(message)
     spoilt = workspace / "local_features/rootsift/descriptors/0002.jpg.desc"
     content = spoilt.read_bytes()
-    spoilt.unlink()
+    spoilt.unlink()  # a map may have it by another name
     spoilt.write_bytes(content[:-512])
-    places = ["-i", workspace / "mapping", "--pairs", workspace / "pairs/mapping.txt"]
-    done = megloc("match", *places, "--features-dir", workspace, "-o", tmp_path / "new", *INLINE)
+    done = megloc(*command, "--pairs", workspace / "pairs/mapping.txt")
     done.refused(f"{spoilt}: 799 descriptors for 800 keypoints")
     assert not (tmp_path / "new").exists()
 
@@ -322,18 +292,12 @@ def test_match_compares_the_numbers_of_keypoints_and_descriptors(
 def test_import_links_images_and_prefixes_queries(megloc: Any, scene: Path, tmp_path: Path) -> None:
     done = megloc("import", "kapture", scene, "-o", tmp_path / "in", "--query-prefix", "q/")
     counts = dict(line.rsplit(maxsplit=1) for line in done.out.splitlines())
-    assert counts == {
-        "map images": "7",
-        "map images with pose": "7",
-        "queries": "4",
-        "queries with truth": "4",
-    }
+    expected = {"map images": "7", "map images with pose": "7", "queries": "4"}
+    assert counts == expected | {"queries with truth": "4"}
     query = KaptureFolder(tmp_path / "in" / "query")
     assert query.read().image_names()[0] == "q/0001.jpg"
-    assert (
-        query.image_path("q/0001.jpg").read_bytes()
-        == (scene / "query/sensors/records_data/0001.jpg").read_bytes()
-    )
+    original = scene / "query/sensors/records_data/0001.jpg"
+    assert query.image_path("q/0001.jpg").read_bytes() == original.read_bytes()
     megloc("import", "venice", scene, "-o", tmp_path / "x").refused("unknown dataset 'venice'")
 
 
@@ -347,10 +311,8 @@ def test_networks_compute_where_the_flags_say(
     assert megloc(*half, "--device", "cpu").status == 0
     full = [*extract, "--features", "xfeat", "-o", tmp_path / "full"]
     assert megloc(*full).status == 0
-    name = "local_features/xfeat/keypoints/" + next(
-        iter(KaptureFolder(mapping).read().image_names())
-    )
-    both = [(place / f"{name}.kpt").read_bytes() for place in (features, tmp_path / "full")]
+    name = f"local_features/xfeat/keypoints/{KaptureFolder(mapping).read().image_names()[0]}.kpt"
+    both = [(place / name).read_bytes() for place in (features, tmp_path / "full")]
     assert both[0] != both[1]
     pairs = tmp_path / "pairs.txt"
     megloc("pairs-mapping", "-i", mapping, "-o", pairs, "--by", "sequence")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import re
 import shutil
 import subprocess
 import sys
@@ -19,11 +18,13 @@ from corner import pose_at, write_kapture, write_scene
 from safetensors.torch import load_file, save_file
 
 import megloc_kapture as megloc_package
+from megloc_kapture.cli.main import main
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import read_status
 from megloc_kapture.nets.xfeat import XFeatNetwork
+from megloc_kapture.refinement import field_training
 from megloc_kapture.stages.rigs import depth_records
 
 SMALL = ("steps=2", "layers=2", "pairs_per_step=1", "max_keypoints=40", "pairs.max_size_px=200")
@@ -50,27 +51,19 @@ def arguments(inputs: Path, *more: str | Path) -> list[str | Path]:
 def test_a_matcher_and_its_files(megloc: Any, inputs: Path, tmp_path: Path) -> None:
     output = tmp_path / "small.safetensors"
     mine, other = inputs / "mine", inputs / "other"
-    command = [
-        "train",
-        "matcher",
-        "-i",
-        mine,
-        "--held-out",
-        other,
-        "--licence",
-        f"{mine}=CC BY 4.0",
-    ]
-    done = megloc(*command, *arguments(inputs, "-o", output))
+    data = ("-i", mine, "--held-out", other, "--licence", f"{mine}=CC BY 4.0")
+    command = ["train", "matcher", *data, *arguments(inputs, "-o", output)]
+    done = megloc(*command)
     assert done.status == 0, done.err
     assert "held out loss" in done.out and f"trained: {output}" in done.out
     assert "bin_score" in load_file(output)
     manifest = json.loads(output.with_suffix(".json").read_text())
-    (data,) = manifest["training"]["data"]
-    assert (data["folder"], data["licence"]) == ("mine", "CC BY 4.0")
+    (told,) = manifest["training"]["data"]
+    assert (told["folder"], told["licence"]) == ("mine", "CC BY 4.0")
     assert manifest["training"]["held_out_data"][0]["licence"] == "unknown"
     assert manifest["held_out"]["other"]["pairs"] == 100
     assert np.isfinite(manifest["held_out"]["other"]["loss"])
-    again = megloc(*command, *arguments(inputs, "-o", output))
+    again = megloc(*command)
     assert again.status == 0 and again.out == done.out
 
 
@@ -92,8 +85,6 @@ def test_what_it_refuses(megloc: Any, inputs: Path, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-pytest.importorskip("torch")
-
 QUICK = ("--steps", "6", "--max-side", "40", "--device", "cpu")
 CAMERA_TEXT = "SIMPLE_PINHOLE,48,36,40,24,18"
 
@@ -107,13 +98,16 @@ def mapping(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def field(mapping: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from megloc_kapture.cli.main import main
-
     out = tmp_path_factory.mktemp("field") / "field"
     with pytest.raises(SystemExit) as end:
         main(["train-field", "-i", str(mapping), "-o", str(out), *QUICK, "-q"])
     assert end.value.code == 0
     return out
+
+
+def same_field(one: Path, other: Path) -> bool:
+    names = ("field.json", "field.safetensors")
+    return all((one / name).read_bytes() == (other / name).read_bytes() for name in names)
 
 
 def pose_text(mapping: Path) -> str:
@@ -125,16 +119,13 @@ def test_the_same_bytes_twice(megloc: Any, mapping: Path, field: Path, tmp_path:
     done = megloc("train-field", "-i", mapping, "-o", tmp_path / "again", *QUICK)
     assert done.status == 0 and "PSNR of 0 held-out images" in done.out
     assert "step 1 of 6" in done.err
-    for name in ("field.json", "field.safetensors"):
-        assert (tmp_path / "again" / name).read_bytes() == (field / name).read_bytes()
+    assert same_field(tmp_path / "again", field)
     assert len(json.loads((field / "field.json").read_text())["images"]) == 7
 
 
 def test_an_interrupted_training_goes_on(
     megloc: Any, mapping: Path, field: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from megloc_kapture.refinement import field_training
-
     monkeypatch.setattr(field_training, "_KEEP_EVERY", 2)
     learn, out = field_training.FieldTrainer._learn, tmp_path / "out"
     command = ("train-field", "-i", mapping, "-o", out, *QUICK)
@@ -157,8 +148,7 @@ def test_an_interrupted_training_goes_on(
         field_training.FieldTrainer, "_learn", lambda t, g: (steps.append(t._step), learn(t, g))
     )
     assert megloc(*command).status == 0 and steps == [4, 5]
-    for name in ("field.json", "field.safetensors"):
-        assert (out / name).read_bytes() == (field / name).read_bytes()
+    assert same_field(out, field)
     assert not (out / "field.state.pt").exists()
 
 
@@ -167,8 +157,7 @@ def test_gaussians_begin_where_depth_says(megloc: Any, mapping: Path, tmp_path: 
     options = ("--kind", "gaussians", "--gaussians", "1500", *QUICK[2:], "--steps", "20")
     assert megloc("train-field", "-i", mapping, "-o", out, *options).status == 0
     assert megloc("train-field", "-i", mapping, "-o", again, *options).status == 0
-    for name in ("field.json", "field.safetensors"):
-        assert (again / name).read_bytes() == (out / name).read_bytes()
+    assert same_field(again, out)
     rendered = tmp_path / "rendered"
     assert megloc("render", out, "--along", mapping, "-o", rendered, "--max-side", "40").status == 0
     maps, truth = (KaptureFolder(each) for each in (rendered, mapping))
@@ -238,7 +227,7 @@ def test_processes_render_the_same_views(
 
 
 def test_the_view_shows_them_beside_the_photographs(
-    megloc: Any, finished: Path, field: Path, tmp_path: Path
+    megloc: Any, finished: Path, field: Path, tmp_path: Path, data_of: Any
 ) -> None:
     found, rendered, page = finished / "localized", tmp_path / "rendered", tmp_path / "view.html"
     assert megloc("render", field, "--along", found, "-o", rendered, "--max-side", "80").status == 0
@@ -274,13 +263,6 @@ def test_the_view_shows_them_beside_the_photographs(
     )
     with pytest.raises(OptionError, match="renderings need the result"):
         megloc_package.open_map(finished / "map").view(page, rendered=rendered)
-
-
-def data_of(page: Path) -> dict[str, Any]:
-    found = re.search(r'id="data">(.*?)</script>', page.read_text(), re.DOTALL)
-    assert found is not None
-    data: dict[str, Any] = json.loads(found[1])
-    return data
 
 
 def apart(one: np.ndarray, other: np.ndarray) -> float:
@@ -324,10 +306,6 @@ def test_views_that_no_camera_took_join_the_map(
     assert len(data.records_depth) == len(real) + len(views)
     assert set(depth_records(data)) == set(real) | set(views)
     assert all(KaptureFolder(joined).image_path(name).is_file() for name in data.image_names())
-    megloc("render", field, "--between", out / "none", "-o", tmp_path / "x").refused("none")
-    megloc("render", field, "--between", mapping, "--along", mapping, "-o", tmp_path / "x").refused(
-        "say what to render"
-    )
 
 
 def test_poses_are_refined_by_it_or_stay(
@@ -349,20 +327,22 @@ def test_poses_are_refined_by_it_or_stay(
 def test_what_is_refused(megloc: Any, mapping: Path, field: Path, tmp_path: Path) -> None:
     out = tmp_path / "view.png"
     pose, camera = pose_text(mapping), ("--camera", CAMERA_TEXT)
-    megloc("render", field, "-o", out).refused(
-        "say what to render: --pose and --camera, --along or --between"
-    )
-    megloc("render", field, pose, "-o", out).refused("--pose needs the --camera")
-    side = ("--max-side", "9")
-    megloc("render", field, pose, *camera, *side, "-o", out).refused("--max-side changes nothing")
-    workers = ("--workers", "2")
-    megloc("render", field, pose, *camera, *workers, "-o", out).refused("--workers changes nothing")
-    megloc("render", field, "--along", mapping, *camera, "-o", out).refused("--camera changes")
-    for wrong in ("1,0,0", "2,0,0,0,0,0,0", "1,0,0,0,0,0,nan", "x,0,0,0,0,0,0"):
-        megloc("render", field, f"--pose={wrong}", *camera, "-o", out).refused("qw,qx,qy,qz,tx")
+    for arguments, words in (
+        ((), "say what to render: --pose and --camera, --along or --between"),
+        (("--between", mapping, "--along", mapping), "say what to render"),
+        ((pose,), "--pose needs the --camera"),
+        ((pose, *camera, "--max-side", "9"), "--max-side changes nothing"),
+        ((pose, *camera, "--workers", "2"), "--workers changes nothing"),
+        ((pose, *camera, "--appearance", "me.jpg"), "not trained on an image 'me.jpg'"),
+        (("--along", mapping, *camera), "--camera changes"),
+        (("--between", out / "none"), "none"),
+        *(
+            ((f"--pose={wrong}", *camera), "qw,qx,qy,qz,tx")
+            for wrong in ("1,0,0", "2,0,0,0,0,0,0", "1,0,0,0,0,0,nan", "x,0,0,0,0,0,0")
+        ),
+    ):
+        megloc("render", field, *arguments, "-o", out).refused(words)
     megloc("render", field, pose, *camera, "-o", tmp_path / "view.gif").refused("must end in")
-    unknown = megloc("render", field, pose, *camera, "-o", out, "--appearance", "me.jpg")
-    unknown.refused("not trained on an image 'me.jpg'")
     megloc("render", mapping, pose, *camera, "-o", out).refused("train-field writes one")
     train = ("train-field", "-i", mapping, "-o", tmp_path / "out")
     megloc(*train, "--steps", "0").refused("steps: .*greater than 0")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -30,15 +29,8 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 
 
-def data_of(page: Path) -> dict[str, Any]:
-    found = re.search(r'id="data">(.*?)</script>', page.read_text(), re.DOTALL)
-    assert found is not None
-    data: dict[str, Any] = json.loads(found[1])
-    return data
-
-
 def test_a_map_alone_then_a_result_then_its_truth(
-    megloc: Any, finished: Path, tmp_path: Path
+    megloc: Any, finished: Path, tmp_path: Path, data_of: Any
 ) -> None:
     out = tmp_path / "view.html"
     done = megloc("view", finished / "map", "-o", out)
@@ -82,7 +74,9 @@ def test_inliers_lie_where_the_query_sees_their_points(finished: Path) -> None:
         assert np.linalg.norm(seen - pixels, axis=1).max() <= 12.0
 
 
-def test_a_report_has_the_view_beside_it(megloc: Any, finished: Path, tmp_path: Path) -> None:
+def test_a_report_has_the_view_beside_it(
+    megloc: Any, finished: Path, tmp_path: Path, data_of: Any
+) -> None:
     assert 'href="view.html"' in (finished / "evaluation/report.html").read_text()
     view = data_of(finished / "evaluation/view.html")
     assert sum(query["drawn"] for query in view["queries"]) > 20
@@ -99,19 +93,21 @@ def test_a_report_has_the_view_beside_it(megloc: Any, finished: Path, tmp_path: 
         assert (out / "view.html").is_file()
 
 
-def test_refused(megloc: Any, finished: Path, tmp_path: Path) -> None:
-    other = tmp_path / "notes.html"
+def test_refused(megloc: Any, finished: Path, tmp_path: Path, data_of: Any) -> None:
+    other, page = tmp_path / "notes.html", tmp_path / "v.html"
     other.write_text("mine")
     a_map, gt = finished / "map", finished / "query_gt"
     megloc("view", a_map, "-o", other).refused("notes.html", "is no view; -f overwrites")
     assert other.read_text() == "mine"
     megloc("view", a_map, "-o", tmp_path).refused("is a folder")
-    megloc("view", a_map, "--gt", gt, "-o", tmp_path / "v.html").refused("--gt needs a result")
-    megloc("view", a_map, tmp_path / "no", "-o", tmp_path / "v.html").refused("no such file")
-    megloc("view", tmp_path / "no", "-o", tmp_path / "v.html").refused("no")
-    nothing = finished / "query"  # images without poses
-    megloc("view", nothing, "-o", tmp_path / "v.html").refused("no image has a pose")
-    assert not (tmp_path / "v.html").exists()
+    for arguments, words in (
+        ((a_map, "--gt", gt), "--gt needs a result"),
+        ((a_map, tmp_path / "no"), "no such file"),
+        ((tmp_path / "no",), "no"),
+        ((finished / "query",), "no image has a pose"),  # images without poses
+    ):
+        megloc("view", *arguments, "-o", page).refused(words)
+    assert not page.exists()
     assert megloc("view", a_map, "-o", other, "-f").status == 0
     assert data_of(other)["cameras"]
 
@@ -121,17 +117,14 @@ def test_it_is_opened_in_the_browser(finished: Path, tmp_path: Path) -> None:
     browser.write_text(f'#!/bin/sh\necho "$1" > {tmp_path}/opened\n')
     browser.chmod(0o755)
     out = tmp_path / "a view.html"
-    command = [str(Path(sys.executable).with_name("megloc")), "view"]
-    subprocess.run(
-        [*command, str(finished / "map"), "-o", str(out), "--open"],
-        env={**os.environ, "BROWSER": str(browser)},
-        check=True,
-        capture_output=True,
-    )
+    program = str(Path(sys.executable).with_name("megloc"))
+    command = [program, "view", str(finished / "map"), "-o", str(out), "--open"]
+    environment = {**os.environ, "BROWSER": str(browser)}
+    subprocess.run(command, env=environment, check=True, capture_output=True)
     assert (tmp_path / "opened").read_text().strip() == out.as_uri()
 
 
-def test_from_python(finished: Path, tmp_path: Path) -> None:
+def test_from_python(finished: Path, tmp_path: Path, data_of: Any) -> None:
     opened = megloc_package.open_map(finished / "map", features_dirs=[finished])
     opened.view(tmp_path / "map.html")
     assert data_of(tmp_path / "map.html")["queries"] == []
@@ -164,18 +157,9 @@ def browse(page: Path, width: int, height: int, tmp_path: Path, *, script: str =
     flags += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--v=0"]
     flags += ["--force-prefers-reduced-motion"]  # flying takes no time
     flags += [f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=3000"]
-    done = subprocess.run(
-        [
-            CHROMIUM,
-            *flags,
-            f"--window-size={width},{height}",
-            f"--screenshot={shot}",
-            page.as_uri(),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+    flags += [f"--window-size={width},{height}", f"--screenshot={shot}"]
+    command = [CHROMIUM, *flags, page.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     said = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
     assert said == [], said
     with Image.open(shot) as image:
@@ -184,7 +168,7 @@ def browse(page: Path, width: int, height: int, tmp_path: Path, *, script: str =
 
 @needs_chromium
 @pytest.mark.slow
-def test_a_browser_draws_the_view(finished: Path, tmp_path: Path) -> None:
+def test_a_browser_draws_the_view(finished: Path, tmp_path: Path, data_of: Any) -> None:
     page = finished / "evaluation/view.html"
     shot = np.asarray(browse(page, 1000, 700, tmp_path))
     picture = shot[:600, :600].astype(int)
@@ -195,9 +179,8 @@ def test_a_browser_draws_the_view(finished: Path, tmp_path: Path) -> None:
     assert blue > 20
     # the first of the list is flown to, and what is seen is another thing
     name = data_of(page)["queries"][0]["name"]
-    flown = browse(
-        page, 1000, 700, tmp_path, script="document.querySelector('#list button').click()"
-    )
+    click = "document.querySelector('#list button').click()"
+    flown = browse(page, 1000, 700, tmp_path, script=click)
     assert name and (np.abs(np.asarray(flown)[:600, :600] - picture).sum(axis=2) > 60).mean() > 0.01
 
 
@@ -286,18 +269,14 @@ def test_a_recording_has_the_map_and_the_queries(
     localized = KaptureFolder(finished / "localized").read().poses()
     statuses = read_status(finished / "localized/status.csv")
     for name in statuses:
-        parts = {
-            key.rpartition("/")[2]: v
-            for key, v in found.items()
-            if key.startswith("/quer") and name in key
-        }
+        of_query = (key for key in found if key.startswith("/quer") and name in key)
+        parts = {key.rpartition("/")[2]: found[key] for key in of_query}
         assert {"truth", "estimate"} <= parts.keys()
         center = parts["estimate"]["translation"][0] + origin
         np.testing.assert_allclose(center, localized[name].center(), atol=1e-4)
         strips = np.stack([np.stack(strip) for strip in parts["inliers"]["strips"]])
-        np.testing.assert_allclose(
-            strips[:, 0] + origin, np.tile(center, (len(strips), 1)), atol=1e-4
-        )
+        starts = np.tile(center, (len(strips), 1))
+        np.testing.assert_allclose(strips[:, 0] + origin, starts, atol=1e-4)
     # again: a recording may be overwritten, another file may not
     assert megloc(*asked, "-o", page, "--rerun", out).status == 0
     megloc(*asked, "-o", tmp_path / "b.html", "--rerun", page).refused("is no view; -f overwrites")

@@ -39,11 +39,9 @@ def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Folder that a server gives out, and a registry of what is in it."""
     folder = tmp_path / "served"
     folder.mkdir()
-    for name, content in (
-        *(("free.pth", FREE), ("bound.pth", BOUND), ("unknown.pth", UNKNOWN)),
-        ("aliked-n16.pth", FREE),
-    ):
-        (folder / name).write_bytes(content)
+    files = {"free": FREE, "bound": BOUND, "unknown": UNKNOWN, "aliked-n16": FREE}
+    for name, content in files.items():
+        (folder / f"{name}.pth").write_bytes(content)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     monkeypatch.setenv("MEGLOC_WEIGHTS", str(tmp_path / "weights"))
     running = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder)))
@@ -61,27 +59,22 @@ def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def registry_text(address: str) -> str:
-    def entry(name: str, content: bytes | None, *, commercial: bool, url: bool = True) -> str:
+    def entry(name: str, content: bytes | None, *, commercial: str = "true") -> str:
         lines = [
             *(f"[{name}]", 'purpose = "finds"', f'page = "{address}/page"'),
-            *('licence = "SHORT"', 'terms = "for looking at only"'),
-            f"commercial = {str(commercial).lower()}",
+            *('licence = "SHORT"', 'terms = "for looking at only"', f"commercial = {commercial}"),
             *(f"[[{name}.files]]", f'name = "{name}.pth"'),
         ]
-        if url:
+        if name != "by-hand":
             lines.append(f'url = "{address}/{name}.pth"')
         if content is not None:
             lines.append(f"size = {len(content)}")
             lines.append(f'sha256 = "{hashlib.sha256(content).hexdigest()}"')
         return "\n".join(lines) + "\n"
 
-    return (
-        entry("free", FREE, commercial=True)
-        + entry("bound", BOUND, commercial=False)
-        + entry("unknown", None, commercial=True)
-        + entry("by-hand", None, commercial=True, url=False)
-        + entry("aliked-n16", FREE, commercial=True)
-    )
+    bound = entry("bound", BOUND, commercial="false")
+    others = [entry(name, None) for name in ("unknown", "by-hand")]
+    return "".join([entry("free", FREE), bound, *others, entry("aliked-n16", FREE)])
 
 
 @pytest.fixture
@@ -134,27 +127,27 @@ def test_consent(megloc: Any, folder: Path) -> None:
 
 
 def test_fetch_refuses(megloc: Any, served: Path, folder: Path) -> None:
-    megloc("weights", "fetch").refused("say which weights to fetch: free, bound")
-    megloc("weights", "fetch", "fre").refused(
-        "no weights 'fre' in the registry; did you mean 'free'\\? there are free"
+    fetch = ("weights", "fetch")
+    megloc(*fetch).refused("say which weights to fetch: free, bound")
+    megloc(*fetch, "fre").refused(
+        "no weights 'fre' in the registry; did you mean 'free'\\? there are"
     )
-    megloc("weights", "fetch", "by-hand").refused(
+    megloc(*fetch, "by-hand").refused(
         "by-hand cannot be fetched by a program: download it from http.*/page and run: megloc "
         "weights add FILE"
     )
     folder.mkdir()
     (folder / "free.pth").write_bytes(BOUND)
-    megloc("weights", "fetch", "free", "-q").refused("stands there, but is not the published file")
-    assert megloc("weights", "fetch", "free", "-f", "-q").status == 0
+    megloc(*fetch, "free", "-q").refused("stands there, but is not the published file")
+    assert megloc(*fetch, "free", "-f", "-q").status == 0
     (served / "unknown.pth").write_bytes(b"something else")
-    megloc("weights", "fetch", "unknown", "-q").refused("no file of weights that can be read")
+    megloc(*fetch, "unknown", "-q").refused("no file of weights that can be read")
     (served / "free.pth").write_bytes(BOUND)
-    megloc("weights", "fetch", "free", "-f", "-q").refused(
-        f"sha256 {hashlib.sha256(BOUND).hexdigest()} instead of {hashlib.sha256(FREE).hexdigest()}"
-    )
+    wrong, right = (hashlib.sha256(content).hexdigest() for content in (BOUND, FREE))
+    megloc(*fetch, "free", "-f", "-q").refused(f"sha256 {wrong} instead of {right}")
     assert (folder / "free.pth").read_bytes() == FREE
     (served / "free.pth").unlink()
-    megloc("weights", "fetch", "free", "-f", "-q").refused("the server answers 404")
+    megloc(*fetch, "free", "-f", "-q").refused("the server answers 404")
 
 
 def test_add_check_list(megloc: Any, folder: Path, tmp_path: Path) -> None:
@@ -206,4 +199,7 @@ def test_the_shipped_registry(megloc: Any) -> None:
     assert header.split() == ["name", "what", "for", "file", "size", "licence", "state", "sha256"]
     names = [row.split()[0] for row in rows[: len(weights_registry.registry())]]
     assert names == list(weights_registry.registry())
-    assert "weights" in megloc("doctor").out
+    done = megloc("doctor")
+    assert (done.status, done.err) == (0, "")
+    assert "pycolmap" in done.out and "weights" in done.out
+    assert done.out.endswith("no problem found\n")

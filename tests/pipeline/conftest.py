@@ -7,12 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from megloc_kapture.pipeline.datasets import choose_dataset
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run
-from megloc_kapture.pipeline.workspace import Workspace
+from tests.pipeline.runs import evaluated
 
 
 @pytest.fixture(scope="session")
@@ -30,12 +26,9 @@ def virtual_gallery(shared_data: Path) -> Path:
 @pytest.fixture(scope="session")
 def workspace(fountain: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A workspace with our map of the scene, few keypoints per image; not to be written into."""
-    workspace = Workspace(tmp_path_factory.mktemp("fountain") / "workspace")
-    options = options_of_preset(assignments=["local_features.options.max_keypoints=800"])
-    with workspace.lock():
-        run = Run(choose_dataset("kapture", fountain), "classic", options, workspace)
-        run_plan(plan_evaluation(run), workspace, last="map")
-    return workspace.root
+    few = options_of_preset(assignments=["local_features.options.max_keypoints=800"])
+    root = tmp_path_factory.mktemp("fountain") / "workspace"
+    return evaluated(root, fountain, few, last="map").root
 
 
 @pytest.fixture

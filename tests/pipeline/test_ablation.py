@@ -21,55 +21,40 @@ from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import Run, find_benchmark
 from megloc_kapture.pipeline.workspace import Workspace
-from megloc_kapture.stages.options import PipelineOptions
+from tests.pipeline.runs import run_in
+
+# the paper's steps, by what an option model calls what each changes
+STEPS = {
+    "masks": {"preprocessing"},
+    "second local features": {"local_features"},
+    "fusion": {"global_features"},
+    "map refinement": {"refinement"},
+    "reranking": {"reranking", "query_pairs"},
+    "guided pyramid": {"guided_pyramid"},
+    "clusters": {"localization"},
+    "pose ranking": {"localization"},
+}
 
 
-def names(*assignments: str, preset: str = "classic") -> list[str]:
-    return [v.name for v in variants(options_of_preset(preset, assignments=assignments))]
-
-
-def megloc_on_aachen() -> PipelineOptions:
-    """The paper's options with what its steps need of a dataset."""
-    changes = find_benchmark("aachen").changes("megloc", query_depth=False)
-    return options_of_preset("megloc", changes=changes)
+def names(*assignments: str) -> list[str]:
+    return [v.name for v in variants(options_of_preset(assignments=assignments))]
 
 
 def test_only_steps_that_are_there_are_left_out() -> None:
     assert names() == ["map refinement", "clusters", "pose ranking"]
     plain = ("localization.rank.name=inliers", "localization.clusters.by=none")
     assert names(*plain) == ["map refinement"]
-    assert [v.name for v in variants(megloc_on_aachen())] == [
-        "masks",
-        "second local features",
-        "fusion",
-        "map refinement",
-        "reranking",
-        "guided pyramid",
-        "clusters",
-        "pose ranking",
-    ]
     assert names('pose_refinement.by=[{name="icp"}]')[-1] == "icp"
 
 
 def test_a_variant_lacks_its_step_and_nothing_else() -> None:
-    options = megloc_on_aachen()
+    changes = find_benchmark("aachen").changes("megloc", query_depth=False)
+    options = options_of_preset("megloc", changes=changes)
+    assert [variant.name for variant in variants(options)] == list(STEPS)
+    whole = options.model_dump()
     for variant in variants(options):
-        changed = {
-            name
-            for name, value in variant.options.model_dump().items()
-            if value != options.model_dump()[name]
-        }
-        expected = {
-            "masks": {"preprocessing"},
-            "second local features": {"local_features"},
-            "fusion": {"global_features"},
-            "map refinement": {"refinement"},
-            "reranking": {"reranking", "query_pairs"},
-            "guided pyramid": {"guided_pyramid"},
-            "clusters": {"localization"},
-            "pose ranking": {"localization"},
-        }
-        assert changed == expected[variant.name]
+        without = variant.options.model_dump()
+        assert {name for name in whole if without[name] != whole[name]} == STEPS[variant.name]
         assert variant.name not in [v.name for v in variants(variant.options)]
 
 
@@ -83,10 +68,8 @@ def first(fountain: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
             "global_features.options.num_clusters=8",
         ]
     )
-    run = Run(choose_dataset("kapture", fountain), "classic", options, workspace)
-    with workspace.lock():
-        run_plan(plan_evaluation(run), workspace)
-    return run
+    run_in(workspace, fountain, options)
+    return Run(choose_dataset("kapture", fountain), "classic", options, workspace)
 
 
 def folder_bytes(root: Path) -> dict[str, bytes]:
@@ -100,10 +83,8 @@ def test_a_variant_runs_only_what_differs_and_leaves_the_first_run_alone(first: 
     variant = next(v for v in variants(first.options) if v.name == "pose ranking")
     workspace = fresh_copy(first.workspace, variant.slug)
     assert workspace.root == first.workspace.root / "ablation" / "without_pose_ranking"
-    changed = Run(first.source, "classic", variant.options, workspace)
-    with workspace.lock():
-        reports = run_plan(plan_evaluation(changed), workspace)
-    again = {report.name for report in reports if report.state == "run"}
+    reports = run_in(workspace, first.source, variant.options)
+    again = {name for name, report in reports.items() if report.state == "run"}
     assert again == {"localization", "submission", "evaluation"}
     after = folder_bytes(first.workspace.root)
     kept = {name: content for name, content in after.items() if not name.startswith("ablation/")}

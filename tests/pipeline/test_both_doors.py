@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -20,57 +19,41 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_refinement, read_status
-from megloc_kapture.pipeline.datasets import choose_dataset
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.executors import single_threaded
-from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.results import Results
-from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.values import Failure, RigidTransform
+from megloc_kapture.values import RigidTransform
+from tests.pipeline.runs import evaluated
 
 FEW = ("local_features.rootsift.options.max_keypoints=300",)
 TWO_TYPES = ('local_features=["rootsift","sift"]', *FEW)
 
 
-def evaluated(scene: Path, workspace: Path, options: PipelineOptions) -> Workspace:
-    """A workspace that all stages have run in."""
-    place = Workspace(workspace)
-    with place.lock(), single_threaded():
-        run_plan(
-            plan_evaluation(Run(choose_dataset("kapture", scene), "classic", options, place)), place
-        )
-    return place
+def both(scene: Path, root: Path, *assignments: str) -> tuple[Workspace, Localizer]:
+    """A workspace in which all stages have run, and a localizer in its map, of the same options."""
+    options = options_of_preset(assignments=assignments)
+    workspace = evaluated(root, scene, options)
+    return workspace, Localizer(KaptureMap.open(workspace.path("map")), options=options)
 
 
-def assert_same(
-    workspace: Workspace, localized: Iterable[tuple[str, Pose | Failure]]
-) -> list[Pose]:
-    """Check that results are those of the workspace, to the last bit; returns the poses."""
-    evaluated = workspace.folder("localized").read()
+def same_poses(workspace: Workspace, localizer: Localizer) -> list[Pose]:
+    """The poses of the queries from Python, compared with those of the workspace."""
+    in_run = workspace.folder("localized").read()
     status = read_status(workspace.path("localized/status.csv"))
-    found = dict(localized)
-    assert sorted(found) == evaluated.image_names()
-    poses = []
+    found = dict(localizer.localize_kapture(workspace.path("query")))
+    assert sorted(found) == in_run.image_names()
     for name, result in found.items():
-        pose = evaluated.cam_from_world(name)
-        assert bool(result) == (status[name].status == "localized")
-        assert (result.num_matches, result.num_inliers, result.candidates) == (
-            status[name].num_matches, status[name].num_inliers, status[name].candidates,
-        )  # fmt: skip
+        pose, row = in_run.cam_from_world(name), status[name]
+        assert bool(result) == (row.status == "localized")
+        numbers = (result.num_matches, result.num_inliers, result.candidates)
+        assert numbers == (row.num_matches, row.num_inliers, row.candidates)
         if isinstance(result, Pose):
             assert pose is not None
-            np.testing.assert_allclose(
-                [*result.cam_from_world.quat_wxyz, *result.cam_from_world.translation],
-                [*pose.quat_wxyz, *pose.translation],
-                rtol=0,
-                atol=1e-9,
-            )
-            poses.append(result)
-    return poses
+            own = [*result.cam_from_world.quat_wxyz, *result.cam_from_world.translation]
+            expected = [*pose.quat_wxyz, *pose.translation]
+            np.testing.assert_allclose(own, expected, rtol=0, atol=1e-9)
+    return [result for result in found.values() if isinstance(result, Pose)]
 
 
 @pytest.fixture(scope="module")
@@ -87,17 +70,13 @@ def with_rig(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("rig") / "scene"
     shutil.copytree(scene, root, copy_function=shutil.copyfile)
     truth = KaptureFolder(scene / "query_gt").read()
-    names = truth.image_names()
-    poses = truth.poses()
-    sensor = truth.sensors["cam"]
-    data = KaptureData(sensors={"left": sensor, "right": sensor})
+    names, poses = truth.image_names(), truth.poses()
+    data = KaptureData(sensors=dict.fromkeys(("left", "right"), truth.sensors["cam"]))
     # the second camera stands where the true poses of the first moment put it
     right_from_left = poses[names[1]] @ poses[names[0]].inverse()
     data.rigs["rig"] = {"left": RigidTransform.identity(), "right": right_from_left}
-    data.records_camera = {
-        (1, "left"): names[0], (1, "right"): names[1],
-        (2, "left"): names[2], (3, "right"): names[3],
-    }  # fmt: skip
+    moments = ((1, "left"), (1, "right"), (2, "left"), (3, "right"))
+    data.records_camera = dict(zip(moments, names, strict=True))
     write_sensors(root / "query", data)
     shutil.rmtree(root / "query_gt")
     return root
@@ -127,22 +106,7 @@ def with_rig(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_the_same_poses(scene: Path, tmp_path: Path, assignments: tuple[str, ...]) -> None:
-    options = options_of_preset(assignments=assignments)
-    workspace = evaluated(scene, tmp_path / "workspace", options)
-    opened = KaptureMap.open(workspace.path("map"))
-    localizer = Localizer(opened, options=options)
-    assert len(assert_same(workspace, localizer.localize_kapture(workspace.path("query")))) == 4
-
-
-def test_options_that_contradict_each_other_are_refused(scene: Path, tmp_path: Path) -> None:
-    options = options_of_preset(assignments=["verification=none", "guided_pyramid.mode=all"])
-    message = "guided pyramid matching counts verified matches"
-    with pytest.raises(OptionError, match=message):
-        evaluated(scene, tmp_path / "workspace", options)
-    map_options = options_of_preset(assignments=FEW)
-    workspace = evaluated(scene, tmp_path / "map", map_options)
-    with pytest.raises(OptionError, match=message):
-        Localizer(KaptureMap.open(workspace.path("map")), options=options)
+    assert len(same_poses(*both(scene, tmp_path / "workspace", *assignments))) == 4
 
 
 def test_a_fallback_is_the_pose_of_the_first_candidate_after_reranking(
@@ -152,46 +116,43 @@ def test_a_fallback_is_the_pose_of_the_first_candidate_after_reranking(
         *FEW, "localization.pose.min_inliers=5000", "localization.fallback=retrieval",
         "reranking.by=verified", "reranking.keep=3", "global_features.vlad.options.num_clusters=1",
     ]  # fmt: skip
-    options = options_of_preset(assignments=sets)
-    workspace = evaluated(scene, tmp_path / "workspace", options)
+    workspace, localizer = both(scene, tmp_path / "workspace", *sets)
     first = [
         {name: images[0] for name, images in iterate_candidates(read_pairs(workspace.path(pairs)))}
         for pairs in ("pairs/query_candidates.txt", "pairs/query.txt")
     ]
     assert first[0] != first[1]
-    localizer = Localizer(KaptureMap.open(workspace.path("map")), options=options)
     Results(localizer, workspace.path("query")).save(tmp_path / "localized")
     found = KaptureFolder(tmp_path / "localized").read().poses()
     map_poses = workspace.folder("map").read().poses()
     assert found == {name: map_poses[image] for name, image in first[1].items()}
     assert found == workspace.folder("localized").read().poses()
+    # options that contradict each other are refused by both
+    wrong = options_of_preset(assignments=["verification=none", "guided_pyramid.mode=all"])
+    message = "guided pyramid matching counts verified matches"
+    with pytest.raises(OptionError, match=message):
+        evaluated(tmp_path / "wrong", scene, wrong)
+    with pytest.raises(OptionError, match=message):
+        Localizer(localizer.map, options=wrong)
 
 
 @pytest.mark.slow
 def test_the_same_poses_of_rigs(with_rig: Path, tmp_path: Path) -> None:
-    options = options_of_preset(assignments=[*FEW, "localization.rigs=true"])
-    workspace = evaluated(with_rig, tmp_path / "workspace", options)
-    localizer = Localizer(KaptureMap.open(workspace.path("map")), options=options)
-    poses = assert_same(workspace, localizer.localize_kapture(workspace.path("query")))
+    workspace, localizer = both(with_rig, tmp_path / "workspace", *FEW, "localization.rigs=true")
+    poses = same_poses(workspace, localizer)
     assert len(poses) == 4
     rigs = KaptureFolder(with_rig / "query").read().rigs["rig"]
-    found = dict(localizer.localize_kapture(workspace.path("query")))
-    names = sorted(found)
-    left, right = found[names[0]], found[names[1]]
-    assert isinstance(left, Pose) and isinstance(right, Pose)
-    expected = rigs["right"] @ left.cam_from_world
-    np.testing.assert_allclose(right.cam_from_world.translation, expected.translation, atol=1e-9)
+    left, right = (pose.cam_from_world for pose in poses[:2])
+    expected = rigs["right"] @ left
+    np.testing.assert_allclose(right.translation, expected.translation, atol=1e-9)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("by", ["icp", "rendering"])
 def test_the_same_refined_poses(with_depth: Path, tmp_path: Path, by: str) -> None:
-    options = options_of_preset(
-        assignments=[*FEW, f'pose_refinement.by=["{by}"]', "localization.rank=perceptual"]
-    )
-    workspace = evaluated(with_depth, tmp_path / "workspace", options)
-    localizer = Localizer(KaptureMap.open(workspace.path("map")), options=options)
-    poses = assert_same(workspace, localizer.localize_kapture(workspace.path("query")))
+    sets = (*FEW, f'pose_refinement.by=["{by}"]', "localization.rank=perceptual")
+    workspace, localizer = both(with_depth, tmp_path / "workspace", *sets)
+    poses = same_poses(workspace, localizer)
     rows = read_refinement(workspace.path("localized/refinement.csv"))
     assert [row.method for row in rows] == [by] * 4
     for pose, row in zip(poses, rows, strict=True):
@@ -201,14 +162,11 @@ def test_the_same_refined_poses(with_depth: Path, tmp_path: Path, by: str) -> No
 @pytest.mark.parametrize("by", ["icp", pytest.param("rendering", marks=pytest.mark.slow)])
 def test_the_command_writes_what_eval_writes(with_depth: Path, tmp_path: Path, by: str) -> None:
     sets = [*FEW, f'pose_refinement.by=["{by}"]', "preprocessing.max_size_px=240"]
-    workspace = evaluated(with_depth, tmp_path / "w", options_of_preset(assignments=sets))
+    workspace = evaluated(tmp_path / "w", with_depth, options_of_preset(assignments=sets))
     flags = [flag for one in sets for flag in ("--set", one)]
-    out = tmp_path / "localized"
+    out, inputs = tmp_path / "localized", [str(workspace.path(name)) for name in ("map", "query")]
     with pytest.raises(SystemExit) as end:
-        main(
-            ["localize", "-i", str(workspace.path("map")), "--query", str(workspace.path("query")),
-             "-o", str(out), *flags]
-        )  # fmt: skip
+        main(["localize", "-i", inputs[0], "--query", inputs[1], "-o", str(out), *flags])
     assert end.value.code == 0
     names = ["status.csv", "refinement.csv", "clusters.csv", "sensors/trajectories.txt"]
     tested = [place / CONSISTENCY_FILE for place in (out, workspace.path("localized"))]

@@ -44,10 +44,9 @@ class Toy:
         sensor = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 10, 8, (9.0, 5.0, 4.0)))
         missing = Missing(root)
         missing.require(root / "2.jpg")
+        posed = {(0, "c"): RigidTransform.identity()}
         return OfficialDataset(
-            mapping=KaptureData(
-                {"c": sensor}, {}, {(0, "c"): RigidTransform.identity()}, {(0, "c"): "1.jpg"}
-            ),
+            mapping=KaptureData({"c": sensor}, {}, posed, {(0, "c"): "1.jpg"}),
             query=KaptureData({"c": sensor}, {}, {}, {(0, "c"): "2.jpg"}),
             links={"": root},
             protocol=Protocol(dataset="toy"),
@@ -64,7 +63,7 @@ def test_the_names_are_those_of_the_adapters_and_their_twins() -> None:
 
 
 @pytest.mark.parametrize("name", OFFICIAL)
-def test_an_official_dataset_says_where_it_is_published(
+def test_an_official_dataset_is_published_somewhere_and_has_a_twin(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("MEGLOC_DATA", raising=False)
@@ -75,6 +74,14 @@ def test_an_official_dataset_says_where_it_is_published(
     assert f"`megloc eval synthetic-{name}`" in text
     card = choose_dataset(name, Path()).adapter.card  # type: ignore[union-attr]
     assert card.size in text and card.layout in text and card.title in text
+    # rendered, and imported by the adapter of its layout
+    choice = choose_dataset(f"synthetic-{name}", None)
+    assert choice.root is None and choice.twin is not None
+    assert choice.adapter is not None and choice.adapter.name == name
+    assert isinstance(choice.adapter, DatasetAdapter)
+    assert choice.render_options()["world"]["seed"] == 0
+    assert isinstance(choice.twin, RenderedDataset)
+    assert twin_of(name, seed=3).options != choice.twin.options
 
 
 def test_the_root_is_found_below_the_environment(
@@ -101,17 +108,6 @@ def test_what_cannot_be_is_refused() -> None:
         choose_dataset("inloc", Path(), query_prefix="q")
     with pytest.raises(OptionError, match="nothing renders 'venice'"):
         twin_of("venice")
-
-
-@pytest.mark.parametrize("name", OFFICIAL)
-def test_a_twin_is_rendered_and_imported_by_the_adapter_of_its_layout(name: str) -> None:
-    choice = choose_dataset(f"synthetic-{name}", None)
-    assert choice.root is None and choice.twin is not None
-    assert choice.adapter is not None and choice.adapter.name == name
-    assert isinstance(choice.adapter, DatasetAdapter)
-    assert choice.render_options()["world"]["seed"] == 0
-    assert isinstance(choice.twin, RenderedDataset)
-    assert twin_of(name, seed=3).options != choice.twin.options
 
 
 def test_without_the_twins_one_line_says_what_to_install(

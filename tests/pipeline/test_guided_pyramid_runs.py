@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -12,17 +11,13 @@ import pytest
 
 from megloc_kapture import Camera, KaptureMap, Localizer
 from megloc_kapture.errors import OptionError
-from megloc_kapture.evaluation.metrics import pose_errors
 from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.io.kapture import KaptureFolder, Sensor, write_sensors
-from megloc_kapture.pipeline.datasets import choose_dataset
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.plan import StageReport, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import RigidTransform
+from tests.pipeline.runs import errors, evaluated, recall, run_in
 
 pytestmark = pytest.mark.slow
 
@@ -72,68 +67,44 @@ def turned_camera(camera: Camera) -> Camera:
     return Camera("PINHOLE", camera.height, camera.width, (fy, fx, cy, camera.width - cx))
 
 
-def run(scene: Path, workspace: Path, options: PipelineOptions) -> list[StageReport]:
-    place = Workspace(workspace)
-    with place.lock():
-        return run_plan(
-            plan_evaluation(Run(choose_dataset("kapture", scene), "classic", options, place)), place
-        )
-
-
 def pyramid(options: PipelineOptions, **changes: object) -> PipelineOptions:
     return options.model_copy(
         update={"guided_pyramid": options.guided_pyramid.model_copy(update=changes)}
     )
 
 
-def recall(workspace: Path) -> float:
-    """At 25 cm and 2 degrees."""
-    found = json.loads((workspace / "evaluation" / "recall.json").read_text())
-    return float(found["rows"][-1]["recall"][1]["recall"])
-
-
 def test_turned_queries_are_found_with_it_and_easy_pairs_are_not_tried(
     turned: Path, options: PipelineOptions, tmp_path: Path
 ) -> None:
-    workspace = tmp_path / "workspace"
-    run(turned, workspace, options)
-    assert recall(workspace) == 0
-    reports = {
-        report.name: report for report in run(turned, workspace, pyramid(options, mode="all"))
-    }
-    assert recall(workspace) == 1
+    workspace = evaluated(tmp_path / "workspace", turned, options)
+    assert recall(workspace)[1] == 0
+    with_pyramid = pyramid(options, mode="all")
+    reports = run_in(workspace, turned, with_pyramid)
+    assert recall(workspace)[1] == 1
     counts = reports["query_pyramid"].counts
     assert counts["xfeat pairs_tried"] == counts["xfeat pairs"] == 28
     assert counts["xfeat matches_after"] > 4 * counts["xfeat matches_before"]
     # of the upright map images only those that see little of each other are tried again
     mapping = reports["mapping_pyramid"].counts
     assert mapping["xfeat pairs_tried"] < 0.5 * mapping["xfeat pairs"]
-    report = (workspace / "evaluation" / "report.html").read_text()
-    assert "matches" in report
+    assert "matches" in workspace.path("evaluation/report.html").read_text()
 
     # from Python, in the map that it made
-    opened = KaptureMap.open(workspace / "map")
+    opened = KaptureMap.open(workspace.path("map"))
     assert list(opened.keypoints) == ["xfeat-pyramid"]
-    localizer = Localizer(opened, options=pyramid(options, mode="all"))
-    found = dict(localizer.localize_kapture(workspace / "preprocessed" / "query"))
+    localizer = Localizer(opened, options=with_pyramid)
     truth = KaptureFolder(turned / "query_gt").read().poses()
-    assert all(found.values()), found
-    errors = pose_errors({name: pose.cam_from_world for name, pose in found.items()}, truth)
-    assert max(errors.position_m) < 0.25
+    for name, pose in localizer.localize_kapture(workspace.path("preprocessed/query")):
+        assert errors(pose, truth[name])[0] < 0.25
 
 
 def test_upright_queries_are_left_alone(
     fountain: Path, options: PipelineOptions, tmp_path: Path
 ) -> None:
-    few = pyramid(options, mode="max", min_matches=15)
-    counts = {report.name: report.counts for report in run(fountain, tmp_path / "runs", few)}
-    assert counts["query_pyramid"]["xfeat pairs_tried"] == 0
-    assert counts["query_pyramid"]["xfeat images_extracted_again"] == 0
-
-
-def test_it_needs_verified_matches(
-    fountain: Path, options: PipelineOptions, tmp_path: Path
-) -> None:
+    workspace = Workspace(tmp_path / "runs")
     unverified = pyramid(options, mode="all").model_copy(update={"verification": "none"})
     with pytest.raises(OptionError, match="guided pyramid matching counts verified matches"):
-        run(fountain, tmp_path / "runs", unverified)
+        run_in(workspace, fountain, unverified)
+    reports = run_in(workspace, fountain, pyramid(options, mode="max", min_matches=15))
+    counts = reports["query_pyramid"].counts
+    assert counts["xfeat pairs_tried"] == counts["xfeat images_extracted_again"] == 0

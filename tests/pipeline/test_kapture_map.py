@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.evaluation.metrics import pose_errors
 from megloc_kapture.geometry.cameras import project, shift_principal_point
 from megloc_kapture.io.kapture import FeatureWriter, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.localization.map_index import observed_matches
@@ -22,6 +20,7 @@ from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.matches import Features, match_all, verification_of, verified
 from megloc_kapture.values import Pose
+from tests.pipeline.runs import errors
 
 
 def shift_keypoints(root: Path, shift_px: float) -> None:
@@ -55,60 +54,39 @@ def test_our_own_map_is_as_colmap_has_it(workspace: Path) -> None:
     assert opened.global_types() == ["vlad_rootsift"]
 
 
-@pytest.mark.parametrize(
-    ("change", "intrinsics", "keypoints"),
-    [
-        (lambda root: shift_keypoints(root, -0.5), "corner", "centre"),
-        (lambda root: shift_intrinsics(root, -0.5), "centre", "corner"),
-    ],
-    ids=["keypoints", "intrinsics"],
-)
+@pytest.mark.parametrize("intrinsics", ["corner", "centre"])
 def test_a_half_pixel_between_keypoints_and_intrinsics_is_found_and_undone(
-    workspace: Path,
-    map_copy: Path,
-    change: Callable[[Path], None],
-    intrinsics: str,
-    keypoints: str,
+    workspace: Path, map_copy: Path, intrinsics: str
 ) -> None:
-    change(map_copy)
+    (shift_intrinsics if intrinsics == "centre" else shift_keypoints)(map_copy, -0.5)
     original, opened = KaptureMap.open(workspace / "map"), KaptureMap.open(map_copy)
     found = opened.pixel_origin
-    assert (found.intrinsics, found.keypoints) == (intrinsics, keypoints)
-    assert found.error_px[found.intrinsics] == min(found.error_px.values())
+    assert {found.intrinsics, found.keypoints} == {"corner", "centre"}
+    assert found.intrinsics == intrinsics
+    assert found.error_px[intrinsics] == min(found.error_px.values())
+    before, after = (one.keypoints["rootsift"] for one in (original, opened))
     for image in original.images:
-        np.testing.assert_allclose(
-            opened.keypoints["rootsift"].keypoints_px(image),
-            original.keypoints["rootsift"].keypoints_px(image),
-            atol=1e-3,
-        )
-        np.testing.assert_allclose(
-            opened.camera(image).params, original.camera(image).params, atol=1e-9
-        )
+        np.testing.assert_allclose(after.keypoints_px(image), before.keypoints_px(image), atol=1e-3)
+        own, expected = (one.camera(image).params for one in (opened, original))
+        np.testing.assert_allclose(own, expected, atol=1e-9)
 
 
 def residuals_px(opened: KaptureMap, queries: KaptureFolder, truth: Path) -> list[float]:
     """Of each query, the median distance of its matches from where its true pose puts them."""
     poses, options, found = KaptureFolder(truth).read().poses(), options_of_preset(), []
     (local_type,) = opened.keypoints
-    stored = opened.keypoints[local_type]
-    matcher, verify = (
-        options.make_matcher(local_type),
-        verification_of(options.query_verification),
-    )
-
-    def match_one(a: Features, b: Features) -> tuple[np.ndarray, np.ndarray]:
-        return verified(a, b, match_all(matcher, a, [b], ["b"])[0], verify)[:2]
-
+    stored, verify = opened.keypoints[local_type], verification_of(options.query_verification)
+    matcher = options.make_matcher(local_type)
     for query in KaptureQueries(queries, opened):
         features = query.features[local_type]
         keypoints = features.keypoints_px[:, :2]
         ours = Features.of(query.camera, keypoints, features.descriptors)
         matches = []
         for image in opened.images:
-            theirs = Features.of(
-                opened.camera(image), stored.keypoints_px(image), stored.descriptors(image)
-            )
-            matches.append((image, *match_one(ours, theirs)))
+            described = stored.keypoints_px(image), stored.descriptors(image)
+            theirs = Features.of(opened.camera(image), *described)
+            of_pair = match_all(matcher, ours, [theirs], ["theirs"])[0]
+            matches.append((image, *verified(ours, theirs, of_pair, verify)[:2]))
         pairs = observed_matches(stored.index, matches).resolve()
         seen = project(query.camera, poses[query.name], stored.index.xyz[pairs.point_ids])
         distances = np.linalg.norm(seen - keypoints[pairs.keypoint_ids], axis=1)
@@ -126,9 +104,9 @@ def test_the_origin_of_the_foreign_map_and_what_the_wrong_one_costs(virtual_gall
     assert (wrong.pixel_origin.intrinsics, wrong.pixel_origin.reason) == ("corner", "as asked for")
     # the map's points, seen from where the queries truly are; no pose can hide the half pixel
     queries, truth = KaptureFolder(virtual_gallery / "query"), virtual_gallery / "query_gt"
-    errors = np.array([residuals_px(opened, queries, truth) for opened in (right, wrong)])
-    assert errors.shape == (2, 4)
-    assert (errors[0] < errors[1]).all(), errors
+    off_px = np.array([residuals_px(opened, queries, truth) for opened in (right, wrong)])
+    assert off_px.shape == (2, 4)
+    assert (off_px[0] < off_px[1]).all(), off_px
 
 
 def test_queries_are_described_as_their_map(
@@ -142,20 +120,17 @@ def test_queries_are_described_as_their_map(
     queries, truth = KaptureFolder(query, features_dirs=[workspace]), fountain / "query_gt"
     right = KaptureMap.open(map_copy)
     wrong = KaptureMap.open(map_copy, pixel_origin="corner")
-    errors = np.array([residuals_px(opened, queries, truth) for opened in (right, wrong)])
+    off_px = np.array([residuals_px(opened, queries, truth) for opened in (right, wrong)])
     # half of one query's few matches are wrong ones
-    assert np.median(errors[0]) < 0.6 * np.median(errors[1]), errors
+    assert np.median(off_px[0]) < 0.6 * np.median(off_px[1]), off_px
     # and the poses are those of the map before
     before = Localizer(KaptureMap.open(workspace / "map"))
     original = KaptureFolder(fountain / "query", features_dirs=[workspace])
     expected = dict(before.localize_kapture(original))
-    found = dict(Localizer(right).localize_kapture(queries))
-    for name, pose in found.items():
-        assert isinstance(pose, Pose)
+    for name, pose in Localizer(right).localize_kapture(queries):
         reference = expected[name]
         assert isinstance(reference, Pose)
-        difference = pose_errors({name: pose.cam_from_world}, {name: reference.cam_from_world})
-        assert difference.position_m[0] < 1e-3
+        assert errors(pose, reference.cam_from_world)[0] < 1e-3
 
 
 def test_opening_writes_nothing_and_reads_through_links(
@@ -206,18 +181,17 @@ def test_what_cannot_be_opened(workspace: Path, map_copy: Path, tmp_path: Path) 
         KaptureMap.open(map_copy)
 
 
-def test_features_may_lie_elsewhere(workspace: Path, map_copy: Path) -> None:
+def test_features_may_lie_elsewhere_and_their_sizes_are_checked_without_reading(
+    workspace: Path, map_copy: Path
+) -> None:
+    opened = KaptureMap.open(map_copy)
+    file = map_copy / "reconstruction/descriptors/rootsift/0003.jpg.desc"
+    file.write_bytes(file.read_bytes()[:-512])
+    with pytest.raises(DataError, match=r"0003\.jpg\.desc: 799 descriptors for 800 keypoints"):
+        opened.check()
     shutil.rmtree(map_copy / "reconstruction" / "descriptors")
     bare = KaptureMap.open(map_copy)
     assert not bare.keypoints["rootsift"].has_descriptors(bare.images)
     opened = KaptureMap.open(map_copy, features_dirs=[workspace])
     assert opened.keypoints["rootsift"].has_descriptors(opened.images)
     opened.check()
-
-
-def test_sizes_are_checked_without_reading(map_copy: Path) -> None:
-    opened = KaptureMap.open(map_copy)
-    file = map_copy / "reconstruction/descriptors/rootsift/0003.jpg.desc"
-    file.write_bytes(file.read_bytes()[:-512])
-    with pytest.raises(DataError, match=r"0003\.jpg\.desc: 799 descriptors for 800 keypoints"):
-        opened.check()

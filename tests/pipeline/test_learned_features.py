@@ -10,23 +10,12 @@ import pytest
 
 from megloc_kapture import KaptureMap, Localizer
 from megloc_kapture.errors import OptionError
-from megloc_kapture.evaluation.metrics import pose_errors
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.pipeline.datasets import choose_dataset
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.options import PipelineOptions
+from tests.pipeline.runs import errors, evaluated, recall
 
 pytestmark = pytest.mark.slow
-
-SMALL = [
-    "local_features.aliked.options.max_keypoints=600",
-    "preprocessing.max_size_px=640",
-    "global_features.options.num_clusters=16",
-]
 
 
 @pytest.fixture(autouse=True)
@@ -34,31 +23,23 @@ def real_weights(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MEGLOC_WEIGHTS", str(shared_data / "weights"))
 
 
-def run(scene: Path, place: Path, options: PipelineOptions) -> Workspace:
-    workspace = Workspace(place)
-    with workspace.lock():
-        run_plan(
-            plan_evaluation(Run(choose_dataset("kapture", scene), "modern", options, workspace)),
-            workspace,
-        )
-    return workspace
+def modern(*assignments: str) -> PipelineOptions:
+    """The preset, on small images with few keypoints, once there are its features."""
+    small = ("preprocessing.max_size_px=640", "global_features.options.num_clusters=16")
+    few = "local_features.aliked.options.max_keypoints=600"
+    return options_of_preset("modern", assignments=[*assignments, few, *small])
 
 
 def test_several_types_are_one_map_and_one_problem(fountain: Path, tmp_path: Path) -> None:
-    options = options_of_preset(
-        "modern",
-        assignments=[
-            'local_features=["aliked", "xfeat"]',
-            "local_features.xfeat.matching.name=lighterglue",
-            "local_features.xfeat.options.max_keypoints=300",
-            *SMALL,
-        ],
+    options = modern(
+        'local_features=["aliked", "xfeat"]',
+        "local_features.xfeat.matching.name=lighterglue",
+        "local_features.xfeat.options.max_keypoints=300",
     )
-    workspace = run(fountain, tmp_path / "workspace", options)
+    workspace = evaluated(tmp_path / "workspace", fountain, options)
     seen = workspace.folder("map").observations()
     assert {name for name, some in seen.items() if len(some)} == {"aliked-n16", "xfeat"}
-    found = json.loads(workspace.path("evaluation/recall.json").read_text())
-    assert found["rows"][-1]["recall"][0]["recall"] == 1.0
+    assert recall(workspace)[0] == 1.0
     manifest = json.loads(workspace.path("stages/local_features.json").read_text())
     weights = manifest["options"]["weights"]
     assert list(weights) == ["aliked-n16.pth", "xfeat.pt"]
@@ -70,31 +51,21 @@ def test_several_types_are_one_map_and_one_problem(fountain: Path, tmp_path: Pat
 def test_modern_maps_smaller_images_and_localizes_whole_ones(
     fountain: Path, tmp_path: Path
 ) -> None:
-    options = options_of_preset("modern", assignments=SMALL)
-    workspace = run(fountain, tmp_path / "workspace", options)
-    cameras = workspace.folder("map").read()
-    assert {cameras.camera_of(image).width for image in cameras.image_names()} == {640}
+    options = modern()
+    workspace = evaluated(tmp_path / "workspace", fountain, options)
     # what is written of the queries is as they were imported
-    queries = workspace.folder("localized").read()
-    assert {queries.camera_of(image).width for image in queries.image_names()} == {1536}
-
+    for folder, width in (("map", 640), ("localized", 1536)):
+        data = workspace.folder(folder).read()
+        assert {data.camera_of(image).width for image in data.image_names()} == {width}
     opened = KaptureMap.open(workspace.path("map"))
     assert opened.pixel_origin.intrinsics == "corner"
-    localizer = Localizer(opened, options=options)
-    found = dict(localizer.localize_kapture(fountain / "query"))
-    assert all(found.values()), found
     truth = KaptureFolder(fountain / "query_gt").read().poses()
-    errors = pose_errors({name: pose.cam_from_world for name, pose in found.items()}, truth)
-    assert np.median(errors.position_m) < 0.02
-
-    masked = options_of_preset(
-        "modern", assignments=[*SMALL, "preprocessing.masks.unchanging=true"]
-    )
+    found = Localizer(opened, options=options).localize_kapture(fountain / "query")
+    assert np.median([errors(pose, truth[name])[0] for name, pose in found]) < 0.02
     with pytest.raises(OptionError, match=r"Query\(mask=...\)"):
-        Localizer(opened, options=masked)
+        Localizer(opened, options=modern("preprocessing.masks.unchanging=true"))
 
 
 def test_a_given_map_is_not_resized(fountain: Path, tmp_path: Path) -> None:
-    options = options_of_preset("modern", assignments=[*SMALL, "map=given+triangulate"])
     with pytest.raises(OptionError, match="keypoints are in the original images"):
-        run(fountain, tmp_path / "workspace", options)
+        evaluated(tmp_path / "workspace", fountain, modern("map=given+triangulate"))

@@ -18,13 +18,9 @@ from megloc_kapture.io.kapture import (
     write_points3d,
 )
 from megloc_kapture.io.tables import read_status
-from megloc_kapture.pipeline.datasets import choose_dataset
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.executors import single_threaded
-from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
+from tests.pipeline.runs import evaluated, run_in
 
 pytestmark = pytest.mark.slow
 
@@ -57,33 +53,25 @@ def enlarged(root: Path, count: int) -> None:
 @pytest.fixture(scope="module")
 def workspace(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     """A finished run with two types."""
-    place = Workspace(tmp_path_factory.mktemp("two_types") / "workspace")
-    options = options_of_preset(assignments=SETS)
-    with place.lock(), single_threaded():
-        run_plan(
-            plan_evaluation(Run(choose_dataset("kapture", scene), "classic", options, place)), place
-        )
-    return place
+    root = tmp_path_factory.mktemp("two_types") / "workspace"
+    return evaluated(root, scene, options_of_preset(assignments=SETS))
 
 
 def test_200_000_points_of_two_types(workspace: Workspace, tmp_path: Path) -> None:
-    root = tmp_path / "map"
+    root, out = tmp_path / "map", tmp_path / "localized"
     shutil.copytree(workspace.path("map"), root, symlinks=True)
     (root / "reconstruction" / "point_covariances.npy").unlink()
     enlarged(root, 200_000)
     theirs = kapture_from_dir(str(root))
-    assert len(theirs.points3d) > 200_000
-    assert len(theirs.observations) > 200_000
+    assert len(theirs.points3d) > 200_000 and len(theirs.observations) > 200_000
     localizer = Localizer(KaptureMap.open(root), options=options_of_preset(assignments=SETS))
     assert [local.name for local in localizer.types] == ["rootsift", "sift"]
     found = dict(localizer.localize_kapture(workspace.path("query")))
     assert all(found.values())
-    out = tmp_path / "localized"
     # its second type's points are nowhere near their keypoints: only who insists may go on
-    flags = [flag for one in SETS for flag in ("--set", one)]
+    places = ["-i", str(root), "--query", str(workspace.path("query")), "-o", str(out)]
     with pytest.raises(SystemExit) as end:
-        main(["localize", "-i", str(root), "--query", str(workspace.path("query")), "-o", str(out),
-              "-f", *flags])  # fmt: skip
+        main(["localize", *places, "-f", *(flag for one in SETS for flag in ("--set", one))])
     assert end.value.code == 0
     written = KaptureFolder(out).read()
     for name, pose in found.items():
@@ -96,13 +84,10 @@ def test_a_type_without_any_point(scene: Path, workspace: Workspace, tmp_path: P
     shutil.copytree(workspace.root, copy.root, symlinks=True, dirs_exist_ok=True)
     options = options_of_preset(assignments=[*SETS, "reranking.by=coverage", "reranking.keep=4"])
     for name in ("map_unrefined", "map"):
-        root = copy.path(name)
-        kept = {"rootsift": KaptureFolder(root).observations()["rootsift"]}
-        write_observations(root, kept)
-    run = Run(choose_dataset("kapture", scene), "classic", options, copy)
-    with copy.lock(), single_threaded():
-        run_plan(plan_evaluation(run), copy, first="query_candidates")
-    evaluated = copy.folder("localized").read()
+        seen = copy.folder(name).observations()
+        write_observations(copy.path(name), {"rootsift": seen["rootsift"]})
+    run_in(copy, scene, options, first="query_candidates")
+    in_run = copy.folder("localized").read()
     statuses = read_status(copy.path("localized/status.csv"))
     opened = KaptureMap.open(copy.path("map"))
     assert list(opened.keypoints) == ["rootsift"]
@@ -111,5 +96,5 @@ def test_a_type_without_any_point(scene: Path, workspace: Workspace, tmp_path: P
     assert [local.name for local in localizer.types] == ["rootsift", "sift"]
     for name, found in localizer.localize_kapture(copy.path("query")):
         assert isinstance(found, Pose)
-        assert found.cam_from_world == evaluated.cam_from_world(name)
+        assert found.cam_from_world == in_run.cam_from_world(name)
         assert found.num_matches == statuses[name].num_matches

@@ -87,6 +87,11 @@ def test_the_preset_does_every_step_that_a_dataset_permits(dataset: str) -> None
     steps = steps_of(dataset, "megloc")
     assert {name for name, step in steps.items() if not step.on} == OFF[dataset] | OFF_EVERYWHERE
     assert all(step.why for step in steps.values())
+    # outdoors and indoors differ as the networks do
+    network = {"inloc": "4 px, superglue_indoor", "kapture": ""}.get(
+        dataset, "3 px, superglue_outdoor"
+    )
+    assert network in steps["SuperPoint matched by SuperGlue"].why
     # with its own options each dataset needs no download
     check_weights(layers(dataset, "classic").chosen)
 
@@ -99,16 +104,6 @@ def test_stereo_and_a_field_are_on_where_they_are_asked_for() -> None:
     steps = steps_of("aachen", "megloc", rendering, "mvs.mode=depth")
     assert steps[STEREO].on and steps["poses refined by rendering"].on
     assert steps_of("inloc", "megloc", "mvs.mode=depth")[STEREO].why == "the map images have depth"
-
-
-def test_outdoors_and_indoors_differ_as_the_networks_do() -> None:
-    said = {
-        dataset: steps_of(dataset, "megloc")["SuperPoint matched by SuperGlue"].why
-        for dataset in FACTS
-    }
-    for dataset in ("aachen", "robotcar", "4seasons"):
-        assert "within 3 px, superglue_outdoor" in said[dataset]
-    assert "within 4 px, superglue_indoor" in said["inloc"]
 
 
 @pytest.mark.parametrize(
@@ -140,16 +135,12 @@ def test_who_turned_a_step_on_is_said() -> None:
     assert steps["ASLFeat"].why == "preset megloc"
     masked = steps["people and vehicles masked"]
     assert masked.why == "the dataset's file (preprocessing.masks.segmenter); deeplabv3plus"
-
-
-def test_weights_of_ones_own_training_are_said() -> None:
+    # weights of one's own training
     assert "megloc train descriptor makes such" in steps_of("aachen", "megloc")[TRAINED].why
     own = "local_features.superpoint.options.descriptor_weights=night.safetensors"
     step = steps_of("aachen", "megloc", own)[TRAINED]
     assert step == PaperStep(TRAINED, True, "an option of this run (local_features)")
-
-
-def test_a_step_without_its_data_is_off_whoever_asks_for_it() -> None:
+    # a step without its data is off whoever asks for it
     icp = "poses refined by ICP"
     asked = steps_of("aachen", "classic", 'pose_refinement.by=["icp"]')
     assert asked[icp] == PaperStep(icp, False, "the queries have no depth")

@@ -24,14 +24,6 @@ def write(path: Path, *, width: int = 64, height: int = 48, focal_35mm: int = 0)
     return path
 
 
-def write_video(path: Path, frames: int) -> Path:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
-    for number in range(frames):
-        writer.write(np.full((48, 64, 3), 5 * number, np.uint8))
-    writer.release()
-    return path
-
-
 def test_names_are_paths_below_what_was_given(tmp_path: Path) -> None:
     for name in ("b.jpg", "a dir/c.PNG", ".hidden/d.jpg", "._b.jpg", "raw.NEF"):
         write(tmp_path / "in" / name) if name != "raw.NEF" else (tmp_path / "in" / name).touch()
@@ -73,7 +65,12 @@ def test_a_given_camera_is_of_the_stored_pixels(tmp_path: Path) -> None:
 
 
 def test_frames_of_a_video(tmp_path: Path) -> None:
-    write_video(tmp_path / "walk.avi", 25)
+    film = cv2.VideoWriter(
+        str(tmp_path / "walk.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48)
+    )
+    for number in range(25):
+        film.write(np.full((48, 64, 3), 5 * number, np.uint8))
+    film.release()
     (tmp_path / "broken.mp4").write_bytes(b"no video")
     photos = Photographs([tmp_path], every=10)
     assert photos.names == [f"walk.avi/{n:06}.jpg" for n in (0, 10, 20)]
@@ -86,23 +83,25 @@ def test_frames_of_a_video(tmp_path: Path) -> None:
         assert abs(int(stored.mean()) - 5 * number) <= 2
 
 
+@pytest.mark.parametrize("name", ["Paris, Texas.jpg", " x.jpg", "#1.jpg", "a\tb.jpg", "a\\b.jpg"])
+def test_a_name_that_kapture_cannot_hold_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(DataError, match="rename the file"):
+        Photographs([write(tmp_path / name)])
+
+
 def test_refused(tmp_path: Path) -> None:
     one, two = write(tmp_path / "a" / "x.jpg"), write(tmp_path / "b" / "x.jpg")
-    with pytest.raises(DataError, match="same name"):
-        Photographs([one, two])
-    with pytest.raises(DataError, match="no such file"):
-        Photographs([tmp_path / "nowhere"])
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match="no image or video"):
-        Photographs([tmp_path / "empty"])
-    with pytest.raises(OptionError, match="no video"):
-        Photographs([one], every=3)
-    with pytest.raises(OptionError, match="give 1 or more"):
-        Photographs([one], every=0)
-    for name in ("Paris, Texas.jpg", " x.jpg", "#1.jpg", "a\tb.jpg", "a\\b.jpg"):
-        with pytest.raises(DataError, match="rename the file"):
-            Photographs([write(tmp_path / "c" / name)])
     (tmp_path / "k" / "sensors").mkdir(parents=True)
     (tmp_path / "k" / "sensors" / "sensors.txt").touch()
-    with pytest.raises(DataError, match="--query"):
-        Photographs([tmp_path / "k"])
+    for paths, words in (
+        ([one, two], "same name"),
+        ([tmp_path / "nowhere"], "no such file"),
+        ([tmp_path / "empty"], "no image or video"),
+        ([tmp_path / "k"], "--query"),
+    ):
+        with pytest.raises(DataError, match=words):
+            Photographs(paths)
+    for every, words in ((3, "no video"), (0, "give 1 or more")):
+        with pytest.raises(OptionError, match=words):
+            Photographs([one], every=every)

@@ -29,17 +29,18 @@ class Step(Stage):
     def __init__(
         self,
         name: str,
-        version: int,
-        settings: dict[str, Any],
         reads: Sequence[str],
         writes: Sequence[str],
         do: Callable[[Path], Mapping[str, float]],
+        *,
+        version: int = 1,
+        settings: dict[str, Any] | None = None,
         outside: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(Options())
         self.name, self.reads, self.writes, self._do = name, reads, writes, do
         self.version = version  # type: ignore[misc]
-        self._settings, self._outside = settings, outside or {}
+        self._settings, self._outside = settings or {}, outside or {}
 
     def settings(self) -> dict[str, Any]:
         return self._settings
@@ -62,12 +63,12 @@ class Kitchen:
     log: list[str] = field(default_factory=list)
 
     def stages(self) -> list[Stage]:
+        a, b, c = (self.options[name] for name in "abc")
+        first: dict[str, Any] = {"version": self.version, "outside": self.external}
         return [
-            Step("a", self.version, self.options["a"], (), ("a.txt",), self.do("a"), self.external),
-            Step("b", 1, self.options["b"], ("a.txt",), ("b", "b.csv"), self.do("b", "a.txt")),
-            Step(
-                "c", 1, self.options["c"], ("a.txt", "b/b.txt"), ("c.txt",), self.do("c", "b/b.txt")
-            ),
+            Step("a", (), ("a.txt",), self.do("a"), settings=a, **first),
+            Step("b", ("a.txt",), ("b", "b.csv"), self.do("b", "a.txt"), settings=b),
+            Step("c", ("a.txt", "b/b.txt"), ("c.txt",), self.do("c", "b/b.txt"), settings=c),
         ]
 
     def do(self, name: str, reads: str | None = None) -> Callable[[Path], Mapping[str, float]]:
@@ -114,43 +115,55 @@ def test_everything_runs_once(kitchen: Kitchen) -> None:
     assert [r.counts for r in again] == [r.counts for r in reports]
 
 
-def test_a_changed_option_reruns_what_follows(kitchen: Kitchen) -> None:
+def spoil(path: Path, content: str, *, same_time: bool) -> None:
+    before = path.stat()
+    path.write_text(content)
+    if same_time:
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+CHANGED = "b/b.txt was changed since it was written"
+DEEP = {"pair": (1, 2), "deep": {"x": 1, "y": [(0.5, None)]}}
+# what follows a stage that writes the same bytes as before is kept
+CHANGES: dict[str, tuple[Callable[[Kitchen], Any], list[str]]] = {
+    "an option": (
+        lambda k: k.options["b"].update(extra="!"),
+        ["", "options changed: extra", "b changed"],
+    ),
+    "some of the options": (
+        lambda k: k.options["a"].update(deep={"x": 2, "y": [(0.5, None)]}, new=1),
+        ["options changed: deep.x, new", "", ""],
+    ),
+    "an input": (lambda k: k.external.update(flour="2"), ["flour changed", "", ""]),
+    "no input": (lambda k: k.external.clear(), ["flour changed", "", ""]),
+    "a version": (lambda k: setattr(k, "version", 2), ["a newer version of the stage", "", ""]),
+    "an output gone": (lambda k: k.workspace.path("a.txt").unlink(), ["a.txt is gone", "", ""]),
+    "a file gone": (lambda k: k.workspace.path("b/b.txt").unlink(), ["", "b/b.txt is gone", ""]),
+    # as of a run cut off before it was written
+    "no manifest": (lambda k: k.workspace.manifest_path("b").unlink(), ["", "not done yet", ""]),
+    "a file cut": (
+        lambda k: spoil(k.workspace.path("b/b.txt"), "a", same_time=True),
+        ["", CHANGED, ""],
+    ),
+    "a file changed": (
+        lambda k: spoil(k.workspace.path("b/b.txt"), "AB", same_time=False),
+        ["", CHANGED, ""],
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "why"), CHANGES.values(), ids=CHANGES)
+def test_what_has_changed_runs_again(
+    kitchen: Kitchen, change: Callable[[Kitchen], Any], why: list[str]
+) -> None:
+    kitchen.options["a"] = dict(DEEP)
     kitchen.cook()
-    kitchen.options["b"] = {"extra": "!"}
+    change(kitchen)
     reports = kitchen.cook()
-    assert kitchen.log == ["b", "c"]
-    assert [r.why for r in reports] == ["", "options changed: extra", "b changed"]
-    assert kitchen.meal() == "ab!c"
-
-
-def test_only_what_differs_is_told(kitchen: Kitchen) -> None:
-    kitchen.options["a"] = {"pair": (1, 2), "deep": {"x": 1, "y": [(0.5, None)]}}
-    kitchen.cook()
-    kitchen.options["a"] = {"pair": (1, 2), "deep": {"x": 2, "y": [(0.5, None)]}, "new": 1}
-    assert kitchen.cook()[0].why == "options changed: deep.x, new"
-
-
-def test_a_changed_input_from_outside(kitchen: Kitchen) -> None:
-    kitchen.cook()
-    kitchen.external = {"flour": "2"}
-    assert kitchen.cook()[0].why == "flour changed"
-    kitchen.external = {}
-    assert kitchen.cook()[0].why == "flour changed"
-    # what follows is kept: it reads the same bytes as before
-    assert kitchen.log == ["a"]
-
-
-def test_a_newer_version(kitchen: Kitchen) -> None:
-    kitchen.cook()
-    kitchen.version = 2
-    assert kitchen.cook()[0].why == "a newer version of the stage"
-
-
-def test_an_output_that_is_gone_is_made_again_and_nothing_else(kitchen: Kitchen) -> None:
-    kitchen.cook()
-    kitchen.workspace.path("a.txt").unlink()
-    assert kitchen.cook()[0].why == "a.txt is gone"
-    assert kitchen.log == ["a"]
+    assert [report.why for report in reports] == why
+    assert kitchen.log == [name for name, reason in zip("abc", why, strict=True) if reason]
+    assert kitchen.meal() == f"ab{kitchen.options['b'].get('extra', '')}c"
+    assert all_kept(kitchen.cook(verify=True))
 
 
 def test_an_output_a_stage_no_longer_writes_is_taken_away(kitchen: Kitchen) -> None:
@@ -172,10 +185,10 @@ class Diner(Kitchen):
 
     def stages(self) -> list[Stage]:
         plain = "plain.txt" if self.seasoned else "soup.txt"
-        soup: list[Stage] = [Step("cook", 1, {}, (), (plain,), self.put(plain, "soup"))]
+        soup: list[Stage] = [Step("cook", (), (plain,), self.put(plain, "soup"))]
         if self.seasoned:
             salted = self.put("soup.txt", "soup, salted")
-            soup.append(Step("season", 1, {}, (plain,), ("soup.txt",), salted))
+            soup.append(Step("season", (plain,), ("soup.txt",), salted))
         return soup
 
     def put(self, name: str, text: str) -> Callable[[Path], Mapping[str, float]]:
@@ -217,21 +230,10 @@ def test_a_stage_that_fails_leaves_the_old_output(kitchen: Kitchen) -> None:
     assert all_kept(kitchen.cook())
 
 
-def test_a_run_cut_off_before_the_manifest_counts_as_not_done(kitchen: Kitchen) -> None:
-    kitchen.cook()
-    kitchen.workspace.manifest_path("b").unlink()
-    assert [r.why for r in kitchen.cook()] == ["", "not done yet", ""]
-
-
-def test_rests_of_a_killed_run_do_not_get_into_the_output(kitchen: Kitchen) -> None:
+def test_rests_of_killed_runs_and_workers_do_not_get_into_the_output(kitchen: Kitchen) -> None:
     rest = kitchen.workspace.path(".partial/b/b")
     rest.mkdir(parents=True)
     (rest / "rest.txt").write_text("half")
-    kitchen.cook()
-    assert [p.name for p in kitchen.workspace.path("b").iterdir()] == ["b.txt"]
-
-
-def test_half_a_file_of_a_worker_that_died_does_not_get_into_the_output(kitchen: Kitchen) -> None:
     dying = "from megloc_kapture.io.files import *; import os, sys\n"
     dying += "with atomic_write(sys.argv[1]) as file: file.write(b'half'); os._exit(9)"
     kitchen.options["b"]["killed"] = [sys.executable, "-c", dying]
@@ -240,37 +242,14 @@ def test_half_a_file_of_a_worker_that_died_does_not_get_into_the_output(kitchen:
     assert [p.name for p in kitchen.workspace.path("b").iterdir()] == ["b.txt"]
 
 
-def spoil(path: Path, content: str, *, same_time: bool) -> None:
-    before = path.stat()
-    path.write_text(content)
-    if same_time:
-        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
-
-
-@pytest.mark.parametrize(
-    ("content", "same_time", "verify"),
-    [("a", True, False), ("AB", False, False), ("AB", True, True)],
-    ids=["cut", "changed", "changed and dated back"],
-)
-def test_a_stage_whose_file_was_changed_runs_again(
-    kitchen: Kitchen, content: str, same_time: bool, verify: bool
+def test_a_file_that_was_changed_and_dated_back_is_found_where_all_is_compared(
+    kitchen: Kitchen,
 ) -> None:
     kitchen.cook()
-    spoil(kitchen.workspace.path("b/b.txt"), content, same_time=same_time)
-    if verify:
-        assert all_kept(kitchen.cook())
-    reports = kitchen.cook(verify=verify)
-    assert reports[1].why == "b/b.txt was changed since it was written"
-    assert [report.state for report in reports] == ["kept", "run", "kept"]
-    assert kitchen.workspace.path("b/b.txt").read_text() == "ab"
-    assert all_kept(kitchen.cook(verify=True))
-
-
-def test_a_stage_whose_file_is_gone_runs_again(kitchen: Kitchen) -> None:
-    kitchen.cook()
-    kitchen.workspace.path("b/b.txt").unlink()
-    assert [report.why for report in kitchen.cook()] == ["", "b/b.txt is gone", ""]
+    spoil(kitchen.workspace.path("b/b.txt"), "AB", same_time=True)
     assert all_kept(kitchen.cook())
+    assert [report.why for report in kitchen.cook(verify=True)] == ["", CHANGED, ""]
+    assert kitchen.workspace.path("b/b.txt").read_text() == "ab"
 
 
 def test_a_copied_workspace_and_one_without_records_are_kept(kitchen: Kitchen) -> None:
@@ -290,11 +269,11 @@ def test_what_follows_a_changed_file_is_made_again_once_that_is_mended(kitchen: 
     reports = kitchen.cook(first="c")
     assert [describe(report) for report in reports[:2]] == [
         "a: taken as it is",
-        "b: taken as it is; b/b.txt was changed since it was written",
+        f"b: taken as it is; {CHANGED}",
     ]
     assert kitchen.workspace.path("c.txt").read_text() == "ABc"
     reports = kitchen.cook()
-    assert [r.why for r in reports[1:]] == ["b/b.txt was changed since it was written", "b changed"]
+    assert [r.why for r in reports[1:]] == [CHANGED, "b changed"]
     assert kitchen.workspace.path("c.txt").read_text() == "abc"
 
 
@@ -309,7 +288,7 @@ def test_a_workspace_that_is_deleted_while_a_stage_runs_is_an_error(
             (out / "d.txt").write_text("d")
         return {}
 
-    stages = [*kitchen.stages(), Step("d", 1, {}, ("c.txt",), ("d.txt",), leave, {})]
+    stages = [*kitchen.stages(), Step("d", ("c.txt",), ("d.txt",), leave)]
     with (
         pytest.raises(OutputError, match="was deleted or moved while a run was working in it"),
         kitchen.workspace.lock(),
@@ -324,6 +303,7 @@ def test_first_and_last(kitchen: Kitchen) -> None:
     assert [r.name for r in kitchen.cook(last="a")] == ["a"]
     reports = kitchen.cook(first="b")
     assert [(r.name, r.state) for r in reports] == [("a", "skipped"), ("b", "run"), ("c", "run")]
+    assert [r.why for r in reports] == ["", "asked for", "follows b"]
     reports = kitchen.cook(first="b", last="b")
     assert [(r.state, r.why) for r in reports] == [("skipped", ""), ("run", "asked for")]
     # what follows was asked for as well, and is still to be done
@@ -341,13 +321,10 @@ def test_first_takes_earlier_stages_as_they_are(kitchen: Kitchen) -> None:
     assert kitchen.log == ["c"] and kitchen.meal() == "abc"
     kitchen.cook()
     assert kitchen.log == ["a", "b", "c"] and kitchen.meal() == "a?bc"
-
-
-def test_first_leaves_alone_what_does_not_read_its_output(kitchen: Kitchen) -> None:
+    # what does not read its output is left alone
     stages = kitchen.stages()
     stages[2].reads = ("a.txt",)
     run_plan(stages, kitchen.workspace)
-    kitchen.log.clear()
     reports = run_plan(stages, kitchen.workspace, first="b")
     assert [r.state for r in reports] == ["skipped", "run", "kept"]
 

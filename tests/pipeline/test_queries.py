@@ -9,15 +9,11 @@ import pytest
 
 from megloc_kapture import KaptureMap, Localizer
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.pipeline.datasets import choose_dataset
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.executors import single_threaded
-from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import KaptureQueries
 from megloc_kapture.pipeline.results import Results
-from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
+from tests.pipeline.runs import evaluated
 
 FEW = "local_features.rootsift.options.max_keypoints=300"
 PYRAMID = ("guided_pyramid.mode=all", "guided_pyramid.scales=[0.5,1.0]")
@@ -27,15 +23,11 @@ TYPES = ("rootsift", "rootsift-pyramid")
 @pytest.fixture(scope="module")
 def workspaces(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Workspace]:
     """A run without and one with guided pyramids, by the type that their maps are of."""
-    found = {}
-    for name, more in zip(TYPES, ((), PYRAMID), strict=True):
-        place = Workspace(tmp_path_factory.mktemp(name) / "workspace")
-        options = options_of_preset(assignments=[FEW, *more])
-        run = Run(choose_dataset("kapture", scene), "classic", options, place)
-        with place.lock(), single_threaded():
-            run_plan(plan_evaluation(run), place)
-        found[name] = place
-    return found
+    root = tmp_path_factory.mktemp("pyramids")
+    return {
+        name: evaluated(root / name, scene, options_of_preset(assignments=[FEW, *more]))
+        for name, more in zip(TYPES, ((), PYRAMID), strict=True)
+    }
 
 
 @pytest.mark.parametrize("of_map", TYPES)
@@ -60,25 +52,19 @@ def test_either_type_serves_the_other(
     assert all(results.values())
 
 
-def test_of_both_the_fitting_type_is_read(workspaces: dict[str, Workspace]) -> None:
-    place = workspaces["rootsift-pyramid"]
-    both = [place.root, place.path("pyramid/query")]
-    folder = KaptureFolder(place.path("query"), features_dirs=both)
-    for of_map, expected in (("rootsift", TYPES[:1]), ("rootsift-pyramid", TYPES)):
-        opened = KaptureMap.open(workspaces[of_map].path("map"))
-        assert tuple(opened.stored_types()) == expected
-        assert all(tuple(one.features) == expected for one in KaptureQueries(folder, opened))
-
-
-def test_an_image_without_any_of_them_is_named(
+def test_of_both_the_fitting_type_is_read_and_an_image_without_either_is_named(
     workspaces: dict[str, Workspace], tmp_path: Path
 ) -> None:
     place = workspaces["rootsift-pyramid"]
+    both = place.folder("query", "", "pyramid/query")
+    for of_map, expected in (("rootsift", TYPES[:1]), ("rootsift-pyramid", TYPES)):
+        opened = KaptureMap.open(workspaces[of_map].path("map"))
+        assert tuple(opened.stored_types()) == expected
+        assert all(tuple(one.features) == expected for one in KaptureQueries(both, opened))
     features = Path(shutil.copytree(place.path("pyramid/query"), tmp_path / "features"))
-    names = place.folder("query").read().image_names()
+    name = both.read().image_names()[2]
     for suffix in ("kpt", "desc"):
-        (found,) = features.rglob(f"{names[2]}.{suffix}")
+        (found,) = features.rglob(f"{name}.{suffix}")
         found.unlink()
-    folder = KaptureFolder(place.path("query"), features_dirs=[features])
-    opened = KaptureMap.open(workspaces["rootsift"].path("map"))
-    assert KaptureQueries(folder, opened).lacking("rootsift") == names[2]
+    queries = KaptureQueries(KaptureFolder(place.path("query"), features_dirs=[features]), opened)
+    assert queries.lacking("rootsift") == name

@@ -6,9 +6,9 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -89,13 +89,9 @@ nudge = patches.plugins:Nudge
 OPTIONS = ("local_features=corners", "global_features=thumbnail", "matching=nearest")
 EVERY_STAGE = (
     *("local_features=corners", "matching=nearest", "global_features.vlad.options.num_clusters=8"),
-    *("preprocessing.max_size_px=320",),
-    *(
-        "guided_pyramid.mode=all",
-        "guided_pyramid.min_matches=1000",
-        "guided_pyramid.rotations_deg=[0]",
-    ),
-    "localization.min_confidence=0",
+    *("preprocessing.max_size_px=320", "localization.min_confidence=0"),
+    *("guided_pyramid.mode=all", "guided_pyramid.min_matches=1000"),
+    "guided_pyramid.rotations_deg=[0]",
 )
 REFINED = ('pose_refinement.by=["nudge","rendering"]', "localization.min_confidence=0")
 
@@ -160,9 +156,9 @@ class Runs:
         workspace = Workspace(self.root)
         options = options_of_preset(assignments=self.options)
         run = Run(choose_dataset("kapture", self.scene), "classic", options, workspace)
-        how = {"last": self.last, **how}
         with workspace.lock():
-            reports = run_plan(plan_evaluation(run), workspace, Work(executor, track), **how)
+            work = Work(executor, track)
+            reports = run_plan(plan_evaluation(run), workspace, work, **{"last": self.last, **how})
         assert list(workspace.path(".partial").iterdir()) == []
         return {report.name: report for report in reports}
 
@@ -173,8 +169,12 @@ class Runs:
         (left,) = [path for path in (self.root / ".partial").iterdir() if "~" not in path.name]
         return left
 
-    def output(self) -> dict[str, bytes]:
-        return contents(self.root)
+    def check_undisturbed(self) -> None:
+        """Compare what there is with what a run from nothing writes of the scene as it is now."""
+        fresh = replace(self, root=self.root.with_name("undisturbed"), told={})
+        shutil.rmtree(fresh.root, ignore_errors=True)
+        fresh.run()
+        assert contents(self.root) == contents(fresh.root)
 
 
 def contents(root: Path) -> dict[str, bytes]:
@@ -191,19 +191,6 @@ def runs(package: Path, scene: Path, tmp_path: Path) -> Runs:
     return Runs(copy, tmp_path / "run")
 
 
-@pytest.fixture
-def undisturbed(runs: Runs, tmp_path: Path) -> Callable[[], dict[str, bytes]]:
-    """Function: the output of a run from nothing of the scene as it is now."""
-
-    def fresh() -> dict[str, bytes]:
-        root = tmp_path / "undisturbed"
-        shutil.rmtree(root, ignore_errors=True)
-        Runs(runs.scene, root, runs.options, runs.last).run()
-        return contents(root)
-
-    return fresh
-
-
 def paint(scene: Path, image: str) -> None:
     """Change an image visibly."""
     path = scene / image
@@ -212,13 +199,14 @@ def paint(scene: Path, image: str) -> None:
     cv2.imwrite(str(path), pixels)
 
 
+def kept_of(reports: dict[str, StageReport]) -> dict[str, str]:
+    return {name: report.kept_items for name, report in reports.items() if report.kept_items}
+
+
 CHANGED = "mapping/sensors/records_data/0003.jpg"
 
 
-def test_a_stopped_run_goes_on_inside_the_stage(
-    runs: Runs, undisturbed: Callable[[], dict[str, bytes]]
-) -> None:
-    expected = undisturbed()
+def test_a_stopped_run_goes_on_inside_the_stage(runs: Runs) -> None:
     runs.stopped("corners", 4)
     # and it may be stopped again
     runs.stopped("corners", 3)
@@ -231,29 +219,24 @@ def test_a_stopped_run_goes_on_inside_the_stage(
     assert [reports[f"{name}_features"].state for name in ("local", "global")] == ["kept"] * 2
     assert reports["mapping_matches"].kept_items == "11 of 21 kept"
     assert reports["query_matches"].kept_items == ""
-    assert runs.output() == expected
+    runs.check_undisturbed()
 
 
-def test_one_changed_image_costs_one_image_and_its_pairs(
-    runs: Runs, undisturbed: Callable[[], dict[str, bytes]]
-) -> None:
+def test_one_changed_image_costs_one_image_and_its_pairs(runs: Runs) -> None:
     runs.run()
     paint(runs.scene, CHANGED)
     reports = runs.run()
     assert runs.told["corners"][0] == runs.told["thumbnail"][0] == 1
-    kept = {name: report.kept_items for name, report in reports.items() if report.kept_items}
-    assert kept == {
+    assert kept_of(reports) == {
         "local_features": "10 of 11 kept",
         "global_features": "10 of 11 kept",
         "mapping_matches": "15 of 21 kept",  # 7 images, all pairs: 6 are of the one
         "query_matches": "24 of 28 kept",
     }
-    assert runs.output() == undisturbed()
+    runs.check_undisturbed()
 
 
-def test_one_new_image_costs_one_image(
-    runs: Runs, undisturbed: Callable[[], dict[str, bytes]]
-) -> None:
+def test_one_new_image_costs_one_image(runs: Runs) -> None:
     records = runs.scene / "mapping" / "sensors" / "records_camera.txt"
     text = records.read_text()
     records.write_text("".join(line for line in text.splitlines(True) if "0003.jpg" not in line))
@@ -261,22 +244,11 @@ def test_one_new_image_costs_one_image(
     records.write_text(text)
     runs.run()
     assert runs.told["corners"] == (1, "corners features, 10 of 11 kept")
-    assert runs.output() == undisturbed()
+    runs.check_undisturbed()
     # and one image less leaves nothing of itself
     records.write_text("".join(line for line in text.splitlines(True) if "0003.jpg" not in line))
     runs.run()
-    assert not any("0003.jpg" in name for name in runs.output())
-
-
-def test_a_pose_that_verifies_matches_counts(runs: Runs) -> None:
-    runs.run(last="mapping_matches")
-    poses = runs.scene / "mapping" / "sensors" / "trajectories.txt"
-    lines = poses.read_text().splitlines()
-    *row, z = lines[-1].split(",")
-    poses.write_text("\n".join([*lines[:-1], ",".join([*row, str(float(z) + 0.1)])]) + "\n")
-    reports = runs.run(last="mapping_matches")
-    assert reports["local_features"].kept_items == "11 of 11 kept"
-    assert reports["mapping_matches"].kept_items == "15 of 21 kept"
+    assert not any("0003.jpg" in name for name in contents(runs.root))
 
 
 @pytest.fixture
@@ -286,9 +258,7 @@ def whole(runs: Runs) -> Runs:
     return runs
 
 
-def test_images_vectors_pyramids_and_poses_go_on_inside_their_stages(
-    whole: Runs, undisturbed: Callable[[], dict[str, bytes]]
-) -> None:
+def test_images_vectors_pyramids_and_poses_go_on_inside_their_stages(whole: Runs) -> None:
     whole.stopped("pre-processing", 3)
     whole.stopped("VLAD", 4)
     assert whole.told["pre-processing"][1] == "pre-processing"  # that of the queries
@@ -302,18 +272,15 @@ def test_images_vectors_pyramids_and_poses_go_on_inside_their_stages(
     reports = whole.run()
     assert whole.told["localizing"] == (3, "localizing, 1 of 4 kept")
     assert reports["localization"].kept_items == "1 of 4 kept"
-    assert whole.output() == undisturbed()
+    whole.check_undisturbed()
 
 
-def test_one_changed_query_is_localized_anew_and_no_other(
-    whole: Runs, undisturbed: Callable[[], dict[str, bytes]]
-) -> None:
+def test_one_changed_query_is_localized_anew_and_no_other(whole: Runs) -> None:
     whole.run()
     name = sorted((whole.scene / "query/sensors/records_data").iterdir())[1].name
     paint(whole.scene, f"query/sensors/records_data/{name}")
     reports = whole.run()
-    kept = {name: report.kept_items for name, report in reports.items() if report.kept_items}
-    assert kept == {
+    assert kept_of(reports) == {
         "preprocess": "10 of 11 kept",
         "local_features": "10 of 11 kept",
         "global_features": "11 of 12 kept",  # the vocabulary is one
@@ -323,12 +290,10 @@ def test_one_changed_query_is_localized_anew_and_no_other(
         "localization": "3 of 4 kept",
     }
     assert whole.told["localizing"] == (1, "localizing, 3 of 4 kept")
-    assert whole.output() == undisturbed()
+    whole.check_undisturbed()
 
 
-def test_refinement_of_poses_goes_on_inside_its_stage(
-    whole: Runs, undisturbed: Callable[[], dict[str, bytes]]
-) -> None:
+def test_refinement_of_poses_goes_on_inside_its_stage(whole: Runs) -> None:
     whole.options, whole.last = (*OPTIONS, *REFINED), "refine_poses"
     whole.stopped("refining", 2)
     reports = whole.run()
@@ -336,39 +301,44 @@ def test_refinement_of_poses_goes_on_inside_its_stage(
     assert reports["refine_poses"].kept_items == "3 of 5 kept"  # and the map's consistency
     table = pd.read_csv(whole.root / "localized" / "refinement.csv")
     assert sorted(table["moved_m"] > 0) == [False] * 4 + [True] * 4  # rendering wants depth
-    assert whole.output() == undisturbed()
+    whole.check_undisturbed()
     name = sorted((whole.scene / "query/sensors/records_data").iterdir())[1].name
     paint(whole.scene, f"query/sensors/records_data/{name}")
     whole.run()
     assert whole.told["refining"] == (1, "refining, 3 of 4 kept")
-    assert whole.output() == undisturbed()
+    whole.check_undisturbed()
     # a map image that no query needs may be looked at all the same
     paint(whole.scene, CHANGED)
     assert "kept" not in whole.run()["refine_poses"].kept_items
 
 
-def test_a_new_mask_and_another_camera_count(runs: Runs) -> None:
+def test_a_pose_a_mask_and_another_camera_count(runs: Runs) -> None:
     runs.run(last="mapping_matches")
-    mask = runs.scene / "mapping/sensors/masks/0003.jpg.png"
+    sensors = runs.scene / "mapping" / "sensors"
+    lines = (sensors / "trajectories.txt").read_text().splitlines()
+    *row, z = lines[-1].split(",")
+    moved = ",".join([*row, str(float(z) + 0.1)])
+    (sensors / "trajectories.txt").write_text("\n".join([*lines[:-1], moved]) + "\n")
+    reports = runs.run(last="mapping_matches")
+    assert reports["local_features"].kept_items == "11 of 11 kept"
+    assert reports["mapping_matches"].kept_items == "15 of 21 kept"  # poses verify matches
+    mask = sensors / "masks/0003.jpg.png"
     mask.parent.mkdir()
     size = cv2.imread(str(runs.scene / CHANGED)).shape[:2]
     cv2.imwrite(str(mask), np.full(size, 255, np.uint8))
     runs.run(last="mapping_matches")
     assert runs.told["corners"] == (1, "corners features, 10 of 11 kept")
     assert runs.told["matching"] == (0, "matching, 21 of 21 kept")  # the same features
-    sensors = runs.scene / "mapping" / "sensors" / "sensors.txt"
-    sensors.write_text(
-        re.sub(r"(PINHOLE, *\d+, *\d+, *)[\d.]+", r"\g<1>333.25", sensors.read_text())
-    )
+    table = sensors / "sensors.txt"
+    text = re.sub(r"(PINHOLE, *\d+, *\d+, *)[\d.]+", r"\g<1>333.25", table.read_text())
+    table.write_text(text)
     reports = runs.run(last="mapping_matches")
     assert reports["local_features"].kept_items == "11 of 11 kept"
     assert reports["mapping_matches"].kept_items == ""
 
 
 @pytest.mark.parametrize("cut", ["a file", "the journal", "a file that all share"])
-def test_what_is_not_whole_is_done_again(
-    runs: Runs, undisturbed: Callable[[], dict[str, bytes]], cut: str
-) -> None:
+def test_what_is_not_whole_is_done_again(runs: Runs, cut: str) -> None:
     left = runs.stopped("corners", 5)
     name = {
         "a file": "local_features/corners/descriptors/0002.jpg.desc",
@@ -380,12 +350,10 @@ def test_what_is_not_whole_is_done_again(
     runs.run()
     expected = "" if cut.endswith("share") else ", 4 of 11 kept"
     assert runs.told["corners"][1] == f"corners features{expected}"
-    assert runs.output() == undisturbed()
+    runs.check_undisturbed()
 
 
-def test_a_file_of_the_output_that_is_cut_costs_one_image(
-    runs: Runs, undisturbed: Callable[[], dict[str, bytes]]
-) -> None:
+def test_a_file_of_the_output_that_is_cut_costs_one_image(runs: Runs) -> None:
     runs.run()
     place = runs.root / "local_features/corners/keypoints/0005.jpg.kpt"
     place.write_bytes(place.read_bytes()[:-12])
@@ -397,7 +365,7 @@ def test_a_file_of_the_output_that_is_cut_costs_one_image(
     place.write_bytes(bytes(times.st_size))
     os.utime(place, ns=(times.st_atime_ns, times.st_mtime_ns))
     assert runs.run(verify=True)["local_features"].kept_items == "10 of 11 kept"
-    assert runs.output() == undisturbed()
+    runs.check_undisturbed()
 
 
 def test_what_is_asked_for_again_is_done_whole(runs: Runs) -> None:
@@ -427,11 +395,9 @@ def test_changed_code_of_a_plugin_makes_its_stage_run_again(runs: Runs, package:
     (package / "shift.py").write_text("SHIFT = 1\n")
     assert runs.run(last="local_features")["local_features"].why.startswith("code of patches")
     assert "code of" in runs.run(dry_run=True)["global_features"].why
-
-
-def test_a_new_release_of_a_plugin_makes_its_stage_run_again(runs: Runs, package: Path) -> None:
+    # and a new release
     runs.run(last="local_features")
     metadata = package.parent / "patches-1.2.dist-info" / "METADATA"
     metadata.write_text(metadata.read_text().replace("1.2", "1.3"))
-    reports = runs.run(last="local_features")
-    assert reports["local_features"].why == "code of patches.plugins.Corners changed"
+    again = runs.run(last="local_features")["local_features"]
+    assert again.why == "code of patches.plugins.Corners changed"

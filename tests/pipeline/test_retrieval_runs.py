@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -15,14 +14,11 @@ from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.nets.global_descriptors import EigenPlacesNet
-from megloc_kapture.pipeline.datasets import choose_dataset
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.plan import StageReport, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import KaptureQueries, Query
-from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.options import PipelineOptions
+from tests.pipeline.runs import evaluated, recall, run_in
 
 pytestmark = pytest.mark.slow
 
@@ -48,60 +44,48 @@ def options(tmp_path_factory: pytest.TempPathFactory) -> PipelineOptions:
     )
 
 
-def run(fountain: Path, workspace: Workspace, options: PipelineOptions) -> dict[str, StageReport]:
-    chosen = Run(choose_dataset("kapture", fountain), "classic", options, workspace)
-    with workspace.lock():
-        reports = run_plan(plan_evaluation(chosen), workspace)
-    return {report.name: report for report in reports}
-
-
 @pytest.fixture(scope="module")
 def finished(
     fountain: Path, options: PipelineOptions, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Workspace, dict[str, StageReport]]:
-    workspace = Workspace(tmp_path_factory.mktemp("fused") / "workspace")
-    return workspace, run(fountain, workspace, options)
+) -> Workspace:
+    return evaluated(tmp_path_factory.mktemp("fused") / "workspace", fountain, options)
 
 
 def test_all_candidates_are_matched_once_and_the_best_are_localized_with(
-    finished: tuple[Workspace, dict[str, StageReport]],
+    finished: Workspace,
 ) -> None:
-    workspace, reports = finished
-    assert reports["evaluation"].counts["recall at 0.25 m, 2 deg"] == 1
-    candidates = read_pairs(workspace.path("pairs/query_candidates.txt"))
-    kept = read_pairs(workspace.path("pairs/query.txt"))
-    counted = read_match_counts(workspace.path("matches/query"), "rootsift")
+    assert recall(finished)[1] == 1
+    candidates = read_pairs(finished.path("pairs/query_candidates.txt"))
+    kept = read_pairs(finished.path("pairs/query.txt"))
+    counted = read_match_counts(finished.path("matches/query"), "rootsift")
     assert len(candidates) == 4 * 5 and len(kept) == 4 * 3
     assert {(c.image, c.other) for c in counted} == {(p.query, p.map) for p in candidates}
     assert {(p.query, p.map) for p in kept} < {(p.query, p.map) for p in candidates}
-    assert not workspace.path("matches/query_candidates").exists()
-    types = workspace.folder("mapping", "").types("global_features")
+    assert not finished.path("matches/query_candidates").exists()
+    types = finished.folder("mapping", "").types("global_features")
     assert types == ["eigenplaces-random", "vlad_rootsift"]
 
 
 def test_another_number_to_keep_matches_nothing_again(
-    finished: tuple[Workspace, dict[str, StageReport]], fountain: Path, options: PipelineOptions
+    finished: Workspace, fountain: Path, options: PipelineOptions
 ) -> None:
-    workspace, _ = finished
-    fewer = options.model_copy(
-        update={"reranking": options.reranking.model_copy(update={"keep": 2, "by": "verified"})}
-    )
-    reports = run(fountain, workspace, fewer)
+    reranking = options.reranking.model_copy(update={"keep": 2, "by": "verified"})
+    fewer = options.model_copy(update={"reranking": reranking})
+    reports = run_in(finished, fountain, fewer)
     again = {name for name, report in reports.items() if report.state == "run"}
     assert again == {"query_pairs", "localization", "submission", "evaluation"}
-    run(fountain, workspace, options)
+    run_in(finished, fountain, options)
 
 
 def test_the_localizer_ranks_and_keeps_the_same_images(
-    finished: tuple[Workspace, dict[str, StageReport]], options: PipelineOptions
+    finished: Workspace, options: PipelineOptions
 ) -> None:
-    workspace, _ = finished
     kept: dict[str, list[str]] = {}
-    for pair in read_pairs(workspace.path("pairs/query.txt")):
+    for pair in read_pairs(finished.path("pairs/query.txt")):
         kept.setdefault(pair.query, []).append(pair.map)
-    opened = KaptureMap.open(workspace.path("map"), features_dirs=[workspace.root])
+    opened = KaptureMap.open(finished.path("map"), features_dirs=[finished.root])
     localizer = Localizer(opened, options=options)
-    queries = KaptureFolder(workspace.path("preprocessed/query"), features_dirs=[workspace.root])
+    queries = KaptureFolder(finished.path("preprocessed/query"), features_dirs=[finished.root])
     for query in KaptureQueries(queries, opened):
         assert query.global_features.keys() == {"vlad_rootsift", "eigenplaces-random"}
         found = localizer.localize_query(query)
@@ -112,11 +96,10 @@ def test_the_localizer_ranks_and_keeps_the_same_images(
 
 
 def test_vectors_that_the_map_lacks_are_made_from_its_images(
-    finished: tuple[Workspace, dict[str, StageReport]], options: PipelineOptions, tmp_path: Path
+    finished: Workspace, options: PipelineOptions, tmp_path: Path
 ) -> None:
-    workspace, _ = finished
     only = options.model_copy(update={"global_features": options.global_features[1:]})
-    bare = Path(shutil.copytree(workspace.path("map"), tmp_path / "map", symlinks=True))
+    bare = Path(shutil.copytree(finished.path("map"), tmp_path / "map", symlinks=True))
     shutil.rmtree(bare / "reconstruction" / "global_features" / "eigenplaces-random")
     opened = KaptureMap.open(bare)
     assert opened.global_types() == ["vlad_rootsift"]
@@ -128,24 +111,20 @@ def test_vectors_that_the_map_lacks_are_made_from_its_images(
 
 
 def test_all_missing_weights_are_told_at_once(fountain: Path, tmp_path: Path) -> None:
-    workspace = Workspace(tmp_path / "workspace")
+    root = tmp_path / "workspace"
     with pytest.raises(MissingWeightsError) as caught:
-        run(fountain, workspace, options_of_preset("megloc"))
+        evaluated(root, fountain, options_of_preset("megloc"))
     said = str(caught.value).splitlines()
     assert len(said) == len(set(said)) == 7
     for name in ("superpoint_v1", "superglue", "aslfeat", "netvlad", "delg", "apgem", "openibl"):
         assert any(name in line for line in said), name
-    assert not workspace.root.exists()
+    assert not root.exists()
 
 
-def test_the_same_vectors_twice_are_refused(fountain: Path, tmp_path: Path) -> None:
+def test_vectors_that_cannot_be_are_refused(fountain: Path, tmp_path: Path) -> None:
     twice = options_of_preset(assignments=['global_features=["vlad","vlad"]'])
     with pytest.raises(OptionError, match="global features 'vlad_rootsift' are asked for twice"):
-        run(fountain, Workspace(tmp_path / "workspace"), twice)
-
-
-def test_options_of_vlad_are_checked_by_name() -> None:
+        evaluated(tmp_path / "workspace", fountain, twice)
     wrong = options_of_preset(assignments=["global_features.options.num_clusters=0"])
     with pytest.raises(OptionError, match="global features vlad: option num_clusters"):
         wrong.retrieval()
-    assert np.isfinite(options_of_preset().global_features[0].weight)

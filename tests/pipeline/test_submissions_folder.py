@@ -40,33 +40,26 @@ def contents(folder: Path) -> dict[str, bytes]:
     }
 
 
-def test_a_pose_file_and_its_provenance_are_copied(tmp_path: Path) -> None:
-    place = pose_file(tmp_path / "run", "a 1 0 0 0 0 0 0\n")
-    kept = keep_submission(place, tmp_path / "kept")
-    assert kept == tmp_path / "kept" / f"{NAME}.txt"
-    assert contents(kept.parent) == contents(place.parent)
-
-
-def test_other_poses_of_the_name_stand_beside_the_old_ones(tmp_path: Path) -> None:
-    folder = tmp_path / "kept"
-    for number, text in enumerate(("first\n", "second\n", "third\n"), start=1):
-        keep_submission(pose_file(tmp_path / str(number), text, preset=text), folder)
-    names = (f"{NAME}.txt", f"{NAME}-2.txt", f"{NAME}-3.txt")
-    assert [(folder / name).read_text() for name in names] == ["first\n", "second\n", "third\n"]
-    for name, text in zip(names, ("first\n", "second\n", "third\n"), strict=True):
-        told = json.loads((folder / f"{name}.json").read_text())
-        assert list(told["files"]) == [name] and told["preset"] == text
-
-
-def test_the_same_poses_are_found_again_under_whatever_name(tmp_path: Path) -> None:
-    folder = tmp_path / "kept"
-    places = [pose_file(tmp_path / text, text) for text in ("first", "second")]
+def test_other_poses_of_the_name_stand_beside_the_old_ones_and_the_same_are_found(
+    tmp_path: Path,
+) -> None:
+    folder, texts = tmp_path / "kept", ("first\n", "second\n", "third\n")
+    places = [pose_file(tmp_path / text.strip(), text, preset=text) for text in texts]
+    names = [f"{NAME}.txt", f"{NAME}-2.txt", f"{NAME}-3.txt"]
     kept = [keep_submission(place, folder) for place in places]
+    assert kept == [folder / name for name in names]
+    assert kept[0].with_name(f"{NAME}.txt.json").read_bytes() == (
+        places[0].with_name(f"{NAME}.txt.json").read_bytes()
+    )
+    for place, text in zip(kept, texts, strict=True):
+        told = json.loads(place.with_name(f"{place.name}.json").read_text())
+        assert place.read_text() == text
+        assert list(told["files"]) == [place.name] and told["preset"] == text
     before = contents(folder)
-    assert [keep_submission(place, folder) for place in reversed(places)] == kept[::-1]
-    # their provenance is that of the run that made them first
-    again = pose_file(tmp_path / "again", "second", preset="another")
-    assert keep_submission(again, folder) == kept[1]
+    # whatever name they have; their provenance is that of the run that made them first
+    again = pose_file(tmp_path / "again", "second\n", preset="another")
+    for place, expected in zip([*reversed(places), again], [*kept[::-1], kept[1]], strict=True):
+        assert keep_submission(place, folder) == expected
     assert contents(folder) == before
 
 
@@ -90,6 +83,11 @@ def test_what_a_killed_run_left_is_completed(tmp_path: Path) -> None:
     (kept / "a.txt").write_text("1 2\n")
     assert keep_submission(place, kept.parent) == kept
     assert contents(kept.parent) == contents(place.parent)
+    # a provenance without its poses is replaced
+    place = pose_file(tmp_path / "new", "new\n")
+    keep_submission(pose_file(tmp_path / "old", "old\n"), tmp_path / "other").unlink()
+    keep_submission(place, tmp_path / "other")
+    assert contents(tmp_path / "other") == contents(place.parent)
 
 
 def test_what_is_no_pose_file_is_left_alone(tmp_path: Path) -> None:
@@ -100,14 +98,6 @@ def test_what_is_no_pose_file_is_left_alone(tmp_path: Path) -> None:
     kept = keep_submission(pose_file(tmp_path / "run", "a\n"), folder)
     assert kept.name == f"{NAME}-4.txt"
     assert not (tmp_path / "nowhere").exists()
-
-
-def test_a_provenance_without_its_poses_is_replaced(tmp_path: Path) -> None:
-    folder = tmp_path / "kept"
-    keep_submission(pose_file(tmp_path / "old", "old\n"), folder).unlink()
-    place = pose_file(tmp_path / "new", "new\n")
-    keep_submission(place, folder)
-    assert contents(folder) == contents(place.parent)
 
 
 @pytest.mark.parametrize("gone", [f"{NAME}.txt", f"{NAME}.txt.json"])

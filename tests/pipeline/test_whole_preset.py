@@ -126,13 +126,12 @@ def test_every_container_has_the_published_name_and_keys(
     assert common <= found["delg-r101-gldv2clean"]
 
 
-def test_every_stage_leaves_what_kapture_reads(workspace: Path) -> None:
+def test_every_stage_leaves_what_kapture_reads_and_every_network_was_asked(
+    workspace: Path,
+) -> None:
     found = artefacts(workspace)
     assert list(dict.fromkeys(one.stage for one in found)) == STAGES
     assert sorted(p.stem for p in (workspace / "stages").glob("[!.]*.json")) == sorted(STAGES)
-
-
-def test_every_network_was_asked(workspace: Path) -> None:
     images = tuple(workspace / "preprocessed" / part for part in ("mapping", "query"))
     features = read_features(workspace, images)
     assert {name for name in features if name.endswith(" vectors")} == {
@@ -154,9 +153,7 @@ def test_every_network_was_asked(workspace: Path) -> None:
         assert after[f"{local_type}-pyramid keypoints"] > 0
     classes = list((workspace / "preprocessed" / "query" / "sensors" / "classes").rglob("*.png"))
     assert len(classes) == QUERIES
-
-
-def test_queries_are_undistorted_and_keep_their_depth(workspace: Path) -> None:
+    # queries are undistorted and keep their depth
     before = KaptureFolder(workspace / "query").read()
     after = KaptureFolder(workspace / "preprocessed" / "query").read()
     for image in after.image_names():
@@ -165,16 +162,13 @@ def test_queries_are_undistorted_and_keep_their_depth(workspace: Path) -> None:
     assert len(after.records_depth) == QUERIES
 
 
-def test_what_became_of_each_query_is_said(workspace: Path) -> None:
+def test_queries_are_told_of_and_points_were_judged(workspace: Path) -> None:
     statuses = read_status(workspace / "localized" / "status.csv")
     poses = KaptureFolder(workspace / "localized").read().poses()
     assert len(statuses) == QUERIES
     for image, status in statuses.items():
         assert (image in poses) == (status.status == "localized")
         assert bool(status.reason) == (status.status == "failed")
-
-
-def test_the_map_has_points_that_were_judged(workspace: Path) -> None:
     report = json.loads((workspace / "map" / "reconstruction" / "refinement.json").read_text())
     assert report["points_before"] > report["points_after"] > 50
     checked = {each["name"]: each["checked"] for each in report["filters"]}

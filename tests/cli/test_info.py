@@ -1,0 +1,85 @@
+"""``megloc info``: what a map is, and what it allows."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+from megloc_kapture.io.kapture import KaptureFolder, write_sensors
+
+
+def described(out: str) -> dict[str, str]:
+    """First column to the rest, of the lines that have one."""
+    return dict(re.findall(r"^(\w[\w ]*?)  +(.*)$", out, re.MULTILINE))
+
+
+def test_info_says_what_the_foreign_map_allows(megloc: Any, virtual_gallery: Path) -> None:
+    done = megloc("info", virtual_gallery / "map")
+    assert (done.status, done.err) == (0, "")
+    told = described(done.out)
+    assert told["images"] == "12 (12 PINHOLE), 12 with a pose"
+    assert told["points"] == "630"
+    assert told["pixel origin"].startswith("centre: ")
+    assert told["map descriptors"] == "there"
+    # R2D2 has an extractor, whose weights are not there
+    assert told["query features"].startswith("must be given in kapture; plugin r2d2 could extract")
+    assert "megloc weights fetch r2d2_WASF_N16" in told["query features"]
+    # so few that all are matched; vectors without the weights that make a query's
+    assert told["retrieval"] == "all 12 map images, not ranked"
+    assert (
+        "where queries bring AP-GeM-LM18: all 12 map images, ranked by global features AP-GeM-LM18"
+    ) in done.out
+    errors = re.search(r"origin: corner ([\d.]+) px, centre ([\d.]+) px", done.out)
+    assert errors is not None
+    assert float(errors[2]) < 0.9 * float(errors[1])
+
+
+def test_info_of_our_own_map_and_of_what_is_none(megloc: Any, finished: Path, scene: Path) -> None:
+    told = described(megloc("info", finished / "map", "--deep").out)
+    assert told["checked"] == "everything, image by image"
+    assert told["pixel origin"].startswith("corner: ")
+    assert told["query features"].startswith("extracted by plugin rootsift")
+    assert told["map descriptors"] == "there"
+    told = described(megloc("info", scene / "query").out)
+    assert told["images"] == "4 (4 PINHOLE), 0 with a pose"
+    assert told["localizing"] == "not possible: no points3d and observations"
+
+
+def test_info_says_what_ranks_many_images(megloc: Any, finished: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(finished / "map", tmp_path / "map", symlinks=True))
+    of_vlad = root / "reconstruction" / "global_features"
+    assert described(megloc("info", root).out)["retrieval"] == (
+        "all 7 map images, ranked by VLAD over the map's descriptors"
+    )
+    shutil.rmtree(of_vlad)
+    assert described(megloc("info", root).out)["retrieval"] == "all 7 map images, not ranked"
+    # sixty images more, of one camera and place
+    folder = KaptureFolder(root)
+    data, (local_type,) = folder.read(), folder.types("keypoints")
+    name = data.image_names()[0]
+    timestamp, sensor = data.record_of(name)
+    places = [folder.keypoints(local_type), folder.descriptors(local_type)]
+    for number in range(60):
+        data.records_camera[10_000 + number, sensor] = f"more/{number}.png"
+        data.trajectories[10_000 + number, sensor] = data.trajectories[timestamp, sensor]
+        for reader in places:
+            stored = Path(reader.where(name))
+            copy = stored.parents[len(Path(name).parts) - 1] / f"more/{number}.png{stored.suffix}"
+            copy.parent.mkdir(exist_ok=True)
+            shutil.copyfile(stored, copy)
+    write_sensors(root, data)
+    assert described(megloc("info", root).out)["retrieval"] == (
+        "the 50 of 67 map images that are most similar by VLAD over the map's descriptors"
+    )
+
+
+def test_info_of_a_map_whose_descriptors_are_missing(megloc: Any, gallery: Path) -> None:
+    shutil.rmtree(gallery / "map" / "reconstruction" / "descriptors")
+    told = described(megloc("info", gallery / "map").out)
+    assert told["map descriptors"] == "missing; will be extracted again by plugin r2d2"
+    assert told["retrieval"] == "all 12 map images, not ranked"
+    (gallery / "map" / "sensors" / "records_data").rename(gallery / "away")
+    told = described(megloc("info", gallery / "map").out)
+    assert told["retrieval"] == "not possible without the map's descriptors"

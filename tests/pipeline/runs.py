@@ -1,0 +1,89 @@
+"""Runs of ``megloc eval`` from Python."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from megloc_kapture import Failure, Pose
+from megloc_kapture.evaluation.metrics import pose_errors
+from megloc_kapture.pipeline.datasets import TWIN_PREFIX, DatasetChoice, choose_dataset, twin_of
+from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
+from megloc_kapture.pipeline.executors import open_executor, single_threaded
+from megloc_kapture.pipeline.manifests import Manifest
+from megloc_kapture.pipeline.plan import StageReport, run_plan
+from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.run import Run, find_benchmark
+from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.stages.work import Work
+from megloc_kapture.values import RigidTransform
+
+
+def run_in(
+    workspace: Workspace,
+    source: Path | DatasetChoice,
+    options: PipelineOptions,
+    *,
+    workers: int = 1,
+    benchmark: Any = None,
+    **how: Any,
+) -> dict[str, StageReport]:
+    """Run the stages in a workspace, of a scene or a dataset; their reports by name."""
+    chosen = choose_dataset("kapture", source) if isinstance(source, Path) else source
+    run = Run(chosen, "classic", options, workspace, benchmark)
+    with workspace.lock(), single_threaded(), open_executor("processes", workers) as executor:
+        reports = run_plan(plan_evaluation(run), workspace, Work(executor), **how)
+    return {report.name: report for report in reports}
+
+
+def evaluated(
+    root: Path, source: Path | DatasetChoice, options: PipelineOptions, **how: Any
+) -> Workspace:
+    """A new workspace in which the stages have run."""
+    workspace = Workspace(root)
+    run_in(workspace, source, options, **how)
+    return workspace
+
+
+def run_twin(
+    workspace: Workspace, name: str, world: dict[str, Any], changes: Sequence[str] = ()
+) -> dict[str, StageReport]:
+    """Run a small twin of a dataset by the dataset's own benchmark file, in two processes."""
+    dataset = f"{TWIN_PREFIX}{name}"
+    benchmark = find_benchmark(dataset)
+    source = choose_dataset(dataset, None, import_options=benchmark.import_options)
+    source = replace(source, twin=twin_of(name, **world))
+    few = ["local_features.options.max_keypoints=1500", "global_features.options.num_clusters=32"]
+    options = options_of_preset(changes=[benchmark.options], assignments=[*few, *changes])
+    return run_in(workspace, source, options, workers=2, benchmark=benchmark)
+
+
+def recall_rows(workspace: Workspace) -> dict[str, Any]:
+    """Rows of the recall table by name."""
+    rows = json.loads(workspace.path("evaluation/recall.json").read_text())["rows"]
+    return {row["name"]: row for row in rows}
+
+
+def recall(workspace: Workspace, name: str = "all") -> list[float]:
+    """The shares of queries at each threshold."""
+    return [at["recall"] for at in recall_rows(workspace)[name]["recall"]]
+
+
+def errors(found: Pose | Failure, truth: RigidTransform | None) -> tuple[float, float]:
+    """Metres and degrees."""
+    assert isinstance(found, Pose), found
+    assert truth is not None
+    result = pose_errors({"it": found.cam_from_world}, {"it": truth})
+    return float(result.position_m[0]), float(result.angle_deg[0])
+
+
+def manifest(stage: str, **changes: Any) -> Manifest:
+    """What a finished stage leaves."""
+    content: dict[str, Any] = {"options": {}, "inputs": {}, "outputs": (), "versions": {}}
+    content |= {"seconds": 1.5, "started": "2024-01-01T00:00:00"}
+    content |= {"version": 1, "fingerprint": f"print of {stage}", **changes}
+    return Manifest(stage=stage, **content)
