@@ -200,9 +200,7 @@ def in_turn(
         solved = solve(few)
         results = solved if isinstance(solved, list) else [solved.result]
         if all(
-            isinstance(r, Pose)
-            and (r.confidence or 0.0) >= sure
-            and r.num_inliers >= _SURE_INLIERS
+            isinstance(r, Pose) and (r.confidence or 0.0) >= sure and r.num_inliers >= _SURE_INLIERS
             for r in results
         ):
             return solved

@@ -28,6 +28,7 @@ from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.query_poses import (
     LocalizationOptions,
+    in_turn,
     localize_from_matches,
     localize_views,
 )
@@ -92,6 +93,26 @@ def test_a_ranker_sees_poses_and_images(world: Any, monkeypatch: pytest.MonkeyPa
 def test_an_unknown_ranker_is_refused_before_the_first_query(world: Any) -> None:
     with pytest.raises(PluginError, match="no plugin 'no-such' in megloc_kapture.pose_rankers"):
         world.localized(rank=PluginChoice(name="no-such"))
+
+
+def test_candidates_are_taken_in_turn_until_the_pose_is_sure_and_well_supported() -> None:
+    asked: list[int] = []
+
+    def solve(count: int) -> list[Pose | Failure]:
+        asked.append(count)
+        confidence, inliers = {5: (0.99, 29), 10: (0.89, 30), 20: (0.9, 30)}.get(count, (1.0, 99))
+        return [Pose(RigidTransform.identity(), 100, inliers, confidence=confidence)]
+
+    def turns(count: int, options: LocalizationOptions, *also: Failure) -> list[int]:
+        asked.clear()
+        in_turn(lambda few: [*solve(few), *also], count, options)
+        return asked.copy()
+
+    options = LocalizationOptions(sure_confidence=0.9)
+    assert turns(50, options) == [5, 10, 20]
+    assert turns(15, options) == [5, 10, 15]  # all of them where no turn is sure
+    assert turns(50, options, Failure("none")) == [5, 10, 20, 40, 50]  # a rig's other camera
+    assert turns(50, LocalizationOptions()) == [50]
 
 
 def test_map_points_are_those_that_an_image_observes(world: Any) -> None:
