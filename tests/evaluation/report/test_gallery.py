@@ -205,6 +205,10 @@ def test_the_best_match_stands_beside_the_query(run: Run, chosen: Chosen) -> Non
     # without candidates the map image nearest to the pose is shown
     nearest = pictures.of(replace(chosen, candidates=())).main
     assert f"{NEAR}</span>, nearest to the true pose" in nearest.caption
+    # and not one that stands there and looks the other way
+    turned = RigidTransform((0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0)) @ POSES[QUERY]
+    behind = QueryPictures(run.context, {**run.context.map_poses(), FAR: turned})
+    assert behind.of(replace(chosen, candidates=())).main.caption == nearest.caption
     # without a known pose lines have one colour
     unknown = QueryPictures(run.context, {}).of(replace(chosen, pose=None)).main
     assert UNKNOWN in unknown.element and AGREES not in unknown.element

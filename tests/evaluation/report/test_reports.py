@@ -364,6 +364,7 @@ def test_differences_that_are_real_and_that_could_be_chance() -> None:
         "the difference is real (p = 0.035)."
     )
     assert sentence_of(9, 4).endswith("the difference could be chance (p = 0.27).")
+    assert sentence_of(3, 3).endswith("the difference could be chance (p = 1).")
     assert sentence_of(1, 0) == (
         "At 0.25 m, 2 deg A finds 1 query that B misses and B finds none that A misses: "
         "too few queries differ to tell it from chance (p = 1)."
