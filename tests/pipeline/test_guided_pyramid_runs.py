@@ -101,10 +101,10 @@ def test_turned_queries_are_found_with_it_and_easy_pairs_are_not_tried(
 def test_upright_queries_are_left_alone(
     fountain: Path, options: PipelineOptions, tmp_path: Path
 ) -> None:
-    workspace = Workspace(tmp_path / "runs")
     unverified = pyramid(options, mode="all").model_copy(update={"verification": "none"})
     with pytest.raises(OptionError, match="guided pyramid matching counts verified matches"):
-        run_in(workspace, fountain, unverified)
+        evaluated(tmp_path / "unverified", fountain, unverified)
+    workspace = Workspace(tmp_path / "runs")
     reports = run_in(workspace, fountain, pyramid(options, mode="max", min_matches=15))
     counts = reports["query_pyramid"].counts
     assert counts["xfeat pairs_tried"] == counts["xfeat images_extracted_again"] == 0
