@@ -18,6 +18,7 @@ from megloc_kapture.geometry.poses import movement
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
+from megloc_kapture.localization.cluster_poses import ClusterOptions
 from megloc_kapture.localization.map_index import MapIndex, QueryView, TypedMatches
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import TwoViewOptions
@@ -178,3 +179,27 @@ def test_every_cluster_gives_a_pose_whichever_retrieval_ranks_first(first: str) 
     assert isinstance(found, Pose)
     assert len(found.clusters) == 2
     np.testing.assert_allclose(found.cam_from_world.center(), truth.center(), atol=1e-5)
+
+
+@pytest.mark.parametrize(("frames", "clusters"), [(["", ""], 1), (["DUC1", "DUC2"], 2)])
+def test_places_whose_poses_agree_are_one_but_in_two_frames(
+    frames: list[str], clusters: int
+) -> None:
+    camera, rows = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0)), np.arange(100)
+    points = np.random.default_rng(0).uniform((-2, -2, 4), (2, 2, 8), (100, 3))
+    index = MapIndex.build(points, ("a", "b"), np.repeat([0, 1], 50), rows, rows)
+    truth = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.2, -0.1, 0.4))
+    halves = zip("ab", np.split(rows, 2), strict=True)
+    matches = [(name, np.stack([own] * 2, axis=1), np.full(50, 0.9)) for name, own in halves]
+    seen = project(camera, truth, points).astype(np.float32)
+    found = localize_views(
+        [QueryView("q", camera, (TypedMatches(index, seen, matches),))],
+        ["a", "b"],
+        frames,
+        LocalizationOptions(clusters=ClusterOptions(by="poses", radius=1.0)),
+        centers={"a": np.zeros(3), "b": np.full(3, 9.0)},
+        ranker=load_plugin(POSE_RANKERS, "inliers"),
+        scene=cast(RankingScene, None),
+    ).result
+    assert isinstance(found, Pose)
+    assert (len(found.clusters), found.num_matches) == (clusters, 100 // clusters)
