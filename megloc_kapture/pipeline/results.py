@@ -183,7 +183,8 @@ class Results(Mapping[str, Pose | Failure]):
                 raise DataError(f"image {lacking!r}: {error.message}", path=error.path) from error
 
     def _localized(self, workers: int, track: Track) -> Iterator[tuple[str, Pose | Failure]]:
-        with ThreadPoolExecutor(workers) as executor:
+        executor, read_on = ThreadPoolExecutor(workers), True
+        try:
             units = self.queries.read_units(rigs=self._rigs)
             results = self.localizer.localize_units(units, executor, candidates=self._candidates)
             tracked = track(results, len(self._units), "localizing")
@@ -195,6 +196,13 @@ class Results(Mapping[str, Pose | Failure]):
                     if isinstance(result, Failure) and name in self.queries.faults:
                         result = replace(result, reason=self.queries.faults[name])
                     yield name, result
+        except GeneratorExit:
+            # nobody reads on; the garbage collector may say so in any thread, one that is being
+            # started and holds what ending the workers needs included, so nothing is waited for
+            read_on = False
+            raise
+        finally:
+            executor.shutdown(wait=read_on, cancel_futures=not read_on)
 
     def _with_shared_cameras(self, results: list[Pose | Failure]) -> list[Pose | Failure]:
         """Results of photographs, each by itself; those of one camera are solved with one."""
