@@ -202,7 +202,7 @@ class Results(Mapping[str, Pose | Failure]):
             read_on = False
             raise
         finally:
-            executor.shutdown(wait=read_on, cancel_futures=not read_on)
+            executor.shutdown(wait=read_on)
 
     def _with_shared_cameras(self, results: list[Pose | Failure]) -> list[Pose | Failure]:
         """Results of photographs, each by itself; those of one camera are solved with one."""

@@ -94,8 +94,8 @@ class LocalizationOptions(Options):
         default=None,
         gt=0,
         le=1,
-        description="candidates are taken in turn, best first, and no more once the pose has 30 "
-        "inliers and is as likely to be right as this; none: all are taken",
+        description="candidates are taken in turn, best first, and no more once the pose has "
+        f"{_SURE_INLIERS} inliers and is as likely to be right as this; none: all are taken",
     )
     rigs: bool = Field(default=False, description="one pose for all cameras of a rig's moment")
     fallback: Fallback = Field(
