@@ -48,17 +48,27 @@ from tensorflow_checkpoints import write_saved_model  # noqa: E402
 DELG_REFERENCE = Path(__file__).parents[1] / "nets" / "data" / "delg" / "reference.npz"
 CLUSTERS = 2
 KINDS: dict[str, Any] = {
-    **{"netvlad": NetVlad, "openibl": OpenIbl, "apgem": ApGem},
-    **{"delg": Delg, "eigenplaces": EigenPlaces, "megaloc": MegaLoc},
+    "netvlad": NetVlad,
+    "openibl": OpenIbl,
+    "apgem": ApGem,
+    "delg": Delg,
+    "eigenplaces": EigenPlaces,
+    "megaloc": MegaLoc,
 }
 # components, and by how much vectors of two images differ at least
 SIZES = {
-    **{"netvlad": (12, 0.03), "openibl": (12, 0.03), "apgem": (2048, 1e-4)},
-    **{"delg": (2048, 1e-4), "eigenplaces": (128, 1e-5), "megaloc": (10, 1e-3)},
+    "netvlad": (12, 0.03),
+    "openibl": (12, 0.03),
+    "apgem": (2048, 1e-4),
+    "delg": (2048, 1e-4),
+    "eigenplaces": (128, 1e-5),
+    "megaloc": (10, 1e-3),
 }
 # that keep the tests short
 CHOSEN: dict[str, dict[str, object]] = {
-    **{"openibl": {"max_size_px": 64}, "apgem": {"whitening": ""}, "delg": {"scales": [1.0]}},
+    "openibl": {"max_size_px": 64},
+    "apgem": {"whitening": ""},
+    "delg": {"scales": [1.0]},
 }
 REFUSALS = {
     "netvlad": "no average_image",
@@ -161,8 +171,12 @@ def write_megaloc(folder: Path) -> Path:
 
 
 WRITERS: dict[str, Callable[[Path], Path]] = {
-    **{"netvlad": write_netvlad, "openibl": write_openibl, "apgem": write_apgem},
-    **{"delg": write_delg, "eigenplaces": write_eigenplaces, "megaloc": write_megaloc},
+    "netvlad": write_netvlad,
+    "openibl": write_openibl,
+    "apgem": write_apgem,
+    "delg": write_delg,
+    "eigenplaces": write_eigenplaces,
+    "megaloc": write_megaloc,
 }
 FILES: dict[str, Path] = {}
 

@@ -27,8 +27,13 @@ from megloc_kapture.values import LocalFeatures
 Make = Callable[..., Any]
 ALL = 100_000
 KINDS: dict[str, Any] = {
-    **{"rootsift": RootSift, "sift": ColmapSift, "superpoint": SuperPoint, "aslfeat": AslFeat},
-    **{"aliked": Aliked, "xfeat": XFeat, "r2d2": R2D2},
+    "rootsift": RootSift,
+    "sift": ColmapSift,
+    "superpoint": SuperPoint,
+    "aslfeat": AslFeat,
+    "aliked": Aliked,
+    "xfeat": XFeat,
+    "r2d2": R2D2,
 }
 # those with published weights see a part of a photograph, x, y, width and height
 PUBLISHED = {
@@ -40,14 +45,18 @@ NETWORKS = [name for name in KINDS if "sift" not in name]
 DESCRIPTORS = {"superpoint": 256, "xfeat": 64}  # the others have 128
 # how far and how many keypoints are found again in half precision
 HALF = {
-    **{"superpoint": (8.0, 0.3), "aslfeat": (1.0, 0.7), "aliked": (1.0, 0.8)},
-    **{"xfeat": (0.01, 0.5), "r2d2": (1.5, 0.8)},
+    "superpoint": (8.0, 0.3),
+    "aslfeat": (1.0, 0.7),
+    "aliked": (1.0, 0.8),
+    "xfeat": (0.01, 0.5),
+    "r2d2": (1.5, 0.8),
 }
 # height and width; where there are no features without texture
 FLAT = [(1, 1), (2, 5), (5, 5), (10, 40), (11, 11), (33, 31), (64, 48), (120, 160)]
 SMALL = {
-    **{"superpoint": [(7, 100), (8, 8)], "xfeat": [(20, 31), (33, 100)]},
-    **{"r2d2": [(9, 21), (40, 60)]},
+    "superpoint": [(7, 100), (8, 8)],
+    "xfeat": [(20, 31), (33, 100)],
+    "r2d2": [(9, 21), (40, 60)],
 }
 REFUSALS = {
     "superpoint": "23 missing keys",

@@ -20,8 +20,12 @@ from tests.pipeline.runs import evaluated, recall, run_in
 pytestmark = pytest.mark.slow
 
 SMALL = {
-    **{"num_places": 1, "stations_per_place": 6, "day_queries": 3, "night_queries": 1},
-    **{"width": 400, "height": 300},
+    "num_places": 1,
+    "stations_per_place": 6,
+    "day_queries": 3,
+    "night_queries": 1,
+    "width": 400,
+    "height": 300,
 }
 CHEAP = {
     "local_features": {"options": {"max_keypoints": 800}},

@@ -16,8 +16,12 @@ from tests.pipeline.runs import recall_rows, run_twin
 
 SMALL: dict[str, dict[str, Any]] = {
     "aachen": {
-        **{"num_places": 2, "stations_per_place": 7, "day_queries": 4, "night_queries": 2},
-        **{"width": 480, "height": 360},
+        "num_places": 2,
+        "stations_per_place": 7,
+        "day_queries": 4,
+        "night_queries": 2,
+        "width": 480,
+        "height": 360,
     },
     "robotcar": {"num_locations": 2, "size_px": 360, "moments_per_condition": 2},
     "4seasons": {"num_places": 2, "map_keyframes": 24, "winter_keyframes": 6, "dusk_keyframes": 2},
