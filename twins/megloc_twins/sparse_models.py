@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from megloc_kapture.matching.nearest_neighbours import NearestNeighbourOptions, 
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, LocalFeatures
 from megloc_twins.frames import Frame
-from megloc_twins.options import SyntheticWorldOptions
+from megloc_twins.options import JPEG_QUALITY, SyntheticWorldOptions
 from megloc_twins.rasterization import intrinsics, project, sample_grid
 from megloc_twins.render import RenderedFrame, render_frames
 
@@ -142,10 +142,16 @@ def _in_field(camera: Camera, in_camera: Floats) -> Bools:
 
     Farther out the distortion need not be monotonous and may fold a point back into the image.
     """
-    grid = sample_grid(camera, 1)
-    limit = float((grid.x**2 + grid.y**2).max())
     z = in_camera[:, 2]
-    return np.asarray((z > 0) & ((in_camera[:, :2] ** 2).sum(1) <= limit * z**2), np.bool_)
+    inside = (in_camera[:, :2] ** 2).sum(1) <= _squared_reach(camera) * z**2
+    return np.asarray((z > 0) & inside, np.bool_)
+
+
+@cache
+def _squared_reach(camera: Camera) -> float:
+    """Greatest squared distance of a pixel's ray from the axis, at depth 1."""
+    grid = sample_grid(camera, 1)
+    return float((grid.x**2 + grid.y**2).max())
 
 
 def sift_points(frames: Sequence[Frame], features: Features, depths_m: Depths) -> SparsePoints:
@@ -181,11 +187,11 @@ def sift_points(frames: Sequence[Frame], features: Features, depths_m: Depths) -
 
 
 def write_sift_database(path: Path, frames: Mapping[str, Frame], features: Features) -> None:
-    """Write COLMAP's database of the frames' features, under the names given, in their order.
+    """Write COLMAP's database of the frames' features, under the names given, sorted by these.
 
     Raises OutputError where it cannot be written.
     """
-    found = ((name, frame.camera, features[frame.name]) for name, frame in frames.items())
+    found = ((name, frames[name].camera, features[frames[name].name]) for name in sorted(frames))
     write_feature_database(
         path, (DatabaseFeatures(n, cam, f.keypoints_px, f.descriptors) for n, cam, f in found)
     )
@@ -269,7 +275,7 @@ def render_map_and_queries(
     The depth of ``mapping`` is returned, with ``model_features`` their SIFT as well.
     """
     names = frozenset(frame.name for frame in mapping)
-    finish = partial(_write, images, world.jpeg_quality, names if model_features else frozenset())
+    finish = partial(_write, images, names if model_features else frozenset())
     drawn = render_frames(world, [*mapping, *others], finish, with_depth=names, work=work)
     return MapFrames(
         {name: depth for name, (depth, _) in drawn.items() if depth is not None},
@@ -278,14 +284,10 @@ def render_map_and_queries(
 
 
 def _write(
-    images: Path,
-    jpeg_quality: int,
-    with_features: frozenset[str],
-    frame: Frame,
-    view: RenderedFrame,
+    images: Path, with_features: frozenset[str], frame: Frame, view: RenderedFrame
 ) -> tuple[Depth | None, LocalFeatures | None]:
     path = images / frame.name
-    write_image(path, view.image, jpeg_quality=jpeg_quality)
+    write_image(path, view.image, jpeg_quality=JPEG_QUALITY)
     # of the image as it was written
     wanted = frame.name in with_features
     return view.depth_m, ColmapSift().extract(read_image_rgb(path)) if wanted else None

@@ -260,7 +260,6 @@ class _TextureStore:
         params: dict[str, str | float] = {
             "material": kind,
             "material_seed": shared_seed,
-            "dirt": self.options.unique_texture,
         }
         if painter == "wall":
             params["graffiti"] = float(self.rng.integers(0, 3))

@@ -30,7 +30,7 @@ from megloc_twins.frames import (
     noise_seed,
 )
 from megloc_twins.moving_objects import place_moving_objects
-from megloc_twins.options import SyntheticDataset, SyntheticWorldOptions, stream
+from megloc_twins.options import JPEG_QUALITY, SyntheticDataset, SyntheticWorldOptions, stream
 from megloc_twins.render import RenderedFrame, render_frames
 from megloc_twins.squares import Place, build_place
 from megloc_twins.viewpoints import CoarseView, coarse_view, query_frames
@@ -83,8 +83,7 @@ def _mapping_frames(
         moving_objects = place_moving_objects(place.plan, rng, options.moving_objects, position)
         for sensor_id, camera in rig_cameras(options).items():
             folder = sensor_id.removeprefix("rig_")
-            image = f"db/{place.name}/{folder}/{station:05d}.{options.image_format}"
-            seed = noise_seed(options.seed, image)
+            image = f"db/{place.name}/{folder}/{station:05d}.jpg"
             frames.append(
                 Frame(
                     name=image,
@@ -95,9 +94,10 @@ def _mapping_frames(
                     sensor_id=sensor_id,
                     camera=camera,
                     cam_from_world=geometry[sensor_id] @ pose,
-                    lighting=day_lighting(rng, sun, overcast=0.15, noise_seed=seed),
+                    lighting=day_lighting(rng, sun, overcast=0.15),
+                    noise_seed=noise_seed(options.seed, image),
                     moving_objects=moving_objects,
-                    bonnet=options.bonnet and sensor_id == _BONNET_SENSOR,
+                    bonnet=sensor_id == _BONNET_SENSOR,
                 )
             )
     return frames
@@ -168,7 +168,7 @@ class SyntheticKapture(SyntheticDataset[SyntheticWorldOptions]):
         render_frames(
             self.options,
             world.frames(),
-            partial(_write_files, root, self.options),
+            partial(write_files, root, self.options),
             with_depth=[frame.name for frame in world.mapping] if self.options.depth else (),
             work=work,
         )
@@ -224,12 +224,13 @@ def _depth_sensor(sensor_id: str) -> str:
     return f"{sensor_id}_depth"
 
 
-def _write_files(
+def write_files(
     root: Path, options: SyntheticWorldOptions, frame: Frame, view: RenderedFrame
 ) -> None:
+    """Write an image, its depth where it has one, and its mask where asked for."""
     sensors = root / frame.role / "sensors"
     records = sensors / "records_data"
-    write_image(records / frame.name, view.image, jpeg_quality=options.jpeg_quality)
+    write_image(records / frame.name, view.image, jpeg_quality=JPEG_QUALITY)
     if view.depth_m is not None:
         write_depth_map(records / depth_name(frame.name), view.depth_m)
     if options.masks and not view.mask.all():

@@ -65,8 +65,8 @@ for _ in range(60):
 surfaces = builder.build()
 grid = sample_grid(Camera("SIMPLE_RADIAL", 320, 240, (230.0, 160.0, 120.0, -0.07)), 2)
 lamps = rng.uniform((-5, -5, 2), (5, 5, 3), (6, 3))
-day = day_lighting(rng, (1.0, 0.8), overcast=0.2, noise_seed=1)
-night = night_lighting(rng, exposure=1.0, noise_seed=2)
+day = day_lighting(rng, (1.0, 0.8), overcast=0.2)
+night = night_lighting(rng, exposure=1.0)
 atlas, clouds = build_atlas(textures), cloud_texture(0)
 for look in (day, night):
     pose = looking_at(np.array([0.3, -7.0, 1.6]), 1.5, 0.05, 0.02)
@@ -78,7 +78,7 @@ for look in (day, night):
         clouds=clouds,
     )
     digest(look.condition, seen.planes, seen.inverse_depth, colour, light)
-    digest(look.condition + " developed", develop(light, look, 2, bonnet_seed=None))
+    digest(look.condition + " developed", develop(light, look, 2, noise_seed=1, bonnet_seed=None))
 """
 
 TWIN = """

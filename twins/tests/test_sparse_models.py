@@ -15,12 +15,11 @@ from megloc_twins.aachen import (
 )
 from megloc_twins.frames import Frame, day_lighting, in_frame, looking_at
 from megloc_twins.moving_objects import moving_object_surfaces
-from megloc_twins.options import SyntheticWorldOptions
 from megloc_twins.rasterization import depth_map, sample_grid, visible_surfaces
 from megloc_twins.robotcar import RobotCarTwin, RobotCarTwinOptions
 from megloc_twins.sparse_models import exact_tracks
 from megloc_twins.squares import build_place
-from megloc_twins.synthetic_kapture import SyntheticWorld, build_world
+from megloc_twins.synthetic_kapture import SyntheticWorld
 from numpy.typing import NDArray
 
 from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
@@ -50,13 +49,6 @@ def colmap_px(frame: Frame, points: NDArray[np.float64]) -> NDArray[np.float64]:
         pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(frame.cam_from_world.translation)
     )
     return px_from_cam(frame.camera, np.array([pose * point for point in points]))
-
-
-@pytest.fixture(scope="module")
-def world() -> SyntheticWorld:
-    size = {"width": 160, "height": 120}
-    queries = {"day_queries": 2, "night_queries": 0}
-    return build_world(SyntheticWorldOptions(num_places=2, stations_per_place=5, **queries, **size))
 
 
 @pytest.fixture(scope="module")
@@ -121,9 +113,9 @@ def test_tracks_are_in_order_and_within_a_place(frames: list[Frame], points: Spa
 
 def frame(name: str, x: float, *, camera: Camera, yaw_deg: float = 90.0) -> Frame:
     """A camera at (x, 0, 0) that looks along +y unless turned."""
-    lighting = day_lighting(rng(), (0.0, 1.0), overcast=0.0, noise_seed=0)
+    lighting = day_lighting(rng(), (0.0, 1.0), overcast=0.0)
     pose = looking_at(np.array([x, 0.0, 0.0]), np.radians(yaw_deg), 0.0, 0.0)
-    return Frame(name, "mapping", "day", 0, 0, name, camera, pose, lighting, (), False)
+    return Frame(name, "mapping", "day", 0, 0, name, camera, pose, lighting, 0)
 
 
 PINHOLE = Camera("PINHOLE", 40, 30, (40.0, 40.0, 20.0, 15.0))
