@@ -16,6 +16,7 @@ from megloc_twins.frames import kapture_records, noise_seed
 from megloc_twins.options import SyntheticWorldOptions
 from megloc_twins.render import render_frames
 from megloc_twins.synthetic_kapture import (
+    SENSOR_FROM_RIG,
     SyntheticWorld,
     build_world,
     depth_name,
@@ -105,7 +106,7 @@ def _stepped(world: SyntheticWorld, steps: int) -> SyntheticWorld:
                     shot,
                     name=name,
                     timestamp=timestamp,
-                    cam_from_world=world.sensor_from_rig[shot.sensor_id] @ pose,
+                    cam_from_world=SENSOR_FROM_RIG[shot.sensor_id] @ pose,
                     noise_seed=noise_seed(world.options.seed, name),
                 )
             )

@@ -20,7 +20,7 @@ from megloc_twins.frames import (
     noise_seed,
 )
 from megloc_twins.moving_objects import FloorPlan, place_moving_objects
-from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.options import SyntheticWorldOptions, seed_of, stream
 from megloc_twins.squares import Place, build_place
 
 # of the published recordings: pixels of an image 800 wide and 400 high, metres
@@ -121,12 +121,12 @@ def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> list[Moment]:
 def winter_place(options: SyntheticWorldOptions, index: int) -> Place:
     """A place whose ground has other leaves, patches and markings, on wet asphalt."""
     place = build_place(options, index)
-    seed = int(stream(options.seed, "winter", index).integers(2**31))
+    seed = seed_of(options.seed, "winter", index)
     recipes = []
     for recipe in place.recipes:
         if recipe.painter == "ground":
             params = dict(recipe.params) | {"material": "asphalt"}
-            recipe = replace(recipe, seed=seed, params=tuple(sorted(params.items())))
+            recipe = replace(recipe, seed=seed, params=tuple(params.items()))
         recipes.append(recipe)
     return replace(place, recipes=tuple(recipes))
 

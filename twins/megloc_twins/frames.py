@@ -14,7 +14,7 @@ from megloc_kapture.datasets.official import GROUND_TRUTH
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
 from megloc_twins.moving_objects import MovingObject
-from megloc_twins.options import stream
+from megloc_twins.options import seed_of
 from megloc_twins.portable import exp, product, settled, settled_pose
 
 Triple = tuple[float, float, float]
@@ -228,7 +228,7 @@ class Frame:
 
 def noise_seed(seed: int, image: str) -> int:
     """Seed of the sensor's noise in an image of the world of ``seed``."""
-    return int(stream(seed, "noise", image.rsplit(".", 1)[0]).integers(2**31))
+    return seed_of(seed, "noise", image.rsplit(".", 1)[0])
 
 
 def in_frame(frames: Iterable[Frame], official_from_world: RigidTransform) -> list[Frame]:

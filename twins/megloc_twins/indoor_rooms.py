@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.values import RigidTransform
 from megloc_twins.moving_objects import FloorPlan, Obstacle, moving_object_recipes
-from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.options import SyntheticWorldOptions, seed_of, stream
 from megloc_twins.portable import product, settled_pose
 from megloc_twins.squares import Place, about_z
 from megloc_twins.surfaces import PASSAGE, Opening, SurfaceBuilder, Surfaces, Vector, Wall
@@ -62,13 +62,13 @@ class Recipes:
 
     def thing(self, painter: str, *label: str | int) -> int:
         """A texture of a kind, the same for the same label."""
-        number = int(stream(self.seed, "indoor", painter, *label).integers(2**31))
+        number = seed_of(self.seed, "indoor", painter, *label)
         return index_of(TextureRecipe(painter, *_SIZES[painter], number), self.items)
 
     def material(self, kind: str, size_m: tuple[float, float], *label: str | int) -> int:
         """A wall's, floor's or ceiling's texture, the same for the same label and size."""
-        number = int(stream(self.seed, "indoor", kind, *label).integers(2**31))
-        material_seed = int(stream(self.seed, "indoor", label[0]).integers(2**31))
+        number = seed_of(self.seed, "indoor", kind, *label)
+        material_seed = seed_of(self.seed, "indoor", label[0])
         params = (("material", kind), ("material_seed", material_seed), ("dirt", _DIRT))
         recipe = TextureRecipe("wall", *texels(size_m, _TEXELS_PER_M), number, params)
         return index_of(recipe, self.items)

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from megloc_twins.options import stream
+from megloc_twins.options import seed_of
 from megloc_twins.surfaces import SurfaceBuilder, Surfaces
 from megloc_twins.textures import TextureRecipe
 
@@ -135,7 +135,7 @@ class MovingObject:
 
 def moving_object_recipes(seed: int) -> list[TextureRecipe]:
     """Textures of all moving objects; a place puts them first, their indices are the same."""
-    number = int(stream(seed, "movers").integers(2**31))
+    number = seed_of(seed, "movers")
     recipes = [TextureRecipe("cloth", 120, 360, number + i) for i in range(NUM_PEOPLE)]
     for i in range(NUM_CARS):
         recipes.append(TextureRecipe("car", 420, 90, number + 100 + i, (("side", 1.0),)))

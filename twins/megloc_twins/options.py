@@ -73,6 +73,11 @@ def stream(seed: int, *labels: str | int) -> np.random.Generator:
     return np.random.default_rng([seed, crc32("/".join(map(str, labels)).encode())])
 
 
+def seed_of(seed: int, *labels: str | int) -> int:
+    """A seed of one thing in the world, see :func:`stream`."""
+    return int(stream(seed, *labels).integers(2**31))
+
+
 class SyntheticDataset(ABC, Generic[OptionsT]):
     """A dataset that is rendered from its options; group ``megloc_kapture.rendered_datasets``.
 

@@ -27,7 +27,7 @@ SMALL: dict[str, SyntheticDataset[Any]] = {
         SyntheticWorldOptions(**PLACES, **SIZE, stations_per_place=4, depth=True, masks=True)
     ),
     "aachen": AachenTwin(
-        AachenTwinOptions(**CITY, **SIZE, stations_per_place=7, points_per_image=60)
+        AachenTwinOptions(**CITY, **SIZE, stations_per_place=5, points_per_image=60)
     ),
     "robotcar": RobotCarTwin(
         RobotCarTwinOptions(**STREETS, size_px=96, supersampling=1, points_per_image=40)

@@ -32,7 +32,7 @@ import hashlib
 import numpy as np
 from megloc_twins.surfaces import build_atlas
 from megloc_twins.frames import day_lighting, looking_at, night_lighting
-from megloc_twins.synthetic_kapture import rig_geometry
+from megloc_twins.synthetic_kapture import SENSOR_FROM_RIG
 from megloc_twins.drawing import periodic_noise, smooth_noise
 from megloc_twins.options import stream
 from megloc_twins.rasterization import sample_colour, sample_grid, visible_surfaces
@@ -49,7 +49,7 @@ rng = stream(0, "portable")
 poses = [looking_at(rng.normal(0, 3, 3), *rng.normal(0, 1, 3)) for _ in range(50)]
 chain = poses[0]
 for pose in poses[1:]:
-    chain = chain @ pose.inverse() @ list(rig_geometry().values())[1]
+    chain = chain @ pose.inverse() @ SENSOR_FROM_RIG["rig_left"]
     digest("pose", chain.quat_wxyz, chain.translation, chain.center())
 digest("noise", smooth_noise(rng, 300, 400, cell=90), periodic_noise(rng, 256, cell=40))
 wall = (("material", "brick"), ("material_seed", 3.0))

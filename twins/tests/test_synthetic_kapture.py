@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 from kapture.io.csv import kapture_from_dir
 from megloc_twins.options import SyntheticWorldOptions
-from megloc_twins.synthetic_kapture import SyntheticWorld, build_world, depth_name
+from megloc_twins.synthetic_kapture import (
+    SENSOR_FROM_RIG,
+    SyntheticWorld,
+    build_world,
+    depth_name,
+)
 from megloc_twins.viewpoints import coarse_view, overlap, support
 
 from megloc_kapture.io.dataset_tables import read_groups, read_protocol, read_world
@@ -70,9 +75,9 @@ def test_every_query_shares_its_view_with_the_map_of_its_place_only(world: Synth
 def test_poses_of_the_map_are_those_of_the_rig(world: SyntheticWorld) -> None:
     assert len(world.rig_from_world) * 3 == len(world.mapping)
     for frame in world.mapping:
-        expected = world.sensor_from_rig[frame.sensor_id] @ world.rig_from_world[frame.timestamp]
+        expected = SENSOR_FROM_RIG[frame.sensor_id] @ world.rig_from_world[frame.timestamp]
         assert_same(frame.cam_from_world, expected)
-    offsets = [pose.center() for pose in world.sensor_from_rig.values()]
+    offsets = [pose.center() for pose in SENSOR_FROM_RIG.values()]
     assert max(np.linalg.norm(a - b) for a in offsets for b in offsets) > 0.5
 
 
