@@ -41,14 +41,12 @@ def write_colmap_text(folder: Path, model: ColmapModel) -> None:
         cameras.append(f"{camera_id} {camera.model} {camera.width} {camera.height} {params}")
     images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "# POINTS2D[] as X Y POINT3D_ID"]
     for image, xy_px, seen in _features(model):
-        numbers = " ".join(repr(float(value)) for value in _pose(image))
+        pose = " ".join(repr(float(value)) for value in _pose(image))
         rows = zip(xy_px.astype(str).tolist(), seen.tolist(), strict=True)
         features = " ".join(f"{x} {y} {point}" for (x, y), point in rows)
-        images += [f"{image.image_id} {numbers} {image.camera_id} {image.name}", features]
-    points, elements = (
-        ["# POINT3D_ID X Y Z R G B ERROR TRACK[] as IMAGE_ID POINT2D_IDX"],
-        _elements(model),
-    )
+        images += [f"{image.image_id} {pose} {image.camera_id} {image.name}", features]
+    points = ["# POINT3D_ID X Y Z R G B ERROR TRACK[] as IMAGE_ID POINT2D_IDX"]
+    elements = _elements(model)
     for number, (xyz, rgb, track) in enumerate(_tracks(model.points), start=1):
         numbers = (number, *xyz, *rgb, _UNKNOWN_ERROR_PX, *elements[track].ravel().tolist())
         points.append(" ".join(map(repr, numbers)))
