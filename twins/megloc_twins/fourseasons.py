@@ -163,9 +163,7 @@ def _write_recording(
     for index, moment in enumerate(keyframes):
         left = moment.frames[0]
         points = _cloud_of(tracks, 2 * index, left.cam_from_world)
-        lines = _keyframe_lines(
-            slam, moment, left.camera, points, images[left.name][0], exposure_ms
-        )
+        lines = _keyframe_lines(slam, moment, points, images[left.name][0], exposure_ms)
         write_lines(folder / "KeyFrameData" / f"KeyFrame_{moment.timestamp}.txt", lines)
 
 
@@ -274,12 +272,12 @@ def _result_lines(slam: SlamFrames, moments: Iterable[Moment]) -> list[str]:
 def _keyframe_lines(
     slam: SlamFrames,
     moment: Moment,
-    camera: Camera,
     points: NDArray[np.float64],
     image: NDArray[np.uint8],
     exposure_ms: float,
 ) -> list[str]:
     """Of points float64 (P, 3): u and v in pixels, depth in metres; of a grey image (H, W)."""
+    camera = moment.frames[0].camera
     fx, fy, cx, cy = camera.params
     lines = [
         "# timestamp",

@@ -209,23 +209,16 @@ def _sky(
     return base * (1 - 0.5 * cover) + cover * base.mean() * np.float32(1.1) + haze
 
 
-def develop(
-    light: Float32,
-    lighting: Lighting,
-    supersampling: int,
-    *,
-    noise_seed: int,
-    bonnet_seed: int | None,
-) -> NDArray[np.uint8]:
-    """Image uint8 (H, W, 3) RGB of the samples' light (H * ss, W * ss, 3).
+def develop(light: Float32, frame: Frame, supersampling: int, seed: int) -> NDArray[np.uint8]:
+    """Image uint8 (H, W, 3) RGB of a frame's samples' light (H * ss, W * ss, 3).
 
-    ``noise_seed`` is the sensor's; ``bonnet_seed`` puts a car's bonnet in front, None none.
+    ``seed`` is that of the bonnet, where the frame shows one.
     """
-    height, width = light.shape[0] // supersampling, light.shape[1] // supersampling
+    lighting, width, height = frame.lighting, frame.camera.width, frame.camera.height
     if supersampling > 1:
         light = averaged(light, supersampling)
-    if bonnet_seed is not None:
-        cover, paint = bonnet(width, height, bonnet_seed)
+    if frame.bonnet:
+        cover, paint = bonnet(width, height, seed)
         lit = _rgb(lighting.sky) + np.float32(0.4) * _rgb(lighting.sun)
         lit = lit + np.float32(0.04) * _rgb(lighting.lamps)
         light = light * (1 - cover[..., None]) + paint * cover[..., None] * lit
@@ -235,7 +228,7 @@ def develop(
         haze = resized(blurred(averaged(np.minimum(signal, 4.0), 8), 3.0), width, height)
         signal = signal + np.float32(0.06) * haze
     signal = blurred(signal, lighting.blur_px)
-    rng = np.random.default_rng(noise_seed)
+    rng = np.random.default_rng(frame.noise_seed)
     deviation = np.sqrt(lighting.shot_noise * signal + lighting.read_noise**2)
     signal = signal + deviation * rng.standard_normal(signal.shape, dtype=np.float32)
     # a shoulder instead of a hard limit, then gamma 2
@@ -331,13 +324,7 @@ class PlaceRenderer:
             shadows=shadows,
             clouds=self._clouds,
         )
-        image = develop(
-            light,
-            lighting,
-            self._supersampling,
-            noise_seed=frame.noise_seed,
-            bonnet_seed=self._seed if frame.bonnet else None,
-        )
+        image = develop(light, frame, self._supersampling, self._seed)
         mask = _bonnet_cover(frame, self._seed) < _BONNET_COVERS
         depth_m = None
         if depth:

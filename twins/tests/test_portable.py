@@ -31,7 +31,7 @@ FIELDS = """
 import hashlib
 import numpy as np
 from megloc_twins.surfaces import build_atlas
-from megloc_twins.frames import day_lighting, looking_at, night_lighting
+from megloc_twins.frames import Frame, day_lighting, looking_at, night_lighting
 from megloc_twins.synthetic_kapture import SENSOR_FROM_RIG
 from megloc_twins.drawing import periodic_noise, smooth_noise
 from megloc_twins.options import stream
@@ -78,7 +78,8 @@ for look in (day, night):
         clouds=clouds,
     )
     digest(look.condition, seen.planes, seen.inverse_depth, colour, light)
-    digest(look.condition + " developed", develop(light, look, 2, noise_seed=1, bonnet_seed=None))
+    frame = Frame("f", "query", "", 0, 0, "s", grid.camera, pose, look, 1, bonnet=True)
+    digest(look.condition + " developed", develop(light, frame, 2, 0))
 """
 
 TWIN = """
