@@ -104,14 +104,8 @@ class AachenTwin(SyntheticDataset[AachenTwinOptions]):
         frames = build_aachen_frames(options)
         mapping = in_frame(frames.mapping(), OFFICIAL_FROM_WORLD)
         database = mapping[: len(frames.database)]
-        drawn = render_map_and_queries(
-            options.world(),
-            frames.mapping(),
-            [*frames.queries(), *frames.unlisted],
-            root / "images_upright",
-            model_features=options.model_features,
-            work=work,
-        )
+        others, images = [*frames.queries(), *frames.unlisted], root / "images_upright"
+        drawn = render_map_and_queries(options, frames.mapping(), others, images, work)
         _write_nvm_model(models, options, database, drawn)
         if options.model_features:
             by_name = {frame.name: frame for frame in database}
@@ -139,8 +133,7 @@ class AachenFrames:
     database: tuple[Frame, ...]  # map images with a camera each, in the order of the NVM
     sequences: tuple[Frame, ...]  # map images, those of a sequence with one sensor
     day: tuple[Frame, ...]
-    night: tuple[Frame, ...]
-    additional_night: tuple[Frame, ...]
+    night: tuple[Frame, ...]  # v1.0's, then those that v1.1 adds
     unlisted: tuple[Frame, ...]  # below ``query/``, but in no list
 
     def mapping(self) -> tuple[Frame, ...]:
@@ -149,7 +142,7 @@ class AachenFrames:
 
     def queries(self) -> tuple[Frame, ...]:
         """All queries that are in a list."""
-        return self.day + self.night + self.additional_night
+        return self.day + self.night
 
 
 def build_aachen_frames(options: AachenTwinOptions) -> AachenFrames:
@@ -178,8 +171,8 @@ def build_aachen_frames(options: AachenTwinOptions) -> AachenFrames:
         database=ordered(database, "nvm"),
         sequences=tuple(sequences),
         day=ordered(day[:num_day], "day"),
-        night=ordered(night[: options.night_queries], "night"),
-        additional_night=ordered(night[options.night_queries :], "additional"),
+        night=ordered(night[: options.night_queries], "night")
+        + ordered(night[options.night_queries :], "additional"),
         unlisted=tuple(day[num_day:]),
     )
 
@@ -303,7 +296,7 @@ def _write_nvm_model(
 ) -> None:
     """v1.0's model, which knows only focal lengths, and the list that has the whole cameras."""
     rng = stream(options.seed, "aachen", "points", "1.0")
-    points = drawn.points(frames, points_per_frame=options.points_per_image, rng=rng)
+    points = drawn.points(frames, rng)
     if not drawn.features:
         # as if the images had more features than see a point
         points = replace(points, feature_ids=3 * points.feature_ids + 1)
@@ -328,14 +321,13 @@ def _write_colmap_model(
             ColmapImage(image_id, frame.name, camera_ids[frame.sensor_id], frame.cam_from_world)
             for image_id, frame in zip(image_ids, frames, strict=False)
         ),
-        points=drawn.points(frames, points_per_frame=options.points_per_image, rng=rng),
+        points=drawn.points(frames, rng),
     )
     write_colmap_binary(folder, model)
 
 
 def _write_lists(folder: Path, frames: AachenFrames) -> None:
-    night = frames.night + frames.additional_night
-    for when, some in (("day", frames.day), ("night", night)):
+    for when, some in (("day", frames.day), ("night", frames.night)):
         cameras = {frame.name: frame.camera for frame in some}
         path = folder / f"{when}_time_queries_with_intrinsics.txt"
         write_query_list(path, cameras, last_line_ends=False)

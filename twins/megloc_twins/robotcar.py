@@ -121,14 +121,8 @@ class RobotCarTwin(SyntheticDataset[RobotCarTwinOptions]):
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
         layout, options = Layout(Path(root)), self.options
         frames = build_robotcar_frames(options)
-        drawn = render_map_and_queries(
-            options.world(),
-            frames.mapping,
-            frames.queries,
-            layout.images,
-            model_features=options.model_features,
-            work=work,
-        )
+        images = layout.images
+        drawn = render_map_and_queries(options, frames.mapping, frames.queries, images, work)
         registered = in_frame(_registered(frames.mapping), OFFICIAL_FROM_WORLD)
         queries = in_frame(frames.queries, OFFICIAL_FROM_WORLD)
         _write_models(layout, options, registered, drawn)
@@ -296,7 +290,7 @@ def _write_models(
         positions = np.flatnonzero(places == place).tolist()
         here = [frames[position] for position in positions]
         rng = stream(options.seed, "robotcar", "points", place)
-        points = drawn.points(here, points_per_frame=options.points_per_image, rng=rng)
+        points = drawn.points(here, rng)
         write_colmap_text(layout.individual_model(_location(place)), _colmap_model(here, points))
         own = np.array(positions, np.int32)
         parts.append(replace(points, image_ids=own[points.image_ids]))

@@ -29,7 +29,7 @@ from megloc_kapture.matching.nearest_neighbours import NearestNeighbourOptions, 
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, LocalFeatures
 from megloc_twins.frames import Frame
-from megloc_twins.options import JPEG_QUALITY, SyntheticWorldOptions
+from megloc_twins.options import JPEG_QUALITY, ModelTwinOptions
 from megloc_twins.rasterization import intrinsics, project, sample_grid
 from megloc_twins.render import RenderedFrame, render_frames
 
@@ -251,35 +251,32 @@ class MapFrames:
 
     depths_m: Depths
     features: Features
+    points_per_image: int
 
-    def points(
-        self, frames: Sequence[Frame], *, points_per_frame: int, rng: np.random.Generator
-    ) -> SparsePoints:
+    def points(self, frames: Sequence[Frame], rng: np.random.Generator) -> SparsePoints:
         """:func:`sift_points` where there are features, else :func:`exact_tracks`."""
         if self.features:
             return sift_points(frames, self.features, self.depths_m)
-        return exact_tracks(frames, self.depths_m, points_per_frame=points_per_frame, rng=rng)
+        count = self.points_per_image
+        return exact_tracks(frames, self.depths_m, points_per_frame=count, rng=rng)
 
 
 def render_map_and_queries(
-    world: SyntheticWorldOptions,
+    options: ModelTwinOptions,
     mapping: Sequence[Frame],
     others: Sequence[Frame],
     images: Path,
-    *,
-    model_features: bool,
     work: Work,
 ) -> MapFrames:
-    """Draw all frames and write them below ``images`` under their names.
-
-    The depth of ``mapping`` is returned, with ``model_features`` their SIFT as well.
-    """
+    """Draw all frames and write them below ``images`` under their names."""
     names = frozenset(frame.name for frame in mapping)
-    finish = partial(_write, images, names if model_features else frozenset())
-    drawn = render_frames(world, [*mapping, *others], finish, with_depth=names, work=work)
+    finish = partial(_write, images, names if options.model_features else frozenset())
+    frames = [*mapping, *others]
+    drawn = render_frames(options.world(), frames, finish, with_depth=names, work=work)
     return MapFrames(
         {name: depth for name, (depth, _) in drawn.items() if depth is not None},
         {name: features for name, (_, features) in drawn.items() if features is not None},
+        options.points_per_image,
     )
 
 
