@@ -24,7 +24,7 @@ DRIVES = {"num_places": 2, "map_keyframes": 6, "winter_keyframes": 3, "dusk_keyf
 CUTOUTS = {"cutout_width": 64, "cutout_height": 48, "query_width": 96, "query_height": 72}
 SMALL: dict[str, SyntheticDataset[Any]] = {
     "synthetic": SyntheticKapture(
-        SyntheticWorldOptions(**PLACES, **SIZE, stations_per_place=4, depth=True, masks=True)
+        SyntheticWorldOptions(**PLACES, **SIZE, stations_per_place=6, depth=True, masks=True)
     ),
     "aachen": AachenTwin(
         AachenTwinOptions(**CITY, **SIZE, stations_per_place=5, points_per_image=60)

@@ -30,7 +30,7 @@ import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.
 
 LAYOUTS = ("aachen", "robotcar", "4seasons", "inloc")
 COUNTS = {
-    "synthetic": {"places": 2, "mapping images": 24, "query images": 4},
+    "synthetic": {"places": 2, "mapping images": 36, "query images": 4},
     "aachen": {"places": 2, "mapping images": 36, "query images": 8},
     "robotcar": {"places": 2, "mapping images": 16, "query images": 36},
     "4seasons": {"places": 2, "mapping images": 24, "query images": 20},

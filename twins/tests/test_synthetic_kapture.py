@@ -82,7 +82,7 @@ def test_poses_of_the_map_are_those_of_the_rig(world: SyntheticWorld) -> None:
 
 
 def test_the_same_options_give_the_same_world_and_others_another() -> None:
-    # of fewer stations hardly a query is supported, and many are tried
+    # fewer stations support hardly a query, so that many are tried
     size = {"width": 160, "height": 120, "stations_per_place": 9}
     options = SyntheticWorldOptions(num_places=1, day_queries=2, night_queries=1, **size)
 
