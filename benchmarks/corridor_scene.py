@@ -25,7 +25,7 @@ from megloc_twins.indoor_rooms import (
 )
 from megloc_twins.inloc import phone_camera
 from megloc_twins.moving_objects import FloorPlan, moving_object_recipes
-from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.options import JPEG_QUALITY, SyntheticWorldOptions, stream
 from megloc_twins.rasterization import (
     NO_SURFACE,
     depth_map,
@@ -215,12 +215,7 @@ def _shot(
     rng: np.random.Generator,
 ) -> Frame:
     query = role == "query"
-    look = lamp_lighting(
-        rng,
-        noise=3.0 if query else 1.0,
-        noise_seed=noise_seed(seed, name),
-        spread=0.15 if query else 0.05,
-    )
+    look = lamp_lighting(rng, noise=3.0 if query else 1.0, spread=0.15 if query else 0.05)
     return Frame(
         name=name,
         role="query" if query else "mapping",
@@ -231,6 +226,7 @@ def _shot(
         camera=_CAMERA,
         cam_from_world=cam_from_place @ room.place.place_from_world,
         lighting=look,
+        noise_seed=noise_seed(seed, name),
     )
 
 
@@ -266,6 +262,6 @@ def _depth_record(name: str) -> str:
 
 def _write_view(root: Path, shot: Frame, view: RenderedFrame) -> None:
     folder = root / shot.role / "sensors" / "records_data"
-    write_image(folder / shot.name, view.image, jpeg_quality=92)
+    write_image(folder / shot.name, view.image, jpeg_quality=JPEG_QUALITY)
     if view.depth_m is not None:
         write_depth_map(folder / _depth_record(shot.name), view.depth_m)

@@ -12,19 +12,20 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from megloc_twins.frames import Frame, kapture_records, noise_seed
+from megloc_twins.frames import kapture_records, noise_seed
 from megloc_twins.options import SyntheticWorldOptions
-from megloc_twins.render import RenderedFrame, render_frames
+from megloc_twins.render import render_frames
 from megloc_twins.synthetic_kapture import (
+    SENSOR_FROM_RIG,
     SyntheticWorld,
     build_world,
     depth_name,
     mapping_data,
+    write_files,
     write_side_tables,
 )
 
 from megloc_kapture.io.files import link_images
-from megloc_kapture.io.images import write_depth_map, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.tables import STATUS_FILE, QueryStatus, write_status
 from megloc_kapture.values import RigidTransform
@@ -81,7 +82,7 @@ def write_scene(root: Path, scene: Scene) -> None:
         world = _queries_beside(world)
     names = [shot.name for shot in world.frames()]
     render_frames(
-        world.options, world.frames(), partial(_write_view, root, world.options), with_depth=names
+        world.options, world.frames(), partial(write_files, root, world.options), with_depth=names
     )
     write_sensors(root / "mapping", mapping_data(world))
     write_sensors(root / "query", _with_depth(kapture_records(world.queries, poses=False)))
@@ -105,10 +106,8 @@ def _stepped(world: SyntheticWorld, steps: int) -> SyntheticWorld:
                     shot,
                     name=name,
                     timestamp=timestamp,
-                    cam_from_world=world.sensor_from_rig[shot.sensor_id] @ pose,
-                    lighting=replace(
-                        shot.lighting, noise_seed=noise_seed(world.options.seed, name)
-                    ),
+                    cam_from_world=SENSOR_FROM_RIG[shot.sensor_id] @ pose,
+                    noise_seed=noise_seed(world.options.seed, name),
                 )
             )
     return replace(world, mapping=tuple(mapping), rig_from_world=rig_from_world)
@@ -123,20 +122,6 @@ def _queries_beside(world: SyntheticWorld) -> SyntheticWorld:
         for query, near in zip(world.queries, world.mapping[1::every], strict=False)
     ]
     return replace(world, queries=tuple(queries))
-
-
-def _write_view(
-    root: Path, options: SyntheticWorldOptions, shot: Frame, view: RenderedFrame
-) -> None:
-    if view.depth_m is None:
-        raise ValueError(f"{shot.name} was drawn without depth")
-    sensors = root / shot.role / "sensors"
-    records = sensors / "records_data"
-    write_image(records / shot.name, view.image, jpeg_quality=options.jpeg_quality)
-    write_depth_map(records / depth_name(shot.name), view.depth_m)
-    if not view.mask.all():
-        mask = np.where(view.mask, 255, 0).astype(np.uint8)
-        write_image(sensors / "masks" / f"{shot.name}.png", mask)
 
 
 def _with_depth(data: KaptureData) -> KaptureData:

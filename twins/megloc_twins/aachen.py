@@ -8,13 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from operator import attrgetter
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from megloc_kapture.datasets.aachen.layout import Layout
 from megloc_kapture.datasets.formats.colmap_model import ColmapImage, ColmapModel
@@ -34,7 +32,6 @@ from megloc_twins.moving_objects import place_moving_objects
 from megloc_twins.options import (
     ModelTwinOptions,
     SyntheticDataset,
-    SyntheticWorldOptions,
     shuffled,
     stream,
     write_lines,
@@ -56,48 +53,41 @@ OFFICIAL_FROM_WORLD = settled_pose(
 NUM_UNLISTED = 2  # query images on disk that no list names
 _PORTRAIT_SHARE = 1 / 6
 _YAWS_DEG = (0.0, 62.0, -62.0)  # photographs taken from about the same spot
-_DEVICES = ("nexus4", "milestone", "nexus4", "milestone", "nexus5x")
+_DEVICES = ("nexus4", "milestone", "nexus4", "milestone", "nexus5x")  # by day, by turns
+_FILES = {  # what they call an image: hour, minute, second, a number of its own
+    "day/nexus4": "IMG_20140520_{:02d}{:02d}{:02d}.jpg",
+    "day/milestone": "2011-12-17_{:02d}-{:02d}-{:02d}_{}.jpg",
+    "day/nexus5x": "IMG_20160914_{:02d}{:02d}{:02d}.jpg",
+    "night/nexus5x": "IMG_20161227_{:02d}{:02d}{:02d}.jpg",
+    "night/nexus5x_additional_night": "IMG_20180115_{:02d}{:02d}{:02d}.jpg",
+}
 _WRONG_IMAGE = 1228  # db/1228.jpg has a wrong pose in the published model; ours have none
 
 
 class AachenTwinOptions(ModelTwinOptions):
     """Contents of Aachen's twin; the defaults are what ``make eval`` localizes in."""
 
-    version: Literal["1.0", "1.1"] = Field(
-        default="1.1",
-        description="1.1 adds sequences, a COLMAP model and more night queries to 1.0",
-    )
     num_places: int = Field(default=4, ge=1, description="places, at least 60 m apart")
     stations_per_place: int = Field(
         default=8, ge=3, description="spots in each place where three photographs are taken"
     )
     sequence_images: int = Field(
-        default=5, ge=2, description="images of the sequence through each place (v1.1)"
+        default=5, ge=2, description="images of the sequence through each place"
     )
     day_queries: int = Field(default=24, ge=1, description="query images by day, all places")
     night_queries: int = Field(default=16, ge=1, description="query images at night, all places")
     additional_night_queries: int = Field(
-        default=8, ge=1, description="more query images at night (v1.1)"
+        default=8, ge=1, description="query images at night that v1.0 does not have"
     )
     width: int = Field(default=640, ge=64, description="image width in px; a portrait's height")
     height: int = Field(default=480, ge=48, description="image height in px")
 
-    @field_validator("version", mode="before")
-    @classmethod
-    def _as_text(cls, version: Any) -> Any:
-        # on the command line and in TOML 1.1 is a number
-        return str(version) if isinstance(version, float) else version
-
-    def world(self) -> SyntheticWorldOptions:
-        """The rendered world this is a photograph album of."""
-        return self.rendered_world(self.num_places, self.width, self.height)
-
 
 class AachenTwin(SyntheticDataset[AachenTwinOptions]):
-    """Aachen Day-Night as it is published, with its truth.
+    """Aachen Day-Night v1.1 as it is published, which holds v1.0, with its truth.
 
-    ``images_upright/``, ``3D-models/`` (NVM, its list and ``database_intrinsics.txt``; for v1.1
-    also ``aachen_v_1_1/`` with a binary COLMAP model), ``queries/`` and ``ground_truth/``. Quirks
+    ``images_upright/``, ``3D-models/`` (v1.0's NVM, its list and ``database_intrinsics.txt``;
+    ``aachen_v_1_1/`` with a binary COLMAP model), ``queries/`` and ``ground_truth/``. Quirks
     of the original: database images are numbered without order and the NVM has an order of its
     own, features of the NVM are not numbered densely, v1.1's night list stands in the place of
     v1.0's, lists end without a line end, and some images below ``query/`` are in no list. With
@@ -114,20 +104,13 @@ class AachenTwin(SyntheticDataset[AachenTwinOptions]):
         frames = build_aachen_frames(options)
         mapping = in_frame(frames.mapping(), OFFICIAL_FROM_WORLD)
         database = mapping[: len(frames.database)]
-        drawn = render_map_and_queries(
-            options.world(),
-            frames.mapping(),
-            [*frames.queries(), *frames.unlisted],
-            root / "images_upright",
-            model_features=options.model_features,
-            work=work,
-        )
+        others, images = [*frames.queries(), *frames.unlisted], root / "images_upright"
+        drawn = render_map_and_queries(options, frames.mapping(), others, images, work)
         _write_nvm_model(models, options, database, drawn)
         if options.model_features:
-            by_name = {frame.name: frame for frame in sorted(database, key=attrgetter("name"))}
+            by_name = {frame.name: frame for frame in database}
             write_sift_database(Layout(root).feature_database, by_name, drawn.features)
-        if options.version == "1.1":
-            _write_colmap_model(models / "aachen_v_1_1", options, mapping, drawn)
+        _write_colmap_model(models / "aachen_v_1_1", options, mapping, drawn)
         _write_lists(root / "queries", frames)
         queries = in_frame(frames.queries(), OFFICIAL_FROM_WORLD)
         # nothing was taken at the same time
@@ -148,10 +131,9 @@ class AachenFrames:
     """All images of the twin, queries in the order of the lists; poses in the world's frame."""
 
     database: tuple[Frame, ...]  # map images with a camera each, in the order of the NVM
-    sequences: tuple[Frame, ...]  # map images of v1.1, those of a sequence with one sensor
+    sequences: tuple[Frame, ...]  # map images, those of a sequence with one sensor
     day: tuple[Frame, ...]
-    night: tuple[Frame, ...]
-    additional_night: tuple[Frame, ...]
+    night: tuple[Frame, ...]  # v1.0's, then those that v1.1 adds
     unlisted: tuple[Frame, ...]  # below ``query/``, but in no list
 
     def mapping(self) -> tuple[Frame, ...]:
@@ -160,26 +142,24 @@ class AachenFrames:
 
     def queries(self) -> tuple[Frame, ...]:
         """All queries that are in a list."""
-        return self.day + self.night + self.additional_night
+        return self.day + self.night
 
 
 def build_aachen_frames(options: AachenTwinOptions) -> AachenFrames:
     """Choose all images of the twin; the same options give the same images."""
     world = options.world()
     numbers = _database_numbers(options)
-    added = options.version == "1.1"
     database: list[Frame] = []
     sequences: list[Frame] = []
     day: list[Frame] = []
     night: list[Frame] = []
     num_day = options.day_queries
-    num_night = options.night_queries + options.additional_night_queries * added
+    num_night = options.night_queries + options.additional_night_queries
     for index in range(options.num_places):
         place = build_place(world, index)
         album = _photographs(options, place, numbers[len(database) :])
         database += album
-        if added:
-            sequences += _sequence(options, place)
+        sequences += _sequence(options, place)
         day += query_frames(world, place, album, "day", num_day + NUM_UNLISTED)
         night += query_frames(world, place, album, "night", num_night)
 
@@ -191,8 +171,8 @@ def build_aachen_frames(options: AachenTwinOptions) -> AachenFrames:
         database=ordered(database, "nvm"),
         sequences=tuple(sequences),
         day=ordered(day[:num_day], "day"),
-        night=ordered(night[: options.night_queries], "night"),
-        additional_night=ordered(night[options.night_queries :], "additional"),
+        night=ordered(night[: options.night_queries], "night")
+        + ordered(night[options.night_queries :], "additional"),
         unlisted=tuple(day[num_day:]),
     )
 
@@ -259,7 +239,6 @@ def _map_frame(
 ) -> Frame:
     """An image, its and its sensor's name, taken by hand from ``at`` (place's frame, metres)."""
     pitch, roll = (float(a) for a in rng.normal(0.02, 0.03, 2))
-    seed = noise_seed(options.seed, names[0])
     return Frame(
         name=names[0],
         role="mapping",
@@ -269,7 +248,8 @@ def _map_frame(
         sensor_id=names[1],
         camera=camera,
         cam_from_world=looking_at(at, yaw, pitch, roll) @ place.place_from_world,
-        lighting=day_lighting(rng, sun, overcast=0.15, noise_seed=seed),
+        lighting=day_lighting(rng, sun, overcast=0.15),
+        noise_seed=noise_seed(options.seed, names[0]),
         moving_objects=place_moving_objects(place.plan, rng, options.world().moving_objects, at),
     )
 
@@ -299,34 +279,16 @@ def _as_telephones(
     for number, frame in enumerate(sorted(frames, key=lambda frame: frame.timestamp)):
         focal, _, _, k = frame.camera.params
         camera = _simple_radial(frame.camera.width, frame.camera.height, focal, k)
-        name = _day_name(number) if condition == "day" else _night_name(number, options)
+        if condition == "day":
+            folder, first_hour = f"day/{_DEVICES[number % len(_DEVICES)]}", 14
+        else:
+            added = "_additional_night" if number >= options.night_queries else ""
+            folder, first_hour = f"night/nexus5x{added}", 18
+        second = 37 * number  # each was taken at another time
+        clock = first_hour + second // 3600, second // 60 % 60, second % 60
+        name = f"query/{folder}/{_FILES[folder].format(*clock, 257 + number)}"
         renamed.append(replace(frame, name=name, camera=camera))
     return renamed
-
-
-def _day_name(number: int) -> str:
-    device = _DEVICES[number % len(_DEVICES)]
-    hour, minute, second = _clock(number)
-    if device == "milestone":
-        file = f"2011-12-17_{hour:02d}-{minute:02d}-{second:02d}_{257 + number}.jpg"
-    else:
-        date = {"nexus4": "20140520", "nexus5x": "20160914"}[device]
-        file = f"IMG_{date}_{hour:02d}{minute:02d}{second:02d}.jpg"
-    return f"query/day/{device}/{file}"
-
-
-def _night_name(number: int, options: AachenTwinOptions) -> str:
-    folder, date = "nexus5x", "20161227"
-    if number >= options.night_queries:
-        folder, date = "nexus5x_additional_night", "20180115"
-    hour, minute, second = _clock(number)
-    return f"query/night/{folder}/IMG_{date}_{hour + 4:02d}{minute:02d}{second:02d}.jpg"
-
-
-def _clock(number: int) -> tuple[int, int, int]:
-    """When the query of a number was taken: each at another time."""
-    second = 37 * number
-    return 14 + second // 3600, second // 60 % 60, second % 60
 
 
 def _write_nvm_model(
@@ -334,7 +296,7 @@ def _write_nvm_model(
 ) -> None:
     """v1.0's model, which knows only focal lengths, and the list that has the whole cameras."""
     rng = stream(options.seed, "aachen", "points", "1.0")
-    points = drawn.points(frames, points_per_frame=options.points_per_image, rng=rng)
+    points = drawn.points(frames, rng)
     if not drawn.features:
         # as if the images had more features than see a point
         points = replace(points, feature_ids=3 * points.feature_ids + 1)
@@ -359,14 +321,13 @@ def _write_colmap_model(
             ColmapImage(image_id, frame.name, camera_ids[frame.sensor_id], frame.cam_from_world)
             for image_id, frame in zip(image_ids, frames, strict=False)
         ),
-        points=drawn.points(frames, points_per_frame=options.points_per_image, rng=rng),
+        points=drawn.points(frames, rng),
     )
     write_colmap_binary(folder, model)
 
 
 def _write_lists(folder: Path, frames: AachenFrames) -> None:
-    night = frames.night + frames.additional_night
-    for when, some in (("day", frames.day), ("night", night)):
+    for when, some in (("day", frames.day), ("night", frames.night)):
         cameras = {frame.name: frame.camera for frame in some}
         path = folder / f"{when}_time_queries_with_intrinsics.txt"
         write_query_list(path, cameras, last_line_ends=False)

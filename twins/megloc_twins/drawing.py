@@ -14,9 +14,27 @@ from megloc_twins.portable import exp, resized
 Field2D = NDArray[np.float32]
 
 Rgb = NDArray[np.uint8]
+Box = tuple[int, int, int, int]  # x0, y0, x1, y1, texels
 Colour = NDArray[np.float32]  # (3,), 0..255
 Picture = NDArray[np.float32]  # (H, W, 3), 0..255
 TILE = 512  # texels; the period of a material
+_FINE = 16  # OpenCV's drawing functions take positions in parts of a texel
+_SMOOTH = cv2.LINE_AA, 4  # the last arguments of those: the edges' kind, bits of the parts
+_MATERIALS = {  # colour, and the least factor on each of its channels
+    "brick": ((150, 84, 66), 0.8),
+    "stone": ((172, 160, 136), 0.85),
+    "plaster": ((196, 176, 138), 0.75),
+    "paving": ((142, 138, 130), 0.9),
+    "asphalt": ((104, 104, 106), 1.0),
+}
+_STAINS = {"stone": (0.07, 24, 2), "plaster": (0.08, 64, 3), "asphalt": (0.14, 24, 2)}
+# rows and columns of blocks in a tile, every second row shifted by half a block; spread of their
+# tones; width of the joints, texels, and their grey
+_MASONRY: dict[str, tuple[int, int, float, float, float]] = {
+    "brick": (30, 12, 0.16, 1.2, 168.0),
+    "stone": (12, 6, 0.12, 1.5, 92.0),
+    "paving": (16, 16, 0.14, 1.6, 70.0),
+}
 
 
 def smooth_noise(
@@ -76,14 +94,9 @@ def cv_colour(colour: Colour) -> tuple[float, float, float]:
 
 
 def draw_glyphs(
-    rng: np.random.Generator,
-    image: Rgb,
-    box: tuple[int, int, int, int],
-    colour: Colour,
-    *,
-    rows: int,
+    rng: np.random.Generator, image: Rgb, box: Box, colour: Colour, *, rows: int
 ) -> None:
-    """Fill ``box`` (x0, y0, x1, y1 texels) with lines of random letter-like strokes, in place."""
+    """Fill ``box`` with lines of random letter-like strokes, in place."""
     x0, y0, x1, y1 = box
     line = (y1 - y0) / rows
     size = 0.72 * line
@@ -99,16 +112,9 @@ def draw_glyphs(
             nodes = np.array([[i, j] for j in range(3) for i in range(2)], np.float32)
             picks = rng.permutation(6)[: int(rng.integers(3, 6))]
             points = nodes[picks] * (0.55 * size, 0.5 * size) + (x, y)
-            stroke = np.round(points * 16).astype(np.int32)
-            cv2.polylines(
-                image,
-                [stroke],
-                bool(rng.random() < 0.3),
-                cv_colour(colour),
-                thickness,
-                cv2.LINE_AA,
-                4,
-            )
+            stroke = np.round(points * _FINE).astype(np.int32)
+            closed = bool(rng.random() < 0.3)
+            cv2.polylines(image, [stroke], closed, cv_colour(colour), thickness, *_SMOOTH)
             x += 0.85 * size
 
 
@@ -119,33 +125,21 @@ def draw_shapes(rng: np.random.Generator, image: Rgb, count: int) -> None:
     for _ in range(count):
         kind = int(rng.integers(0, 4))
         colour = cv_colour(random_colour(rng, 10, 245))
-        center = (int(rng.uniform(0, width) * 16), int(rng.uniform(0, height) * 16))
+        center = (int(rng.uniform(0, width) * _FINE), int(rng.uniform(0, height) * _FINE))
         radius = rng.uniform(0.06, 0.3) * extent
-        if kind == 0:
-            cv2.circle(image, center, int(radius * 16), colour, -1, cv2.LINE_AA, 4)
-        elif kind == 1:
-            cv2.circle(
-                image, center, int(radius * 16), colour, max(1, int(radius / 4)), cv2.LINE_AA, 4
-            )
+        if kind < 2:
+            thickness = max(1, int(radius / 4)) if kind else -1
+            cv2.circle(image, center, int(radius * _FINE), colour, thickness, *_SMOOTH)
         elif kind == 2:
             angles = np.sort(rng.uniform(0, 2 * np.pi, int(rng.integers(3, 6))))
-            ring = np.stack([np.cos(angles), np.sin(angles)], 1) * radius * 16 * 1.4
+            ring = np.stack([np.cos(angles), np.sin(angles)], 1) * radius * _FINE * 1.4
             points = np.round(ring + center).astype(np.int32)
-            cv2.fillPoly(image, [points], colour, cv2.LINE_AA, 4)
+            cv2.fillPoly(image, [points], colour, *_SMOOTH)
         else:
             angle = rng.uniform(0, np.pi)
-            along = np.array([np.cos(angle), np.sin(angle)]) * extent * 12
-            start = np.round(center - along).astype(int)
-            stop = np.round(center + along).astype(int)
-            cv2.line(
-                image,
-                (int(start[0]), int(start[1])),
-                (int(stop[0]), int(stop[1])),
-                colour,
-                max(1, int(radius * 0.3)),
-                cv2.LINE_AA,
-                4,
-            )
+            along = np.array([np.cos(angle), np.sin(angle)]) * extent * (0.75 * _FINE)
+            start, stop = np.round([center - along, center + along]).astype(int).tolist()
+            cv2.line(image, start, stop, colour, max(1, int(radius * 0.3)), *_SMOOTH)
 
 
 def draw_cracks(rng: np.random.Generator, image: Rgb, count: int) -> None:
@@ -154,22 +148,14 @@ def draw_cracks(rng: np.random.Generator, image: Rgb, count: int) -> None:
     for _ in range(count):
         steps = rng.normal(0, 5, (int(rng.integers(10, 40)), 2)) + rng.normal(0, 3, 2)
         start = rng.uniform((0, 0), (width, height))
-        points = np.round((start + np.cumsum(steps, 0)) * 16).astype(np.int32)
+        points = np.round((start + np.cumsum(steps, 0)) * _FINE).astype(np.int32)
         tone = float(rng.uniform(30, 80))
-        cv2.polylines(image, [points], False, (tone, tone, tone), 1, cv2.LINE_AA, 4)
+        cv2.polylines(image, [points], False, (tone, tone, tone), 1, *_SMOOTH)
 
 
-def _blocks(
-    rng: np.random.Generator,
-    *,
-    base: Colour,
-    rows: int,
-    cols: int,
-    spread: float,
-    joint: float,
-    joint_colour: Colour,
-) -> Picture:
-    """Masonry of ``rows`` x ``cols`` blocks per tile, every second row shifted by half a block."""
+def _blocks(rng: np.random.Generator, base: Colour, kind: str) -> Picture:
+    """Masonry of a kind."""
+    rows, cols, spread, joint, joint_grey = _MASONRY[kind]
     y, x = np.mgrid[0:TILE, 0:TILE].astype(np.float32)
     v = (y + 0.5) / TILE * rows
     row = np.floor(v).astype(int)
@@ -183,38 +169,25 @@ def _blocks(
     mortar = np.clip(joint - edge + 0.5, 0, 1)[..., None]
     blocks = base * (1 + tone[row, col][..., None] + tint[row, col])
     blocks = shade(blocks, 1 + 0.10 * periodic_noise(rng, TILE, cell=40, octaves=2))
-    return blocks * (1 - mortar) + joint_colour * mortar
+    return blocks * (1 - mortar) + np.float32(joint_grey) * mortar
 
 
 @lru_cache(maxsize=32)
 def material_tile(kind: str, seed: int) -> Picture:
     """A seamless tile (TILE, TILE, 3) float32 of the material, RGB 0..255; not to be written to."""
     rng = stream(seed, "material", kind)
-    if kind == "brick":
-        base = np.array([150, 84, 66], np.float32) * rng.uniform(0.8, 1.1, 3).astype(np.float32)
-        grey = np.full(3, 168, np.float32)
-        tile = _blocks(rng, base=base, rows=30, cols=12, spread=0.16, joint=1.2, joint_colour=grey)
-    elif kind == "stone":
-        base = np.array([172, 160, 136], np.float32) * rng.uniform(0.85, 1.1, 3).astype(np.float32)
-        dark = np.full(3, 92, np.float32)
-        tile = _blocks(rng, base=base, rows=12, cols=6, spread=0.12, joint=1.5, joint_colour=dark)
-        tile = shade(tile, 1 + 0.07 * periodic_noise(rng, TILE, cell=24, octaves=2))
-    elif kind == "plaster":
-        base = np.array([196, 176, 138], np.float32) * rng.uniform(0.75, 1.1, 3).astype(np.float32)
-        tile = np.broadcast_to(base, (TILE, TILE, 3))
-        tile = shade(tile, 1 + 0.08 * periodic_noise(rng, TILE, cell=64, octaves=3))
+    colour, darkest = _MATERIALS[kind]
+    base = np.array(colour, np.float32)
+    if darkest < 1:
+        base = base * rng.uniform(darkest, 1.1, 3).astype(np.float32)
+    flat = np.broadcast_to(base, (TILE, TILE, 3))
+    tile = _blocks(rng, base, kind) if kind in _MASONRY else flat
+    if kind in _STAINS:
+        strength, cell, octaves = _STAINS[kind]  # the coarsest octave in texels
+        tile = shade(tile, 1 + strength * periodic_noise(rng, TILE, cell=cell, octaves=octaves))
+    if kind == "plaster":
         pits = np.clip(periodic_noise(rng, TILE, cell=28, octaves=2) - 1.6, 0, 1)
         tile = shade(tile, 1 - 0.35 * pits)
-    elif kind == "paving":
-        base = np.array([142, 138, 130], np.float32) * rng.uniform(0.9, 1.1, 3).astype(np.float32)
-        dark = np.full(3, 70, np.float32)
-        tile = _blocks(rng, base=base, rows=16, cols=16, spread=0.14, joint=1.6, joint_colour=dark)
-    elif kind == "asphalt":
-        base = np.array([104, 104, 106], np.float32)
-        tile = np.broadcast_to(base, (TILE, TILE, 3))
-        tile = shade(tile, 1 + 0.14 * periodic_noise(rng, TILE, cell=24, octaves=2))
-    else:
-        raise ValueError(f"no material {kind!r}")
     return np.ascontiguousarray(tile, dtype=np.float32)
 
 

@@ -22,20 +22,21 @@ from megloc_kapture.datasets.formats.sparse_points import SparsePoints
 from megloc_kapture.geometry.poses import earth_from_enu, geodetic
 from megloc_kapture.io.images import write_image
 from megloc_kapture.stages.work import HERE, Work
-from megloc_kapture.values import Camera, Options, RigidTransform
+from megloc_kapture.values import Camera, RigidTransform
 from megloc_twins.fourseasons_drive import (
     CAM1_FROM_CAM0,
     Drive,
     Moment,
-    SeasonBuilder,
     drive_moments,
     stereo_camera,
+    winter_place,
 )
 from megloc_twins.frames import Frame, write_truth
-from megloc_twins.options import SyntheticDataset, SyntheticWorldOptions, stream, write_lines
+from megloc_twins.options import SyntheticDataset, TwinOptions, stream, write_lines
 from megloc_twins.portable import settled, settled_pose
 from megloc_twins.render import RenderedFrame, render_frames
 from megloc_twins.sparse_models import exact_tracks
+from megloc_twins.squares import build_place
 
 REFERENCE = "recording_2020-06-18_10-12-33"
 WINTER = "recording_2021-01-15_13-04-17"
@@ -65,10 +66,9 @@ def _settled_earth_from_enu(
 EARTH_FROM_WORLD = _settled_earth_from_enu(48.1861, 11.6197, 540.0)
 
 
-class FourSeasonsTwinOptions(Options):
+class FourSeasonsTwinOptions(TwinOptions):
     """Contents of 4Seasons' twin."""
 
-    seed: int = Field(default=0, ge=0, description="every random choice hangs on it")
     num_places: int = Field(default=4, ge=1, description="places on the route")
     map_keyframes: int = Field(
         default=12, ge=3, description="keyframes of the map's recording in each place"
@@ -81,22 +81,16 @@ class FourSeasonsTwinOptions(Options):
     )
     width: int = Field(default=800, ge=64, description="image width in px")
     height: int = Field(default=400, ge=48, description="image height in px")
-    supersampling: int = Field(default=2, ge=1, le=4, description="samples per px and axis")
     cloud_points: int = Field(
         default=150, ge=0, description="pixels tried for each keyframe's point cloud"
     )
 
-    def world(self) -> SyntheticWorldOptions:
-        """The options of the world that is driven through."""
-        names = {"seed", "num_places", "width", "height", "supersampling"}
-        return SyntheticWorldOptions(**self.model_dump(include=names))
-
     def drives(self) -> tuple[Drive, Drive, Drive]:
         """The recordings, the map's first."""
         return (
-            Drive(REFERENCE, "summer", _start_of(REFERENCE), self.map_keyframes, "mapping", 0.1, 2),
-            Drive(WINTER, "winter", _start_of(WINTER), self.winter_keyframes, "query", 0.6, 8),
-            Drive(DUSK, "dusk", _start_of(DUSK), self.dusk_keyframes, "query", 0.9, 12),
+            Drive(REFERENCE, "summer", self.map_keyframes, "mapping", 0.1, 2),
+            Drive(WINTER, "winter", self.winter_keyframes, "query", 0.6, 8),
+            Drive(DUSK, "dusk", self.dusk_keyframes, "query", 0.9, 12),
         )
 
 
@@ -135,7 +129,6 @@ def _write_recording(
     root: Path, options: FourSeasonsTwinOptions, drive: Drive, moments: list[Moment], work: Work
 ) -> None:
     folder, exposure_ms = root / drive.name, _EXPOSURE_MS[drive.name]
-    season = SeasonBuilder(drive.season)
     published = drive.name != DUSK  # the poses of a challenge's test recording are withheld
     keyframes = [moment for moment in moments if moment.keyframe]
     # the odometry sees depth by stereo and by motion
@@ -145,11 +138,13 @@ def _write_recording(
         [frame for moment in moments for frame in moment.frames],
         partial(_write_files, root),
         with_depth=[frame.name for frame in seeing],
-        build=season,
-        sky_seed=season.sky_seed(options.world()),
+        build=winter_place if drive.season == "winter" else build_place,
+        sky_seed=drive.sky_seed(options.seed),
         work=work,
     )
-    write_lines(folder / "times.txt", _times_lines(moments, exposure_ms))
+    times = (moment.timestamp for moment in moments)  # most without images
+    rows = [f"{time} {time / 1e9:.10f} {exposure_ms:.10f}" for time in times]
+    write_lines(folder / "times.txt", rows)
     if not published:
         return
     slam = SlamFrames.drawn(options.seed, drive.name)
@@ -168,9 +163,7 @@ def _write_recording(
     for index, moment in enumerate(keyframes):
         left = moment.frames[0]
         points = _cloud_of(tracks, 2 * index, left.cam_from_world)
-        lines = _keyframe_lines(
-            slam, moment, left.camera, points, images[left.name][0], exposure_ms
-        )
+        lines = _keyframe_lines(slam, moment, points, images[left.name][0], exposure_ms)
         write_lines(folder / "KeyFrameData" / f"KeyFrame_{moment.timestamp}.txt", lines)
 
 
@@ -231,6 +224,10 @@ class SlamFrames:
         x, y, z = (value / self.scale for value in metric.translation)
         return RigidTransform(metric.quat_wxyz, (x, y, z))
 
+    def odometry_from_cam(self, cam_from_world: RigidTransform) -> RigidTransform:
+        """A pose as the keyframe files have it."""
+        return self.odometry_from_as @ self.slam_from_cam(cam_from_world)
+
 
 def _transformation_lines(slam: SlamFrames, blank_lines: bool) -> list[str]:
     cam_from_imu = RigidTransform(
@@ -260,12 +257,6 @@ def _gnss_lines(slam: SlamFrames, keyframes: Iterable[Moment]) -> list[str]:
     return lines
 
 
-def _times_lines(moments: Iterable[Moment], exposure_ms: float) -> list[str]:
-    """All frames, most without images."""
-    times = (moment.timestamp for moment in moments)
-    return [f"{time} {time / 1e9:.10f} {exposure_ms:.10f}" for time in times]
-
-
 def _result_lines(slam: SlamFrames, moments: Iterable[Moment]) -> list[str]:
     """The odometry's poses of all slam, level, of the unrectified camera."""
     half = np.radians(_RECTIFICATION_DEG) / 2
@@ -273,7 +264,7 @@ def _result_lines(slam: SlamFrames, moments: Iterable[Moment]) -> list[str]:
     rectification = RigidTransform((w, 0.0, y, 0.0), (0.0, 0.0, 0.0))
     lines = []
     for moment in moments:
-        pose = slam.s_from_as @ _odometry_pose(slam, moment) @ rectification
+        pose = slam.s_from_as @ slam.odometry_from_cam(moment.cam0_from_world) @ rectification
         lines.append(f"{moment.timestamp / 1e9:.5f}   {_pose_fields(pose, ' ', 15)}")
     return lines
 
@@ -281,12 +272,12 @@ def _result_lines(slam: SlamFrames, moments: Iterable[Moment]) -> list[str]:
 def _keyframe_lines(
     slam: SlamFrames,
     moment: Moment,
-    camera: Camera,
     points: NDArray[np.float64],
     image: NDArray[np.uint8],
     exposure_ms: float,
 ) -> list[str]:
     """Of points float64 (P, 3): u and v in pixels, depth in metres; of a grey image (H, W)."""
+    camera = moment.frames[0].camera
     fx, fy, cx, cy = camera.params
     lines = [
         "# timestamp",
@@ -296,7 +287,7 @@ def _keyframe_lines(
         f"{fx:.12f},{fy:.12f},{cx:.12f},{cy:.12f},{camera.width},{camera.height},{len(points)}",
         "",
         f"# camToWorld: {_TAGS}",
-        _pose_fields(_odometry_pose(slam, moment), ",", 12),
+        _pose_fields(slam.odometry_from_cam(moment.cam0_from_world), ",", 12),
         "",
         "# Exposure time (ms)",
         f"{exposure_ms:.6f}",
@@ -364,16 +355,6 @@ def _relocalization_lines(reference: Sequence[Moment], queries: Sequence[Moment]
         distances = np.linalg.norm(centers - moment.cam0_from_world.center(), axis=1)
         lines.append(f"{reference[int(distances.argmin())].timestamp} {moment.timestamp}")
     return lines
-
-
-def _start_of(recording: str) -> int:
-    """The time in a recording's name, nanoseconds."""
-    moment = datetime.strptime(recording, "recording_%Y-%m-%d_%H-%M-%S").replace(tzinfo=UTC)
-    return int(moment.timestamp()) * 10**9
-
-
-def _odometry_pose(slam: SlamFrames, moment: Moment) -> RigidTransform:
-    return slam.odometry_from_as @ slam.slam_from_cam(moment.cam0_from_world)
 
 
 def _random_transform(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from typing import Literal, get_args
 
 import numpy as np
@@ -18,8 +19,8 @@ from megloc_twins.frames import (
     night_lighting,
     noise_seed,
 )
-from megloc_twins.moving_objects import place_moving_objects
-from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.moving_objects import FloorPlan, place_moving_objects
+from megloc_twins.options import SyntheticWorldOptions, seed_of, stream
 from megloc_twins.squares import Place, build_place
 
 # of the published recordings: pixels of an image 800 wide and 400 high, metres
@@ -59,13 +60,25 @@ class Moment:
 class Drive:
     """A recording as it is driven: where, when, and how it looks."""
 
-    name: str
+    name: str  # with its time
     season: Season  # light, and what lies on the ground
-    start_ns: int  # time of its first frame
     keyframes_per_place: int  # at equal distances along a place's path
     role: Role  # of its images
     lateral_m: float  # deviation from the path, up to this
     turn_deg: float  # deviation from its direction, up to this
+
+    @property
+    def start_ns(self) -> int:
+        """Time of its first frame."""
+        moment = datetime.strptime(self.name, "recording_%Y-%m-%d_%H-%M-%S").replace(tzinfo=UTC)
+        return int(moment.timestamp()) * 10**9
+
+    def sky_seed(self, seed: int) -> int:
+        """Seed of clouds and of the dirt on the bonnet: another each season.
+
+        With the same dirt in map and queries the bonnet would be the best match of all.
+        """
+        return seed + (get_args(Season).index(self.season) << 32)
 
 
 def stereo_camera(width: int, height: int) -> Camera:
@@ -83,18 +96,17 @@ def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> list[Moment]:
     for index in range(options.num_places):
         place = build_place(options, index)
         sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(*_SUN[drive.season])))
-        path = _Path(place.plan.path)
         phase = rng.uniform(0.25, 0.75) if drive.role == "query" else 0.5
         for stop in range(drive.keyframes_per_place):
-            along = (stop + phase) / drive.keyframes_per_place * path.length
-            lateral = _free_offset(place, path, along, drive.lateral_m, rng)
+            along = (stop + phase) / drive.keyframes_per_place * place.plan.path_length_m
+            lateral = _free_offset(place.plan, along, drive.lateral_m, rng)
             turn = float(np.radians(rng.uniform(-drive.turn_deg, drive.turn_deg)))
             pitch, roll = (float(a) for a in rng.normal(0, 0.012, 2))
             for step in range(_FRAMES_PER_KEYFRAME):
                 clock += _FRAME_NS + int(rng.integers(-40_000, 40_000))
                 # the published times have been floats of seconds
                 timestamp = int(clock / 1e9 * 1e9)
-                spot, heading = path.beside(along + step * _STEP_M, lateral)
+                spot, heading = _beside(place.plan, along + step * _STEP_M, lateral)
                 position = np.array([*spot, _CAMERA_HEIGHT_M])
                 cam_from_place = looking_at(position, heading + turn, pitch, roll)
                 pose = cam_from_place @ place.place_from_world
@@ -106,45 +118,28 @@ def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> list[Moment]:
     return moments
 
 
-@dataclass(frozen=True)
-class SeasonBuilder:
-    """Lays out places as they look in a season, for :func:`render.render_frames`.
-
-    In winter the ground has other leaves, patches and markings, on wet asphalt.
-    """
-
-    season: Season
-
-    def __call__(self, options: SyntheticWorldOptions, index: int) -> Place:
-        place = build_place(options, index)
-        if self.season != "winter":
-            return place
-        seed = int(stream(options.seed, "winter", index).integers(2**31))
-        recipes = []
-        for recipe in place.recipes:
-            if recipe.painter == "ground":
-                params = dict(recipe.params) | {"material": "asphalt"}
-                recipe = replace(recipe, seed=seed, params=tuple(sorted(params.items())))
-            recipes.append(recipe)
-        return replace(place, recipes=tuple(recipes))
-
-    def sky_seed(self, options: SyntheticWorldOptions) -> int:
-        """Seed of clouds and of the dirt on the bonnet: another each season.
-
-        With the same dirt in map and queries the bonnet would be the best match of all.
-        """
-        return options.seed + (get_args(Season).index(self.season) << 32)
+def winter_place(options: SyntheticWorldOptions, index: int) -> Place:
+    """A place whose ground has other leaves, patches and markings, on wet asphalt."""
+    place = build_place(options, index)
+    seed = seed_of(options.seed, "winter", index)
+    recipes = []
+    for recipe in place.recipes:
+        if recipe.painter == "ground":
+            params = dict(recipe.params) | {"material": "asphalt"}
+            recipe = replace(recipe, seed=seed, params=tuple(params.items()))
+        recipes.append(recipe)
+    return replace(place, recipes=tuple(recipes))
 
 
 def _lighting(season: Season, rng: np.random.Generator, sun: tuple[float, float]) -> Lighting:
     if season == "dusk":
-        night = night_lighting(rng, exposure=_DUSK_EXPOSURE, noise_seed=0)
+        night = night_lighting(rng, exposure=_DUSK_EXPOSURE)
         # lamps are on, and the sky still gives a little light
         light = float(rng.uniform(*_DUSK_SKY))
         sky = (0.85 * light, 0.95 * light, 1.25 * light)
         return replace(night, sky=sky, sky_colour=sky)
     overcast = 0.15 if season == "summer" else float(rng.choice([0.3, 0.7, 1.0]))
-    return day_lighting(rng, sun, overcast=overcast, noise_seed=0)
+    return day_lighting(rng, sun, overcast=overcast)
 
 
 def _frames(
@@ -173,47 +168,29 @@ def _frames(
                 sensor_id=sensor_id,
                 camera=stereo_camera(options.width, options.height),
                 cam_from_world=pose,
-                lighting=replace(lighting, noise_seed=noise_seed(options.seed, name)),
+                lighting=lighting,
+                noise_seed=noise_seed(options.seed, name),
                 moving_objects=moving_objects,
-                bonnet=options.bonnet,
+                bonnet=True,
             )
         )
     return tuple(frames)
 
 
-def _free_offset(
-    place: Place, path: _Path, along: float, most: float, rng: np.random.Generator
-) -> float:
+def _free_offset(plan: FloorPlan, along: float, most: float, rng: np.random.Generator) -> float:
     """A deviation to the left of the path, metres, that leads into nothing."""
     for _ in range(50):
         offset = float(rng.uniform(-most, most))
-        track = [
-            path.beside(along + step * _STEP_M, offset)[0] for step in range(_FRAMES_PER_KEYFRAME)
-        ]
-        if all(place.plan.is_free(float(x), float(y), _MARGIN_M) for x, y in track):
+        steps = range(_FRAMES_PER_KEYFRAME)
+        track = [_beside(plan, along + step * _STEP_M, offset)[0].tolist() for step in steps]
+        if all(plan.is_free(x, y, _MARGIN_M) for x, y in track):
             return offset
     return 0.0
 
 
-class _Path:
-    """A closed path on the ground by distance along it, metres."""
-
-    def __init__(self, corners: NDArray[np.float64]) -> None:
-        self._corners = corners
-        self._legs = np.roll(corners, -1, axis=0) - corners
-        self._ends = np.cumsum(np.hypot(*self._legs.T))
-        self.length = float(self._ends[-1])
-
-    def beside(self, along: float, offset: float) -> tuple[NDArray[np.float64], float]:
-        """Position (2,), ``offset`` to the left, and direction (radians) of a car, which looks
-        ahead."""
-        ahead = self._spot(along + _LOOK_AHEAD_M) - self._spot(along - 0.5)
-        heading = float(np.arctan2(ahead[1], ahead[0]))
-        left = np.array([-np.sin(heading), np.cos(heading)])
-        return self._spot(along) + offset * left, heading
-
-    def _spot(self, along: float) -> NDArray[np.float64]:
-        along = along % self.length
-        leg = int(np.searchsorted(self._ends, along))
-        part = 1 - (self._ends[leg] - along) / np.hypot(*self._legs[leg])
-        return np.asarray(self._corners[leg] + part * self._legs[leg])
+def _beside(plan: FloorPlan, along: float, offset: float) -> tuple[NDArray[np.float64], float]:
+    """Position (2,) at a distance along the path, ``offset`` to its left, metres, and direction
+    (radians) of a car, which looks ahead."""
+    (ahead, behind, spot), _ = plan.on_path([along + _LOOK_AHEAD_M, along - 0.5, along])
+    heading = float(np.arctan2(*(ahead - behind)[::-1]))
+    return spot + offset * np.array([-np.sin(heading), np.cos(heading)]), heading

@@ -14,7 +14,7 @@ from megloc_kapture.datasets.official import GROUND_TRUTH
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
 from megloc_twins.moving_objects import MovingObject
-from megloc_twins.options import stream
+from megloc_twins.options import seed_of
 from megloc_twins.portable import exp, product, settled, settled_pose
 
 Triple = tuple[float, float, float]
@@ -43,7 +43,6 @@ class Lighting:
     read_noise: float = 0.002  # deviation of the signal in the dark
     blur_px: float = 0.5  # deviation of the Gaussian blur of lens and hand
     vignetting: float  # loss of light in the corner, 0..1
-    noise_seed: int  # of the sensor's noise
 
 
 def _triple(values: NDArray[np.float64]) -> Triple:
@@ -52,7 +51,7 @@ def _triple(values: NDArray[np.float64]) -> Triple:
 
 
 def day_lighting(
-    rng: np.random.Generator, sun: tuple[float, float], *, overcast: float, noise_seed: int
+    rng: np.random.Generator, sun: tuple[float, float], *, overcast: float
 ) -> Lighting:
     """Daylight; exposure and white balance vary a little from image to image.
 
@@ -73,11 +72,10 @@ def day_lighting(
         exposure=float(0.85 * exp(rng.normal(0, 0.12))),
         white_balance=_triple(np.exp(rng.normal(0, 0.03, 3))),
         vignetting=0.12,
-        noise_seed=noise_seed,
     )
 
 
-def night_lighting(rng: np.random.Generator, *, exposure: float, noise_seed: int) -> Lighting:
+def night_lighting(rng: np.random.Generator, *, exposure: float) -> Lighting:
     """Night: warm lamps, a little blue from the sky, a slow and noisy sensor."""
     return Lighting(
         condition="night",
@@ -92,13 +90,10 @@ def night_lighting(rng: np.random.Generator, *, exposure: float, noise_seed: int
         read_noise=0.006,
         blur_px=float(rng.uniform(0.7, 1.1)),
         vignetting=0.3,
-        noise_seed=noise_seed,
     )
 
 
-def lamp_lighting(
-    rng: np.random.Generator, *, noise: float, noise_seed: int, spread: float = 0.0
-) -> Lighting:
+def lamp_lighting(rng: np.random.Generator, *, noise: float, spread: float = 0.0) -> Lighting:
     """Light of ceiling lamps; ``spread`` is how much light and colour vary between images."""
     light = float(exp(rng.normal(0, spread)))
     red, green, blue = np.exp(rng.normal(0, 0.35 * spread, 3)).tolist()
@@ -111,7 +106,6 @@ def lamp_lighting(
         shot_noise=4e-5 * noise,
         read_noise=0.002 * noise,
         vignetting=0.1 if spread else 0.0,
-        noise_seed=noise_seed,
     )
 
 
@@ -142,12 +136,7 @@ WEATHERS: dict[str, Weather] = {
 
 
 def road_lighting(
-    condition: str,
-    rng: np.random.Generator,
-    *,
-    azimuth: float,
-    noise_seed: int,
-    night_exposure: float = 1.0,
+    condition: str, rng: np.random.Generator, *, azimuth: float, night_exposure: float = 1.0
 ) -> Lighting:
     """The lighting of one image of a traversal.
 
@@ -160,11 +149,11 @@ def road_lighting(
     """
     weather = WEATHERS[condition]
     if weather.elevation_deg is None:
-        lighting = night_lighting(rng, exposure=night_exposure, noise_seed=noise_seed)
+        lighting = night_lighting(rng, exposure=night_exposure)
         cast = weather.tint
     else:
         sun = azimuth, float(np.radians(weather.elevation_deg))
-        lighting = day_lighting(rng, sun, overcast=weather.overcast, noise_seed=noise_seed)
+        lighting = day_lighting(rng, sun, overcast=weather.overcast)
         lighting = replace(lighting, sun=_product(lighting.sun, weather.tint))
         cast = weather.cast
     return replace(
@@ -232,13 +221,14 @@ class Frame:
     camera: Camera
     cam_from_world: RigidTransform  # metres
     lighting: Lighting
+    noise_seed: int  # of the sensor's noise
     moving_objects: tuple[MovingObject, ...] = ()  # in the place's frame
     bonnet: bool = False  # the car's, in view
 
 
 def noise_seed(seed: int, image: str) -> int:
     """Seed of the sensor's noise in an image of the world of ``seed``."""
-    return int(stream(seed, "noise", image.rsplit(".", 1)[0]).integers(2**31))
+    return seed_of(seed, "noise", image.rsplit(".", 1)[0])
 
 
 def in_frame(frames: Iterable[Frame], official_from_world: RigidTransform) -> list[Frame]:

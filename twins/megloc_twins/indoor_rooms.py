@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.values import RigidTransform
 from megloc_twins.moving_objects import FloorPlan, Obstacle, moving_object_recipes
-from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.options import SyntheticWorldOptions, seed_of, stream
 from megloc_twins.portable import product, settled_pose
 from megloc_twins.squares import Place, about_z
 from megloc_twins.surfaces import PASSAGE, Opening, SurfaceBuilder, Surfaces, Vector, Wall
@@ -62,13 +62,13 @@ class Recipes:
 
     def thing(self, painter: str, *label: str | int) -> int:
         """A texture of a kind, the same for the same label."""
-        number = int(stream(self.seed, "indoor", painter, *label).integers(2**31))
+        number = seed_of(self.seed, "indoor", painter, *label)
         return index_of(TextureRecipe(painter, *_SIZES[painter], number), self.items)
 
     def material(self, kind: str, size_m: tuple[float, float], *label: str | int) -> int:
         """A wall's, floor's or ceiling's texture, the same for the same label and size."""
-        number = int(stream(self.seed, "indoor", kind, *label).integers(2**31))
-        material_seed = int(stream(self.seed, "indoor", label[0]).integers(2**31))
+        number = seed_of(self.seed, "indoor", kind, *label)
+        material_seed = seed_of(self.seed, "indoor", label[0])
         params = (("material", kind), ("material_seed", material_seed), ("dirt", _DIRT))
         recipe = TextureRecipe("wall", *texels(size_m, _TEXELS_PER_M), number, params)
         return index_of(recipe, self.items)
@@ -79,6 +79,8 @@ class Parts:
     """A room or a piece of corridor while it is built, in a frame of its own (metres, z up)."""
 
     recipes: Recipes
+    low: Point  # its corners on the ground
+    high: Point
     shared: SurfaceBuilder = field(default_factory=SurfaceBuilder)  # what all of its kind have
     own: SurfaceBuilder = field(default_factory=SurfaceBuilder)  # what only this one has
     lamps: list[Vector] = field(default_factory=list)
@@ -98,8 +100,9 @@ class Parts:
         )
         self.lamps.append(np.array([x, y, low - 0.1]))
 
-    def floor_and_ceiling(self, low: Point, high: Point, kind: str) -> None:
-        """Add floor and ceiling between two corners."""
+    def floor_and_ceiling(self, kind: str) -> None:
+        """Add floor and ceiling."""
+        low, high = self.low, self.high
         size_m = high[0] - low[0], high[1] - low[1]
         along, across = np.array([size_m[0], 0.0, 0.0]), np.array([0.0, size_m[1], 0.0])
         floor = self.recipes.material("asphalt", size_m, kind, "floor")
@@ -167,7 +170,7 @@ class _RoomKind:
 
 _KINDS = {
     "office": _RoomKind(
-        ("plaster", "plaster", "plaster", "plaster"),
+        ("plaster",) * 4,
         ((0.6, 4.0), 1.4, 0.95, 2.25),
         (((2.55, 1.0),), ((0.4, 1.0), (1.7, 0.9)), ((3.05, 1.0),), ((0.5, 0.9), (3.6, 0.9))),
         (4.2, 0.25),
@@ -190,9 +193,9 @@ _ORDER = (0, 3, 1, 2)  # of the walls whose posters are counted
 
 def build_room(recipes: Recipes, kind: str, owner: str) -> Parts:
     """A room of a kind in its own frame: x and y from 0 to ROOM_M; ``owner`` names what is its."""
-    parts, built = Parts(recipes), _KINDS[kind]
+    parts, built = Parts(recipes, (0.0, 0.0), ROOM_M), _KINDS[kind]
     width, depth = ROOM_M
-    parts.floor_and_ceiling((0.0, 0.0), ROOM_M, kind)
+    parts.floor_and_ceiling(kind)
     corners = ((0.0, depth), (width, depth), (width, 0.0), (0.0, 0.0), (0.0, depth))
     trim = recipes.thing("plain", kind, "trim")
     walls = []
@@ -248,8 +251,9 @@ def build_module(recipes: Recipes, owner: str) -> Parts:
     Both its sides are alike, one the other turned by half a turn. Each has the door of a room and
     one that is closed.
     """
-    parts, half = Parts(recipes), CORRIDOR_M / 2
-    parts.floor_and_ceiling((0.0, -half), (MODULE_M, half), "corridor")
+    half = CORRIDOR_M / 2
+    parts = Parts(recipes, (0.0, -half), (MODULE_M, half))
+    parts.floor_and_ceiling("corridor")
     parts.lamp(0.5 * MODULE_M, 0.0)
     trim = recipes.thing("plain", "corridor")
     texture = recipes.material("plaster", (MODULE_M, _HEIGHT_M), "corridor", "wall")
@@ -280,7 +284,8 @@ def build_module(recipes: Recipes, owner: str) -> Parts:
 
 def _build_end(recipes: Recipes, owner: str) -> Parts:
     """The wall at an end of the corridor, seen by who looks along +x; at x = 0."""
-    parts, half = Parts(recipes), CORRIDOR_M / 2
+    half = CORRIDOR_M / 2
+    parts = Parts(recipes, (0.0, -half), (0.0, half))
     texture = recipes.material("plaster", (CORRIDOR_M, _HEIGHT_M), "corridor", "end")
     end = _wall((0.0, half), (0.0, -half), texture, recipes.thing("plain", "corridor"))
     window = Opening(0.2, 1.1, 0.9, 2.3, 0.12, recipes.thing("window", "corridor"))
@@ -310,18 +315,9 @@ class Floor:
     glass: NDArray[np.bool_]  # (N,), the surfaces that give a laser nothing back
 
 
-@dataclass(frozen=True)
-class FloorBuilder:
-    """Lays out floors of a number of modules, for :func:`render.render_frames`."""
-
-    modules: int
-
-    def floors(self, seed: int, count: int) -> list[Floor]:
-        """The first floors of a building."""
-        return [build_floor(seed, index, self.modules) for index in range(count)]
-
-    def __call__(self, options: SyntheticWorldOptions, index: int) -> Place:
-        return build_floor(options.seed, index, self.modules).place
+def floor_place(modules: int, options: SyntheticWorldOptions, index: int) -> Place:
+    """A floor of a number of modules as :func:`render.render_frames` draws it."""
+    return build_floor(options.seed, index, modules).place
 
 
 @lru_cache(maxsize=4)
@@ -331,22 +327,20 @@ def build_floor(seed: int, index: int, modules: int) -> Floor:
     placed: list[tuple[Parts, RigidTransform]] = []
     rooms: list[Zone] = []
     corridor: list[Zone] = []
-    half = CORRIDOR_M / 2
     for module in range(modules):
         name = f"module{module}"
         at = _placed(MODULE_M * (module - 0.5 * modules), 0.0, turned=False)
         placed.append((build_module(recipes, f"floor{index}/{name}"), at))
-        zone = _zone(seed, index, (name, "corridor"), *placed[-1], (0, -half), (MODULE_M, half))
-        corridor.append(zone)
+        corridor.append(_zone(seed, index, name, "corridor", *placed[-1]))
         for turned, kind in zip((False, True), ROOM_KINDS, strict=True):
             name = f"{kind}{module}"
             pose = at @ _beside_corridor(turned)
             placed.append((build_room(recipes, kind, f"floor{index}/{name}"), pose))
-            rooms.append(_zone(seed, index, (name, kind), *placed[-1], (0, 0), ROOM_M))
+            rooms.append(_zone(seed, index, name, kind, *placed[-1]))
     for turned in (False, True):
         pose = _placed((-0.5 if turned else 0.5) * MODULE_M * modules, 0.0, turned=turned)
         placed.append((_build_end(recipes, f"floor{index}/end{turned:d}"), pose))
-    surfaces, own = Parts(recipes).surfaces()
+    surfaces, own = SurfaceBuilder().build(), np.zeros(0, bool)
     lamps: list[Vector] = []
     for parts, pose in placed:  # place_from_part
         new, new_own = parts.surfaces()
@@ -385,23 +379,18 @@ def _official_frame(seed: int, index: int) -> RigidTransform:
 
 
 def _zone(
-    seed: int,
-    index: int,
-    names: tuple[str, str],
-    parts: Parts,
-    place_from_part: RigidTransform,
-    low: Point,
-    high: Point,
+    seed: int, index: int, name: str, kind: str, parts: Parts, place_from_part: RigidTransform
 ) -> Zone:
-    """The zone of a part that reaches from ``low`` to ``high`` in its own frame."""
-    corners = np.array([low, (high[0], low[1]), high, (low[0], high[1])], np.float64)
+    """The zone of a part of floor ``index``."""
+    (x0, y0), (x1, y1) = parts.low, parts.high
+    corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
     outline = place_from_part.apply(np.column_stack([corners, np.zeros(4)]))[:, :2]
     obstacles = []
     for obstacle in parts.obstacles:
         x, y, _ = place_from_part.apply(np.array([[obstacle.x, obstacle.y, 0.0]]))[0].tolist()
         obstacles.append(Obstacle(x, y, obstacle.radius))
     plan = FloorPlan(outline, outline, tuple(obstacles))
-    rng = stream(seed, "indoor", "scan", index, names[0])
+    rng = stream(seed, "indoor", "scan", index, name)
     shift = rng.uniform(-_SCAN_SHIFT_M, _SCAN_SHIFT_M, 2)
     spot = np.array([*(outline.mean(axis=0) + shift), _SCAN_HEIGHT_M])
     spot[2] += rng.normal(0, 0.03)
@@ -410,4 +399,4 @@ def _zone(
     about_x = RigidTransform((float(np.cos(lean_x)), float(np.sin(lean_x)), 0.0, 0.0), (0, 0, 0))
     about_y = RigidTransform((float(np.cos(lean_y)), 0.0, float(np.sin(lean_y)), 0.0), (0, 0, 0))
     rotation = product((about_x @ about_y).rotation_matrix(), turn)
-    return Zone(*names, plan, place_from_part, settled_pose(rotation, spot).inverse())
+    return Zone(name, kind, plan, place_from_part, settled_pose(rotation, spot).inverse())

@@ -17,23 +17,22 @@ from megloc_kapture.io.dataset_tables import SIDE_TABLES, ImageGroup, write_grou
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.mat_file import write_mat_arrays
 from megloc_kapture.stages.work import HERE, Work
-from megloc_kapture.values import Camera, Options, RigidTransform
+from megloc_kapture.values import Camera, RigidTransform
 from megloc_twins.frames import (
     Frame,
     lamp_lighting,
     looking_at,
     noise_seed,
-    reduced,
     write_truth,
 )
-from megloc_twins.indoor_rooms import MODULE_M, Floor, FloorBuilder, Zone, build_floor
+from megloc_twins.indoor_rooms import MODULE_M, Floor, Zone, build_floor, floor_place
 from megloc_twins.model_files import write_transformation
 from megloc_twins.moving_objects import NUM_PEOPLE, MovingObject
-from megloc_twins.options import SyntheticDataset, SyntheticWorldOptions, stream
+from megloc_twins.options import JPEG_QUALITY, SyntheticDataset, TwinOptions, stream
 from megloc_twins.portable import product, settled
-from megloc_twins.rasterization import NO_SURFACE, depth_map, sample_grid, visible_surfaces
+from megloc_twins.rasterization import NO_SURFACE, sample_grid, visible_surfaces
 from megloc_twins.render import RenderedFrame, render_frames
-from megloc_twins.viewpoints import CoarseView, coarse_view, visible
+from megloc_twins.viewpoints import CoarseView, coarse_view, first_fitting, visible
 
 YAWS_DEG = tuple(range(0, 360, 30))
 PITCHES_DEG = (-30, 0, 30)
@@ -47,7 +46,6 @@ _DROPOUTS = 0.02  # share of pixels without a return, for no reason
 _FLOORS = ("DUC1", "DUC2")
 _BUILDING = "DUC"
 _FIRST_QUERY = 801  # of the numbers the telephone gave its images
-_JPEG_QUALITY = 92
 
 _REDUCTION = 20  # of a glance, px per px
 _ATTEMPTS = 400
@@ -66,10 +64,9 @@ Bools = NDArray[np.bool_]
 ScanViews = tuple[Floats, list[CoarseView]]
 
 
-class InLocTwinOptions(Options):
+class InLocTwinOptions(TwinOptions):
     """Contents of InLoc's twin; the defaults are what ``make eval`` localizes in."""
 
-    seed: int = Field(default=0, ge=0, description="every random choice hangs on it")
     modules: int = Field(
         default=2, ge=1, le=20, description="pieces of corridor per floor, two rooms on each"
     )
@@ -84,7 +81,7 @@ class InLocTwinOptions(Options):
 
     def floors(self) -> list[Floor]:
         """The building."""
-        return FloorBuilder(self.modules).floors(self.seed, len(_FLOORS))
+        return [build_floor(self.seed, index, self.modules) for index in range(len(_FLOORS))]
 
 
 class InLocTwin(SyntheticDataset[InLocTwinOptions]):
@@ -104,15 +101,13 @@ class InLocTwin(SyntheticDataset[InLocTwinOptions]):
             for number, zone in enumerate(floor.zones)
         ]
         mapping = [frame for scan in scans for frame in _cutouts(options, scan)]
-        queries = _queries(options)
+        queries = build_queries(options)
         for frames, samples in ((mapping, 1), (queries, options.supersampling)):
             render_frames(
-                SyntheticWorldOptions(
-                    seed=options.seed, num_places=len(_FLOORS), supersampling=samples
-                ),
+                options.world().model_copy(update={"supersampling": samples}),
                 frames,
                 partial(_write_files, root, options),
-                build=FloorBuilder(options.modules),
+                build=partial(floor_place, options.modules),
                 work=work,
             )
         for scan in scans:
@@ -156,7 +151,6 @@ def _cutouts(options: InLocTwinOptions, scan: _Scan) -> list[Frame]:
             name = scan.image(yaw, pitch)
             # one exposure for the whole panorama
             rng = stream(options.seed, "inloc", "light", scan.transformation)
-            seed = noise_seed(options.seed, name)
             frames.append(
                 Frame(
                     name=name,
@@ -167,34 +161,10 @@ def _cutouts(options: InLocTwinOptions, scan: _Scan) -> list[Frame]:
                     sensor_id="cutout",
                     camera=camera,
                     cam_from_world=cam_from_scan(yaw, pitch) @ scan.scan_from_floor,
-                    lighting=lamp_lighting(rng, noise=1.0, noise_seed=seed),
+                    lighting=lamp_lighting(rng, noise=1.0),
+                    noise_seed=noise_seed(options.seed, name),
                 )
             )
-    return frames
-
-
-def _queries(options: InLocTwinOptions) -> list[Frame]:
-    floors = options.floors()
-    size = options.query_width, options.query_height
-    frames = []
-    for number, view in enumerate(query_views(floors, options.seed, options.queries, size)):
-        name = f"query/iphone7/IMG_{_FIRST_QUERY + number:04d}.JPG"
-        rng = stream(options.seed, "inloc", "light", name)
-        seed = noise_seed(options.seed, name)
-        frames.append(
-            Frame(
-                name=name,
-                role="query",
-                condition=_FLOORS[view.floor],
-                place=view.floor,
-                timestamp=number,
-                sensor_id="upright" if view.camera.height > view.camera.width else "iphone7",
-                camera=view.camera,
-                cam_from_world=view.cam_from_place @ floors[view.floor].place.place_from_world,
-                lighting=lamp_lighting(rng, noise=3.0, noise_seed=seed, spread=0.15),
-                moving_objects=view.people,
-            )
-        )
     return frames
 
 
@@ -209,7 +179,7 @@ def _displaced(pose: RigidTransform, rng: np.random.Generator) -> RigidTransform
 
 def _write_files(root: Path, options: InLocTwinOptions, frame: Frame, view: RenderedFrame) -> None:
     """A frame's image and, of a cutout, what the scanner measured in its pixels."""
-    write_image(root / frame.name, view.image, jpeg_quality=_JPEG_QUALITY)
+    write_image(root / frame.name, view.image, jpeg_quality=JPEG_QUALITY)
     if frame.role == "query":
         return
     floor = build_floor(options.seed, frame.place, options.modules)
@@ -267,50 +237,58 @@ def phone_camera(width: int, height: int) -> Camera:
     return Camera.pinhole(width, height, max(width, height) * 28 / 36)
 
 
-@dataclass(frozen=True)
-class QueryView:
-    """A telephone's pose, and the people in front of it; in the place's frame."""
-
-    floor: int
-    zone: str
-    camera: Camera
-    cam_from_place: RigidTransform
-    people: tuple[MovingObject, ...]
-
-
-def query_views(
-    floors: Sequence[Floor], seed: int, count: int, size: tuple[int, int]
-) -> list[QueryView]:
-    """Views of floors, the first floor's first, zone by zone; about every third held upright.
+def build_queries(options: InLocTwinOptions) -> list[Frame]:
+    """Telephones' images, the first floor's first, zone by zone; about every third held upright.
 
     Of some hundred random poses in the zone the first of which the scans of the floor have seen
     enough, and more than those of other rooms of what looks the same; else the nearest to that.
     """
+    floors = options.floors()
     scans = [[_scan_views(floor, zone) for zone in floor.zones] for floor in floors]
-    views = []
+    size = options.query_width, options.query_height
+    frames: list[Frame] = []
     for index, floor in enumerate(floors):
-        first, last = (count * number // len(floors) for number in (index, index + 1))
+        first, last = (options.queries * number // len(floors) for number in (index, index + 1))
         for position in range(last - first):
             zone = floor.zones[position % len(floor.zones)]
-            rng = stream(seed, "indoor", "query", index, position)
+            rng = stream(options.seed, "indoor", "query", index, position)
             upright = (position + position // len(floor.zones)) % 3 == 2
             camera = phone_camera(*(size[::-1] if upright else size))
-            pose, yaw = _query_pose(floors, (index, zone), camera, scans, rng)
-            views.append(QueryView(index, zone.name, camera, pose, _people(zone, pose, yaw, rng)))
-    return views
+            poses = _query_poses(floors, index, zone, camera, scans, rng)
+            pose, yaw = first_fitting(poses, zone.name)
+            name = f"query/iphone7/IMG_{_FIRST_QUERY + len(frames):04d}.JPG"
+            light = stream(options.seed, "inloc", "light", name)
+            frames.append(
+                Frame(
+                    name=name,
+                    role="query",
+                    condition=_FLOORS[index],
+                    place=index,
+                    timestamp=len(frames),
+                    sensor_id="upright" if camera.height > camera.width else "iphone7",
+                    camera=camera,
+                    cam_from_world=pose @ floor.place.place_from_world,
+                    lighting=lamp_lighting(light, noise=3.0, spread=0.15),
+                    noise_seed=noise_seed(options.seed, name),
+                    moving_objects=_people(zone, pose, yaw, rng),
+                )
+            )
+    return frames
 
 
-def _query_pose(
+def _query_poses(
     floors: Sequence[Floor],
-    where: tuple[int, Zone],
+    index: int,
+    zone: Zone,
     camera: Camera,
     scans: Sequence[Sequence[ScanViews]],
     rng: np.random.Generator,
-) -> tuple[RigidTransform, float]:
-    index, zone = where
+) -> Iterator[tuple[float, tuple[RigidTransform, float]]]:
+    """Random poses in a zone of floor ``index`` and their yaws, each behind what it misses; of
+    those that miss more than one before, most are left out."""
     floor, plan = floors[index], zone.plan
     copies = list(_copies(floors, index, zone))
-    best: tuple[float, RigidTransform, float] | None = None
+    least = np.inf
     for _ in range(_ATTEMPTS):
         x, y = (float(v) for v in rng.uniform(plan.outline.min(axis=0), plan.outline.max(axis=0)))
         yaw = float(rng.uniform(-np.pi, np.pi))
@@ -319,26 +297,22 @@ def _query_pose(
         if not plan.is_free(x, y, _WALL_DISTANCE_M):
             continue
         pose = looking_at(position, yaw, pitch, roll)
-        depth, points, surface = _glance(floor, camera, pose)
+        view = coarse_view(floor.place.surfaces, camera, pose, reduction=_REDUCTION, stride=1)
+        depth, points = view.depth[view.depth > 0].astype(np.float64), view.points
         if np.percentile(depth, 10) < _NEAREST_M or np.median(depth) < _MEDIAN_M:
             continue
-        matt = ~floor.glass[surface]
+        matt = ~floor.glass[view.surface]
         seen = float((_have_seen(scans[index], points, position) & matt).mean())
         miss = max(0.0, _MIN_SEEN - seen)
-        if best is not None and miss >= best[0]:
+        if miss >= least:
             continue
-        common = ~floor.own[surface] & matt
+        common = ~floor.own[view.surface] & matt
         for other, moved in copies:
             again = _have_seen(scans[other], moved.apply(points), moved.apply(position))
             alike = float((again & common).mean())
             miss = max(miss, _MIN_MARGIN - (seen - alike))
-        if best is None or miss < best[0]:
-            best = (miss, pose, yaw)
-        if miss == 0.0:
-            break
-    if best is None:  # every zone has room for a query
-        raise RuntimeError(f"no free view in {zone.name}")
-    return best[1:]
+        least = min(least, miss)
+        yield miss, (pose, yaw)
 
 
 def _copies(
@@ -355,18 +329,6 @@ def _copies(
             if zone.kind == "corridor":
                 turned = other.place_from_zone @ half_turn @ zone.place_from_zone.inverse()
                 yield other_index, turned
-
-
-def _glance(
-    floor: Floor, camera: Camera, cam_from_place: RigidTransform
-) -> tuple[Floats, Floats, NDArray[np.int16]]:
-    """Of each point of a coarse view: depth (P,), where it is (P, 3), and its surface (P,)."""
-    grid = sample_grid(reduced(camera, _REDUCTION), 1)
-    seen = visible_surfaces(floor.place.surfaces, cam_from_place, grid)
-    hit = seen.surface != NO_SURFACE
-    z = depth_map(seen).astype(np.float64)[hit]
-    points = cam_from_place.inverse().apply(grid.rays()[hit] * z[:, None])
-    return z, points, seen.surface[hit]
 
 
 def _scan_views(floor: Floor, zone: Zone) -> ScanViews:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from megloc_twins.options import stream
+from megloc_twins.options import seed_of
 from megloc_twins.surfaces import SurfaceBuilder, Surfaces
 from megloc_twins.textures import TextureRecipe
 
@@ -73,18 +73,26 @@ class FloorPlan:
         """Distance of (x, y) from the mapping rig's path."""
         return _distance_to_ring(x, y, self.path)
 
-    def stops(self, count: int) -> list[tuple[Floats, float]]:
-        """Positions (2,) at equal distances along the path, with the headings there (radians)."""
+    @property
+    def path_length_m(self) -> float:
+        """Length of the rig's path."""
+        return float(np.hypot(*(np.roll(self.path, -1, axis=0) - self.path).T).sum())
+
+    def on_path(self, distance_m: ArrayLike) -> tuple[Floats, Floats]:
+        """Positions (..., 2) at distances (...) along the path, and headings there (radians)."""
         along = np.roll(self.path, -1, axis=0) - self.path
         lengths = np.hypot(*along.T)
         ends = np.cumsum(lengths)
-        result = []
-        for distance in (np.arange(count) + 0.5) / count * ends[-1]:
-            leg = int(np.searchsorted(ends, distance))
-            part = (distance - ends[leg] + lengths[leg]) / lengths[leg]
-            heading = float(np.arctan2(along[leg, 1], along[leg, 0]))
-            result.append((self.path[leg] + part * along[leg], heading))
-        return result
+        distance = np.asarray(distance_m) % ends[-1]
+        leg = np.searchsorted(ends, distance)
+        part = (distance - ends[leg] + lengths[leg]) / lengths[leg]
+        heading = np.arctan2(along[leg, 1], along[leg, 0])
+        return self.path[leg] + part[..., None] * along[leg], heading
+
+    def stops(self, count: int) -> list[tuple[Floats, float]]:
+        """Positions (2,) at equal distances along the path, with the headings there (radians)."""
+        spots, headings = self.on_path((np.arange(count) + 0.5) / count * self.path_length_m)
+        return list(zip(spots, headings.tolist(), strict=True))
 
     def _is_inside(self, x: float, y: float) -> bool:
         start, end = self.outline, np.roll(self.outline, -1, axis=0)
@@ -127,7 +135,7 @@ class MovingObject:
 
 def moving_object_recipes(seed: int) -> list[TextureRecipe]:
     """Textures of all moving objects; a place puts them first, their indices are the same."""
-    number = int(stream(seed, "movers").integers(2**31))
+    number = seed_of(seed, "movers")
     recipes = [TextureRecipe("cloth", 120, 360, number + i) for i in range(NUM_PEOPLE)]
     for i in range(NUM_CARS):
         recipes.append(TextureRecipe("car", 420, 90, number + 100 + i, (("side", 1.0),)))

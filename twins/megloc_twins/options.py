@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar, Generic, Literal, TypeVar
+from typing import ClassVar, Generic, TypeVar
 from zlib import crc32
 
 import numpy as np
@@ -18,15 +18,28 @@ from megloc_kapture.values import Options
 Item = TypeVar("Item")
 OptionsT = TypeVar("OptionsT", bound=Options)
 
+JPEG_QUALITY = 92  # of all images
 
-class SyntheticWorldOptions(Options):
+
+class TwinOptions(Options):
+    """What can be chosen of every rendered dataset."""
+
+    seed: int = Field(default=0, ge=0, description="every random choice hangs on it")
+    supersampling: int = Field(default=2, ge=1, le=4, description="samples per px and axis")
+
+    def world(self) -> SyntheticWorldOptions:
+        """The rendered world that the images are taken in."""
+        names = SyntheticWorldOptions.model_fields.keys() & type(self).model_fields.keys()
+        return SyntheticWorldOptions(**self.model_dump(include=names))
+
+
+class SyntheticWorldOptions(TwinOptions):
     """Contents of the synthetic world, and how its images are taken.
 
     The defaults: hard enough that retrieval is often wrong and night is worse than day, easy
     enough that day queries localize.
     """
 
-    seed: int = Field(default=0, ge=0, description="every random choice hangs on it")
     num_places: int = Field(default=4, ge=1, description="places, at least 60 m apart")
     stations_per_place: int = Field(
         default=9, ge=3, description="stops of the mapping rig in each place"
@@ -35,28 +48,18 @@ class SyntheticWorldOptions(Options):
     night_queries: int = Field(default=24, ge=0, description="query images at night, all places")
     width: int = Field(default=640, ge=64, description="image width in px")
     height: int = Field(default=480, ge=48, description="image height in px")
-    supersampling: int = Field(default=2, ge=1, le=4, description="samples per px and axis")
     repetition: float = Field(
         default=0.6,
         ge=0,
         le=1,
         description="share of posters, doors and windows that every place has in common",
     )
-    unique_texture: float = Field(
-        default=1.0, ge=0, description="strength of the dirt that makes each surface unique"
-    )
     moving_objects: int = Field(
         default=2, ge=0, description="people and cars around each stop of the rig or query"
-    )
-    bonnet: bool = Field(default=True, description="the rig's front camera sees the car's bonnet")
-    distortion: bool = Field(
-        default=True, description="query cameras have radial distortion (SIMPLE_RADIAL)"
     )
     night_exposure: float = Field(
         default=1.0, gt=0, description="light that reaches the sensor at night, relative"
     )
-    image_format: Literal["jpg", "png"] = Field(default="jpg", description="file type of images")
-    jpeg_quality: int = Field(default=92, ge=1, le=100, description="quality of JPEG images")
     depth: bool = Field(default=False, description="write depth maps of the mapping images")
     masks: bool = Field(default=False, description="write masks that leave the bonnet out")
 
@@ -68,6 +71,11 @@ def stream(seed: int, *labels: str | int) -> np.random.Generator:
     change the rest of the world.
     """
     return np.random.default_rng([seed, crc32("/".join(map(str, labels)).encode())])
+
+
+def seed_of(seed: int, *labels: str | int) -> int:
+    """A seed of one thing in the world, see :func:`stream`."""
+    return int(stream(seed, *labels).integers(2**31))
 
 
 class SyntheticDataset(ABC, Generic[OptionsT]):
@@ -94,31 +102,19 @@ class SyntheticDataset(ABC, Generic[OptionsT]):
         """
 
 
-class ModelTwinOptions(Options):
+class ModelTwinOptions(TwinOptions):
     """Options of a twin that is published with a sparse model."""
 
-    seed: int = Field(default=0, ge=0, description="every random choice hangs on it")
-    supersampling: int = Field(default=2, ge=1, le=4, description="samples per px and axis")
     points_per_image: int = Field(
         default=100, ge=1, description="points of the sparse models that are drawn in each image"
     )
     night_exposure: float = Field(
         default=1.0, gt=0, description="light that reaches the sensor at night, relative"
     )
-    jpeg_quality: int = Field(default=92, ge=1, le=100, description="quality of JPEG images")
     model_features: bool = Field(
         default=False,
         description="sparse models of SIFT of the images, not of exact points, with their database",
     )
-
-    def rendered_world(self, num_places: int, width: int, height: int) -> SyntheticWorldOptions:
-        """The world that the twin's images are taken in."""
-        return SyntheticWorldOptions(
-            num_places=num_places,
-            width=width,
-            height=height,
-            **self.model_dump(include={"seed", "supersampling", "night_exposure", "jpeg_quality"}),
-        )
 
 
 def shuffled(items: Sequence[Item], seed: int, *labels: str) -> list[Item]:

@@ -31,7 +31,8 @@ from megloc_twins.rasterization import (
     visible_surfaces,
 )
 from megloc_twins.squares import Place, build_place
-from megloc_twins.surfaces import Surfaces, build_atlas
+from megloc_twins.surfaces import Atlas, Surfaces, build_atlas
+from megloc_twins.textures import TextureRecipe
 
 Result = TypeVar("Result")
 PlaceBuilder = Callable[[SyntheticWorldOptions, int], Place]
@@ -208,18 +209,16 @@ def _sky(
     return base * (1 - 0.5 * cover) + cover * base.mean() * np.float32(1.1) + haze
 
 
-def develop(
-    light: Float32, lighting: Lighting, supersampling: int, *, bonnet_seed: int | None
-) -> NDArray[np.uint8]:
-    """Image uint8 (H, W, 3) RGB of the samples' light (H * ss, W * ss, 3).
+def develop(light: Float32, frame: Frame, supersampling: int, seed: int) -> NDArray[np.uint8]:
+    """Image uint8 (H, W, 3) RGB of a frame's samples' light (H * ss, W * ss, 3).
 
-    ``bonnet_seed`` puts a car's bonnet in front; None leaves it out.
+    ``seed`` is that of the bonnet, where the frame shows one.
     """
-    height, width = light.shape[0] // supersampling, light.shape[1] // supersampling
+    lighting, width, height = frame.lighting, frame.camera.width, frame.camera.height
     if supersampling > 1:
         light = averaged(light, supersampling)
-    if bonnet_seed is not None:
-        cover, paint = bonnet(width, height, bonnet_seed)
+    if frame.bonnet:
+        cover, paint = bonnet(width, height, seed)
         lit = _rgb(lighting.sky) + np.float32(0.4) * _rgb(lighting.sun)
         lit = lit + np.float32(0.04) * _rgb(lighting.lamps)
         light = light * (1 - cover[..., None]) + paint * cover[..., None] * lit
@@ -229,7 +228,7 @@ def develop(
         haze = resized(blurred(averaged(np.minimum(signal, 4.0), 8), 3.0), width, height)
         signal = signal + np.float32(0.06) * haze
     signal = blurred(signal, lighting.blur_px)
-    rng = np.random.default_rng(lighting.noise_seed)
+    rng = np.random.default_rng(frame.noise_seed)
     deviation = np.sqrt(lighting.shot_noise * signal + lighting.read_noise**2)
     signal = signal + deviation * rng.standard_normal(signal.shape, dtype=np.float32)
     # a shoulder instead of a hard limit, then gamma 2
@@ -288,6 +287,11 @@ class RenderedFrame:
     mask: Mask  # (H, W), False on the bonnet
 
 
+def painted(recipes: Iterable[TextureRecipe]) -> Atlas:
+    """The atlas of the textures."""
+    return build_atlas([recipe.paint() for recipe in recipes])
+
+
 class PlaceRenderer:
     """Draws the frames of one place; painting the place's textures takes about a second."""
 
@@ -295,7 +299,7 @@ class PlaceRenderer:
         self._place = place
         self._seed = seed
         self._supersampling = supersampling
-        self._atlas = build_atlas([recipe.paint() for recipe in place.recipes])
+        self._atlas = painted(place.recipes)
         self._clouds = cloud_texture(seed)
         self._shadows: tuple[Triple, ShadowMap] | None = None
 
@@ -320,13 +324,13 @@ class PlaceRenderer:
             shadows=shadows,
             clouds=self._clouds,
         )
-        bonnet_seed = self._seed if frame.bonnet else None
-        image = develop(light, lighting, self._supersampling, bonnet_seed=bonnet_seed)
+        image = develop(light, frame, self._supersampling, self._seed)
         mask = _bonnet_cover(frame, self._seed) < _BONNET_COVERS
         depth_m = None
         if depth:
-            exact = visible_surfaces(surfaces, cam_from_place, sample_grid(frame.camera, 1))
-            depth_m = depth_map(exact)
+            if self._supersampling > 1:
+                seen = visible_surfaces(surfaces, cam_from_place, sample_grid(frame.camera, 1))
+            depth_m = depth_map(seen)
             depth_m[~mask] = 0
         return RenderedFrame(image, depth_m, mask)
 

@@ -100,8 +100,8 @@ class RobotCarTwinOptions(ModelTwinOptions):
     size_px: int = Field(default=512, ge=64, description="width and height of an image")
 
     def world(self) -> SyntheticWorldOptions:
-        """The rendered world the car drives through."""
-        return self.rendered_world(self.num_locations, self.size_px, self.size_px)
+        sizes = {"num_places": self.num_locations, "width": self.size_px, "height": self.size_px}
+        return super().world().model_copy(update=sizes)
 
 
 class RobotCarTwin(SyntheticDataset[RobotCarTwinOptions]):
@@ -121,22 +121,14 @@ class RobotCarTwin(SyntheticDataset[RobotCarTwinOptions]):
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
         layout, options = Layout(Path(root)), self.options
         frames = build_robotcar_frames(options)
-        drawn = render_map_and_queries(
-            options.world(),
-            frames.mapping,
-            frames.queries,
-            layout.images,
-            model_features=options.model_features,
-            work=work,
-        )
+        images = layout.images
+        drawn = render_map_and_queries(options, frames.mapping, frames.queries, images, work)
         registered = in_frame(_registered(frames.mapping), OFFICIAL_FROM_WORLD)
         queries = in_frame(frames.queries, OFFICIAL_FROM_WORLD)
         _write_models(layout, options, registered, drawn)
         if options.model_features:
             named = {_png(frame.name): frame for frame in frames.mapping}
-            write_sift_database(
-                layout.feature_database, dict(sorted(named.items())), drawn.features
-            )
+            write_sift_database(layout.feature_database, named, drawn.features)
         _write_car(layout, options)
         _write_query_lists(layout, queries)
         _write_version_2(layout, options, queries)
@@ -227,11 +219,7 @@ def _moment(
     for camera, intrinsics in car_cameras(options.size_px).items():
         name = f"{condition}/{camera}/{timestamp}.jpg"
         lighting = road_lighting(
-            condition,
-            rng,
-            azimuth=azimuth,
-            noise_seed=noise_seed(options.seed, name),
-            night_exposure=options.night_exposure,
+            condition, rng, azimuth=azimuth, night_exposure=options.night_exposure
         )
         frames.append(
             Frame(
@@ -244,6 +232,7 @@ def _moment(
                 camera=intrinsics,
                 cam_from_world=CAM_FROM_CAR[camera] @ car_from_world,
                 lighting=lighting,
+                noise_seed=noise_seed(options.seed, name),
                 moving_objects=moving_objects,
                 bonnet=camera == SCORED_CAMERA,
             )
@@ -301,7 +290,7 @@ def _write_models(
         positions = np.flatnonzero(places == place).tolist()
         here = [frames[position] for position in positions]
         rng = stream(options.seed, "robotcar", "points", place)
-        points = drawn.points(here, points_per_frame=options.points_per_image, rng=rng)
+        points = drawn.points(here, rng)
         write_colmap_text(layout.individual_model(_location(place)), _colmap_model(here, points))
         own = np.array(positions, np.int32)
         parts.append(replace(points, image_ids=own[points.image_ids]))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from megloc_kapture.matching.nearest_neighbours import NearestNeighbourOptions, 
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, LocalFeatures
 from megloc_twins.frames import Frame
-from megloc_twins.options import SyntheticWorldOptions
+from megloc_twins.options import JPEG_QUALITY, ModelTwinOptions
 from megloc_twins.rasterization import intrinsics, project, sample_grid
 from megloc_twins.render import RenderedFrame, render_frames
 
@@ -142,10 +142,16 @@ def _in_field(camera: Camera, in_camera: Floats) -> Bools:
 
     Farther out the distortion need not be monotonous and may fold a point back into the image.
     """
-    grid = sample_grid(camera, 1)
-    limit = float((grid.x**2 + grid.y**2).max())
     z = in_camera[:, 2]
-    return np.asarray((z > 0) & ((in_camera[:, :2] ** 2).sum(1) <= limit * z**2), np.bool_)
+    inside = (in_camera[:, :2] ** 2).sum(1) <= _squared_reach(camera) * z**2
+    return np.asarray((z > 0) & inside, np.bool_)
+
+
+@cache
+def _squared_reach(camera: Camera) -> float:
+    """Greatest squared distance of a pixel's ray from the axis, at depth 1."""
+    grid = sample_grid(camera, 1)
+    return float((grid.x**2 + grid.y**2).max())
 
 
 def sift_points(frames: Sequence[Frame], features: Features, depths_m: Depths) -> SparsePoints:
@@ -181,11 +187,11 @@ def sift_points(frames: Sequence[Frame], features: Features, depths_m: Depths) -
 
 
 def write_sift_database(path: Path, frames: Mapping[str, Frame], features: Features) -> None:
-    """Write COLMAP's database of the frames' features, under the names given, in their order.
+    """Write COLMAP's database of the frames' features, under the names given, sorted by these.
 
     Raises OutputError where it cannot be written.
     """
-    found = ((name, frame.camera, features[frame.name]) for name, frame in frames.items())
+    found = ((name, frames[name].camera, features[frames[name].name]) for name in sorted(frames))
     write_feature_database(
         path, (DatabaseFeatures(n, cam, f.keypoints_px, f.descriptors) for n, cam, f in found)
     )
@@ -245,47 +251,40 @@ class MapFrames:
 
     depths_m: Depths
     features: Features
+    points_per_image: int
 
-    def points(
-        self, frames: Sequence[Frame], *, points_per_frame: int, rng: np.random.Generator
-    ) -> SparsePoints:
+    def points(self, frames: Sequence[Frame], rng: np.random.Generator) -> SparsePoints:
         """:func:`sift_points` where there are features, else :func:`exact_tracks`."""
         if self.features:
             return sift_points(frames, self.features, self.depths_m)
-        return exact_tracks(frames, self.depths_m, points_per_frame=points_per_frame, rng=rng)
+        count = self.points_per_image
+        return exact_tracks(frames, self.depths_m, points_per_frame=count, rng=rng)
 
 
 def render_map_and_queries(
-    world: SyntheticWorldOptions,
+    options: ModelTwinOptions,
     mapping: Sequence[Frame],
     others: Sequence[Frame],
     images: Path,
-    *,
-    model_features: bool,
     work: Work,
 ) -> MapFrames:
-    """Draw all frames and write them below ``images`` under their names.
-
-    The depth of ``mapping`` is returned, with ``model_features`` their SIFT as well.
-    """
+    """Draw all frames and write them below ``images`` under their names."""
     names = frozenset(frame.name for frame in mapping)
-    finish = partial(_write, images, world.jpeg_quality, names if model_features else frozenset())
-    drawn = render_frames(world, [*mapping, *others], finish, with_depth=names, work=work)
+    finish = partial(_write, images, names if options.model_features else frozenset())
+    frames = [*mapping, *others]
+    drawn = render_frames(options.world(), frames, finish, with_depth=names, work=work)
     return MapFrames(
         {name: depth for name, (depth, _) in drawn.items() if depth is not None},
         {name: features for name, (_, features) in drawn.items() if features is not None},
+        options.points_per_image,
     )
 
 
 def _write(
-    images: Path,
-    jpeg_quality: int,
-    with_features: frozenset[str],
-    frame: Frame,
-    view: RenderedFrame,
+    images: Path, with_features: frozenset[str], frame: Frame, view: RenderedFrame
 ) -> tuple[Depth | None, LocalFeatures | None]:
     path = images / frame.name
-    write_image(path, view.image, jpeg_quality=jpeg_quality)
+    write_image(path, view.image, jpeg_quality=JPEG_QUALITY)
     # of the image as it was written
     wanted = frame.name in with_features
     return view.depth_m, ColmapSift().extract(read_image_rgb(path)) if wanted else None

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from megloc_kapture.values import RigidTransform
 from megloc_twins.frames import Frame
 from megloc_twins.moving_objects import FloorPlan, Obstacle, draw_floor_plan, moving_object_recipes
-from megloc_twins.options import SyntheticWorldOptions, stream
+from megloc_twins.options import SyntheticWorldOptions, seed_of, stream
 from megloc_twins.portable import settled_pose
 from megloc_twins.surfaces import Opening, Span, SurfaceBuilder, Surfaces, Vector, Wall
 from megloc_twins.textures import GROUND_TEXELS_PER_M, TextureRecipe, index_of, texels
@@ -250,23 +250,17 @@ class _TextureStore:
         shared = self.rng.random() < self.options.repetition
         owner = "shared" if shared else f"place{self.place}"
         number = int(self.rng.integers(num_shared if shared else num_own))
-        seed = int(stream(self.options.seed, owner, kind, number).integers(2**31))
+        seed = seed_of(self.options.seed, owner, kind, number)
         return index_of(TextureRecipe(kind, width, height, seed), self.recipes)
 
     def material(self, painter: str, kind: str, size_m: tuple[float, float], label: str) -> int:
         density = _WALL_TEXELS_PER_M if painter == "wall" else GROUND_TEXELS_PER_M
-        seed = int(stream(self.options.seed, self.place, label).integers(2**31))
-        shared_seed = int(stream(self.options.seed, "material").integers(2**31))
-        params: dict[str, str | float] = {
-            "material": kind,
-            "material_seed": shared_seed,
-            "dirt": self.options.unique_texture,
-        }
+        seed = seed_of(self.options.seed, self.place, label)
+        params: dict[str, str | float] = {"material": kind}
+        params["material_seed"] = seed_of(self.options.seed, "material")
         if painter == "wall":
             params["graffiti"] = float(self.rng.integers(0, 3))
-        recipe = TextureRecipe(
-            painter, *texels(size_m, density), seed, tuple(sorted(params.items()))
-        )
+        recipe = TextureRecipe(painter, *texels(size_m, density), seed, tuple(params.items()))
         return index_of(recipe, self.recipes)
 
 

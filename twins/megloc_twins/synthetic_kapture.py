@@ -30,7 +30,7 @@ from megloc_twins.frames import (
     noise_seed,
 )
 from megloc_twins.moving_objects import place_moving_objects
-from megloc_twins.options import SyntheticDataset, SyntheticWorldOptions, stream
+from megloc_twins.options import JPEG_QUALITY, SyntheticDataset, SyntheticWorldOptions, stream
 from megloc_twins.render import RenderedFrame, render_frames
 from megloc_twins.squares import Place, build_place
 from megloc_twins.viewpoints import CoarseView, coarse_view, query_frames
@@ -40,29 +40,27 @@ _RIG_ID = "rig"
 _BONNET_SENSOR = "rig_front"
 
 
+# the rig looks along z, y down, metres
+SENSOR_FROM_RIG = {
+    "rig_front": cam_from_rig(0.0, -2.0, (0.0, -0.05, 0.45)),
+    "rig_left": cam_from_rig(-62.0, 3.0, (-0.35, 0.0, 0.05)),
+    "rig_right": cam_from_rig(62.0, 3.0, (0.35, 0.0, 0.05)),
+}
+_LENSES = {  # focal length and principal point, shares of the width and height
+    "rig_front": (0.76, 0.5, 0.5),
+    "rig_left": (0.73, 0.506, 0.493),
+    "rig_right": (0.73, 0.494, 0.507),
+}
+
+
 def rig_cameras(options: SyntheticWorldOptions) -> dict[str, Camera]:
     """Cameras of the mapping rig by sensor id, PINHOLE."""
     width, height = options.width, options.height
-    shares = {  # of the width and height: focal length, principal point
-        "rig_front": (0.76, 0.5, 0.5),
-        "rig_left": (0.73, 0.506, 0.493),
-        "rig_right": (0.73, 0.494, 0.507),
-    }
-    return {
-        sensor_id: Camera(
-            "PINHOLE", width, height, (f * width, f * width * 1.004, cx * width, cy * height)
-        )
-        for sensor_id, (f, cx, cy) in shares.items()
-    }
-
-
-def rig_geometry() -> dict[str, RigidTransform]:
-    """``sensor_from_rig`` of the rig's cameras; the rig looks along z, y down, metres."""
-    return {
-        "rig_front": cam_from_rig(0.0, -2.0, (0.0, -0.05, 0.45)),
-        "rig_left": cam_from_rig(-62.0, 3.0, (-0.35, 0.0, 0.05)),
-        "rig_right": cam_from_rig(62.0, 3.0, (0.35, 0.0, 0.05)),
-    }
+    cameras = {}
+    for sensor_id, (f, cx, cy) in _LENSES.items():
+        params = (f * width, f * width * 1.004, cx * width, cy * height)
+        cameras[sensor_id] = Camera("PINHOLE", width, height, params)
+    return cameras
 
 
 def _mapping_frames(
@@ -71,7 +69,6 @@ def _mapping_frames(
     """What the rig takes at its stops in a place, in order of time; adds its poses there."""
     rng = stream(options.seed, "mapping", place.index)
     sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(40, 60)))
-    geometry = rig_geometry()
     frames = []
     for station, (spot, heading) in enumerate(place.plan.stops(options.stations_per_place)):
         timestamp = 1000 * (place.index + 1) + station
@@ -83,8 +80,7 @@ def _mapping_frames(
         moving_objects = place_moving_objects(place.plan, rng, options.moving_objects, position)
         for sensor_id, camera in rig_cameras(options).items():
             folder = sensor_id.removeprefix("rig_")
-            image = f"db/{place.name}/{folder}/{station:05d}.{options.image_format}"
-            seed = noise_seed(options.seed, image)
+            image = f"db/{place.name}/{folder}/{station:05d}.jpg"
             frames.append(
                 Frame(
                     name=image,
@@ -94,10 +90,11 @@ def _mapping_frames(
                     timestamp=timestamp,
                     sensor_id=sensor_id,
                     camera=camera,
-                    cam_from_world=geometry[sensor_id] @ pose,
-                    lighting=day_lighting(rng, sun, overcast=0.15, noise_seed=seed),
+                    cam_from_world=SENSOR_FROM_RIG[sensor_id] @ pose,
+                    lighting=day_lighting(rng, sun, overcast=0.15),
+                    noise_seed=noise_seed(options.seed, image),
                     moving_objects=moving_objects,
-                    bonnet=options.bonnet and sensor_id == _BONNET_SENSOR,
+                    bonnet=sensor_id == _BONNET_SENSOR,
                 )
             )
     return frames
@@ -109,7 +106,6 @@ class SyntheticWorld:
 
     options: SyntheticWorldOptions
     places: tuple[Place, ...]  # by index
-    sensor_from_rig: dict[str, RigidTransform]  # of the mapping rig's cameras, by sensor id
     rig_from_world: dict[int, RigidTransform]  # by timestamp
     mapping: tuple[Frame, ...]  # sorted by name
     queries: tuple[Frame, ...]  # sorted by name
@@ -145,7 +141,6 @@ def build_world(options: SyntheticWorldOptions | None = None) -> SyntheticWorld:
     return SyntheticWorld(
         options=options,
         places=places,
-        sensor_from_rig=rig_geometry(),
         rig_from_world=rig_from_world,
         mapping=tuple(sorted(mapping, key=attrgetter("name"))),
         queries=tuple(sorted(queries, key=attrgetter("name"))),
@@ -168,7 +163,7 @@ class SyntheticKapture(SyntheticDataset[SyntheticWorldOptions]):
         render_frames(
             self.options,
             world.frames(),
-            partial(_write_files, root, self.options),
+            partial(write_files, root, self.options),
             with_depth=[frame.name for frame in world.mapping] if self.options.depth else (),
             work=work,
         )
@@ -186,8 +181,8 @@ class SyntheticKapture(SyntheticDataset[SyntheticWorldOptions]):
 def mapping_data(world: SyntheticWorld) -> KaptureData:
     """The mapping images' records; their poses are those of the rig."""
     data = KaptureData()
-    cameras, members = rig_cameras(world.options), dict(world.sensor_from_rig)
-    for sensor_id, camera in cameras.items():
+    members = dict(SENSOR_FROM_RIG)
+    for sensor_id, camera in rig_cameras(world.options).items():
         data.sensors[sensor_id] = Sensor.from_camera(camera, name=sensor_id)
         if world.options.depth:
             depth_id = _depth_sensor(sensor_id)
@@ -224,12 +219,13 @@ def _depth_sensor(sensor_id: str) -> str:
     return f"{sensor_id}_depth"
 
 
-def _write_files(
+def write_files(
     root: Path, options: SyntheticWorldOptions, frame: Frame, view: RenderedFrame
 ) -> None:
+    """Write an image, its depth where it has one, and its mask where asked for."""
     sensors = root / frame.role / "sensors"
     records = sensors / "records_data"
-    write_image(records / frame.name, view.image, jpeg_quality=options.jpeg_quality)
+    write_image(records / frame.name, view.image, jpeg_quality=JPEG_QUALITY)
     if view.depth_m is not None:
         write_depth_map(records / depth_name(frame.name), view.depth_m)
     if options.masks and not view.mask.all():

@@ -75,14 +75,13 @@ def paint_ground(
     *,
     material: str,
     material_seed: float,
-    dirt: float = 1.0,
 ) -> Rgb:
     """Paving or asphalt with patches, lines, manholes and leaves."""
     density = GROUND_TEXELS_PER_M
     ground = tiled(material, int(material_seed), height, width, (0, 0))
     coarse = smooth_noise(rng, height, width, cell=200, octaves=4)
     fine = smooth_noise(rng, height, width, cell=32, octaves=2)
-    ground = shade(ground, np.clip(1 + dirt * (0.08 * coarse + 0.06 * fine), 0.3, 1.6))
+    ground = shade(ground, np.clip(1 + (0.08 * coarse + 0.06 * fine), 0.3, 1.6))
     image = to_rgb(ground)
     area_m2 = height * width / density**2
     for _ in range(int(area_m2 / 14)):  # repaired patches
@@ -105,7 +104,7 @@ def paint_ground(
         begin, end = ((int(x), int(y)) for x, y in (start, stop))
         paint = float(rng.uniform(170, 225))
         cv2.line(image, begin, end, (paint, paint, paint), int(0.12 * density), cv2.LINE_AA)
-    for _ in range(int(dirt * area_m2 * 2.5)):  # leaves, litter
+    for _ in range(int(area_m2 * 2.5)):  # leaves, litter
         x, y = (int(v) for v in rng.uniform((0, 0), (width, height)))
         a, b = (max(1, int(axis)) for axis in rng.uniform(0.02, 0.06, 2) * density)
         colour = cv_colour(random_colour(rng, 20, 230))

@@ -26,8 +26,6 @@ from megloc_twins.rasterization import depth_map, intrinsics, project, sample_gr
 from megloc_twins.squares import Place
 from megloc_twins.surfaces import Surfaces
 
-_REDUCTION = 8
-_STRIDE = 4
 _DEPTH_TOLERANCE = 0.05  # relative; the other view's depth is read at the nearest coarse pixel
 # what SIFT bears between two views of a point: angle between the rays, ratio of sizes and of
 # foreshortenings
@@ -46,44 +44,50 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class CoarseView:
-    """A view's depth at an eighth of its resolution, and points on a sparse grid of it.
+    """A view's depth at a part of its resolution, and points on a sparse grid of it.
 
-    ``depth`` is float32 (h, w), metres, 0 where nothing is seen; ``points`` and ``normals``,
-    float64 (P, 3), are of what is seen, in the surfaces' frame.
+    ``small`` is the camera of that resolution; ``depth`` is float32 (h, w), metres, 0 where nothing
+    is seen; ``points`` and ``normals``, float64 (P, 3), are of what is seen, in the surfaces'
+    frame, ``surface`` (P,) are the surfaces' indices.
     """
 
     camera: Camera
+    small: Camera
     cam_from_world: RigidTransform
     depth: NDArray[np.float32]
     points: Floats
     normals: Floats
+    surface: NDArray[np.int16]
 
 
-def coarse_view(surfaces: Surfaces, camera: Camera, cam_from_world: RigidTransform) -> CoarseView:
-    """Look at surfaces coarsely."""
-    grid = sample_grid(reduced(camera, _REDUCTION), 1)
+def coarse_view(
+    surfaces: Surfaces,
+    camera: Camera,
+    cam_from_world: RigidTransform,
+    *,
+    reduction: int = 8,
+    stride: int = 4,
+) -> CoarseView:
+    """Look at surfaces coarsely: px per px of ``depth``, and of that per point and axis."""
+    grid = sample_grid(reduced(camera, reduction), 1)
     seen = visible_surfaces(surfaces, cam_from_world, grid)
     depth = depth_map(seen)
-    sparse = np.s_[_STRIDE // 2 :: _STRIDE, _STRIDE // 2 :: _STRIDE]
+    sparse = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     z = depth[sparse].astype(np.float64)
-    in_camera = (grid.rays()[sparse] * z[..., None])[z > 0]
-    return CoarseView(
-        camera,
-        cam_from_world,
-        depth,
-        points=cam_from_world.inverse().apply(in_camera),
-        normals=surfaces.normals()[seen.surface[sparse][z > 0]],
-    )
+    points = cam_from_world.inverse().apply((grid.rays()[sparse] * z[..., None])[z > 0])
+    surface = seen.surface[sparse][z > 0]
+    normals = surfaces.normals()[surface]
+    return CoarseView(camera, grid.camera, cam_from_world, depth, points, normals, surface)
 
 
 def visible(points: Floats, view: CoarseView) -> Bools:
     """Visibility, bool (P,), of points (P, 3) in a view."""
     in_camera = view.cam_from_world.apply(points)
     z = in_camera[:, 2]
-    small = reduced(view.camera, _REDUCTION)
     ahead = np.where((z > 0.1)[:, None], in_camera, [0.0, 0.0, 1.0])
-    column, row = np.floor(project(small, ahead)).astype(np.int64).T
-    inside = (column >= 0) & (column < small.width) & (row >= 0) & (row < small.height)
+    column, row = np.floor(project(view.small, ahead)).astype(np.int64).T
+    height, width = view.depth.shape
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     inside &= z > 0.1
     seen = view.depth[np.where(inside, row, 0), np.where(inside, column, 0)]
     return inside & (np.abs(seen - z) < _DEPTH_TOLERANCE * z + 0.05)
@@ -140,7 +144,7 @@ def query_frames(
     frames = []
     for number in range(place.index, total, options.num_places):
         sensor_id = f"{condition}_{number:05d}"
-        image = f"query/{condition}/{number:05d}.{options.image_format}"
+        image = f"query/{condition}/{number:05d}.jpg"
         rng = stream(options.seed, "query", sensor_id)
         camera = query_camera(options, rng)
         position, yaw, cam_from_place = first_fitting(
@@ -156,7 +160,8 @@ def query_frames(
                 sensor_id=sensor_id,
                 camera=camera,
                 cam_from_world=cam_from_place @ place.place_from_world,
-                lighting=_query_lighting(options, condition, rng, image),
+                lighting=_query_lighting(options, condition, rng),
+                noise_seed=noise_seed(options.seed, image),
                 moving_objects=place_moving_objects(
                     place.plan, rng, options.moving_objects, position, yaw
                 ),
@@ -177,20 +182,16 @@ def query_camera(options: SyntheticWorldOptions, rng: np.random.Generator) -> Ca
     width, height = options.width, options.height
     focal = rng.uniform(0.7, 0.95) * width
     cx, cy = width / 2 + rng.normal(0, 2), height / 2 + rng.normal(0, 2)
-    if not options.distortion:
-        return Camera("SIMPLE_PINHOLE", width, height, (focal, cx, cy))
-    k = rng.uniform(-0.09, 0.04)
-    return Camera("SIMPLE_RADIAL", width, height, (focal, cx, cy, k))
+    return Camera("SIMPLE_RADIAL", width, height, (focal, cx, cy, rng.uniform(-0.09, 0.04)))
 
 
 def _query_lighting(
-    options: SyntheticWorldOptions, condition: Condition, rng: np.random.Generator, image: str
+    options: SyntheticWorldOptions, condition: Condition, rng: np.random.Generator
 ) -> Lighting:
-    seed = noise_seed(options.seed, image)
     if condition == "night":
-        return night_lighting(rng, exposure=options.night_exposure, noise_seed=seed)
+        return night_lighting(rng, exposure=options.night_exposure)
     sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(35, 60)))
-    return day_lighting(rng, sun, overcast=float(rng.choice([0.1, 0.5, 1.0])), noise_seed=seed)
+    return day_lighting(rng, sun, overcast=float(rng.choice([0.1, 0.5, 1.0])))
 
 
 def _query_poses(

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
+from collections.abc import Callable, Iterator
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
 import pytest
+from megloc_twins import render
 from megloc_twins.aachen import AachenTwin, AachenTwinOptions
 from megloc_twins.fourseasons import FourSeasonsTwin, FourSeasonsTwinOptions
 from megloc_twins.inloc import InLocTwin, InLocTwinOptions
 from megloc_twins.options import SyntheticDataset, SyntheticWorldOptions
 from megloc_twins.robotcar import RobotCarTwin, RobotCarTwinOptions
-from megloc_twins.synthetic_kapture import SyntheticKapture
+from megloc_twins.synthetic_kapture import SyntheticKapture, SyntheticWorld, build_world
 
 SIZE = {"width": 160, "height": 120, "supersampling": 1}
 PLACES = {"num_places": 2, "day_queries": 2, "night_queries": 2}
@@ -23,10 +24,10 @@ DRIVES = {"num_places": 2, "map_keyframes": 6, "winter_keyframes": 3, "dusk_keyf
 CUTOUTS = {"cutout_width": 64, "cutout_height": 48, "query_width": 96, "query_height": 72}
 SMALL: dict[str, SyntheticDataset[Any]] = {
     "synthetic": SyntheticKapture(
-        SyntheticWorldOptions(**PLACES, **SIZE, stations_per_place=4, depth=True, masks=True)
+        SyntheticWorldOptions(**PLACES, **SIZE, stations_per_place=6, depth=True, masks=True)
     ),
     "aachen": AachenTwin(
-        AachenTwinOptions(**CITY, **SIZE, stations_per_place=7, points_per_image=60)
+        AachenTwinOptions(**CITY, **SIZE, stations_per_place=5, points_per_image=60)
     ),
     "robotcar": RobotCarTwin(
         RobotCarTwinOptions(**STREETS, size_px=96, supersampling=1, points_per_image=40)
@@ -36,6 +37,21 @@ SMALL: dict[str, SyntheticDataset[Any]] = {
     ),
     "inloc": InLocTwin(InLocTwinOptions(**CUTOUTS, modules=1, queries=5, supersampling=1)),
 }
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _painted_once() -> Iterator[None]:
+    """The outdoor places of a seed look alike in all datasets, and painting them is what takes
+    time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(render, "painted", lru_cache(maxsize=4)(render.painted))
+        yield
+
+
+@pytest.fixture(scope="session")
+def world() -> SyntheticWorld:
+    """The world of the small synthetic dataset."""
+    return build_world(SMALL["synthetic"].options)
 
 
 @pytest.fixture(scope="session")
@@ -49,12 +65,12 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """Folder of the small dataset in a layout; not to be written into."""
 
     @cache
-    def render(name: str) -> Path:
+    def written(name: str) -> Path:
         root = tmp_path_factory.mktemp(name) / "root"
         SMALL[name].write(root)
         return root
 
-    return render
+    return written
 
 
 @pytest.fixture(scope="module")

@@ -18,10 +18,10 @@ from megloc_kapture.datasets.formats.fourseasons_files import (
     read_times,
     read_transformations,
 )
-from megloc_kapture.datasets.fourseasons.adapter import FourSeasons, FourSeasonsOptions
+from megloc_kapture.datasets.fourseasons.adapter import FourSeasons
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.geometry.poses import earth_from_enu, geodetic
-from megloc_kapture.io.images import read_depth_map, read_image_rgb
+from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
 
@@ -30,14 +30,7 @@ LAYOUT = "4seasons"
 
 @pytest.fixture(scope="module")
 def dataset(root: Path) -> OfficialDataset:
-    return FourSeasons(FourSeasonsOptions(depth=True)).read(root)
-
-
-@pytest.fixture(scope="module")
-def workspace(dataset: OfficialDataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    output = tmp_path_factory.mktemp("4seasons") / "workspace"
-    write_official(dataset, output)
-    return output
+    return FourSeasons().read(root)
 
 
 def true_poses(root: Path, part: str) -> dict[str, RigidTransform]:
@@ -142,34 +135,6 @@ def test_fixes_of_the_receiver_are_where_the_car_is(root: Path) -> None:
         assert np.linalg.norm(np.array(there) - center) < 1e-2
 
 
-def test_kaptures_importer_has_the_same_poses(
-    root: Path, dataset: OfficialDataset, tmp_path: Path
-) -> None:
-    import kapture
-    from kapture.io.csv import kapture_from_dir
-    from kapture.io.records import TransferAction
-    from tools.kapture_import_4seasons import import_4seasons_sequence
-
-    folders = [str(each) for each in (root / "calibration", root / REFERENCE, tmp_path / "theirs")]
-    import_4seasons_sequence(*folders, TransferAction.skip, True)
-    theirs = kapture_from_dir(folders[-1])
-    assert len(theirs.trajectories) == len(dataset.mapping.trajectories)
-    rig = theirs.rigs["car", "cam1"]
-    for (timestamp, car), pose in dataset.mapping.trajectories.items():
-        other = theirs.trajectories[timestamp, car]
-        unit = tuple(other.r_raw / np.linalg.norm(other.r_raw))
-        found = dataset.world.pose_in_official(pose)
-        expected = RigidTransform(unit, tuple(other.t_raw))
-        assert np.linalg.norm(found.center() - expected.center()) < 1e-6
-        rotations = Rotation.from_quat([found.quat_wxyz, unit], scalar_first=True)
-        assert np.degrees((rotations[0] * rotations[1].inv()).magnitude()) < 1e-6
-        right = kapture.PoseTransform.compose([rig, other])
-        image = dataset.mapping.records_camera[timestamp, "cam1"]
-        ours = dataset.mapping.cam_from_world(image)
-        center = dataset.world.pose_in_official(ours).center()
-        np.testing.assert_allclose(center, right.inverse().t_raw, rtol=0, atol=1e-6)
-
-
 @pytest.mark.parametrize("place", [(48.2, 11.6, 540.0), (-33.9, 151.2, 12.0), (0.0, -180.0, -30.0)])
 def test_geodesy(place: tuple[float, float, float]) -> None:
     found = geodetic(np.array(earth_from_enu(*place).translation))
@@ -192,7 +157,7 @@ def keyframes_of(root: Path, recording: str) -> list[Keyframe]:
     return [read_keyframe(f) for f in sorted((root / recording / "KeyFrameData").iterdir())]
 
 
-def test_point_clouds_reproject(root: Path, workspace: Path) -> None:
+def test_point_clouds_reproject(root: Path, dataset: OfficialDataset, tmp_path: Path) -> None:
     """A point of one keyframe's cloud falls on its own pixel in another keyframe's cloud.
 
     Lifted and moved by kapture's poses as imported, projected by COLMAP's cameras.
@@ -200,7 +165,8 @@ def test_point_clouds_reproject(root: Path, workspace: Path) -> None:
     import pycolmap
     from kapture.io.csv import kapture_from_dir
 
-    theirs = kapture_from_dir(str(workspace / "mapping"))
+    write_official(dataset, tmp_path)
+    theirs = kapture_from_dir(str(tmp_path / "mapping"))
     model, width, height, *params = theirs.sensors["cam0"].sensor_params
     size = {"width": int(width), "height": int(height)}
     camera = pycolmap.Camera(model=model, params=list(map(float, params)), **size)
@@ -225,24 +191,6 @@ def test_point_clouds_reproject(root: Path, workspace: Path) -> None:
         projected = camera.img_from_cam(pose.transform_points(clouds[first][a]))
         assert np.abs(projected - pixels[second][b]).max(initial=0) < 1e-3
     assert found > 100
-
-
-def test_depth_maps_are_metric(root: Path, workspace: Path, dataset: OfficialDataset) -> None:
-    mapping = KaptureFolder(workspace / "mapping").read()
-    assert len(mapping.records_depth) == 12
-    rows = read_gnss_poses(root / REFERENCE / "GNSSPoses.txt")
-    points = 0
-    for keyframe in keyframes_of(root, REFERENCE):
-        name = mapping.records_depth[keyframe.timestamp, "depth"]
-        path = workspace / "mapping/sensors/records_data" / name
-        depth = read_depth_map(path, width=200, height=100)
-        scale = rows[keyframe.timestamp].scale
-        assert scale is not None
-        for u, v, inverse in keyframe.points:
-            assert depth[int(v), int(u)] <= np.float32(scale / inverse)
-            points += depth[int(v), int(u)] == np.float32(scale / inverse)
-        assert (depth > 0).sum() <= len(keyframe.points)
-    assert points > 200
 
 
 def test_the_default_is_large_enough() -> None:

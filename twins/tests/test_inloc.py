@@ -13,9 +13,9 @@ from megloc_twins.frames import lamp_lighting
 from megloc_twins.indoor_rooms import (
     ROOM_KINDS,
     Floor,
-    FloorBuilder,
     Parts,
     Recipes,
+    build_floor,
     build_module,
     build_room,
 )
@@ -23,10 +23,10 @@ from megloc_twins.inloc import (
     PITCHES_DEG,
     YAWS_DEG,
     InLocTwinOptions,
+    build_queries,
     cam_from_scan,
     cutout_camera,
     phone_camera,
-    query_views,
     scanned_points,
 )
 from megloc_twins.rasterization import NO_SURFACE, depth_map, sample_grid, visible_surfaces
@@ -139,7 +139,7 @@ def test_the_default_twin_is_real_work() -> None:
 
 @pytest.fixture(scope="module")
 def floors() -> list[Floor]:
-    return FloorBuilder(2).floors(0, 2)
+    return [build_floor(0, index, 2) for index in (0, 1)]
 
 
 def sizes_of(surfaces: Surfaces) -> np.ndarray:
@@ -249,34 +249,36 @@ def test_cutouts_turn_to_the_right_and_up() -> None:
 
 
 def test_queries_are_held_elsewhere_than_scanners_stand(floors: list[Floor]) -> None:
-    views = query_views(floors, 0, 24, (640, 480))
-    assert Counter(view.floor for view in views) == {0: 12, 1: 12}
-    gaps = []
-    for view in views:
-        zones = {zone.name: zone for zone in floors[view.floor].zones}
-        center = view.cam_from_place.center()
-        assert zones[view.zone].plan.is_free(center[0], center[1], 0.5)
-        assert 1.3 < center[2] < 1.8
-        scanners = [zone.scan_from_place.center() for zone in zones.values()]
-        gaps.append(np.linalg.norm(np.subtract(scanners, center), axis=1).min())
+    frames = build_queries(InLocTwinOptions(modules=2, queries=12))
+    assert Counter(frame.place for frame in frames) == {0: 6, 1: 6}
+    gaps, zones_seen = [], Counter[tuple[int, str]]()
+    for frame in frames:
+        floor = floors[frame.place]
+        x, y, z = floor.place.cam_from_place(frame).center()
+        free = [zone.name for zone in floor.zones if zone.plan.is_free(x, y, 0.5)]
+        zones_seen.update((frame.place, name) for name in free)
+        assert 1.3 < z < 1.8
+        scanners = [zone.scan_from_place.center() for zone in floor.zones]
+        gaps.append(np.linalg.norm(np.subtract(scanners, (x, y, z)), axis=1).min())
     assert np.median(gaps) > 0.6
-    assert Counter(view.zone for view in views if view.floor == 0) == dict.fromkeys(zones, 2)
-    upright = [view.camera.height > view.camera.width for view in views]
+    zones = {(place, zone.name) for place in (0, 1) for zone in floors[place].zones}
+    assert zones_seen == dict.fromkeys(zones, 1)
+    upright = [frame.camera.height > frame.camera.width for frame in frames]
     assert 0.2 < np.mean(upright) < 0.5
-    assert {view.camera.params[0] for view in views} == {640 * 28 / 36}
-    with_people = [bool(view.people) for view in views]
+    assert {frame.camera.params[0] for frame in frames} == {640 * 28 / 36}
+    with_people = [bool(frame.moving_objects) for frame in frames]
     assert 0.2 < np.mean(with_people) < 0.8
-    assert all(person.kind == "person" for view in views for person in view.people)
-    # they do not depend on how many there are
-    small = FloorBuilder(1)
-    few, more = (query_views(small.floors(0, 2), 0, count, (640, 480)) for count in (2, 4))
-    assert few == [more[0], more[2]]
-    other = query_views(small.floors(1, 2), 1, 2, (640, 480))
-    assert other[0].cam_from_place != few[0].cam_from_place
+    assert all(person.kind == "person" for f in frames for person in f.moving_objects)
+    # they do not depend on how many there are, and another seed has others
+    few, more, other = (
+        [frame.cam_from_world for frame in build_queries(InLocTwinOptions(modules=1, **update))]
+        for update in ({"queries": 2}, {"queries": 4}, {"queries": 2, "seed": 1})
+    )
+    assert few == [more[0], more[2]] and other[0] != few[0]
     # light varies between telephones, not within a scan
     rngs = (np.random.default_rng(i % 2) for i in range(4))
-    scans = [lamp_lighting(next(rngs), noise=1, noise_seed=0) for _ in range(2)]
-    phones = [lamp_lighting(next(rngs), noise=1, noise_seed=0, spread=0.2) for _ in range(2)]
+    scans = [lamp_lighting(next(rngs), noise=1) for _ in range(2)]
+    phones = [lamp_lighting(next(rngs), noise=1, spread=0.2) for _ in range(2)]
     assert scans[0] == scans[1]
     assert phones[0].exposure != phones[1].exposure
     assert phones[0].white_balance != phones[1].white_balance

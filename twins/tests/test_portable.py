@@ -31,8 +31,8 @@ FIELDS = """
 import hashlib
 import numpy as np
 from megloc_twins.surfaces import build_atlas
-from megloc_twins.frames import day_lighting, looking_at, night_lighting
-from megloc_twins.synthetic_kapture import rig_geometry
+from megloc_twins.frames import Frame, day_lighting, looking_at, night_lighting
+from megloc_twins.synthetic_kapture import SENSOR_FROM_RIG
 from megloc_twins.drawing import periodic_noise, smooth_noise
 from megloc_twins.options import stream
 from megloc_twins.rasterization import sample_colour, sample_grid, visible_surfaces
@@ -49,7 +49,7 @@ rng = stream(0, "portable")
 poses = [looking_at(rng.normal(0, 3, 3), *rng.normal(0, 1, 3)) for _ in range(50)]
 chain = poses[0]
 for pose in poses[1:]:
-    chain = chain @ pose.inverse() @ list(rig_geometry().values())[1]
+    chain = chain @ pose.inverse() @ SENSOR_FROM_RIG["rig_left"]
     digest("pose", chain.quat_wxyz, chain.translation, chain.center())
 digest("noise", smooth_noise(rng, 300, 400, cell=90), periodic_noise(rng, 256, cell=40))
 wall = (("material", "brick"), ("material_seed", 3.0))
@@ -65,8 +65,8 @@ for _ in range(60):
 surfaces = builder.build()
 grid = sample_grid(Camera("SIMPLE_RADIAL", 320, 240, (230.0, 160.0, 120.0, -0.07)), 2)
 lamps = rng.uniform((-5, -5, 2), (5, 5, 3), (6, 3))
-day = day_lighting(rng, (1.0, 0.8), overcast=0.2, noise_seed=1)
-night = night_lighting(rng, exposure=1.0, noise_seed=2)
+day = day_lighting(rng, (1.0, 0.8), overcast=0.2)
+night = night_lighting(rng, exposure=1.0)
 atlas, clouds = build_atlas(textures), cloud_texture(0)
 for look in (day, night):
     pose = looking_at(np.array([0.3, -7.0, 1.6]), 1.5, 0.05, 0.02)
@@ -78,7 +78,8 @@ for look in (day, night):
         clouds=clouds,
     )
     digest(look.condition, seen.planes, seen.inverse_depth, colour, light)
-    digest(look.condition + " developed", develop(light, look, 2, bonnet_seed=None))
+    frame = Frame("f", "query", "", 0, 0, "s", grid.camera, pose, look, 1, bonnet=True)
+    digest(look.condition + " developed", develop(light, frame, 2, 0))
 """
 
 TWIN = """

@@ -23,9 +23,10 @@ from megloc_twins.viewpoints import overlap
 
 from megloc_kapture.features.rootsift import RootSift
 from megloc_kapture.io.colmap_cameras import normalized_from_px, px_from_cam
-from megloc_kapture.preprocessing.masks import with_margin
 
-OPTIONS = SyntheticWorldOptions(num_places=1, stations_per_place=9, day_queries=2, night_queries=2)
+OPTIONS = SyntheticWorldOptions(
+    num_places=1, stations_per_place=6, day_queries=1, night_queries=1, width=320, height=240
+)
 
 
 @pytest.fixture(scope="module")
@@ -33,13 +34,9 @@ def world() -> SyntheticWorld:
     return build_world(OPTIONS)
 
 
-def new_painter(world: SyntheticWorld) -> PlaceRenderer:
-    return PlaceRenderer(world.places[0], seed=OPTIONS.seed, supersampling=OPTIONS.supersampling)
-
-
 @pytest.fixture(scope="module")
 def painter(world: SyntheticWorld) -> PlaceRenderer:
-    return new_painter(world)
+    return PlaceRenderer(world.places[0], seed=OPTIONS.seed, supersampling=OPTIONS.supersampling)
 
 
 def first(world: SyntheticWorld, prefix: str) -> Frame:
@@ -51,9 +48,9 @@ def test_drawing_gives_the_same_bytes_whatever_was_drawn_before(
 ) -> None:
     frames = [first(world, p) for p in ("db/place0/front", "query/day", "query/night")]
     images = [painter.render(frame).image for frame in frames]
-    fresh = new_painter(world)
+    fresh = PlaceRenderer(world.places[0], seed=OPTIONS.seed, supersampling=OPTIONS.supersampling)
     for frame, image in reversed(list(zip(frames, images, strict=True))):
-        assert image.shape == (480, 640, 3) and image.dtype == np.uint8
+        assert image.shape == (240, 320, 3) and image.dtype == np.uint8
         np.testing.assert_array_equal(fresh.render(frame).image, image)
 
 
@@ -65,7 +62,7 @@ def test_images_are_rich_in_features_by_day_and_poorer_at_night(
     for prefix in ("db/place0/left", "query/day", "query/night"):
         image = painter.render(first(world, prefix)).image
         features = sift.extract(image)
-        assert len(features.scores) > 800
+        assert len(features.scores) > 200
         strong[prefix] = int((features.scores > 0.02).sum())
     assert strong["query/night"] < 0.5 * min(strong["db/place0/left"], strong["query/day"])
 
@@ -79,7 +76,7 @@ def test_the_same_view_is_darker_and_noisier_at_night(
     assert dark.mean() < 0.5 * bright.mean()
     red, _, blue = dark.reshape(-1, 3).mean(0)
     assert red > 1.15 * blue  # the lamps' colour
-    again = painter.render(replace(night, lighting=replace(night.lighting, noise_seed=1))).image
+    again = painter.render(replace(night, noise_seed=1)).image
     assert np.abs(again.astype(int) - dark).mean() > 2
 
 
@@ -90,7 +87,7 @@ def test_the_bonnet_stays_in_the_image_and_is_masked(
     first_view, second_view = (painter.render(frame, depth=True) for frame in frames)
     hidden = ~first_view.mask
     assert 0.05 < hidden.mean() < 0.25
-    assert hidden[-1, 320] and not hidden[: 480 // 2].any()
+    assert hidden[-1, 160] and not hidden[:120].any()
     np.testing.assert_array_equal(hidden, ~second_view.mask)
     assert first_view.depth_m is not None and (first_view.depth_m[hidden] == 0).all()
     open_road = painter.render(replace(frames[0], bonnet=False))
@@ -121,7 +118,7 @@ def test_depth_and_poses_of_two_views_agree(world: SyntheticWorld, painter: Plac
     a = painter.render(_evenly_lit(query), depth=True)
     b = painter.render(_evenly_lit(near), depth=True)
     assert a.depth_m is not None and b.depth_m is not None
-    row, column = (g.ravel() for g in np.mgrid[8:472:4, 8:632:4])
+    row, column = (g.ravel() for g in np.mgrid[4:236:2, 4:316:2])
     z = a.depth_m[row, column].astype(np.float64)
     row, column, z = row[z > 0], column[z > 0], z[z > 0]
     pixels = np.stack([column + 0.5, row + 0.5], 1)
@@ -130,7 +127,7 @@ def test_depth_and_poses_of_two_views_agree(world: SyntheticWorld, painter: Plac
     in_b = near.cam_from_world.apply(query.cam_from_world.inverse().apply(points))
     ahead = in_b[:, 2] > 0.1
     there = px_from_cam(near.camera, in_b[ahead])
-    inside = ((there > 1) & (there < (639, 479))).all(1)
+    inside = ((there > 1) & (there < (319, 239))).all(1)
     x, y = np.floor(there[inside]).astype(int).T
     expected = in_b[ahead][inside, 2]
     seen = b.depth_m[y, x]
@@ -157,7 +154,7 @@ def _overlapping(world: SyntheticWorld) -> tuple[Frame, Frame]:
     return query, best
 
 
-CAR = RobotCarTwinOptions(num_locations=1, moments_per_condition=2, size_px=256)
+CAR = RobotCarTwinOptions(num_locations=1, moments_per_condition=2, size_px=128)
 SEED = CAR.world().seed
 
 
@@ -198,23 +195,6 @@ def test_movers_are_where_the_image_changes_without_them(
     assert there is not None and gone is not None
     assert np.array_equal(there != gone, hidden)
     assert not on_moving_objects(replace(frame, moving_objects=()), place).any()
-
-
-def test_no_feature_is_left_on_the_bonnet_or_on_a_mover(
-    car_frames: list[Frame], car_renderer: PlaceRenderer
-) -> None:
-    place = build_place(CAR.world(), 0)
-    extractor = RootSift()
-    without = 0
-    for frame in (one for one in car_frames if one.sensor_id == "rear"):
-        image = car_renderer.render(frame).image
-        mask = ~(on_bonnet(frame, SEED) | on_moving_objects(frame, place))
-        found = extractor.extract(image, with_margin(mask, 3.0)).keypoints_px
-        column, row = np.floor(found[:, :2]).astype(int).T
-        assert len(found) and mask[row, column].all()
-        column, row = np.floor(extractor.extract(image).keypoints_px[:, :2]).astype(int).T
-        without += int(on_bonnet(frame, SEED)[row, column].sum())
-    assert without > 50  # what there is to be removed
 
 
 SUN = (1 / np.sqrt(2), 0.0, 1 / np.sqrt(2))  # 45 degrees above +x: a metre of height, a metre long

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import kapture
@@ -20,19 +19,15 @@ from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
 from megloc_kapture.io.dataset_tables import read_groups, read_names
 from megloc_kapture.io.images import image_size, read_image_rgb
 
-import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
-
 LAYOUT = "robotcar"
 
-MAX_M, MAX_DEG, MAX_PX = 1e-6, 1e-6, 1e-3
+MAX_M, MAX_DEG = 1e-6, 1e-6
 
 
-@pytest.fixture(scope="module", params=["merged", "individual"])
-def imported(
-    request: pytest.FixtureRequest, root: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+@pytest.fixture(scope="module")
+def imported(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("imported") / "out"
-    write_official(RobotCar(RobotCarOptions(model=request.param)).read(root), out)
+    write_official(RobotCar().read(root), out)
     return out
 
 
@@ -81,63 +76,6 @@ def test_rig_is_consistent_and_its_cameras_are_synchronous(root: Path, imported:
     assert (rear.r * np.quaternion(0, 0, 0, 1) * rear.r.inverse()).z < -0.9  # it looks back
 
 
-def nvm_observations(root: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Image, point, pixel of all.nvm; parsed here, without a reader of ours."""
-    words = (root / "3D-models/all-merged/all.nvm").read_text().split()
-    assert words.pop(0) == "NVM_V3"
-    num_cameras, rest = int(words[0]), words[1:]
-    names = rest[: 11 * num_cameras : 11]
-    rest = rest[11 * num_cameras :]
-    num_points, at = int(rest[0]), 1
-    assert num_points > 100
-    for _ in range(num_points):
-        point = np.array(rest[at : at + 3], float)
-        length = int(rest[at + 6])
-        for k in range(at + 7, at + 7 + 4 * length, 4):
-            yield names[int(rest[k])], point, np.array(rest[k + 2 : k + 4], float)
-        at += 7 + 4 * length
-
-
-def colmap_camera(sensor: kapture.Camera) -> pycolmap.Camera:
-    model, width, height, *params = sensor.sensor_params
-    size = {"width": int(width), "height": int(height)}
-    return pycolmap.Camera(model=model, params=[float(p) for p in params], **size)
-
-
-def test_points_of_the_model_reproject(root: Path, imported: Path) -> None:
-    mapping = kapture_from_dir(str(imported / "mapping"))
-    records = {n: (t, s) for t, s, n in kapture.flatten(mapping.records_camera)}
-    cameras = {sensor: colmap_camera(mapping.sensors[sensor]) for sensor in mapping.sensors}
-    count = 0
-    for name, point, px in nvm_observations(root):
-        assert name.startswith("./overcast-reference/") and name.endswith(".png")
-        timestamp, sensor = records[name[2:-4] + ".jpg"]
-        in_camera = mapping.trajectories[timestamp, sensor].transform_points(point[None])
-        error = np.linalg.norm(cameras[sensor].img_from_cam(in_camera)[0] - px)
-        assert error < MAX_PX
-        count += 1
-    assert count > 500
-
-
-def test_individual_models_are_colmap_models(root: Path, imported: Path) -> None:
-    mapping = kapture_from_dir(str(imported / "mapping"))
-    poses = poses_by_image(mapping)
-    seen = 0
-    for folder in sorted((root / "3D-models/individual/colmap_reconstructions").iterdir()):
-        model = pycolmap.Reconstruction(str(folder))
-        for image in model.images.values():
-            name = image.name.removesuffix(".png") + ".jpg"
-            camera = colmap_camera(mapping.sensors[name.split("/")[1]])
-            for feature in image.points2D:
-                if feature.has_point3D():
-                    point = model.points3D[feature.point3D_id].xyz
-                    in_camera = poses[name].transform_points(point[None])
-                    error = camera.img_from_cam(in_camera)[0] - feature.xy
-                    assert np.linalg.norm(error) < MAX_PX
-                    seen += 1
-    assert seen > 500
-
-
 @pytest.fixture(scope="module", params=["v1", "v2"])
 def theirs(
     request: pytest.FixtureRequest, root: Path, tmp_path_factory: pytest.TempPathFactory
@@ -156,6 +94,7 @@ def theirs(
     return request.param, parts
 
 
+@pytest.mark.slow
 def test_against_kaptures_importer(
     root: Path, theirs: tuple[str, dict[str, kapture.Kapture]], tmp_path: Path
 ) -> None:
@@ -220,7 +159,7 @@ def test_the_car_stands_in_the_rear_cameras_way(root: Path) -> None:
 
 def test_looks_differ() -> None:
     lightings = {
-        condition: road_lighting(condition, np.random.default_rng(0), azimuth=0.3, noise_seed=1)
+        condition: road_lighting(condition, np.random.default_rng(0), azimuth=0.3)
         for condition in WEATHERS
     }
     kinds = {(one.sun, one.sky, one.exposure, one.blur_px) for one in lightings.values()}
@@ -235,4 +174,4 @@ def test_looks_differ() -> None:
     assert not any(lightings["rain"].sun)
     assert lightings["night-rain"].exposure < lightings["night"].exposure
     with pytest.raises(KeyError):
-        road_lighting("fog", np.random.default_rng(0), azimuth=0.0, noise_seed=0)
+        road_lighting("fog", np.random.default_rng(0), azimuth=0.0)

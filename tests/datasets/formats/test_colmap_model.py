@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -106,24 +105,6 @@ def test_the_binary_files_count_where_there_are_both(tmp_path: Path) -> None:
     assert same(read_colmap_model(tmp_path), small_model())
     names = ("cameras.bin", "images.bin")
     assert colmap_model_files(tmp_path, with_points=False) == tuple(tmp_path / n for n in names)
-
-
-@WRITERS
-def test_models_that_colmap_cannot_hold_are_not_written(
-    tmp_path: Path, write: Callable[..., None]
-) -> None:
-    model, none = small_model(), SparsePoints.none()
-    image, points = model.images[0], model.points
-    twice = SparsePoints(*(np.repeat(getattr(points, name), 2, axis=0) for name in vars(points)))
-    for wrong in (
-        replace(model, cameras={}),
-        replace(model, images=(image, image), points=none),
-        replace(model, images=model.images[:2]),
-        replace(model, points=twice),
-        replace(model, images=(replace(image, name="a b.jpg"),), points=none),
-    ):
-        with pytest.raises(ValueError):
-            write(tmp_path / "m", wrong)
 
 
 CAMERAS = "# comment\n\n 1 SIMPLE_RADIAL 1600 1067 1084.6 800 533.5 -0.0811 \n"
