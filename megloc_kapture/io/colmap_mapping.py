@@ -1,4 +1,4 @@
-"""COLMAP's mappers and its stereo: photographs to poses, posed images to depth.
+"""COLMAP's SIFT, its mappers and its stereo: photographs to poses, posed images to depth.
 
 The mappers find poses, cameras and points of photographs from their verified matches. The
 incremental one is that of Schoenberger and Frahm, Structure-from-Motion Revisited (CVPR 2016), the
@@ -12,7 +12,7 @@ Stereo has a workspace, which is written, run where there is CUDA, read, and fus
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -22,17 +22,18 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.io.colmap import (
     NEVER,
     MapImage,
+    colmap_camera,
     database_folder,
+    load_pycolmap,
     numbered_cameras,
     quiet_stderr,
     write_database,
     write_model,
 )
-from megloc_kapture.io.colmap_cameras import load_pycolmap
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.images import write_image
 from megloc_kapture.values import Camera, RigidTransform
@@ -45,6 +46,84 @@ MIN_IMAGES = 3
 _MIN_POINTS = 30
 # matches that move less than this in the median are of one image twice
 _SAME_PX = 0.5
+
+
+def extract_sift(
+    image: NDArray[np.uint8],
+    *,
+    max_keypoints: int = 8192,
+    first_octave: int = -1,
+    peak_threshold: float = 0.02 / 3,
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """COLMAP's SIFT on the CPU, all else at its defaults, in its order (fine scales first).
+
+    Parameters
+    ----------
+    image : uint8 (H, W, 3), RGB; made grey as COLMAP does when it reads a file.
+    max_keypoints : COLMAP keeps whole scale levels, the coarsest first, up to and with the one that
+        exceeds this number; so there may be half as many again.
+
+    Returns
+    -------
+    keypoints : float32 (N, 4): x, y (the first pixel's centre is (0.5, 0.5)), scale in px,
+        orientation in radians.
+    descriptors : uint8 (N, 128): 512 times the square roots of the L1-normalised histograms.
+    """
+    pycolmap = load_pycolmap()
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = 1
+    options.sift.max_num_features = max_keypoints
+    options.sift.first_octave = first_octave
+    options.sift.peak_threshold = peak_threshold
+    bitmap = pycolmap.Bitmap.from_array(np.ascontiguousarray(image)).clone_as_grey()
+    # made anew each time: one has a pyramid of its own, which two threads would share
+    extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+    found, descriptors = extractor.extract(bitmap)
+    rows = [(k.x, k.y, k.compute_scale(), k.compute_orientation()) for k in found]
+    keypoints = np.array(rows, dtype=np.float32).reshape(-1, 4)
+    return keypoints, np.array(descriptors.data, dtype=np.uint8).reshape(-1, 128)
+
+
+@dataclass(frozen=True, eq=False)
+class DatabaseFeatures:
+    """One image of a COLMAP database: keypoints float32 (N, 2 or 4), descriptors uint8 (N, 128)."""
+
+    name: str
+    camera: Camera
+    keypoints_px: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+
+
+def write_feature_database(path: Path, images: Iterable[DatabaseFeatures]) -> None:
+    """Write COLMAP's database of images with SIFT features; equal cameras are one.
+
+    Raises OutputError: ``path`` is there already, or cannot be written.
+    """
+    pycolmap = load_pycolmap()
+    path = Path(path)
+    if path.exists():
+        raise OutputError(f"{path}: is there already")
+    camera_ids: dict[Camera, int] = {}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        database = pycolmap.Database.open(str(path))
+        with pycolmap.DatabaseTransaction(database):
+            for image in images:
+                if image.camera not in camera_ids:
+                    camera = colmap_camera(image.camera)
+                    camera_ids[image.camera] = database.write_camera(camera)
+                entry = pycolmap.Image(name=image.name, camera_id=camera_ids[image.camera])
+                image_id = database.write_image(entry)
+                database.write_keypoints(image_id, np.ascontiguousarray(image.keypoints_px))
+                kind = pycolmap.FeatureExtractorType.SIFT
+                rows = pycolmap.FeatureDescriptors(kind, np.ascontiguousarray(image.descriptors))
+                database.write_descriptors(image_id, rows)
+        database.close()
+    except (OSError, RuntimeError) as error:
+        raise OutputError(f"{path}: cannot be written: {error}") from error
+
+
+# ----------------------------------------------------------------------------------- mappers
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.formats.sparse_points import SparsePoints, image_order
+from megloc_kapture.datasets.formats.sparse_models import SparsePoints, image_order
 from megloc_kapture.datasets.formats.text_lines import check_plain, image_name, reading
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture.sensors import unit_quaternion

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import check_relative, read_text
+from megloc_kapture.io.kapture.format import FLOAT_PATTERN
 from megloc_kapture.io.kapture.sensors import unit_quaternion
-from megloc_kapture.io.kapture.text import FLOAT_PATTERN
 from megloc_kapture.values import RigidTransform
 
 # larger distances are broken and would overflow further on; ECEF coordinates are below 1e7

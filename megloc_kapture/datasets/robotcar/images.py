@@ -23,7 +23,7 @@ from megloc_kapture.datasets.kapture_folders import (
     tables_and_images,
 )
 from megloc_kapture.datasets.official import Missing, with_poses
-from megloc_kapture.datasets.robotcar.layout import (
+from megloc_kapture.datasets.robotcar import (
     CAMERAS,
     REFERENCE_CONDITION,
     SCORED_CAMERA,
@@ -377,7 +377,7 @@ class SeasonsImages:
 
         Those of the rear camera that have a pose are version 2's training images. Without its
         test list all others of that camera are handed in. DataError names a broken list, see
-        :func:`.layout.read_test_names`.
+        :func:`.read_test_names`.
         """
         listed = sorted(
             (locations[0], key.timestamp, key.camera, key)

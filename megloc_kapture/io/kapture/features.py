@@ -32,7 +32,7 @@ from megloc_kapture.io.files import (
     write_bytes,
 )
 from megloc_kapture.io.kapture.blobs import BlobSource, FolderBlobs, TarBlobs, TarBlobWriter
-from megloc_kapture.io.kapture.text import check_columns, format_table, read_rows
+from megloc_kapture.io.kapture.format import check_columns, format_table, read_rows
 
 FeatureKind = Literal["keypoints", "descriptors", "global_features", "matches"]
 ArrayKind = Literal["keypoints", "descriptors", "global_features"]

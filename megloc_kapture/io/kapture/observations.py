@@ -30,7 +30,7 @@ from megloc_kapture.io.files import (
     named,
 )
 from megloc_kapture.io.kapture.features import check_field
-from megloc_kapture.io.kapture.text import (
+from megloc_kapture.io.kapture.format import (
     BYTE_ORDER_MARK,
     FORMAT_LINE,
     check_version,

@@ -24,13 +24,11 @@ from megloc_kapture.io.files import (
     output_error,
     write_bytes,
 )
-from megloc_kapture.io.kapture.data import (
+from megloc_kapture.io.kapture.format import (
     CAMERA_SENSOR_TYPES,
     UNKNOWN_CAMERA,
     KaptureData,
     Sensor,
-)
-from megloc_kapture.io.kapture.text import (
     check_columns,
     format_table,
     parse_float,
