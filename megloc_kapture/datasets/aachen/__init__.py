@@ -25,7 +25,7 @@ from megloc_kapture.datasets.kapture_folders import (
 )
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.files import check_relative
+from megloc_kapture.io.files import check_relative, named
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.values import Camera, RigidTransform
@@ -189,10 +189,8 @@ class Layout:
         name = nvm.names[position]
         width, height = image_size(self.images / name)
         focal, k = float(nvm.focal_px[position]), float(nvm.k_colmap[position])
-        try:
+        with named(self.nvm, about=f"image {name!r}"):
             return Camera("SIMPLE_RADIAL", width, height, (focal, width / 2, height / 2, k))
-        except DataError as error:
-            raise DataError(f"image {name!r}: {error.message}", path=self.nvm) from None
 
     def _add_queries(self, images: AachenImages, missing: Missing) -> int:
         listed: dict[str, Path] = {}

@@ -18,10 +18,10 @@ from megloc_kapture.datasets.formats.fourseasons_files import (
     read_relocalization,
     timestamp_of_name,
 )
-from megloc_kapture.datasets.formats.text_lines import reading
 from megloc_kapture.datasets.kapture_folders import is_kapture
 from megloc_kapture.datasets.official import Count, Missing
 from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.io.files import named, reading
 from megloc_kapture.io.kapture import KaptureFolder
 
 CAMERAS = ("cam0", "cam1")
@@ -95,18 +95,15 @@ class Recording:
         if self.kapture is None:
             return read_calibration(self.calibration_folder(root))
         data = self.kapture.read()
-        path = self.kapture.root / "sensors"
-        try:
+        cars = [members for members in data.rigs.values() if set(CAMERAS) <= set(members)]
+        with named(self.kapture.root / "sensors"):
+            if not cars or not set(CAMERAS) <= set(data.sensors):
+                raise DataError(
+                    f"no cameras {' and '.join(CAMERAS)} on one rig, as kapture's importer of "
+                    "4Seasons writes them"
+                )
             cam0, cam1 = (data.sensors[name].camera() for name in CAMERAS)
-            car = next(members for members in data.rigs.values() if set(CAMERAS) <= set(members))
-        except (KeyError, StopIteration):
-            raise DataError(
-                f"no cameras {' and '.join(CAMERAS)} on one rig, as kapture's importer of "
-                "4Seasons writes them",
-                path=path,
-            ) from None
-        except DataError as error:
-            raise DataError(error.message, path=path) from error
+        car = cars[0]
         return StereoCalibration(cam0, cam1, car[CAMERAS[1]] @ car[CAMERAS[0]].inverse())
 
     def calibration_files(self, root: Path) -> list[Path]:

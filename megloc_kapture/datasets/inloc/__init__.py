@@ -23,7 +23,7 @@ from megloc_kapture.datasets.formats.text_lines import Line, read_lines
 from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, kapture_parent
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import has_control_characters
+from megloc_kapture.io.files import has_control_characters, named
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.kapture.format import FLOAT_PATTERN
 from megloc_kapture.io.mat_file import read_mat_array
@@ -331,10 +331,8 @@ class Scan:
 
 
 def _cutout(folder: Path, name: str) -> Cutout:
-    try:
+    with named(folder / name):
         cutout = parse_cutout_name(name)
-    except DataError as error:
-        raise DataError(error.message, path=folder / name) from error
     floor = folder.parent.name
     if cutout.scan != folder.name or not floor.upper().startswith(cutout.building.upper()):
         raise DataError(

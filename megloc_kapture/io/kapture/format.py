@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import has_control_characters, read_text
+from megloc_kapture.io.files import has_control_characters, named, read_text
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
 CAMERA_SENSOR_TYPES = ("camera", "depth")
@@ -146,10 +146,8 @@ class KaptureData:
         sensor_id = self.record_of(image)[1]
         if sensor_id not in self.sensors:
             raise DataError(f"image {image!r} was taken by the unknown sensor {sensor_id!r}")
-        try:
+        with named(about=f"sensor {sensor_id!r} of image {image!r}"):
             return self.sensors[sensor_id].camera()
-        except DataError as error:
-            raise DataError(f"sensor {sensor_id!r} of image {image!r}: {error.message}") from error
 
     def cam_from_world(self, image: str) -> RigidTransform | None:
         """Pose of an image: its camera's own, else through the (nested) rigs that carry it.

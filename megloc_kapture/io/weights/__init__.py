@@ -19,7 +19,7 @@ import hashlib
 import os
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -29,7 +29,13 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
 
 from megloc_kapture.errors import DataError, OptionError, OutputError, suggestion
-from megloc_kapture.io.files import atomic_write, check_component, check_relative, user_cache
+from megloc_kapture.io.files import (
+    atomic_write,
+    check_component,
+    check_relative,
+    reading,
+    user_cache,
+)
 from megloc_kapture.io.weights.containers import read_checkpoint
 
 if TYPE_CHECKING:
@@ -278,7 +284,7 @@ def how_to_get(weights: Weights) -> str:
 
 def describe(name: str, path: Path) -> WeightsFile:
     """The checkpoint at a path, as it is now."""
-    with _reading(path):
+    with reading(path):
         states = [part.stat() for part in _parts(path)]
     size = sum(state.st_size for state in states)
     return WeightsFile(name, path, size, max(state.st_mtime_ns for state in states))
@@ -288,7 +294,7 @@ def describe(name: str, path: Path) -> WeightsFile:
 def sha256_of(file: WeightsFile) -> str:
     """sha256 of a checkpoint, hexadecimal; of a TensorFlow one, of its files one after another."""
     digest = hashlib.sha256()
-    with _reading(file.path):
+    with reading(file.path):
         for part in file.parts():
             with open(part, "rb") as content:
                 hashlib.file_digest(content, lambda: digest)
@@ -308,7 +314,7 @@ def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
 
 
 def _read(file: WeightsFile) -> dict[str, torch.Tensor]:
-    with _reading(file.path):
+    with reading(file.path):
         contents = {part: part.read_bytes() for part in file.parts()}
     digest = hashlib.sha256()
     for content in contents.values():
@@ -376,14 +382,6 @@ def check_sha256(file: WeightsFile, found: str) -> None:
             "fetch or add it again, or give your own file by its path",
             path=file.path,
         )
-
-
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise DataError(f"cannot read: {error.strerror or error}", path=path) from error
 
 
 def _parts(path: Path) -> list[Path]:

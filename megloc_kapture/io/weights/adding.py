@@ -299,11 +299,10 @@ def prove(
     sha256 : of the file.
     published : what it should be; None: converted, of which no checksum is known.
     """
-    known = published and published.sha256
-    if known and sha256 != known:
+    if published and published.sha256 and sha256 != published.sha256:
         raise DataError(
-            f"is not the published {published.name if published else ''} of {weights.name}: "
-            f"sha256 {sha256} instead of {known}",
+            f"is not the published {published.name} of {weights.name}: "
+            f"sha256 {sha256} instead of {published.sha256}",
             path=file.path,
         )
     read_weights(file)
