@@ -4,7 +4,7 @@ The mappers find poses, cameras and points of photographs from their verified ma
 incremental one is that of Schoenberger and Frahm, Structure-from-Motion Revisited (CVPR 2016), the
 global one GLOMAP (Pan et al., ECCV 2024); both are pycolmap's.
 
-Stereo has a workspace, which is written, run where there is CUDA, read, and fused on any machine:
+Stereo has a workspace, which is written, run where there is CUDA, and read:
 ``images/NAME``, ``sparse/`` and ``stereo/{depth_maps,normal_maps}/NAME.KIND.bin``; a map is
 ``W&H&C&`` and float32 by channels. Images are pinholes without distortion.
 """
@@ -39,7 +39,6 @@ from megloc_kapture.io.images import write_image
 from megloc_kapture.values import Camera, RigidTransform
 
 Mapper = Literal["incremental", "global"]
-MapKind = Literal["photometric", "geometric"]
 _FOLDERS = {"depth": "depth_maps", "normal": "normal_maps"}
 MIN_IMAGES = 3
 # fewer are what RANSAC finds in anything; as many inliers COLMAP asks of an image it adds
@@ -371,22 +370,13 @@ def run_patch_match(
     pycolmap.patch_match_stereo(str(root), options=options)
 
 
-def map_path(root: Path, kind: Literal["depth", "normal"], name: str, of: MapKind) -> Path:
-    """Where a workspace has the depth or normals of an image."""
-    return root / "stereo" / _FOLDERS[kind] / f"{name}.{of}.bin"
-
-
-def write_map(path: Path, array: NDArray[np.floating]) -> None:
-    """Write depth (H, W), 0 unknown, or normals (H, W, 3), camera frame, towards the camera."""
-    values = np.asarray(array, "<f4")
-    values = values[..., None] if values.ndim == 2 else values
-    height, width, channels = values.shape
-    head = f"{width}&{height}&{channels}&".encode()
-    write_bytes(path, head + np.ascontiguousarray(values.transpose(2, 0, 1)).tobytes())
+def map_path(root: Path, kind: Literal["depth", "normal"], name: str) -> Path:
+    """Where a workspace has the depth or normals of an image, compared with nothing but pixels."""
+    return root / "stereo" / _FOLDERS[kind] / f"{name}.photometric.bin"
 
 
 def read_map(path: Path) -> NDArray[np.float32]:
-    """Read depth (H, W) or normals (H, W, 3); raises DataError."""
+    """Read depth (H, W), 0 unknown, or normals (H, W, 3), camera frame; raises DataError."""
     try:
         content = path.read_bytes()
         *sizes, values = content.split(b"&", 3)
@@ -395,21 +385,3 @@ def read_map(path: Path) -> NDArray[np.float32]:
     except (OSError, ValueError) as error:
         raise DataError(f"no map of COLMAP's stereo: {error}", path=path) from error
     return found[0] if channels == 1 else np.ascontiguousarray(found.transpose(1, 2, 0))
-
-
-def fuse(root: Path, *, of: MapKind = "geometric", min_views: int = 2) -> NDArray[np.float64]:
-    """Fuse the maps of a workspace by COLMAP; points float64 (N, 3) in the world.
-
-    Raises DataError: its model has no points: COLMAP would then fuse nothing without a word.
-    """
-    pycolmap = load_pycolmap()
-    if not pycolmap.Reconstruction(str(root / "sparse")).num_points3D():
-        raise DataError("a model without points: no image has neighbours", path=root / "sparse")
-    options = pycolmap.StereoFusionOptions()
-    options.min_num_pixels = min_views
-    options.num_threads = 1
-    fused = pycolmap.stereo_fusion(
-        str(root / "fused.ply"), str(root), input_type=of, options=options, output_type="PLY"
-    )
-    points = [point.xyz for point in fused.points3D.values()]
-    return np.array(points, np.float64).reshape(-1, 3)
