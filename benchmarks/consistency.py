@@ -23,7 +23,7 @@ from refinement import REGARDLESS, Thresholds
 from scenes import errors_of, megloc
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.inloc.layout import read_transformation
+from megloc_kapture.datasets.inloc import read_transformation
 from megloc_kapture.io.tables import (
     CONSISTENCY_FILE,
     REFINEMENT_FILE,

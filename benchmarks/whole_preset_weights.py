@@ -28,8 +28,7 @@ from scipy.io import savemat
 from tensorflow_checkpoints import write_saved_model, write_tensorflow_checkpoint
 from torch import nn
 
-from megloc_kapture.io.weights import UNVERIFIED
-from megloc_kapture.io.weights.registry import registry
+from megloc_kapture.io.weights import UNVERIFIED, registry
 from megloc_kapture.nets.aslfeat import AslFeatNet
 from megloc_kapture.nets.deeplabv3plus import DeepLabV3Plus
 from megloc_kapture.nets.delg import DelgNet

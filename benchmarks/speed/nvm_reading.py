@@ -43,7 +43,7 @@ IMPORT = """
 import json, resource, sys, time
 from pathlib import Path
 import numpy as np
-from megloc_kapture.datasets.formats.nvm import read_nvm
+from megloc_kapture.datasets.formats.sparse_models import read_nvm
 from megloc_kapture.datasets.reference_map import write_reference_map
 from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.values import Camera

@@ -16,19 +16,19 @@ from megloc_kapture.errors import MeglocError, OptionError, OutputError, missing
 from megloc_kapture.evaluation.provenance import installed_version
 from megloc_kapture.io.weights import (
     MissingWeightsError,
+    PublishedFile,
+    Weights,
     WeightsFile,
-    add_weights,
-    convert_weights,
     describe,
     files_of,
     how_to_get,
-    prove,
+    lookup,
     read_weights,
+    registry,
     sha256_of,
     weights_folder,
 )
-from megloc_kapture.io.weights.fetch import fetch
-from megloc_kapture.io.weights.registry import PublishedFile, Weights, lookup, registry
+from megloc_kapture.io.weights.adding import add_weights, convert_weights, fetch, prove
 from megloc_kapture.pipeline.presets import check_weights, options_of_preset
 
 WRONG_FILES = 2

@@ -8,7 +8,7 @@ same. Images keep their official names, and the queries have no poses.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,25 +24,15 @@ from megloc_kapture.io.dataset_tables import (
     WORLD_FILE,
     ImageGroup,
     Protocol,
-    RelocalizationPair,
-    World,
+    SideTables,
     read_groups,
-    read_names,
     read_nowhere,
-    read_priors,
-    read_protocol,
-    read_relocalization,
-    read_world,
+    read_side_tables,
     table_path,
-    write_groups,
-    write_names,
     write_nowhere,
-    write_priors,
-    write_protocol,
-    write_relocalization,
-    write_world,
+    write_side_tables,
 )
-from megloc_kapture.io.files import check_relative, link_images, output_error
+from megloc_kapture.io.files import check_relative, link_images
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
@@ -154,7 +144,7 @@ def import_kapture_folders(
     link_images(mapping.root, output / MAPPING)
     # a query folder with poses in it must not let a stage see them
     write_sensors(output / QUERY, _renamed(query_data, rename, is_truth=False))
-    _link_queries(query.root, output / QUERY, query_prefix)
+    link_images(query.root, output / QUERY, below=query_prefix)
     truth = 0
     if is_kapture(root / QUERY_GT):
         truth_data = KaptureFolder(root / QUERY_GT).read()
@@ -162,7 +152,10 @@ def import_kapture_folders(
         write_sensors(output / QUERY_GT, _renamed(truth_data, rename, is_truth=True))
         if nowhere := [rename(name) for name in read_nowhere(root / QUERY_GT)]:
             write_nowhere(output / QUERY_GT, nowhere)
-    _import_side_tables(root, output, rename, map_data, query_data, protocol_change)
+    tables = _renamed_tables(read_side_tables(root / SIDE_TABLES), rename, map_data, query_data)
+    if protocol_change is not None:
+        tables = replace(tables, protocol=protocol_change(tables.protocol))
+    write_side_tables(output / SIDE_TABLES, tables)
     return {
         "map_images": len(map_data.image_names()),
         "map_images_with_pose": len(poses),
@@ -180,7 +173,7 @@ def import_mapping(mapping: KaptureFolder, output: Path) -> dict[str, float]:
     names = set(data.image_names())
     found = read_groups(_tables_beside(mapping))
     groups = {name: group for name, group in found.items() if name in names}
-    write_side_tables(output / SIDE_TABLES, Protocol(), groups=groups)
+    write_side_tables(output / SIDE_TABLES, SideTables(protocol=Protocol(), groups=groups))
     return {"map_images": len(names), "map_images_with_pose": len(poses)}
 
 
@@ -242,73 +235,25 @@ def _renamed(data: KaptureData, rename: Callable[[str], str], *, is_truth: bool)
     )
 
 
-def _link_queries(source: Path, output: Path, prefix: str) -> None:
-    if not prefix:
-        link_images(source, output)
-        return
-    for name in ("records_data", "masks"):
-        folder = source.resolve() / "sensors" / name
-        if not folder.exists():
-            continue
-        link = output / "sensors" / name / prefix.rstrip("/")
-        try:
-            link.parent.mkdir(parents=True, exist_ok=True)
-            link.symlink_to(folder.resolve(), target_is_directory=True)
-        except OSError as error:
-            raise output_error(link, error) from error
-
-
-def _import_side_tables(
-    root: Path,
-    output: Path,
-    rename: Callable[[str], str],
-    map_data: KaptureData,
-    query_data: KaptureData,
-    protocol_change: Callable[[Protocol], Protocol] | None,
-) -> None:
-    source, target = root / SIDE_TABLES, output / SIDE_TABLES
+def _renamed_tables(
+    tables: SideTables, rename: Callable[[str], str], map_data: KaptureData, query_data: KaptureData
+) -> SideTables:
+    """The tables with the queries' names in the workspace."""
     of_map, of_query = set(map_data.image_names()), set(query_data.image_names())
     groups: dict[str, ImageGroup] = {}
-    for name, group in read_groups(source).items():
+    for name, group in tables.groups.items():
         if name in of_query:
             groups[rename(name)] = group
         # a name that both have says the same of both
         if name in of_map or name not in of_query:
             groups[name] = group
-    protocol = read_protocol(source)
-    write_side_tables(
-        target,
-        protocol_change(protocol) if protocol_change else protocol,
+    return replace(
+        tables,
         groups=groups,
-        priors={rename(query): permitted for query, permitted in read_priors(source).items()},
-        names={rename(query): name for query, name in read_names(source).items()},
-        pairs=[replace(pair, query=rename(pair.query)) for pair in read_relocalization(source)],
-        world=read_world(source) if (source / WORLD_FILE).is_file() else None,
+        priors={rename(query): permitted for query, permitted in tables.priors.items()},
+        names={rename(query): name for query, name in tables.names.items()},
+        relocalization=[replace(pair, query=rename(pair.query)) for pair in tables.relocalization],
     )
-
-
-def write_side_tables(
-    folder: Path,
-    protocol: Protocol,
-    *,
-    groups: Mapping[str, ImageGroup],
-    priors: Mapping[str, Sequence[str]] | None = None,
-    names: Mapping[str, str] | None = None,
-    pairs: Sequence[RelocalizationPair] = (),
-    world: World | None = None,
-) -> None:
-    """Write the tables of ``megloc/`` that have anything to say."""
-    write_protocol(folder, protocol)
-    if world is not None:
-        write_world(folder, world)
-    if groups:
-        write_groups(folder, groups)
-    if priors:
-        write_priors(folder, priors)
-    if names:
-        write_names(folder, names)
-    if pairs:
-        write_relocalization(folder, pairs)
 
 
 # ----------------------------------------------------------- challenges as kapture has them

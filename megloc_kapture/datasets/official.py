@@ -16,17 +16,16 @@ from megloc_kapture.datasets.kapture_folders import (
     QUERY,
     QUERY_GT,
     is_kapture,
-    write_side_tables,
 )
 from megloc_kapture.datasets.reference_map import ReferenceModel, write_reference_map
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import (
     SIDE_TABLES,
     ImageGroup,
-    Protocol,
-    RelocalizationPair,
+    SideTables,
     World,
     read_groups,
+    write_side_tables,
 )
 from megloc_kapture.io.files import link_records
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
@@ -121,8 +120,8 @@ class Missing:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class OfficialDataset:
-    """A dataset as its adapter read it.
+class OfficialDataset(SideTables):
+    """A dataset as its adapter read it, with its tables.
 
     Parameters
     ----------
@@ -132,11 +131,6 @@ class OfficialDataset:
     links : folder below ``records_data`` -> folder of the dataset it is a link to; ``""`` makes
         ``records_data`` itself the link.
     image_files : image -> its file, for images that lie in no such folder; linked one by one.
-    groups : of all images, the queries' and the map's.
-    priors : query -> map images or groups (``location`` of map images) it may be matched with.
-    names : scored query -> its name in the pose file, in the order of the challenge's list; empty
-        where the protocol's rule says it all.
-    relocalization : the pairs of an MLAD challenge, in order.
     summary : what was found beside what is published.
     remarks : what a user should know, a sentence each.
     missing : what is not there.
@@ -147,14 +141,9 @@ class OfficialDataset:
 
     mapping: KaptureData
     query: KaptureData
-    protocol: Protocol
     links: Mapping[str, Path] = field(default_factory=dict)
     image_files: Mapping[str, Path] = field(default_factory=dict)
     query_gt: KaptureData | None = None
-    groups: Mapping[str, ImageGroup] = field(default_factory=dict)
-    priors: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    names: Mapping[str, str] = field(default_factory=dict)
-    relocalization: Sequence[RelocalizationPair] = ()
     world: World = World()
     summary: Sequence[Count] = ()
     remarks: Sequence[str] = ()
@@ -189,15 +178,7 @@ def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: boo
         link_records(output / part, {n: f for n, f in dataset.image_files.items() if n in own})
     if dataset.query_gt is not None and dataset.query_gt.trajectories:
         write_sensors(output / QUERY_GT, dataset.query_gt)
-    write_side_tables(
-        output / SIDE_TABLES,
-        dataset.protocol,
-        groups=dataset.groups,
-        priors=dataset.priors,
-        names=dataset.names,
-        pairs=dataset.relocalization,
-        world=dataset.world,
-    )
+    write_side_tables(output / SIDE_TABLES, dataset)
     if dataset.reference is not None:
         names, points = dataset.reference.read()
         write_reference_map(

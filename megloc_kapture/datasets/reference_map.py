@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase, FeatureType
-from megloc_kapture.datasets.formats.sparse_points import SparsePoints, image_order
+from megloc_kapture.datasets.formats.sparse_models import SparsePoints, image_order
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import link_records
 from megloc_kapture.io.kapture import (

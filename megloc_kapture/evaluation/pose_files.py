@@ -24,7 +24,7 @@ import numpy as np
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import MAX_QUATERNION_NORM_ERROR, PoseFileNames
 from megloc_kapture.io.files import read_text, write_bytes
-from megloc_kapture.io.kapture.text import FLOAT_PATTERN
+from megloc_kapture.io.kapture.format import FLOAT_PATTERN
 from megloc_kapture.values import RigidTransform
 
 COLUMNS = "name qw qx qy qz tx ty tz"

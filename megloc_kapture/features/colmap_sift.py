@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.features.image_bound import BoundedOptions
-from megloc_kapture.io.colmap import extract_sift
+from megloc_kapture.io.colmap_mapping import extract_sift
 from megloc_kapture.values import LocalFeatures
 
 _NO_LIMIT = 2**31 - 1

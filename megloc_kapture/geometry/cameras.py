@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.io.colmap_cameras import normalized_from_px as normalized_from_px
-from megloc_kapture.io.colmap_cameras import px_from_cam as px_from_cam
+from megloc_kapture.io.colmap import normalized_from_px as normalized_from_px
+from megloc_kapture.io.colmap import px_from_cam as px_from_cam
 from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
 
 # models whose first distortion parameter multiplies the squared radius

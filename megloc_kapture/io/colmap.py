@@ -1,31 +1,153 @@
-"""COLMAP through pycolmap: triangulation with known poses, databases, models, SIFT."""
+"""COLMAP through pycolmap: cameras, databases, models, triangulation with known poses.
+
+pycolmap changes its names between releases and has traps of its own (see docs/architecture.md);
+this module and ``colmap_mapping.py`` keep both away from the rest of the package.
+"""
 
 from __future__ import annotations
 
 import os
+import signal
 import tempfile
+import threading
 import zlib  # noqa: F401  pycolmap 4.1.1 to 4.2.1 corrupt the heap when imported before zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from shutil import disk_usage
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError, OutputError
-from megloc_kapture.io.colmap_cameras import colmap_camera, load_pycolmap, new_colmap_camera
 from megloc_kapture.io.files import output_error, owned_name
 from megloc_kapture.values import Camera, Options, RigidTransform
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-
 NEVER = 2**31 - 1
+
+
+@lru_cache(maxsize=1)
+def load_pycolmap() -> Any:
+    """pycolmap, imported when it is first needed; for the modules of ``io`` alone."""
+    before = signal.getsignal(signal.SIGTERM)
+    import pycolmap
+
+    # its import takes SIGTERM over, and would end a run that is asked to end with a stack trace
+    if before is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)
+    pycolmap.logging.minloglevel = 2  # its INFO lines are no concern of our users
+    return pycolmap
+
+
+@contextmanager
+def quiet_stderr() -> Iterator[None]:
+    # COLMAP writes progress to the file descriptor whatever its log level says
+    if os.environ.get("MEGLOC_COLMAP_LOG"):
+        yield
+        return
+    saved = os.dup(2)
+    null = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(null, 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(null)
+
+
+# ------------------------------------------------------------------------------------ cameras
+
+
+def new_colmap_camera(camera: Camera) -> Any:
+    """COLMAP's camera; a new one, which may be written to."""
+    return load_pycolmap().Camera(
+        model=camera.model,
+        width=camera.width,
+        height=camera.height,
+        params=list(camera.params),
+    )
+
+
+colmap_camera = lru_cache(maxsize=4096)(new_colmap_camera)
+
+
+def normalized_from_px(camera: Camera, points_px: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """Undistorted normalised image coordinates (x/z, y/z) of pixels; (N, 2) to (N, 2) float64."""
+    points = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1, 2)
+    if len(points) == 0:
+        return np.zeros((0, 2))
+    return np.asarray(colmap_camera(camera).cam_from_img(points), dtype=np.float64)
+
+
+def px_from_cam(camera: Camera, points_in_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels of points in the camera frame; (N, 3) to (N, 2) float64, NaN behind the camera."""
+    points = np.ascontiguousarray(points_in_cam, dtype=np.float64).reshape(-1, 3)
+    out = np.full((len(points), 2), np.nan)
+    front = points[:, 2] > 0
+    if front.any():
+        out[front] = colmap_camera(camera).img_from_cam(points[front])
+    return out
+
+
+def undistorted_pinhole(camera: Camera, *, blank_pixels: float = 0.0) -> Camera:
+    """The PINHOLE camera with the same focal lengths that COLMAP undistorts an image to.
+
+    Parameters
+    ----------
+    blank_pixels : 0: no pixel that the distorted image does not show; 1: all that it shows; in
+        between, in between. The sides stay between 0.2 and 2 times the old ones.
+    """
+    pycolmap = load_pycolmap()
+    options = pycolmap.UndistortCameraOptions()
+    options.blank_pixels = blank_pixels
+    found = pycolmap.undistort_camera(options, colmap_camera(camera))
+    return replace(Camera.from_colmap(found), focal_deviation=camera.focal_deviation)
+
+
+def focal_from_exif(jpeg: bytes) -> float | None:
+    """Focal length in pixels that COLMAP finds in the EXIF of a JPEG file; None without one."""
+    pycolmap = load_pycolmap()
+    with tempfile.TemporaryDirectory(prefix=f".{owned_name()}") as folder:
+        path = Path(folder) / "blank.jpg"
+        path.write_bytes(jpeg)
+        camera = pycolmap.infer_camera_from_image(str(path))
+    return float(camera.mean_focal_length()) if camera.has_prior_focal_length else None
+
+
+def focal_from_matches(
+    points_px: NDArray[np.float64],
+    points: NDArray[np.float64],
+    camera: Camera,
+    max_error_px: float,
+    seed: int,
+) -> float | None:
+    """Focal length in pixels of a camera of which the rest is known: P4Pf in a RANSAC.
+
+    None where no pose agrees with enough matches.
+
+    Parameters
+    ----------
+    points_px, points : (N, 2) and (N, 3), matched; not finite ones count as none.
+    """
+    usable = np.isfinite(points_px).all(axis=1) & np.isfinite(points).all(axis=1)
+    if np.count_nonzero(usable) < 4:
+        return None
+    pycolmap = load_pycolmap()
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.estimate_focal_length = True
+    options.ransac.max_error = max_error_px
+    options.ransac.random_seed = seed
+    changed = new_colmap_camera(camera)  # the RANSAC writes into it
+    found = pycolmap.estimate_absolute_pose(points_px[usable], points[usable], changed, options)
+    return None if found is None else float(changed.mean_focal_length())
+
+
+# ------------------------------------------------------------------------------- triangulation
 
 
 class TriangulationOptions(Options):
@@ -69,23 +191,6 @@ class TriangulatedPoints:
     point_ids: NDArray[np.int64]
     image_ids: NDArray[np.int64]
     keypoint_ids: NDArray[np.int64]
-
-
-@contextmanager
-def quiet_stderr() -> Iterator[None]:
-    # COLMAP writes progress to the file descriptor whatever its log level says
-    if os.environ.get("MEGLOC_COLMAP_LOG"):
-        yield
-        return
-    saved = os.dup(2)
-    null = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(null, 2)
-        yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(null)
 
 
 def triangulate(
@@ -328,78 +433,3 @@ def write_model(
         model.write(str(output))
     except (OSError, RuntimeError, ValueError) as error:
         raise OutputError(f"{output}: COLMAP cannot write its model: {error}") from error
-
-
-def extract_sift(
-    image: NDArray[np.uint8],
-    *,
-    max_keypoints: int = 8192,
-    first_octave: int = -1,
-    peak_threshold: float = 0.02 / 3,
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """COLMAP's SIFT on the CPU, all else at its defaults, in its order (fine scales first).
-
-    Parameters
-    ----------
-    image : uint8 (H, W, 3), RGB; made grey as COLMAP does when it reads a file.
-    max_keypoints : COLMAP keeps whole scale levels, the coarsest first, up to and with the one that
-        exceeds this number; so there may be half as many again.
-
-    Returns
-    -------
-    keypoints : float32 (N, 4): x, y (the first pixel's centre is (0.5, 0.5)), scale in px,
-        orientation in radians.
-    descriptors : uint8 (N, 128): 512 times the square roots of the L1-normalised histograms.
-    """
-    pycolmap = load_pycolmap()
-    options = pycolmap.FeatureExtractionOptions()
-    options.num_threads = 1
-    options.sift.max_num_features = max_keypoints
-    options.sift.first_octave = first_octave
-    options.sift.peak_threshold = peak_threshold
-    bitmap = pycolmap.Bitmap.from_array(np.ascontiguousarray(image)).clone_as_grey()
-    # made anew each time: one has a pyramid of its own, which two threads would share
-    extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-    found, descriptors = extractor.extract(bitmap)
-    rows = [(k.x, k.y, k.compute_scale(), k.compute_orientation()) for k in found]
-    keypoints = np.array(rows, dtype=np.float32).reshape(-1, 4)
-    return keypoints, np.array(descriptors.data, dtype=np.uint8).reshape(-1, 128)
-
-
-@dataclass(frozen=True, eq=False)
-class DatabaseFeatures:
-    """One image of a COLMAP database: keypoints float32 (N, 2 or 4), descriptors uint8 (N, 128)."""
-
-    name: str
-    camera: Camera
-    keypoints_px: NDArray[np.float32]
-    descriptors: NDArray[np.uint8]
-
-
-def write_feature_database(path: Path, images: Iterable[DatabaseFeatures]) -> None:
-    """Write COLMAP's database of images with SIFT features; equal cameras are one.
-
-    Raises OutputError: ``path`` is there already, or cannot be written.
-    """
-    pycolmap = load_pycolmap()
-    path = Path(path)
-    if path.exists():
-        raise OutputError(f"{path}: is there already")
-    camera_ids: dict[Camera, int] = {}
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        database = pycolmap.Database.open(str(path))
-        with pycolmap.DatabaseTransaction(database):
-            for image in images:
-                if image.camera not in camera_ids:
-                    camera = colmap_camera(image.camera)
-                    camera_ids[image.camera] = database.write_camera(camera)
-                entry = pycolmap.Image(name=image.name, camera_id=camera_ids[image.camera])
-                image_id = database.write_image(entry)
-                database.write_keypoints(image_id, np.ascontiguousarray(image.keypoints_px))
-                kind = pycolmap.FeatureExtractorType.SIFT
-                rows = pycolmap.FeatureDescriptors(kind, np.ascontiguousarray(image.descriptors))
-                database.write_descriptors(image_id, rows)
-        database.close()
-    except (OSError, RuntimeError) as error:
-        raise OutputError(f"{path}: cannot be written: {error}") from error

@@ -1,10 +1,10 @@
-"""COLMAP's mappers and its stereo: photographs to poses, posed images to depth.
+"""COLMAP's SIFT, its mappers and its stereo: photographs to poses, posed images to depth.
 
 The mappers find poses, cameras and points of photographs from their verified matches. The
 incremental one is that of Schoenberger and Frahm, Structure-from-Motion Revisited (CVPR 2016), the
 global one GLOMAP (Pan et al., ECCV 2024); both are pycolmap's.
 
-Stereo has a workspace, which is written, run where there is CUDA, read, and fused on any machine:
+Stereo has a workspace, which is written, run where there is CUDA, and read:
 ``images/NAME``, ``sparse/`` and ``stereo/{depth_maps,normal_maps}/NAME.KIND.bin``; a map is
 ``W&H&C&`` and float32 by channels. Images are pinholes without distortion.
 """
@@ -12,7 +12,7 @@ Stereo has a workspace, which is written, run where there is CUDA, read, and fus
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -22,29 +22,107 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.io.colmap import (
     NEVER,
     MapImage,
+    colmap_camera,
     database_folder,
+    load_pycolmap,
     numbered_cameras,
     quiet_stderr,
     write_database,
     write_model,
 )
-from megloc_kapture.io.colmap_cameras import load_pycolmap
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.images import write_image
 from megloc_kapture.values import Camera, RigidTransform
 
 Mapper = Literal["incremental", "global"]
-MapKind = Literal["photometric", "geometric"]
 _FOLDERS = {"depth": "depth_maps", "normal": "normal_maps"}
 MIN_IMAGES = 3
 # fewer are what RANSAC finds in anything; as many inliers COLMAP asks of an image it adds
 _MIN_POINTS = 30
 # matches that move less than this in the median are of one image twice
 _SAME_PX = 0.5
+
+
+def extract_sift(
+    image: NDArray[np.uint8],
+    *,
+    max_keypoints: int = 8192,
+    first_octave: int = -1,
+    peak_threshold: float = 0.02 / 3,
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """COLMAP's SIFT on the CPU, all else at its defaults, in its order (fine scales first).
+
+    Parameters
+    ----------
+    image : uint8 (H, W, 3), RGB; made grey as COLMAP does when it reads a file.
+    max_keypoints : COLMAP keeps whole scale levels, the coarsest first, up to and with the one that
+        exceeds this number; so there may be half as many again.
+
+    Returns
+    -------
+    keypoints : float32 (N, 4): x, y (the first pixel's centre is (0.5, 0.5)), scale in px,
+        orientation in radians.
+    descriptors : uint8 (N, 128): 512 times the square roots of the L1-normalised histograms.
+    """
+    pycolmap = load_pycolmap()
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = 1
+    options.sift.max_num_features = max_keypoints
+    options.sift.first_octave = first_octave
+    options.sift.peak_threshold = peak_threshold
+    bitmap = pycolmap.Bitmap.from_array(np.ascontiguousarray(image)).clone_as_grey()
+    # made anew each time: one has a pyramid of its own, which two threads would share
+    extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+    found, descriptors = extractor.extract(bitmap)
+    rows = [(k.x, k.y, k.compute_scale(), k.compute_orientation()) for k in found]
+    keypoints = np.array(rows, dtype=np.float32).reshape(-1, 4)
+    return keypoints, np.array(descriptors.data, dtype=np.uint8).reshape(-1, 128)
+
+
+@dataclass(frozen=True, eq=False)
+class DatabaseFeatures:
+    """One image of a COLMAP database: keypoints float32 (N, 2 or 4), descriptors uint8 (N, 128)."""
+
+    name: str
+    camera: Camera
+    keypoints_px: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+
+
+def write_feature_database(path: Path, images: Iterable[DatabaseFeatures]) -> None:
+    """Write COLMAP's database of images with SIFT features; equal cameras are one.
+
+    Raises OutputError: ``path`` is there already, or cannot be written.
+    """
+    pycolmap = load_pycolmap()
+    path = Path(path)
+    if path.exists():
+        raise OutputError(f"{path}: is there already")
+    camera_ids: dict[Camera, int] = {}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        database = pycolmap.Database.open(str(path))
+        with pycolmap.DatabaseTransaction(database):
+            for image in images:
+                if image.camera not in camera_ids:
+                    camera = colmap_camera(image.camera)
+                    camera_ids[image.camera] = database.write_camera(camera)
+                entry = pycolmap.Image(name=image.name, camera_id=camera_ids[image.camera])
+                image_id = database.write_image(entry)
+                database.write_keypoints(image_id, np.ascontiguousarray(image.keypoints_px))
+                kind = pycolmap.FeatureExtractorType.SIFT
+                rows = pycolmap.FeatureDescriptors(kind, np.ascontiguousarray(image.descriptors))
+                database.write_descriptors(image_id, rows)
+        database.close()
+    except (OSError, RuntimeError) as error:
+        raise OutputError(f"{path}: cannot be written: {error}") from error
+
+
+# ----------------------------------------------------------------------------------- mappers
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,22 +370,13 @@ def run_patch_match(
     pycolmap.patch_match_stereo(str(root), options=options)
 
 
-def map_path(root: Path, kind: Literal["depth", "normal"], name: str, of: MapKind) -> Path:
-    """Where a workspace has the depth or normals of an image."""
-    return root / "stereo" / _FOLDERS[kind] / f"{name}.{of}.bin"
-
-
-def write_map(path: Path, array: NDArray[np.floating]) -> None:
-    """Write depth (H, W), 0 unknown, or normals (H, W, 3), camera frame, towards the camera."""
-    values = np.asarray(array, "<f4")
-    values = values[..., None] if values.ndim == 2 else values
-    height, width, channels = values.shape
-    head = f"{width}&{height}&{channels}&".encode()
-    write_bytes(path, head + np.ascontiguousarray(values.transpose(2, 0, 1)).tobytes())
+def map_path(root: Path, kind: Literal["depth", "normal"], name: str) -> Path:
+    """Where a workspace has the depth or normals of an image, compared with nothing but pixels."""
+    return root / "stereo" / _FOLDERS[kind] / f"{name}.photometric.bin"
 
 
 def read_map(path: Path) -> NDArray[np.float32]:
-    """Read depth (H, W) or normals (H, W, 3); raises DataError."""
+    """Read depth (H, W), 0 unknown, or normals (H, W, 3), camera frame; raises DataError."""
     try:
         content = path.read_bytes()
         *sizes, values = content.split(b"&", 3)
@@ -316,21 +385,3 @@ def read_map(path: Path) -> NDArray[np.float32]:
     except (OSError, ValueError) as error:
         raise DataError(f"no map of COLMAP's stereo: {error}", path=path) from error
     return found[0] if channels == 1 else np.ascontiguousarray(found.transpose(1, 2, 0))
-
-
-def fuse(root: Path, *, of: MapKind = "geometric", min_views: int = 2) -> NDArray[np.float64]:
-    """Fuse the maps of a workspace by COLMAP; points float64 (N, 3) in the world.
-
-    Raises DataError: its model has no points: COLMAP would then fuse nothing without a word.
-    """
-    pycolmap = load_pycolmap()
-    if not pycolmap.Reconstruction(str(root / "sparse")).num_points3D():
-        raise DataError("a model without points: no image has neighbours", path=root / "sparse")
-    options = pycolmap.StereoFusionOptions()
-    options.min_num_pixels = min_views
-    options.num_threads = 1
-    fused = pycolmap.stereo_fusion(
-        str(root / "fused.ply"), str(root), input_type=of, options=options, output_type="PLY"
-    )
-    points = [point.xyz for point in fused.points3D.values()]
-    return np.array(points, np.float64).reshape(-1, 3)

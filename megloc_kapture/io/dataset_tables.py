@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -241,6 +241,55 @@ _PRIORS = Table(_PriorRow, keys=[("query", "permitted")])
 _NAMES = Table(_NameRow, keys=[("image",), ("name",)])
 _UNREADABLE = Table(_UnreadableRow, keys=[("image",)])
 _RELOCALIZATION = Table(RelocalizationPair)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SideTables:
+    """The tables that describe a dataset; an empty one has no file.
+
+    Parameters
+    ----------
+    groups : of all images, the queries' and the map's.
+    priors : query -> map images or groups (``location`` of map images) it may be matched with.
+    names : scored query -> its name in the pose file, in the order of the challenge's list; empty
+        where the protocol's rule says it all.
+    relocalization : the pairs of an MLAD challenge, in order.
+    world : None: nothing is said of the frame.
+    """
+
+    protocol: Protocol
+    groups: Mapping[str, ImageGroup] = field(default_factory=dict)
+    priors: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    names: Mapping[str, str] = field(default_factory=dict)
+    relocalization: Sequence[RelocalizationPair] = ()
+    world: World | None = None
+
+
+def read_side_tables(folder: Path) -> SideTables:
+    """Read all tables that describe a dataset."""
+    return SideTables(
+        protocol=read_protocol(folder),
+        groups=read_groups(folder),
+        priors=read_priors(folder),
+        names=read_names(folder),
+        relocalization=read_relocalization(folder),
+        world=read_world(folder) if (folder / WORLD_FILE).is_file() else None,
+    )
+
+
+def write_side_tables(folder: Path, tables: SideTables) -> None:
+    """Write the tables that have anything to say."""
+    write_protocol(folder, tables.protocol)
+    if tables.world is not None:
+        write_world(folder, tables.world)
+    if tables.groups:
+        write_groups(folder, tables.groups)
+    if tables.priors:
+        write_priors(folder, tables.priors)
+    if tables.names:
+        write_names(folder, tables.names)
+    if tables.relocalization:
+        write_relocalization(folder, tables.relocalization)
 
 
 def table_path(folder: Path | str, name: str) -> Path:

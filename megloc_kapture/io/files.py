@@ -47,13 +47,12 @@ def read_content(path: Path | str, max_bytes: int | None = None) -> bytes:
     pipe or a device might never end.
     """
     path = Path(path)
-    try:
-        check_plain(path, max_bytes)
-        return path.read_bytes()
-    except FileNotFoundError as error:
-        raise DataError("cannot read: the file is missing", path=path) from error
-    except OSError as error:
-        raise DataError(f"cannot read: {error.strerror or error}", path=path) from error
+    with reading(path):
+        try:
+            check_plain(path, max_bytes)
+            return path.read_bytes()
+        except FileNotFoundError as error:
+            raise DataError("cannot read: the file is missing", path=path) from error
 
 
 def check_plain(path: Path, max_bytes: int | None = None) -> None:
@@ -87,14 +86,26 @@ def read_text(path: Path | str, max_bytes: int | None = None) -> str:
 
 
 @contextlib.contextmanager
-def named(path: Path | str, line: int | None = None) -> Iterator[None]:
-    """A DataError of the block that names no file gets this one, and the line."""
+def reading(path: Path | str) -> Iterator[None]:
+    """An OSError of the block becomes a DataError that names this file or folder."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f"cannot read: {error.strerror or error}", path=path) from error
+
+
+@contextlib.contextmanager
+def named(
+    path: Path | str | None = None, line: int | None = None, *, about: str = ""
+) -> Iterator[None]:
+    """A DataError of the block that names no file gets this one, the line, and what it is about."""
     try:
         yield
     except DataError as error:
         if error.path is not None:
             raise
-        raise DataError(error.message, path=path, line=line) from error.__cause__
+        message = f"{about}: {error.message}" if about else error.message
+        raise DataError(message, path=path, line=line) from error.__cause__
 
 
 # ------------------------------------------------------------------------------------ paths
@@ -290,12 +301,19 @@ def user_cache() -> Path:
 
 
 def link_images(
-    source_root: Path, output_root: Path, folders: Sequence[str] = ("records_data", "masks")
+    source_root: Path,
+    output_root: Path,
+    folders: Sequence[str] = ("records_data", "masks"),
+    *,
+    below: str = "",
 ) -> None:
-    """Make ``output_root/sensors/records_data`` (and masks) a link to ``source_root``'s."""
+    """Make ``output_root/sensors/records_data`` (and masks) a link to ``source_root``'s.
+
+    ``below`` is a folder of it that becomes the link instead.
+    """
     for name in folders:
         source = Path(source_root).resolve() / "sensors" / name
-        link = Path(output_root) / "sensors" / name
+        link = Path(output_root) / "sensors" / name / below
         if source.exists():
             with _new_link(link):
                 if link.is_symlink():

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.colmap_cameras import focal_from_exif
+from megloc_kapture.io.colmap import focal_from_exif
 from megloc_kapture.io.files import read_content, write_bytes
 from megloc_kapture.values import Camera
 

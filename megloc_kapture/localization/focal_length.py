@@ -34,7 +34,7 @@ from megloc_kapture.geometry.cameras import (
     shift_principal_point,
     with_distortion,
 )
-from megloc_kapture.io.colmap_cameras import focal_from_matches
+from megloc_kapture.io.colmap import focal_from_matches
 from megloc_kapture.localization.absolute_pose import (
     AbsolutePoseOptions,
     PoseEstimate,

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from megloc_kapture.geometry.cameras import px_from_cam
 from megloc_kapture.geometry.warping import scaled_camera
-from megloc_kapture.io.colmap_cameras import undistorted_pinhole
+from megloc_kapture.io.colmap import undistorted_pinhole
 from megloc_kapture.plugins import DepthEstimate, StereoView
 from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, Options, RigidTransform
 

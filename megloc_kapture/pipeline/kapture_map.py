@@ -15,7 +15,7 @@ from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.geometry.cameras import shift_principal_point
 from megloc_kapture.io.dataset_tables import tables_of, unit_of
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
-from megloc_kapture.io.weights.registry import registry
+from megloc_kapture.io.weights import registry
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.mapping.map_check import Origin, PixelOrigin, find_pixel_origin, map_fault
 from megloc_kapture.matching.guided_pyramid import base_type

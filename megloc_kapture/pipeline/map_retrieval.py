@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.vlad import Vocabulary, aggregate, train_vlad
-from megloc_kapture.io.weights import MissingWeightsError
-from megloc_kapture.io.weights.registry import registry
+from megloc_kapture.io.weights import MissingWeightsError, registry
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.local_types import LocalType

@@ -29,7 +29,7 @@ from megloc_kapture.geometry.cameras import (
     shift_principal_point,
     with_distortion,
 )
-from megloc_kapture.io.colmap_cameras import undistorted_pinhole
+from megloc_kapture.io.colmap import undistorted_pinhole
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, ONE_FOCAL_MODELS, Camera, Options
 
 # what lies between two points that belong to each other does so too: the models fold slowly

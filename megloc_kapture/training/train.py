@@ -17,8 +17,7 @@ from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.files import read_content, remove, write_bytes, write_json
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.io.weights import find_weights, sha256_of
-from megloc_kapture.io.weights.registry import by_sha256
+from megloc_kapture.io.weights import by_sha256, find_weights, sha256_of
 from megloc_kapture.nets.runtime import pick_device, state_bytes
 from megloc_kapture.nets.superglue import SuperGlueNet
 from megloc_kapture.stages.work import HERE, Work

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import torch
 
-from megloc_kapture.io.weights import registry as weights_registry
+from megloc_kapture.io import weights
 
 BUNDLE = Path(__file__).parents[1] / "io" / "weights" / "data" / "tensor_bundle"
 
@@ -49,10 +49,10 @@ def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     thread.start()
     table = tmp_path / "registry.toml"
     table.write_text(registry_text(f"http://127.0.0.1:{running.server_port}"))
-    monkeypatch.setattr(weights_registry, "_TABLE", table)
-    weights_registry.registry.cache_clear()
+    monkeypatch.setattr(weights, "_REGISTRY", table)
+    weights.registry.cache_clear()
     yield folder
-    weights_registry.registry.cache_clear()
+    weights.registry.cache_clear()
     running.shutdown()
     thread.join()
     running.server_close()
@@ -197,8 +197,8 @@ def test_the_shipped_registry(megloc: Any) -> None:
     assert done.status == 0 and done.err == ""
     header, *rows = done.out.splitlines()
     assert header.split() == ["name", "what", "for", "file", "size", "licence", "state", "sha256"]
-    names = [row.split()[0] for row in rows[: len(weights_registry.registry())]]
-    assert names == list(weights_registry.registry())
+    names = [row.split()[0] for row in rows[: len(weights.registry())]]
+    assert names == list(weights.registry())
     done = megloc("doctor")
     assert (done.status, done.err) == (0, "")
     assert "pycolmap" in done.out and "weights" in done.out

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from kapture.converter.colmap.database import COLMAPDatabase
 
-from megloc_kapture.datasets.formats.sparse_points import SparsePoints
+from megloc_kapture.datasets.formats.sparse_models import SparsePoints
 from megloc_kapture.datasets.reference_map import write_reference_map
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor

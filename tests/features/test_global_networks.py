@@ -34,7 +34,8 @@ from megloc_kapture.features.global_networks import (
     _with_longer_side,
     official_size,
 )
-from megloc_kapture.io.weights import MissingWeightsError, convert_weights
+from megloc_kapture.io.weights import MissingWeightsError
+from megloc_kapture.io.weights.adding import convert_weights
 from megloc_kapture.nets import delg as nets_delg
 from megloc_kapture.nets import megaloc as nets_megaloc
 from megloc_kapture.nets.global_descriptors import ApGemNet, EigenPlacesNet, VggNetVlad

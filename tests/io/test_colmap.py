@@ -18,16 +18,19 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.io.colmap import (
-    DatabaseFeatures,
     MapImage,
     TriangulatedPoints,
     TriangulationOptions,
+    load_pycolmap,
+    px_from_cam,
     triangulate,
-    write_feature_database,
     write_model,
 )
-from megloc_kapture.io.colmap_cameras import load_pycolmap, px_from_cam
-from megloc_kapture.io.colmap_mapping import connected_models
+from megloc_kapture.io.colmap_mapping import (
+    DatabaseFeatures,
+    connected_models,
+    write_feature_database,
+)
 from megloc_kapture.values import Camera, RigidTransform
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py

@@ -11,16 +11,11 @@ from corner import CAMERA, WALLS, depth_m, pose_at, render
 from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.io.colmap import MapImage
-from megloc_kapture.io.colmap_mapping import (
-    fuse,
-    has_cuda,
-    map_path,
-    read_map,
-    write_map,
-    write_workspace,
-)
+from megloc_kapture.io.colmap_mapping import has_cuda, map_path, read_map, write_workspace
 from megloc_kapture.mvs.colmap import ColmapStereo
 from megloc_kapture.mvs.sweep import as_estimate, planes_of
+
+import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
 POSES = [pose_at((x, 0.0, 0.0), 0.0, 0.0) for x in (-0.3, 0.0, 0.3)]
 NAMES = ["a/0.png", "a/1.png", "b/2.png"]
@@ -42,25 +37,50 @@ def _normals(number: int) -> np.ndarray:
     return found
 
 
-def _workspace(root: Path, *, with_points: bool) -> None:
+def write_map(path: Path, array: np.ndarray) -> None:
+    """Write depth (H, W) or normals (H, W, 3) as COLMAP does."""
+    values = np.asarray(array, "<f4")
+    values = values[..., None] if values.ndim == 2 else values
+    height, width, channels = values.shape
+    head = f"{width}&{height}&{channels}&".encode()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(head + np.ascontiguousarray(values.transpose(2, 0, 1)).tobytes())
+
+
+def fuse(root: Path) -> np.ndarray:
+    """Fuse the maps of a workspace by COLMAP; points (N, 3) in the world."""
+    options = pycolmap.StereoFusionOptions()
+    options.min_num_pixels = 2
+    options.num_threads = 1
+    fused = pycolmap.stereo_fusion(
+        str(root / "fused.ply"),
+        str(root),
+        input_type="photometric",
+        options=options,
+        output_type="PLY",
+    )
+    return np.array([point.xyz for point in fused.points3D.values()])
+
+
+def _workspace(root: Path) -> None:
     exact = depth_m(POSES[1])
     y, x = np.mgrid[20:280:15, 20:380:15]
     px = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
     xyz = POSES[1].inverse().apply(bearing_rays(CAMERA, px) * exact[y, x].reshape(-1, 1))
-    rows = np.arange(len(xyz)) if with_points else np.zeros(0, np.int64)
+    rows = np.arange(len(xyz))
     images = [
         MapImage(name, CAMERA, pose, project(CAMERA, pose, xyz).astype(np.float32))
         for name, pose in zip(NAMES, POSES, strict=True)
     ]
     pixels = [render(pose) for pose in POSES]
-    write_workspace(root, images, pixels, [(rows, rows)] * 3, xyz if with_points else xyz[:0])
+    write_workspace(root, images, pixels, [(rows, rows)] * 3, xyz)
     for number, name in enumerate(NAMES):
-        write_map(map_path(root, "depth", name, "geometric"), depth_m(POSES[number]))
-        write_map(map_path(root, "normal", name, "geometric"), _normals(number))
+        write_map(map_path(root, "depth", name), depth_m(POSES[number]))
+        write_map(map_path(root, "normal", name), _normals(number))
 
 
 def test_colmap_fuses_our_maps_to_the_two_walls(tmp_path: Path) -> None:
-    _workspace(tmp_path, with_points=True)
+    _workspace(tmp_path)
     fused = fuse(tmp_path)
     assert len(fused) > 50_000
     distances = np.min(
@@ -70,14 +90,7 @@ def test_colmap_fuses_our_maps_to_the_two_walls(tmp_path: Path) -> None:
     assert np.percentile(distances, 99) < 0.012
 
 
-def test_a_model_without_points_is_refused(tmp_path: Path) -> None:
-    _workspace(tmp_path, with_points=False)
-    with pytest.raises(DataError, match="no image has neighbours"):
-        fuse(tmp_path)
-
-
 def test_maps_are_those_of_colmap(tmp_path: Path) -> None:
-    pycolmap = pytest.importorskip("pycolmap")
     exact = depth_m(POSES[0])
     ours, theirs = tmp_path / "ours.bin", tmp_path / "theirs.bin"
     write_map(ours, exact)

@@ -17,7 +17,7 @@ from torch import nn
 from transformers import Dinov2Config, Dinov2Model
 
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.weights.registry import lookup
+from megloc_kapture.io.weights import lookup
 from megloc_kapture.nets import megaloc
 from megloc_kapture.nets.megaloc import DinoV2, MegaLocNet, Salad, assignment, megaloc_from, squared
 

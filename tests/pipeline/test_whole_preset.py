@@ -14,8 +14,7 @@ import pytest
 from megloc_kapture.cli.main import main
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import read_clusters, read_refinement, read_status
-from megloc_kapture.io.weights import find_weights, read_weights
-from megloc_kapture.io.weights.registry import registry
+from megloc_kapture.io.weights import find_weights, read_weights, registry
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from whole_preset import (  # noqa: E402

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.colmap_cameras import px_from_cam
+from megloc_kapture.io.colmap import px_from_cam
 from megloc_kapture.preprocessing.frames import (
     FrameOptions,
     FramePlan,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.datasets.inloc.layout import COLOURS, POINTS
+from megloc_kapture.datasets.inloc import COLOURS, POINTS
 from megloc_kapture.datasets.official import GROUND_TRUTH
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, ImageGroup, write_groups
 from megloc_kapture.io.images import write_image

@@ -19,8 +19,7 @@ from megloc_kapture.datasets.formats.colmap_model import (
     ColmapImage,
     ColmapModel,
 )
-from megloc_kapture.datasets.formats.nvm import NvmModel
-from megloc_kapture.datasets.formats.sparse_points import SparsePoints
+from megloc_kapture.datasets.formats.sparse_models import NvmModel, SparsePoints
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import check_relative, write_bytes
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform

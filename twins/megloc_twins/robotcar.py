@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.datasets.formats.colmap_model import ColmapImage, ColmapModel
-from megloc_kapture.datasets.formats.sparse_points import SparsePoints
+from megloc_kapture.datasets.formats.sparse_models import SparsePoints
+from megloc_kapture.datasets.robotcar import Layout
 from megloc_kapture.datasets.robotcar.images import RIG_ID
-from megloc_kapture.datasets.robotcar.layout import Layout
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform
 from megloc_twins.frames import (

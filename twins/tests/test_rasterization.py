@@ -19,7 +19,7 @@ from megloc_twins.surfaces import SurfaceBuilder, Surfaces, build_atlas
 from megloc_twins.viewpoints import query_camera
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.colmap_cameras import normalized_from_px, px_from_cam
+from megloc_kapture.io.colmap import normalized_from_px, px_from_cam
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERAS = [

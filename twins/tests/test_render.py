@@ -22,7 +22,7 @@ from megloc_twins.synthetic_kapture import SyntheticWorld, build_world
 from megloc_twins.viewpoints import overlap
 
 from megloc_kapture.features.rootsift import RootSift
-from megloc_kapture.io.colmap_cameras import normalized_from_px, px_from_cam
+from megloc_kapture.io.colmap import normalized_from_px, px_from_cam
 
 OPTIONS = SyntheticWorldOptions(
     num_places=1, stations_per_place=6, day_queries=1, night_queries=1, width=320, height=240

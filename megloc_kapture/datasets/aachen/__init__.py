@@ -1,0 +1,328 @@
+"""Files of Aachen Day-Night: the official layout, or the folders that kapture distributes.
+
+v1.0 has an NVM with a list of cameras, v1.1 a COLMAP model. kapture has ``mapping/`` and
+``query/``, or the queries by day and at night apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from megloc_kapture.datasets.formats.colmap_reading import colmap_model_files, read_colmap_model
+from megloc_kapture.datasets.formats.sparse_models import NvmModel, SparsePoints, read_single_nvm
+from megloc_kapture.datasets.formats.text_lines import Line, read_lines
+from megloc_kapture.datasets.kapture_folders import (
+    MAPPING,
+    QUERY,
+    KaptureImage,
+    is_kapture,
+    kapture_parent,
+    read_images,
+    tables_and_images,
+)
+from megloc_kapture.datasets.official import Missing
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.io.files import check_relative, named
+from megloc_kapture.io.images import image_size
+from megloc_kapture.io.kapture import KaptureData, Sensor
+from megloc_kapture.values import Camera, RigidTransform
+
+Version = Literal["1.0", "1.1"]
+Wanted = Literal["auto", "1.0", "1.1"]
+
+DAY, NIGHT = "day", "night"
+DATABASE_FOLDER, SEQUENCES_FOLDER, QUERY_FOLDER = "db", "sequences", "query"
+# v1.1's night list replaces v1.0's and has these beside the old ones
+ADDITIONAL_NIGHT = "query/night/nexus5x_additional_night/"
+
+# the first timestamp of each list; map images count from 0
+_FIRST_TIMESTAMP = {DAY: 100_000, NIGHT: 200_000}
+_IMAGE_FOLDERS = ("images_upright", "images/images_upright")
+# the archive's name and the folder's swap an underscore; both are met
+_MODEL_FOLDERS = ("aachen_v_1_1", "aachen_v1_1")
+_SIZE_END = 10**9
+
+_QUERY_PARTS = {DAY: "query_day", NIGHT: "query_night"}
+# in the folder kapture's archives unpack to
+_NAME_OF_V1_1 = ("v1.1", "v1_1", "v11")
+
+
+@dataclass
+class AachenImages:
+    """The images of an import.
+
+    Parameters
+    ----------
+    mapping, query : their sensors and records; poses of the map.
+    conditions : query -> ``day`` or ``night``, in the order of the lists, day first.
+    """
+
+    version: Version
+    mapping: KaptureData = field(default_factory=KaptureData)
+    query: KaptureData = field(default_factory=KaptureData)
+    conditions: dict[str, str] = field(default_factory=dict)
+
+    def add_map_image(
+        self, name: str, position: int, camera_id: int, camera: Camera, pose: RigidTransform
+    ) -> None:
+        """Add an image by its position in the model and the id of its camera there."""
+        record = position, f"camera_{camera_id:05d}"
+        self.mapping.sensors[record[1]] = Sensor.from_camera(camera)
+        self.mapping.records_camera[record] = name
+        self.mapping.trajectories[record] = pose
+
+    def add_query(self, name: str, condition: str, position: int, camera: Camera) -> None:
+        """Add a query by its position in the list of its condition."""
+        record = _FIRST_TIMESTAMP[condition] + position, f"{condition}_{position:05d}"
+        self.query.sensors[record[1]] = Sensor.from_camera(camera)
+        self.query.records_camera[record] = name
+        self.conditions[name] = condition
+
+
+class Layout:
+    """The dataset's official files below ``root``.
+
+    Attributes
+    ----------
+    images : the folder image names are relative to.
+    nvm : the model of v1.0.
+    database_intrinsics : the cameras of v1.0's database images.
+    colmap_model : the folder of v1.1's model.
+    feature_database : COLMAP's database with the features of v1.0's model; large, seldom there.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = Path(root)
+        models = self.root / "3D-models"
+        self.images = _first(self.root / name for name in _IMAGE_FOLDERS)
+        self.nvm = models / "aachen_cvpr2018_db.nvm"
+        self.database_intrinsics = models / "database_intrinsics.txt"
+        self.colmap_model = _first(models / name for name in _MODEL_FOLDERS)
+        self.feature_database = self.root / "aachen.db"
+
+    def query_list(self, condition: str) -> Path:
+        """The list of the queries of ``day`` or ``night``, with their cameras."""
+        return self.root / "queries" / f"{condition}_time_queries_with_intrinsics.txt"
+
+    def absent(self) -> list[str]:
+        """Names of the layout's folders that are not there."""
+        wanted = (self.images, self.query_list(DAY).parent, self.nvm.parent)
+        return [folder.name for folder in wanted if not folder.is_dir()]
+
+    def version(self, wanted: Wanted) -> Version:
+        """``wanted``, or the latest whose model is there; DataError where it is not."""
+        if wanted == "auto":
+            wanted = "1.1" if self.colmap_model.is_dir() else "1.0"
+        model = self.nvm if wanted == "1.0" else self.colmap_model
+        if not model.exists():
+            raise DataError(
+                f"the model of Aachen Day-Night v{wanted} is missing: "
+                f"{model.relative_to(self.root)}",
+                path=self.root,
+            )
+        return wanted
+
+    def model_files(self, version: Version, *, with_points: bool) -> tuple[Path, ...]:
+        """The files that poses and cameras of the map come from; those that are there."""
+        if version == "1.1":
+            return colmap_model_files(self.colmap_model, with_points=with_points)
+        files = (self.nvm, self.database_intrinsics)
+        return tuple(file for file in files if file.is_file())
+
+    def image_files(self) -> Iterator[Path]:
+        """Every file below the folders of images."""
+        for folder in (DATABASE_FOLDER, SEQUENCES_FOLDER, QUERY_FOLDER):
+            yield from sorted(path for path in (self.images / folder).rglob("*") if path.is_file())
+
+    def read(self, version: Version, missing: Missing) -> tuple[AachenImages, int]:
+        """Read the images that are on disk, and how many of v1.1's queries a v1.0 leaves out.
+
+        Raises
+        ------
+        DataError : a broken model or list, an image without a camera or in both lists.
+        """
+        images = AachenImages(version)
+        if version == "1.1":
+            model = read_colmap_model(self.colmap_model, with_points=False)
+            for position, image in enumerate(model.images):
+                if missing.require(self.images / image.name):
+                    camera = model.cameras[image.camera_id]
+                    pose = image.cam_from_world
+                    images.add_map_image(image.name, position, image.camera_id, camera, pose)
+        else:
+            self._add_nvm(images, missing)
+        return images, self._add_queries(images, missing)
+
+    def read_points(self, version: Version) -> tuple[tuple[str, ...], SparsePoints]:
+        """Names of all images of a version's model, and its points; DataError if it is broken."""
+        if version == "1.1":
+            model = read_colmap_model(self.colmap_model)
+            return tuple(image.name for image in model.images), model.points
+        nvm = read_single_nvm(self.nvm, with_points=True)
+        return nvm.names, nvm.points
+
+    def _add_nvm(self, images: AachenImages, missing: Missing) -> None:
+        """Each image has a camera of its own, with the image's position as its id."""
+        nvm = read_single_nvm(self.nvm, with_points=False)
+        listed = None
+        if missing.require(self.database_intrinsics):
+            listed = read_query_list(self.database_intrinsics)
+        for position, name in enumerate(nvm.names):
+            if listed is not None and name not in listed:
+                raise DataError(
+                    f"no line for {name!r}, an image of {self.nvm.name}",
+                    path=self.database_intrinsics,
+                )
+            if missing.require(self.images / name):
+                camera = self._centred(nvm, position) if listed is None else listed[name]
+                pose = nvm.cam_from_world(position)
+                images.add_map_image(name, position, position, camera, pose)
+
+    def _centred(self, nvm: NvmModel, position: int) -> Camera:
+        """The camera of the NVM, with the image's size and the principal point in its middle.
+
+        The published list has the same cameras, as far as is known.
+        """
+        name = nvm.names[position]
+        width, height = image_size(self.images / name)
+        focal, k = float(nvm.focal_px[position]), float(nvm.k_colmap[position])
+        with named(self.nvm, about=f"image {name!r}"):
+            return Camera("SIMPLE_RADIAL", width, height, (focal, width / 2, height / 2, k))
+
+    def _add_queries(self, images: AachenImages, missing: Missing) -> int:
+        listed: dict[str, Path] = {}
+        left_out = 0
+        for condition in (DAY, NIGHT):
+            path = self.query_list(condition)
+            if not missing.require(path):
+                continue
+            for position, (name, camera) in enumerate(read_query_list(path).items()):
+                if listed.setdefault(name, path) != path:
+                    raise DataError(
+                        f"image {name!r} is also in {listed[name].name}: a query by day or at "
+                        "night?",
+                        path=path,
+                    )
+                if images.version == "1.0" and name.startswith(ADDITIONAL_NIGHT):
+                    left_out += 1
+                elif missing.require(self.images / name):
+                    images.add_query(name, condition, position, camera)
+        return left_out
+
+
+def _first(folders: Iterable[Path]) -> Path:
+    """The first folder that is there; else the first of all, where it should be."""
+    candidates = list(folders)
+    return next((folder for folder in candidates if folder.is_dir()), candidates[0])
+
+
+def read_query_list(path: Path) -> dict[str, Camera]:
+    """Read a list of images and their cameras, in its order.
+
+    Lines are ``name MODEL WIDTH HEIGHT PARAMS...``, with COLMAP's camera models.
+
+    Raises
+    ------
+    DataError : missing or not text, a line that is no image with a camera, a name that is no
+        plain relative path or is given twice, or no image at all; names file and line.
+    """
+    cameras: dict[str, Camera] = {}
+    for line in read_lines(path):
+        name, camera = _listed(line)
+        if name in cameras:
+            raise line.error(f"image {name!r} is listed twice")
+        cameras[name] = camera
+    if not cameras:
+        raise DataError("no image in the list; expected lines of 'name MODEL W H ...'", path=path)
+    return cameras
+
+
+def _listed(line: Line) -> tuple[str, Camera]:
+    if len(line.fields) < 4:
+        raise line.error(
+            f"expected 'name MODEL WIDTH HEIGHT PARAMS...', got {len(line.fields)} fields"
+        )
+    name, model, *texts = line.fields
+    width, height = (line.count_of(text, "image size", _SIZE_END) for text in texts[:2])
+    params = tuple(line.numbers_of(texts[2:], "camera parameter"))
+    with line.named():
+        return check_relative(name), Camera(model, width, height, params)
+
+
+@dataclass(frozen=True, slots=True)
+class KaptureLayout:
+    """Aachen's kapture folders below ``root``."""
+
+    root: Path
+
+    @classmethod
+    def find(cls, root: Path) -> KaptureLayout | None:
+        """The folders that are there instead of the official files; None where these are."""
+        parent = kapture_parent(root) if Layout(root).absent() else None
+        return None if parent is None else cls(parent)
+
+    def input_files(self) -> Iterator[Path]:
+        """Every file an import may depend on."""
+        folders = (self.root / MAPPING, *self._queries())
+        yield from tables_and_images(folder for folder in folders if is_kapture(folder))
+
+    def read(self, wanted: Wanted, missing: Missing) -> tuple[AachenImages, dict[str, Path]]:
+        """Read the images, and the file of each.
+
+        Map images count as their times do, which is their order in the model; queries of each
+        condition likewise, which is the order of the official list.
+
+        Raises
+        ------
+        DataError : a broken kapture folder, a query whose name says neither day nor night.
+        OptionError : v1.0 is wanted, and this is v1.1, whose poses are others.
+        """
+        mapping = read_images(self.root / MAPPING, missing.require)
+        queries: list[KaptureImage] = []
+        for folder in self._queries():
+            if missing.require(folder / "sensors" / "sensors.txt"):
+                queries += read_images(folder, missing.require)
+        images = AachenImages(self._version(wanted, [*mapping, *queries]))
+        by_condition: dict[str, list[KaptureImage]] = {DAY: [], NIGHT: []}
+        for image in queries:
+            folders = image.name.split("/")[:-1]
+            condition = next((part for part in folders if part in by_condition), None)
+            if condition is None:
+                raise DataError(
+                    f"query {image.name!r} has neither {DAY}/ nor {NIGHT}/ in its name",
+                    path=self.root,
+                )
+            by_condition[condition].append(image)
+        for condition, of_condition in by_condition.items():
+            for position, image in enumerate(of_condition):
+                images.add_query(image.name, condition, position, image.camera)
+        cameras: dict[str, int] = {}
+        for position, image in enumerate(mapping):
+            if (pose := image.cam_from_world) is not None:
+                camera_id = cameras.setdefault(image.sensor_id, len(cameras))
+                images.add_map_image(image.name, position, camera_id, image.camera, pose)
+        return images, {image.name: image.file for image in [*mapping, *queries]}
+
+    def _queries(self) -> list[Path]:
+        parts = [self.root / name for name in _QUERY_PARTS.values()]
+        whole = self.root / QUERY
+        # kapture's own scripts merge the two and leave them there
+        return [whole] if is_kapture(whole) or not any(map(is_kapture, parts)) else parts
+
+    def _version(self, wanted: Wanted, images: Sequence[KaptureImage]) -> Version:
+        is_newer = any(
+            image.name.startswith((f"{SEQUENCES_FOLDER}/", ADDITIONAL_NIGHT)) for image in images
+        )
+        if wanted == "1.0" and is_newer:
+            raise OptionError(
+                f"version=1.0 is wanted, and {self.root} is v1.1, whose poses are others"
+            )
+        if wanted != "auto":
+            return wanted
+        path = self.root.resolve()
+        folders = (path.name.lower(), path.parent.name.lower())
+        named = any(text in name for text in _NAME_OF_V1_1 for name in folders)
+        return "1.1" if is_newer or named else "1.0"

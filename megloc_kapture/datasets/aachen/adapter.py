@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
-from megloc_kapture.datasets.aachen.layout import (
+from megloc_kapture.datasets.aachen import (
     ADDITIONAL_NIGHT,
     DATABASE_FOLDER,
     DAY,

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.text_lines import check_plain, image_name
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.files import named
 
 _SIZE_END = 2**31
 # x y; x y scale orientation; x y and an affine shape
@@ -157,10 +158,8 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
         for image_id, name, camera_id in self._rows("images", "image_id, name, camera_id"):
             if not isinstance(name, str) or not isinstance(camera_id, int):
                 raise self._error(f"image {image_id!r} has no name or no camera")
-            try:
+            with named(self.path, about=f"image {image_id}"):
                 known = image_name(name)
-            except DataError as error:
-                raise self._error(f"image {image_id}: {error.message}") from None
             if known in images:
                 raise self._error(f"image {known!r} is listed twice")
             images[known] = int(image_id)

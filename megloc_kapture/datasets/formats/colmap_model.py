@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.formats.sparse_points import SparsePoints, image_order
-from megloc_kapture.datasets.formats.text_lines import check_plain, image_name, reading
+from megloc_kapture.datasets.formats.sparse_models import SparsePoints, image_order
+from megloc_kapture.datasets.formats.text_lines import check_plain, image_name
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.files import reading
 from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 

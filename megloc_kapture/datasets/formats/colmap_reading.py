@@ -30,7 +30,7 @@ from megloc_kapture.datasets.formats.colmap_model import (
     read_binary_cameras,
     read_binary_points,
 )
-from megloc_kapture.datasets.formats.sparse_points import (
+from megloc_kapture.datasets.formats.sparse_models import (
     MAX_FEATURE_ID,
     PIXEL_END,
     SparsePoints,

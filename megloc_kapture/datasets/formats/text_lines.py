@@ -14,7 +14,7 @@ import re
 import stat
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import check_relative, read_text
+from megloc_kapture.io.files import check_relative, named, read_text, reading
+from megloc_kapture.io.kapture.format import BYTE_ORDER_MARK, FLOAT_PATTERN
 from megloc_kapture.io.kapture.sensors import unit_quaternion
-from megloc_kapture.io.kapture.text import FLOAT_PATTERN
 from megloc_kapture.values import RigidTransform
 
 # larger distances are broken and would overflow further on; ECEF coordinates are below 1e7
@@ -37,7 +37,6 @@ MAX_ROTATION_ERROR = 1e-3
 _COUNT = re.compile(r"[0-9]{1,18}")
 _BLANKS = " \t\r\v\f"
 _BETWEEN_BLANKS = re.compile(f"[{_BLANKS}]+")
-_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _SHOWN = 40
 _BLOCK_BYTES = 1 << 23
 # no row of any format here comes near it; a file without line breaks shall not fill the memory
@@ -73,13 +72,9 @@ class Line:
         """The error for this line."""
         return DataError(message, path=self.path, line=self.number)
 
-    @contextmanager
-    def named(self) -> Iterator[None]:
+    def named(self) -> AbstractContextManager[None]:
         """Let DataErrors that name no file name this line."""
-        try:
-            yield
-        except DataError as error:
-            raise (error if error.path is not None else self.error(error.message)) from None
+        return named(self.path, self.number)
 
     def expect(self, fields: Sequence[str], counts: int | Iterable[int], form: str) -> None:
         """Raise DataError where there is another number of fields; ``form`` lists them."""
@@ -195,10 +190,8 @@ def image_name(text: str) -> str:
         text.encode()
     except UnicodeEncodeError:
         raise DataError("the image's name is not UTF-8") from None
-    try:
+    with named(about="the image's name"):
         return check_relative(text.removeprefix("./"))
-    except DataError as error:
-        raise DataError(f"the image's name: {error.message}") from None
 
 
 def shown(text: str) -> str:
@@ -216,15 +209,6 @@ def check_plain(path: Path) -> None:
             raise DataError("file is missing", path=path) from error
     if not stat.S_ISREG(mode):
         raise DataError("not a plain file", path=path)
-
-
-@contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Make an OSError a DataError that names the file or folder."""
-    try:
-        yield
-    except OSError as error:
-        raise DataError(f"cannot read: {error.strerror}", path=path) from error
 
 
 # ------------------------------------------------------------------------------------ large files
@@ -314,7 +298,7 @@ class TextFile(AbstractContextManager["TextFile"]):
         check_plain(self.path)
         with reading(self.path):
             self._file = open(self.path, "rb")  # noqa: SIM115
-        if self._read(len(_BYTE_ORDER_MARK)) != _BYTE_ORDER_MARK:
+        if self._read(len(BYTE_ORDER_MARK)) != BYTE_ORDER_MARK:
             self._file.seek(0)
 
     def line(self) -> Line | None:

@@ -1,0 +1,302 @@
+"""4Seasons' recordings on disk, the relocalization files between them, and the choice of both."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from megloc_kapture.datasets.formats.fourseasons_files import (
+    CAMERA_FILES,
+    STEREO_FILE,
+    RelocalizationRow,
+    StereoCalibration,
+    parse_relocalization_name,
+    read_calibration,
+    read_relocalization,
+    timestamp_of_name,
+)
+from megloc_kapture.datasets.kapture_folders import is_kapture
+from megloc_kapture.datasets.official import Count, Missing
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.io.files import named, reading
+from megloc_kapture.io.kapture import KaptureFolder
+
+CAMERAS = ("cam0", "cam1")
+CALIBRATION_FOLDERS = ("calibration", "Calibration")
+GNSS_POSES, POSES, ACCURACY = "GNSSPoses.txt", "poses.txt", "keyframe_accuracy.txt"
+TRANSFORMATIONS, TIMES, KEYFRAMES = "Transformations.txt", "times.txt", "KeyFrameData"
+
+_IMAGES = "undistorted_images"
+_KAPTURE_RECORDS = "records"
+_MARKS = (_IMAGES, GNSS_POSES, POSES, TIMES)
+_RELOCALIZATION_FOLDERS = (".", "RelocalizationFiles*", "*", "*/RelocalizationFiles*")
+# pairs of source and target -> their number, from the challenges' pages
+_PUBLISHED_PAIRS = {
+    ("recording_2020-10-08_09-57-28", "recording_2021-01-07_14-03-57"): 227,
+    ("recording_2020-10-08_11-53-41", "recording_2021-05-10_19-51-14"): 227,
+    ("recording_2021-02-25_13-25-15", "recording_2021-05-10_18-26-26"): 129,
+    ("city_loop_2_train", "city_loop_2_test"): 690,
+    ("old_town_2_train", "old_town_3_test"): 630,
+    ("parking_garage_2_train", "parking_garage_1_test"): 113,
+}
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One drive.
+
+    Parameters
+    ----------
+    name : of its folder, which is also what relocalization files call it.
+    folder : where its files lie; of a kapture folder its ``records_data``.
+    kapture : has cameras and poses, where the recording was converted by kapture's importer.
+    """
+
+    name: str
+    folder: Path
+    kapture: KaptureFolder | None = None
+
+    @property
+    def has_poses(self) -> bool:
+        """True where poses of its keyframes are published and here."""
+        if self.kapture is not None:
+            return bool(self.kapture.read().trajectories)
+        return (self.folder / GNSS_POSES).is_file() or (self.folder / POSES).is_file()
+
+    def image(self, timestamp: int, camera: str) -> str:
+        """Name of an image below the dataset's root."""
+        return f"{self.name}/{_IMAGES}/{camera}/{timestamp}.png"
+
+    def file_of(self, image: str) -> Path:
+        """The file of an image of this recording, by its name."""
+        return self.folder / image.removeprefix(f"{self.name}/")
+
+    def image_file(self, timestamp: int, camera: str) -> Path:
+        """The file of an image, if it is there."""
+        return self.folder / _IMAGES / camera / f"{timestamp}.png"
+
+    def keyframe_file(self, timestamp: int) -> Path:
+        """The file of a keyframe's point cloud, if it is there."""
+        return self.folder / KEYFRAMES / f"KeyFrame_{timestamp}.txt"
+
+    def times_on_disk(self, camera: str) -> list[int]:
+        """Timestamps (ns) of a camera's undistorted images, sorted."""
+        folder = self.folder / _IMAGES / camera
+        with reading(folder):
+            names = os.listdir(folder) if folder.is_dir() else []
+        times = (timestamp_of_name(n.removesuffix(".png")) for n in names if n.endswith(".png"))
+        return sorted(time for time in times if time is not None)
+
+    def calibration(self, root: Path) -> StereoCalibration:
+        """The cameras of its undistorted images; DataError names the file."""
+        if self.kapture is None:
+            return read_calibration(self.calibration_folder(root))
+        data = self.kapture.read()
+        cars = [members for members in data.rigs.values() if set(CAMERAS) <= set(members)]
+        with named(self.kapture.root / "sensors"):
+            if not cars or not set(CAMERAS) <= set(data.sensors):
+                raise DataError(
+                    f"no cameras {' and '.join(CAMERAS)} on one rig, as kapture's importer of "
+                    "4Seasons writes them"
+                )
+            cam0, cam1 = (data.sensors[name].camera() for name in CAMERAS)
+        car = cars[0]
+        return StereoCalibration(cam0, cam1, car[CAMERAS[1]] @ car[CAMERAS[0]].inverse())
+
+    def calibration_files(self, root: Path) -> list[Path]:
+        """The files of :meth:`calibration`; raises what it raises where there are none."""
+        if self.kapture is not None:
+            return sorted((self.kapture.root / "sensors").glob("*.txt"))
+        folder = self.calibration_folder(root)
+        return [folder / name for name in (*CAMERA_FILES, STEREO_FILE)]
+
+    def calibration_folder(self, root: Path) -> Path:
+        """The folder of a calibration: its own, or the dataset's; DataError without one."""
+        for folder in (self.folder, root):
+            for name in CALIBRATION_FOLDERS:
+                if (folder / name).is_dir():
+                    return folder / name
+        raise DataError(
+            f"no folder {' or '.join(CALIBRATION_FOLDERS)} here or in {self.name}; it is a "
+            "download of its own (calibration.zip)",
+            path=root,
+        )
+
+
+@dataclass(frozen=True)
+class RelocalizationFile:
+    """A list of pairs that a challenge asks for.
+
+    Parameters
+    ----------
+    path : of the file; the file to hand in has the same name.
+    source, target : recordings, of the map and of the queries.
+    """
+
+    path: Path
+    source: str
+    target: str
+
+    @cached_property
+    def rows(self) -> list[RelocalizationRow]:
+        """Its pairs; raises DataError that names file and line."""
+        return read_relocalization(self.path)
+
+    def count(self) -> Count:
+        """Its pairs, beside those published."""
+        published = _PUBLISHED_PAIRS.get((self.source, self.target))
+        return Count(f"pairs in {self.path.name}", len(self.rows), published)
+
+
+def find_recordings(root: Path) -> dict[str, Recording]:
+    """The recordings below a dataset's root by name, sorted; DataError where there is none."""
+    found = {
+        folder.name: Recording(folder.name, folder)
+        for folder in _folders(root)
+        if any((folder / mark).exists() for mark in _MARKS)
+    } or _kapture_recordings(root)
+    if not found:
+        raise DataError(
+            f"no recording here, a folder with {_IMAGES}/ and {GNSS_POSES} or {TIMES} in it",
+            path=root,
+        )
+    return found
+
+
+def _kapture_recordings(root: Path) -> dict[str, Recording]:
+    """The recordings that kapture's importer has converted, below ``records/`` or the root."""
+    records = root / _KAPTURE_RECORDS
+    found = {}
+    for folder in _folders(records if records.is_dir() else root):
+        images = folder / "sensors" / "records_data"
+        if is_kapture(folder) and (images / _IMAGES).is_dir():
+            found[folder.name] = Recording(folder.name, images, KaptureFolder(folder))
+    return found
+
+
+def _folders(root: Path) -> list[Path]:
+    if not root.is_dir():
+        raise DataError("no such folder", path=root)
+    with reading(root):
+        return sorted(path for path in root.iterdir() if path.is_dir())
+
+
+def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[RelocalizationFile]:
+    """The relocalization files below a dataset's root, sorted by source and name.
+
+    A file whose name leaves out its source must lie in the source's folder. DataError where two
+    have one name, for so would the files to hand in.
+    """
+    known = set(recordings)
+    found: dict[str, RelocalizationFile] = {}
+    for folder in _RELOCALIZATION_FOLDERS:
+        for path in sorted(root.glob(f"{folder}/reloc*.txt")):
+            named = parse_relocalization_name(path.name)
+            if named is None or not path.is_file():
+                continue
+            source, target = named
+            owner = path.relative_to(root).parts[0]
+            if source is None and owner in known:
+                source = owner
+            if source is None:
+                raise DataError(
+                    "the file's name does not say whose map it means; it belongs into the folder "
+                    "of the reference recording",
+                    path=path,
+                )
+            if path.name in found:
+                raise DataError(f"the same name as {found[path.name].path}", path=path)
+            found[path.name] = RelocalizationFile(path, source, target)
+    return sorted(found.values(), key=lambda file: (file.source, file.path.name))
+
+
+# stands in the list of what is missing where there is a recording for the map only
+ANOTHER_RECORDING = "<another recording, for the queries>"
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The recordings that are imported.
+
+    Parameters
+    ----------
+    recordings : all that are there, by name.
+    references, queries : those of the map and those of the queries, sorted by name.
+    files : the relocalization files between them.
+    """
+
+    recordings: dict[str, Recording]
+    references: list[Recording]
+    queries: list[Recording]
+    files: list[RelocalizationFile]
+
+
+def select(
+    root: Path, reference: Sequence[str], queries: Sequence[str], missing: Missing
+) -> Selection:
+    """Choose recordings by name; where no names are given, by what the dataset says.
+
+    Parameters
+    ----------
+    reference : recordings of the map. Without: the sources of the relocalization files; without
+        such files the first recording with poses.
+    queries : recordings of the queries. Without: the targets of the relocalization files of these
+        sources; without such files all others.
+    missing : takes recordings that relocalization files mean and that are not there.
+
+    Raises
+    ------
+    DataError : there is nothing to choose from.
+    OptionError : a name is unknown, or given for both.
+    """
+    recordings = find_recordings(root)
+    files = find_relocalization_files(root, recordings)
+    _check_names("reference", reference, recordings, root)
+    _check_names("queries", queries, recordings, root)
+    both = sorted(set(reference) & set(queries))
+    if both:
+        raise OptionError(f"recording {both[0]!r} is given for the map and for the queries")
+    sources = sorted(set(reference)) or _default_references(recordings, files, set(queries))
+    targets = sorted(set(queries))
+    if not targets:
+        targets = sorted({f.target for f in files if f.source in sources} - set(sources))
+    if not targets:
+        targets = [name for name in recordings if name not in sources]
+    missing.files += [root / name for name in (*sources, *targets) if name not in recordings]
+    sources, targets = ([n for n in names if n in recordings] for names in (sources, targets))
+    if not sources:
+        raise DataError(
+            f"{len(recordings)} recordings, none for the map; needed are one with published poses "
+            "(GNSSPoses.txt or poses.txt) and another for the queries",
+            path=root,
+        )
+    if not targets:
+        missing.files.append(root / ANOTHER_RECORDING)
+    return Selection(
+        recordings,
+        [recordings[name] for name in sources],
+        [recordings[name] for name in targets],
+        [file for file in files if file.source in sources and file.target in targets],
+    )
+
+
+def _check_names(
+    option: str, names: Iterable[str], recordings: Mapping[str, Recording], root: Path
+) -> None:
+    unknown = sorted(set(names) - set(recordings))
+    if unknown:
+        known = ", ".join(recordings)
+        raise OptionError(
+            f"option {option}: no recording {unknown[0]!r} in {root}; there are {known}"
+        )
+
+
+def _default_references(
+    recordings: Mapping[str, Recording], files: Sequence[RelocalizationFile], queries: set[str]
+) -> list[str]:
+    sources = sorted({file.source for file in files} - queries)
+    with_poses = (name for name, recording in recordings.items() if recording.has_poses)
+    return sources or [name for name in with_poses if name not in queries][:1]

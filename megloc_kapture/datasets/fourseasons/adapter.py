@@ -21,16 +21,7 @@ from megloc_kapture.datasets.formats.fourseasons_files import (
     read_keyframe_accuracy,
     read_times,
 )
-from megloc_kapture.datasets.fourseasons.images import (
-    ChallengeTables,
-    ImageRecords,
-    KeyframePoses,
-    LocalFrame,
-    challenge_tables,
-    read_keyframe_poses,
-    write_depth_maps,
-)
-from megloc_kapture.datasets.fourseasons.recordings import (
+from megloc_kapture.datasets.fourseasons import (
     ACCURACY,
     CAMERAS,
     GNSS_POSES,
@@ -41,6 +32,15 @@ from megloc_kapture.datasets.fourseasons.recordings import (
     RelocalizationFile,
     Selection,
     select,
+)
+from megloc_kapture.datasets.fourseasons.images import (
+    ChallengeTables,
+    ImageRecords,
+    KeyframePoses,
+    LocalFrame,
+    challenge_tables,
+    read_keyframe_poses,
+    write_depth_maps,
 )
 from megloc_kapture.datasets.official import (
     Count,

@@ -26,7 +26,7 @@ from megloc_kapture.datasets.formats.fourseasons_files import (
     read_poses,
     read_transformations,
 )
-from megloc_kapture.datasets.fourseasons.recordings import (
+from megloc_kapture.datasets.fourseasons import (
     CAMERAS,
     GNSS_POSES,
     POSES,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.datasets.inloc.layout import (
+from megloc_kapture.datasets.inloc import (
     DISTRACTOR_FLOORS,
     FLOORS,
     LAYOUT,

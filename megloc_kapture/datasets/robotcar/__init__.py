@@ -1,0 +1,445 @@
+"""Files of RobotCar Seasons and the published counts: images, models, lists of queries.
+
+Images are named ``<condition>/<camera>/<microseconds>``; the files say ``.png`` or ``.jpg`` for the
+same image, and some begin a name with ``./``.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from megloc_kapture.datasets.formats.colmap_reading import read_colmap_model
+from megloc_kapture.datasets.formats.sparse_models import SparsePoints, read_single_nvm
+from megloc_kapture.datasets.formats.text_lines import Line, read_lines, shown
+from megloc_kapture.datasets.official import Missing
+from megloc_kapture.errors import DataError
+from megloc_kapture.values import RigidTransform
+
+CAMERAS = ("left", "rear", "right")
+SCORED_CAMERA = "rear"
+REFERENCE_CONDITION = "overcast-reference"
+_FILE_TYPES = (".jpg", ".png")
+_MODEL = re.compile(r"([0-9]{1,6})_aligned")
+_QUERY_LIST = re.compile(r"queries_location_([0-9]{1,6})\.txt")
+INTRINSICS_KEYS = ("fx", "fy", "cx", "cy")
+
+_PART = r"[A-Za-z0-9][A-Za-z0-9_-]*"
+_IMAGE = re.compile(
+    rf"(?:(?P<condition>{_PART})/)?(?P<camera>{_PART})/(?P<stem>[0-9]{{1,19}})\.(?:jpg|png)"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ImageKey:
+    """An image: its condition, ``""`` where a list leaves it out, its camera and its time."""
+
+    condition: str
+    camera: str
+    stem: str
+
+    @property
+    def timestamp(self) -> int:
+        """The time in microseconds."""
+        return int(self.stem)
+
+    @property
+    def path(self) -> str:
+        """Path below ``images/``, without the file type."""
+        return f"{self.condition}/{self.camera}/{self.stem}"
+
+
+class ListedImage(NamedTuple):
+    """An image of a list, its line, and its pose; the identity where the list has no poses."""
+
+    image: ImageKey
+    line: Line
+    cam_from_world: RigidTransform
+
+
+def parse_image(text: str) -> ImageKey | None:
+    """The image a name stands for, with or without condition; None where it is no image name."""
+    found = _IMAGE.fullmatch(text.removeprefix("./"))
+    if found is None:
+        return None
+    return ImageKey(found["condition"] or "", found["camera"], found["stem"])
+
+
+def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
+    """Read ``<camera>_intrinsics.txt``: fx, fy, cx, cy in pixels, whatever their order there.
+
+    DataError names file and line, also of a key that is unknown, given twice or absent.
+    """
+    values: dict[str, float] = {}
+    lines = read_lines(path)
+    for line in lines:
+        if len(line.fields) != 2 or line.fields[0] not in INTRINSICS_KEYS:
+            raise line.error(
+                f"expected a line 'key value', key one of {', '.join(INTRINSICS_KEYS)}"
+            )
+        key, text = line.fields
+        if key in values:
+            raise line.error(f"{key} is given twice")
+        values[key] = line.number_of(text, key)
+    absent = [key for key in INTRINSICS_KEYS if key not in values]
+    if absent:
+        number = lines[-1].number if lines else 1
+        raise DataError(f"{', '.join(absent)} missing; it ends here", path=path, line=number)
+    fx, fy, cx, cy = (values[key] for key in INTRINSICS_KEYS)
+    return fx, fy, cx, cy
+
+
+def read_query_location(path: Path) -> list[ListedImage]:
+    """Read ``queries_location_NNN.txt``, in its order; DataError names file and line."""
+    return _some([_listed(line, line.text) for line in read_lines(path)], path)
+
+
+def read_test_list(path: Path) -> list[ListedImage]:
+    """Read ``robotcar_v2_test.txt``, in its order; DataError names file and line.
+
+    The official list leaves the condition out (``rear/123.png``); a list that has it is read too.
+    """
+    listed: dict[tuple[str, str], ListedImage] = {}
+    for line in read_lines(path):
+        entry = _listed(line, line.text, conditions=False)
+        if listed.setdefault((entry.image.camera, entry.image.stem), entry) is not entry:
+            raise line.error(f"{line.text!r} is listed twice")
+    return _some(list(listed.values()), path)
+
+
+def read_train_poses(path: Path) -> list[ListedImage]:
+    """Read ``robotcar_v2_train.txt``: a name and the 4x4 matrix ``world_from_cam`` per line.
+
+    DataError names file and line, also of an image given twice.
+    """
+    listed: dict[ImageKey, ListedImage] = {}
+    for line in read_lines(path):
+        line.expect(line.fields, 17, "a name and 16 matrix elements")
+        image = _listed(line, line.fields[0]).image
+        if image in listed:
+            raise line.error(f"{line.fields[0]!r} is given twice")
+        values = line.numbers_of(line.fields[1:], "matrix element")
+        world_from_cam = line.rigid_transform(np.array(values).reshape(4, 4))
+        listed[image] = ListedImage(image, line, world_from_cam.inverse())
+    return _some(list(listed.values()), path)
+
+
+def _some(entries: list[ListedImage], path: Path) -> list[ListedImage]:
+    if not entries:
+        raise DataError("no image in the list", path=path, line=1)
+    return entries
+
+
+def _listed(line: Line, text: str, *, conditions: bool = True) -> ListedImage:
+    image = parse_image(text)
+    if image is None or (conditions and not image.condition):
+        form = "condition/camera/time.jpg" if conditions else "camera/time.png"
+        raise line.error(f"expected {form}, got {shown(text)}")
+    return ListedImage(image, line, RigidTransform.identity())
+
+
+class Layout:
+    """The official layout below ``root``.
+
+    Attributes
+    ----------
+    images : ``<condition>/<camera>/<time>.jpg`` lie below it.
+    models : the folder of all models.
+    merged_model : one model of all locations.
+    feature_database : COLMAP database with the models' features.
+    train_list : of version 2, the rear query images whose poses are public.
+    test_list : of version 2, the rear query images whose poses have to be found.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = Path(root)
+        self.images = self.root / "images"
+        self.models = self.root / "3D-models"
+        self.merged_model = self.models / "all-merged" / "all.nvm"
+        self.feature_database = self.models / "overcast-reference.db"
+        self.train_list = self.root / "robotcar_v2_train.txt"
+        self.test_list = self.root / "robotcar_v2_test.txt"
+
+    def absent(self) -> list[str]:
+        """Names of the layout's folders that are not there."""
+        return [path.name for path in (self.images, self.models) if not path.is_dir()]
+
+    def intrinsics(self, camera: str) -> Path:
+        """Intrinsics of a camera."""
+        return self.root / "intrinsics" / f"{camera}_intrinsics.txt"
+
+    def extrinsics(self, camera: str) -> Path:
+        """Pose of a camera on the car."""
+        return self.root / "extrinsics" / f"{camera}_extrinsics.txt"
+
+    def individual_model(self, location: str) -> Path:
+        """Folder of the COLMAP model of one location."""
+        return self.models / "individual" / "colmap_reconstructions" / f"{location}_aligned"
+
+    def query_list(self, location: str) -> Path:
+        """List of the queries of one location."""
+        folder = self.models / "individual" / "queries_per_location"
+        return folder / f"queries_location_{location}.txt"
+
+    def individual_models(self) -> dict[str, Path]:
+        """Folders of the COLMAP models that are there, by location, sorted."""
+        found = _numbered(self.individual_model("").parent, _MODEL)
+        return {location: folder for location, folder in found.items() if folder.is_dir()}
+
+    def query_lists(self) -> dict[str, Path]:
+        """Lists of queries that are there, by location, sorted."""
+        return _numbered(self.query_list("").parent, _QUERY_LIST)
+
+    def num_reference_images(self) -> int:
+        """The number of images of the reference traversal that are there."""
+        files = self.image_files()
+        return sum(path.parent.parent.name == REFERENCE_CONDITION for path in files)
+
+    def image_files(self) -> Iterator[Path]:
+        """Every image that is there, sorted folder by folder."""
+        for condition in _sorted_names(self.images):
+            for camera in CAMERAS:
+                folder = self.images / condition / camera
+                for name in _sorted_names(folder):
+                    if name.endswith(_FILE_TYPES):
+                        yield folder / name
+
+
+def image_finder(layout: Layout, missing: Missing) -> Callable[[ImageKey], str | None]:
+    """Make a function that finds an image's path below ``images/``, with the type it has on disk.
+
+    Of an image that is not there it returns None, and notes it as missing.
+    """
+    names = cache(lambda folder: frozenset(_sorted_names(folder)))
+
+    def find(image: ImageKey) -> str | None:
+        folder = layout.images / image.condition / image.camera
+        for file_type in _FILE_TYPES:
+            if image.stem + file_type in names(folder):
+                return image.path + file_type
+        missing.files.append(folder / f"{image.stem}{_FILE_TYPES[0]}")
+        return None
+
+    return find
+
+
+def _numbered(folder: Path, pattern: re.Pattern[str]) -> dict[str, Path]:
+    found = {}
+    for name in _sorted_names(folder):
+        number = pattern.fullmatch(name)
+        if number is not None:
+            found[number[1]] = folder / name
+    return found
+
+
+def _sorted_names(folder: Path) -> list[str]:
+    try:
+        return sorted(os.listdir(folder))
+    except OSError:  # not there, or no folder: what should be in it is then missing
+        return []
+
+
+ModelChoice = Literal["auto", "merged", "individual"]
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """``cam_from_world`` by image, in the models' order; locations as far as models tell."""
+
+    poses: Mapping[ImageKey, RigidTransform]
+    locations: Mapping[ImageKey, str]
+    merged: bool
+
+
+def read_reference(
+    layout: Layout, model: ModelChoice, wanted: Sequence[str], missing: Missing
+) -> Reference:
+    """Read the poses of the reference images, and which location each is of.
+
+    Of an image in several individual models the first counts; all share one world. DataError names
+    a broken model, an image name that is none, and two images of one camera and time.
+
+    Parameters
+    ----------
+    wanted : locations that have queries; their individual models are missing where the poses
+        have to come from them.
+    """
+    individual = layout.individual_models()
+    merged = model == "merged" or (
+        model == "auto" and (layout.merged_model.is_file() or not individual)
+    )
+    locations: dict[ImageKey, str] = {}
+    located_poses: dict[ImageKey, RigidTransform] = {}
+    for location, folder in individual.items():
+        model_images = read_colmap_model(folder, with_points=False).images
+        keys = _keys([image.name for image in model_images], folder)
+        for key, image in zip(keys, model_images, strict=True):
+            locations.setdefault(key, location)
+            located_poses.setdefault(key, image.cam_from_world)
+    if not merged:
+        for location in wanted:
+            missing.require(layout.individual_model(location))
+        poses = located_poses
+    else:
+        poses = {}
+        if missing.require(layout.merged_model):
+            nvm = read_single_nvm(layout.merged_model, with_points=False)
+            for index, key in enumerate(_keys(nvm.names, layout.merged_model)):
+                poses[key] = nvm.cam_from_world(index)
+    path = layout.merged_model if merged else layout.individual_model("").parent
+    at_time: dict[tuple[str, int], ImageKey] = {}
+    for key in poses:
+        note_time(key, at_time, partial(DataError, path=path))
+    return Reference(poses, locations, merged)
+
+
+def read_points(layout: Layout, *, merged: bool) -> tuple[list[ImageKey], SparsePoints]:
+    """The images and points of the merged model, or of all individual ones behind one another."""
+    if merged:
+        nvm = read_single_nvm(layout.merged_model, with_points=True)
+        return _keys(nvm.names, layout.merged_model), nvm.points
+    positions: dict[ImageKey, int] = {}
+    parts = []
+    for folder in layout.individual_models().values():
+        model = read_colmap_model(folder)
+        images = _keys([image.name for image in model.images], folder)
+        for image in images:
+            positions.setdefault(image, len(positions))
+        common = np.array([positions[image] for image in images], np.int32)
+        parts.append(replace(model.points, image_ids=common[model.points.image_ids]))
+    return list(positions), SparsePoints.joined(parts)
+
+
+def _keys(names: Sequence[str], path: Path) -> list[ImageKey]:
+    """The images of a model, in its order."""
+    keys: dict[ImageKey, str] = {}
+    for name in names:  # each once, of which the models' readers take care
+        image = parse_image(name)
+        if image is None or not image.condition or image.camera not in CAMERAS:
+            known = ", ".join(CAMERAS)
+            raise DataError(
+                f"image {name!r}; expected condition/camera/time.png, camera one of {known}",
+                path=path,
+            )
+        if keys.setdefault(image, name) != name:
+            raise DataError(f"{name!r} and {keys[image]!r} are one image", path=path)
+    return list(keys)
+
+
+@dataclass(frozen=True, eq=False)
+class Queries:
+    """The content of the lists of queries.
+
+    Parameters
+    ----------
+    locations : query -> the locations that list it, in the order of the lists.
+    train : rear image -> its published pose, in the order of the list.
+    test : rear image -> its name in the pose file, in the order of the list.
+    unlisted : how many images of version 2's lists no location lists; only where missing data was
+        allowed.
+    """
+
+    locations: Mapping[ImageKey, tuple[str, ...]]
+    train: Mapping[ImageKey, RigidTransform]
+    test: Mapping[ImageKey, str]
+    unlisted: int
+
+
+def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missing: bool) -> Queries:
+    """Read the lists of queries of a version; those of version 2 are read wherever they are.
+
+    DataError names file and line, also of two images of one camera and time and, unless missing
+    data is allowed, of an image of version 2 that no location lists.
+    """
+    lists = layout.query_lists()
+    if not lists:
+        missing.files.append(layout.query_list("001"))
+    locations: dict[ImageKey, tuple[str, ...]] = {}
+    at_time: dict[tuple[str, int], ImageKey] = {}
+    for location, path in lists.items():
+        for entry in read_query_location(path):
+            note_time(entry.image, at_time, entry.line.error)
+            others = locations.get(entry.image, ())
+            if location not in others:
+                locations[entry.image] = (*others, location)
+    train: dict[ImageKey, RigidTransform] = {}
+    test: dict[ImageKey, str] = {}
+    unlisted = 0
+    # version 1 is the better for the public poses, but does not need them
+    wanted = version == 2 and missing.require(layout.train_list)
+    if wanted or layout.train_list.is_file():
+        for entry in read_train_poses(layout.train_list):
+            known = _scored_query(entry, at_time, allow_missing)
+            unlisted += known is None
+            if known is not None:
+                train[known] = entry.cam_from_world
+    if version == 2 and missing.require(layout.test_list):
+        test, more = read_test_names(layout.test_list, at_time, train, allow_missing=allow_missing)
+        unlisted += more
+    return Queries(locations, train, test, unlisted)
+
+
+def read_test_names(
+    path: Path,
+    at_time: Mapping[tuple[str, int], ImageKey],
+    train: Collection[ImageKey],
+    *,
+    allow_missing: bool,
+) -> tuple[dict[ImageKey, str], int]:
+    """Read version 2's list of test images: query -> its text in the list, in its order.
+
+    Of an image that has a public pose (in ``train``) DataError names the line. Also returns how
+    many of the list are no queries. ``at_time`` : (camera, time) -> query, for the list leaves
+    conditions out.
+    """
+    test: dict[ImageKey, str] = {}
+    unlisted = 0
+    for entry in read_test_list(path):
+        known = _scored_query(entry, at_time, allow_missing)
+        unlisted += known is None
+        if known in train:
+            raise entry.line.error(f"{entry.line.text!r} is a training image too")
+        if known is not None:
+            test[known] = entry.line.text
+    return test, unlisted
+
+
+def note_time(
+    image: ImageKey,
+    at_time: dict[tuple[str, int], ImageKey],
+    error: Callable[[str], DataError],
+) -> None:
+    """Note the camera and time of an image; raise ``error`` where another has them."""
+    if image.camera not in CAMERAS:
+        known = ", ".join(CAMERAS)
+        raise error(f"{image.path} is of camera {image.camera!r}; known: {known}")
+    other = at_time.setdefault((image.camera, image.timestamp), image)
+    if other != image:
+        raise error(f"{image.path} and {other.path} are of one camera and time")
+
+
+def _scored_query(
+    entry: ListedImage, at_time: Mapping[tuple[str, int], ImageKey], allow_missing: bool
+) -> ImageKey | None:
+    """The query an image of version 2's lists is; a list may leave out its condition."""
+    image = entry.image
+    if image.camera != SCORED_CAMERA:
+        raise entry.line.error(
+            f"an image of camera {image.camera!r}, expected {SCORED_CAMERA!r} only"
+        )
+    found = at_time.get((image.camera, image.timestamp))
+    if found is not None and image.condition in ("", found.condition):
+        return found
+    if allow_missing:
+        return None
+    raise entry.line.error(
+        f"{image.camera}/{image.stem} is in no list of queries_per_location; "
+        "--allow-missing leaves it out"
+    )

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from megloc_kapture.datasets.formats.sparse_points import SparsePoints
+from megloc_kapture.datasets.formats.sparse_models import SparsePoints
 from megloc_kapture.datasets.kapture_folders import without_model
 from megloc_kapture.datasets.official import (
     Count,
@@ -21,16 +21,7 @@ from megloc_kapture.datasets.official import (
     read_ground_truth,
 )
 from megloc_kapture.datasets.reference_map import ReferenceModel
-from megloc_kapture.datasets.robotcar.images import (
-    Car,
-    LocationFolders,
-    Selection,
-    mapping_data,
-    query_truth,
-    read_car,
-    select,
-)
-from megloc_kapture.datasets.robotcar.layout import (
+from megloc_kapture.datasets.robotcar import (
     CAMERAS,
     REFERENCE_CONDITION,
     SCORED_CAMERA,
@@ -40,6 +31,15 @@ from megloc_kapture.datasets.robotcar.layout import (
     read_points,
     read_queries,
     read_reference,
+)
+from megloc_kapture.datasets.robotcar.images import (
+    Car,
+    LocationFolders,
+    Selection,
+    mapping_data,
+    query_truth,
+    read_car,
+    select,
 )
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.protocols import protocol_of

@@ -23,7 +23,7 @@ from megloc_kapture.datasets.kapture_folders import (
     tables_and_images,
 )
 from megloc_kapture.datasets.official import Missing, with_poses
-from megloc_kapture.datasets.robotcar.layout import (
+from megloc_kapture.datasets.robotcar import (
     CAMERAS,
     REFERENCE_CONDITION,
     SCORED_CAMERA,
@@ -38,6 +38,7 @@ from megloc_kapture.datasets.robotcar.layout import (
 )
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.poses import rotation_angles_deg, stack_poses
+from megloc_kapture.io.files import named
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor
 from megloc_kapture.values import Camera, RigidTransform
@@ -168,10 +169,8 @@ def read_car(layout: Layout, selection: Selection, missing: Missing) -> Car:
             fx, fy, cx, cy = read_intrinsics(path)
             known = camera in example
             width, height = image_size(layout.images / example[camera]) if known else _SIZE_PX
-            try:
+            with named(path):
                 pinhole = Camera("PINHOLE", width, height, (fx, fy, cx, cy))
-            except DataError as error:
-                raise DataError(error.message, path=path) from error
             sensors[camera] = Sensor.from_camera(pinhole, name=camera)
         path = layout.extrinsics(camera)
         if missing.require(path) and camera in sensors:
@@ -377,7 +376,7 @@ class SeasonsImages:
 
         Those of the rear camera that have a pose are version 2's training images. Without its
         test list all others of that camera are handed in. DataError names a broken list, see
-        :func:`.layout.read_test_names`.
+        :func:`.read_test_names`.
         """
         listed = sorted(
             (locations[0], key.timestamp, key.camera, key)

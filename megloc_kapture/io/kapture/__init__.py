@@ -5,7 +5,6 @@ is needed only by who wants its objects (:func:`to_kapture`), and imported there
 second.
 """
 
-from megloc_kapture.io.kapture.data import KaptureData, Sensor
 from megloc_kapture.io.kapture.features import (
     FeatureConfig,
     FeatureKind,
@@ -14,6 +13,7 @@ from megloc_kapture.io.kapture.features import (
     feature_folder,
 )
 from megloc_kapture.io.kapture.folder import KaptureFolder, to_kapture
+from megloc_kapture.io.kapture.format import KaptureData, Sensor, writable_name
 from megloc_kapture.io.kapture.matches import (
     ImagePair,
     MatchesReader,
@@ -29,7 +29,6 @@ from megloc_kapture.io.kapture.points import (
     write_points3d,
 )
 from megloc_kapture.io.kapture.sensors import unit_quaternion, write_sensors
-from megloc_kapture.io.kapture.text import writable_name
 from megloc_kapture.io.kapture.vectors import KaptureVectors
 
 __all__ = [

@@ -32,7 +32,7 @@ from megloc_kapture.io.files import (
     write_bytes,
 )
 from megloc_kapture.io.kapture.blobs import BlobSource, FolderBlobs, TarBlobs, TarBlobWriter
-from megloc_kapture.io.kapture.text import check_columns, format_table, read_rows
+from megloc_kapture.io.kapture.format import check_columns, format_table, read_rows
 
 FeatureKind = Literal["keypoints", "descriptors", "global_features", "matches"]
 ArrayKind = Literal["keypoints", "descriptors", "global_features"]
@@ -166,6 +166,11 @@ class FeatureReader:
     """The features of one kind and type, from one or several folders.
 
     Where several folders hold an image, the first counts. Reading is safe from many threads.
+
+    Attributes
+    ----------
+    config : dtype and size of the arrays.
+    sources : the blobs of the folders, in order.
     """
 
     def __init__(
@@ -176,12 +181,12 @@ class FeatureReader:
         Raises DataError: a broken configuration, or folders whose dtypes or sizes differ.
         """
         self.kind, self.type_name = kind, type_name
-        self._sources: list[BlobSource] = []
+        self.sources: list[BlobSource] = []
         configs: list[tuple[Path, FeatureConfig]] = []
         for roots, folder in folders:
             path = check_no_escape(roots, folder / f"{kind}.txt")
             configs.append((path, read_config(path, kind)))
-            self._sources += blob_sources(roots, folder, kind)
+            self.sources += blob_sources(roots, folder, kind)
         first_path, self.config = configs[0]
         for path, config in configs[1:]:
             if (config.dtype, config.dsize) != (self.config.dtype, self.config.dsize):
@@ -197,7 +202,7 @@ class FeatureReader:
         """Images that have these features, sorted."""
         if self._names is None:
             cut = len(SUFFIX[self.kind])
-            self._names = sorted({n[:-cut] for s in self._sources for n in s.names()})
+            self._names = sorted({n[:-cut] for s in self.sources for n in s.names()})
         return list(self._names)
 
     def __contains__(self, image: object) -> bool:
@@ -206,7 +211,7 @@ class FeatureReader:
     def length(self, image: str) -> int:
         """Number of rows of an image, from the size of its file alone; raises as `read` does."""
         source, name = self._source(image)
-        return self._rows(source, name, source.size(name))
+        return self.num_rows(source, name, source.size(name))
 
     def read(self, image: str) -> NDArray[Any]:
         """The array of an image, (N, dsize); (dsize,) for global features. Writable.
@@ -216,7 +221,7 @@ class FeatureReader:
         """
         source, name = self._source(image)
         content = source.read(name)
-        rows = self._rows(source, name, len(content))
+        rows = self.num_rows(source, name, len(content))
         array = np.frombuffer(content, dtype=self.config.dtype)
         if not np.isfinite(array).all():
             raise DataError("not all values are finite", path=source.where(name))
@@ -224,64 +229,13 @@ class FeatureReader:
             return array
         return array.reshape(rows, self.config.dsize)
 
-    def read_rows(self, images: Sequence[str], rows: NDArray[Any]) -> None:
-        """Read the global features of several images into the rows of an array.
-
-        Parameters
-        ----------
-        rows : (N, dsize), C-contiguous, of the configuration's dtype.
-
-        Raises
-        ------
-        ValueError : features of another kind, or rows of another shape or layout.
-        DataError : an image has none, a truncated file, or values that are not finite.
-        """
-        if self.kind != "global_features":
-            raise ValueError(f"{self.kind} have no fixed number of rows")
-        config, shape = self.config, (len(images), self.config.dsize)
-        if rows.shape != shape or rows.dtype != config.dtype or not rows.flags.c_contiguous:
-            raise ValueError(f"expected contiguous {config.dtype.name} {shape}, got {rows.shape}")
-        todo = np.arange(len(images))
-        content = rows.view(np.uint8)
-        for source in self._sources:
-            if len(todo) == 0:
-                return
-            names = [images[k] + SUFFIX[self.kind] for k in todo.tolist()]
-            whole = len(todo) == len(images)
-            here = content if whole else np.empty((len(todo), content.shape[1]), dtype=np.uint8)
-            sizes = source.read_rows(names, here)
-            for k in np.flatnonzero((sizes >= 0) & (sizes != config.row_bytes)).tolist():
-                self._rows(source, names[k], int(sizes[k]))  # says what is wrong
-            found = sizes >= 0
-            if not whole:
-                content[todo[found]] = here[found]
-            todo = todo[~found]
-        if len(todo):
-            raise DataError(
-                f"{len(todo)} images have no global feature of type {self.type_name}, "
-                f"the first is {images[int(todo[0])]}"
-            )
-        for k in np.flatnonzero(~np.isfinite(rows).all(axis=1)).tolist():
-            raise DataError("not all values are finite", path=self.where(images[k]))
-
-    def map_rows(self, images: Sequence[str]) -> NDArray[Any] | None:
-        """Global features (N, dsize) where they lie, if they lie alike in one tar; else None.
-
-        Nothing is copied and nothing can be written. The tar must not be cut while they are used.
-        """
-        source = self._sources[0]
-        if self.kind != "global_features" or not isinstance(source, TarBlobs):
-            return None
-        names = [image + SUFFIX[self.kind] for image in images]
-        rows = source.map_rows(names, self.config.row_bytes)
-        return None if rows is None else rows.view(self.config.dtype)
-
     def where(self, image: str) -> str:
         """The file (or member of a tar) that holds an image's array, for messages."""
         source, name = self._source(image)
         return source.where(name)
 
-    def _rows(self, source: BlobSource, name: str, size: int) -> int:
+    def num_rows(self, source: BlobSource, name: str, size: int) -> int:
+        """Rows of an array of so many bytes; DataError where it is cut, or no global feature."""
         rows, rest = divmod(size, self.config.row_bytes)
         if rest or (self.kind == "global_features" and rows != 1):
             expected = "exactly one row" if self.kind == "global_features" else "whole rows"
@@ -294,7 +248,7 @@ class FeatureReader:
 
     def _find(self, image: str) -> tuple[BlobSource, str] | None:
         name = image + SUFFIX[self.kind]
-        return next(((source, name) for source in self._sources if name in source), None)
+        return next(((source, name) for source in self.sources if name in source), None)
 
     def _source(self, image: str) -> tuple[BlobSource, str]:
         found = self._find(image)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import Roots, check_no_escape, safe_join
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture.data import KaptureData
 from megloc_kapture.io.kapture.features import (
     ArrayKind,
     FeatureKind,
@@ -21,6 +20,7 @@ from megloc_kapture.io.kapture.features import (
     feature_folder,
     list_types,
 )
+from megloc_kapture.io.kapture.format import KaptureData
 from megloc_kapture.io.kapture.matches import MatchesReader
 from megloc_kapture.io.kapture.observations import (
     Observations,

@@ -24,7 +24,7 @@ from megloc_kapture.io.kapture.features import (
     check_field,
     feature_folder,
 )
-from megloc_kapture.io.kapture.text import check_columns, format_table, parse_float, read_rows
+from megloc_kapture.io.kapture.format import check_columns, format_table, parse_float, read_rows
 
 _BETWEEN = ".overlapping/"
 _ROW_BYTES = 3 * 8

@@ -28,9 +28,10 @@ from megloc_kapture.io.files import (
     check_output,
     check_relative,
     named,
+    reading,
 )
 from megloc_kapture.io.kapture.features import check_field
-from megloc_kapture.io.kapture.text import (
+from megloc_kapture.io.kapture.format import (
     BYTE_ORDER_MARK,
     FORMAT_LINE,
     check_version,
@@ -241,37 +242,34 @@ def _chunks(path: Path, chunk_bytes: int) -> Iterator[_Chunk]:
     from megloc_kapture.io.kapture.observation_kernels import PADDING
 
     line, rest = 1, b""
-    try:
-        with open(path, "rb", buffering=0) as file:
-            while True:
-                content = bytearray((len(rest) + chunk_bytes + PADDING + 7) // 8 * 8)
-                content[: len(rest)] = rest
-                read = file.readinto(memoryview(content)[len(rest) : len(rest) + chunk_bytes])
-                filled = len(rest) + read
-                if not filled:
-                    return
-                if not read:
-                    content[filled] = 10  # the last line lacks its break
-                    filled += 1
-                end = content.rfind(b"\n", 0, filled) + 1
-                rest = bytes(content[end:filled])
-                if len(rest) > _MAX_LINE_BYTES:
-                    line += _count(content, b"\n", 0, end)
-                    text = f"a line of more than {_MAX_LINE_BYTES} bytes"
-                    raise DataError(text, path=path, line=line)
-                if not end:
-                    continue  # a line longer than a chunk
-                content[end:filled] = bytes(filled - end)
-                begin = 0
-                if line == 1:
-                    begin = len(BYTE_ORDER_MARK) if content.startswith(BYTE_ORDER_MARK) else 0
-                    head = content[begin : content.index(b"\n")].decode(errors="replace")
-                    check_version(path, head, required=False)
-                num_lines = _count(content, b"\n", begin, end)
-                yield _Chunk(content, begin, end, line, num_lines)
-                line += num_lines
-    except OSError as error:
-        raise DataError(f"cannot read: {error.strerror}", path=path) from error
+    with reading(path), open(path, "rb", buffering=0) as file:
+        while True:
+            content = bytearray((len(rest) + chunk_bytes + PADDING + 7) // 8 * 8)
+            content[: len(rest)] = rest
+            read = file.readinto(memoryview(content)[len(rest) : len(rest) + chunk_bytes])
+            filled = len(rest) + read
+            if not filled:
+                return
+            if not read:
+                content[filled] = 10  # the last line lacks its break
+                filled += 1
+            end = content.rfind(b"\n", 0, filled) + 1
+            rest = bytes(content[end:filled])
+            if len(rest) > _MAX_LINE_BYTES:
+                line += _count(content, b"\n", 0, end)
+                text = f"a line of more than {_MAX_LINE_BYTES} bytes"
+                raise DataError(text, path=path, line=line)
+            if not end:
+                continue  # a line longer than a chunk
+            content[end:filled] = bytes(filled - end)
+            begin = 0
+            if line == 1:
+                begin = len(BYTE_ORDER_MARK) if content.startswith(BYTE_ORDER_MARK) else 0
+                head = content[begin : content.index(b"\n")].decode(errors="replace")
+                check_version(path, head, required=False)
+            num_lines = _count(content, b"\n", begin, end)
+            yield _Chunk(content, begin, end, line, num_lines)
+            line += num_lines
 
 
 def _count(content: bytearray, byte: bytes, begin: int, end: int) -> int:

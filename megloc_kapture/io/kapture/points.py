@@ -26,7 +26,7 @@ from megloc_kapture.io.files import (
     read_content,
     write_bytes,
 )
-from megloc_kapture.io.kapture.text import (
+from megloc_kapture.io.kapture.format import (
     BYTE_ORDER_MARK,
     FORMAT_LINE,
     check_version,

@@ -21,16 +21,15 @@ from megloc_kapture.io.files import (
     check_no_escape,
     check_output,
     check_relative,
+    named,
     output_error,
     write_bytes,
 )
-from megloc_kapture.io.kapture.data import (
+from megloc_kapture.io.kapture.format import (
     CAMERA_SENSOR_TYPES,
     UNKNOWN_CAMERA,
     KaptureData,
     Sensor,
-)
-from megloc_kapture.io.kapture.text import (
     check_columns,
     format_table,
     parse_float,
@@ -279,10 +278,8 @@ def _sensor_rows(data: KaptureData) -> list[list[str]]:
         sensor = data.sensors[sensor_id]
         if not sensor_id:
             raise DataError("empty sensor id")
-        try:
+        with named(about=f"sensor {sensor_id!r}"):
             check_sensor(sensor)
-        except DataError as error:
-            raise DataError(f"sensor {sensor_id!r}: {error.message}") from None
         rows.append([sensor_id, sensor.name, sensor.sensor_type, *sensor.params])
     return rows
 
@@ -332,8 +329,6 @@ def _pose_fields(pose: RigidTransform, where: str) -> list[str]:
     values = [float(v) for v in (*pose.quat_wxyz, *pose.translation)]
     if not all(map(math.isfinite, values)):
         raise DataError(f"{where}: the pose is not finite")
-    try:
+    with named(about=where):
         quat = unit_quaternion((values[0], values[1], values[2], values[3]))
-    except DataError as error:
-        raise DataError(f"{where}: {error.message}") from None
     return [repr(v) for v in (*quat, *values[4:])]

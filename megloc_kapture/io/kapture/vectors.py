@@ -1,7 +1,8 @@
 """The global features of many images at once: float32 rows, or blocks of unit rows.
 
 A map of ten thousand images has some hundred megabytes of them, so they are read straight into
-their rows (``FeatureReader.read_rows``) and scaled while they are in the processor's cache.
+their rows and scaled while they are in the processor's cache; vectors of unit length that lie alike
+in one tar are used where they lie.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture.features import FeatureReader
+from megloc_kapture.io.kapture.blobs import TarBlobs
+from megloc_kapture.io.kapture.features import SUFFIX, FeatureReader
 
 _CHUNK_BYTES = 1 << 22  # few enough calls, and little enough for a cache
 _THREADS = 4  # more do not copy faster from memory to memory
@@ -66,23 +68,73 @@ class KaptureVectors:
             finite; names it.
         """
         images = self._images[start:stop]
-        mapped = self._reader.map_rows(images)
+        mapped = self._mapped(images)
         if mapped is not None and _are_unit(mapped):
             return mapped
         rows = np.empty((len(images), self.dimension), np.float32) if out is None else out
         step = max(1, _CHUNK_BYTES // self._reader.config.row_bytes)
 
         def read_chunk(chunk: slice) -> None:
-            _read(self._reader, images[chunk], rows[chunk])
+            same = self._reader.config.dtype == rows.dtype
+            stored = rows[chunk] if same else np.empty(rows[chunk].shape, self._reader.config.dtype)
+            read_stored(self._reader, images[chunk], stored)
+            if not same:
+                with np.errstate(over="ignore"):
+                    rows[chunk] = stored
             bad = _scale_to_unit_length(rows[chunk])
             if bad is not None:
                 where = self._reader.where(images[chunk][bad])
-                raise DataError("the vector has values that are not finite", path=where)
+                raise DataError("not all values are finite", path=where)
 
         _each(
             read_chunk, [slice(k, min(k + step, len(images))) for k in range(0, len(images), step)]
         )
         return rows
+
+    def _mapped(self, images: Sequence[str]) -> NDArray[Any] | None:
+        """Vectors (N, D) where they lie, if they lie alike in one tar; they cannot be written.
+
+        The tar must not be cut while they are used.
+        """
+        source, config = self._reader.sources[0], self._reader.config
+        if not isinstance(source, TarBlobs):
+            return None
+        names = [image + SUFFIX["global_features"] for image in images]
+        rows = source.map_rows(names, config.row_bytes)
+        return None if rows is None else rows.view(config.dtype)
+
+
+def read_stored(reader: FeatureReader, images: Sequence[str], rows: NDArray[Any]) -> None:
+    """Read global features of images into the rows of an array, unchecked but for their size.
+
+    Parameters
+    ----------
+    rows : (N, dsize), C-contiguous, of the configuration's dtype.
+
+    Raises
+    ------
+    DataError : an image has none, or one that is cut; names it.
+    """
+    todo = np.arange(len(images))
+    content = rows.view(np.uint8)
+    for source in reader.sources:
+        if len(todo) == 0:
+            return
+        names = [images[k] + SUFFIX["global_features"] for k in todo.tolist()]
+        whole = len(todo) == len(images)
+        here = content if whole else np.empty((len(todo), content.shape[1]), dtype=np.uint8)
+        sizes = source.read_rows(names, here)
+        for k in np.flatnonzero((sizes >= 0) & (sizes != reader.config.row_bytes)).tolist():
+            reader.num_rows(source, names[k], int(sizes[k]))  # says what is wrong
+        found = sizes >= 0
+        if not whole:
+            content[todo[found]] = here[found]
+        todo = todo[~found]
+    if len(todo):
+        raise DataError(
+            f"{len(todo)} images have no global feature of type {reader.type_name}, "
+            f"the first is {images[int(todo[0])]}"
+        )
 
 
 def _each(work: Callable[[slice], None], chunks: Sequence[slice]) -> None:
@@ -97,15 +149,6 @@ def _each(work: Callable[[slice], None], chunks: Sequence[slice]) -> None:
         return
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(work, chunks))
-
-
-def _read(reader: FeatureReader, images: Sequence[str], rows: NDArray[np.float32]) -> None:
-    if reader.config.dtype == rows.dtype:
-        reader.read_rows(images, rows)
-        return
-    stored = np.empty(rows.shape, dtype=reader.config.dtype)
-    reader.read_rows(images, stored)
-    rows[:] = stored
 
 
 def _are_unit(rows: NDArray[Any]) -> bool:

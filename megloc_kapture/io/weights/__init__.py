@@ -1,7 +1,9 @@
-"""Weights of networks: checkpoints found, checked, read safely, shared, added and converted.
+"""Weights of networks: what is published, checkpoints found, checked, read safely and shared.
 
-Their folder is MEGLOC_WEIGHTS, else ``megloc-kapture/weights`` in the user's cache. A file may lie
-in it or in a folder of it, so that a collection sorted by network will do.
+The registry, ``registry.toml`` beside this file, says of each network's published checkpoints the
+file, page, licence and sha256. Checkpoints lie in the folder of MEGLOC_WEIGHTS, else
+``megloc-kapture/weights`` in the user's cache, or in a folder of it, so that a collection sorted by
+network will do.
 
 Processes of a machine share what they read: the first of them writes the tensors into a folder of
 the run; it and the others map that file into memory. What is mapped is the system's cache of the
@@ -15,33 +17,136 @@ import fcntl
 import glob
 import hashlib
 import os
-import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated
 
-from megloc_kapture.errors import DataError, OptionError, OutputError
-from megloc_kapture.io.files import atomic_write, user_cache, write_bytes
-from megloc_kapture.io.weights.containers import read_checkpoint
-from megloc_kapture.io.weights.registry import (
-    PublishedFile,
-    Weights,
-    by_file_name,
-    by_sha256,
-    lookup,
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
+
+from megloc_kapture.errors import DataError, OptionError, OutputError, suggestion
+from megloc_kapture.io.files import (
+    atomic_write,
+    check_component,
+    check_relative,
+    reading,
+    user_cache,
 )
-from megloc_kapture.io.weights.registry import registry as registered  # not to hide the module
+from megloc_kapture.io.weights.containers import read_checkpoint
 
 if TYPE_CHECKING:
     import torch
 
 FOLDER_VARIABLE = "MEGLOC_WEIGHTS"
-SOURCE_KEY = "source_sha256"  # of a converted file's metadata
 UNVERIFIED = "unverified"  # folder of files that a user has instead of the published ones
 _shared_folder: Path | None = None
+_REGISTRY = Path(__file__).with_name("registry.toml")
+_Url = Annotated[str, StringConstraints(pattern=r"^https?://[\w.:-]+/\S*$")]
+_Text = Annotated[str, StringConstraints(min_length=1)]
+_FileName = Annotated[str, AfterValidator(check_relative)]
+
+
+# ----------------------------------------------------------------------------------- registry
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class PublishedFile(_Entry):
+    """One file that a network's weights are published in.
+
+    Attributes
+    ----------
+    name : where it lies in the folder of weights.
+    also : other names under which other tools keep the same file.
+    url : where it can be fetched; None: only a person can, from the network's page.
+    size : bytes; None: not known.
+    sha256 : hexadecimal; None: not known.
+    """
+
+    name: _FileName
+    also: tuple[_FileName, ...] = ()
+    url: _Url | None = None
+    size: Annotated[int, Field(gt=0)] | None = None
+    sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")] | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All names that the file may have."""
+        return (self.name, *self.also)
+
+
+class Weights(_Entry):
+    """The checkpoint of one network.
+
+    Attributes
+    ----------
+    purpose : what the network does.
+    page : where a person finds it.
+    licence, terms : its short name, and what one may do in plain words.
+    commercial : whether commercial use is plainly allowed.
+    files : alternatives, preferred first; any one is enough.
+    unverified : what nobody has confirmed on the original file; empty: nothing.
+    """
+
+    name: Annotated[str, AfterValidator(check_component)]
+    purpose: _Text
+    page: _Url
+    licence: _Text
+    terms: _Text
+    commercial: bool
+    files: Annotated[tuple[PublishedFile, ...], Field(min_length=1)]
+    unverified: str = ""
+
+    @property
+    def converted(self) -> str:
+        """Name of the file that ``megloc weights convert`` makes of any of them."""
+        return f"{self.name}.safetensors"
+
+    @property
+    def to_fetch(self) -> PublishedFile | None:
+        """The file that a program can fetch."""
+        return next((file for file in self.files if file.url), None)
+
+
+@lru_cache(maxsize=1)
+def registry() -> Mapping[str, Weights]:
+    """All networks by name, in the order they are listed in."""
+    table = tomllib.loads(_REGISTRY.read_text(encoding="utf-8"))
+    return MappingProxyType({name: Weights(name=name, **entry) for name, entry in table.items()})
+
+
+def lookup(name: str) -> Weights:
+    """The entry of a network; raises OptionError, which lists the names there are."""
+    if name not in registry():
+        told = suggestion(name, registry(), listed="there are ")
+        raise OptionError(f"no weights {name!r} in the registry; {told}")
+    return registry()[name]
+
+
+def by_sha256(sha256: str) -> tuple[Weights, PublishedFile] | None:
+    """The network and file of a checksum."""
+    return next((found for found in _all_files() if found[1].sha256 == sha256), None)
+
+
+def by_file_name(name: str) -> tuple[Weights, PublishedFile] | None:
+    """The network and file of a name without folders."""
+    for weights, file in _all_files():
+        if name in [path.rpartition("/")[2] for path in file.names]:
+            return weights, file
+    return None
+
+
+def _all_files() -> list[tuple[Weights, PublishedFile]]:
+    return [(weights, file) for weights in registry().values() for file in weights.files]
+
+
+# ------------------------------------------------------------------------------------ folder
 
 
 class MissingWeightsError(DataError):
@@ -86,7 +191,7 @@ class WeightsFile:
     @property
     def published(self) -> PublishedFile | None:
         """The registry's file that it should be; None for a user's own and for converted ones."""
-        known = registered().get(self.name)
+        known = registry().get(self.name)
         if known is None or self.path.is_relative_to(weights_folder() / UNVERIFIED):
             return None
         path = self.path.as_posix()
@@ -113,8 +218,8 @@ def find_weights(name: str) -> WeightsFile:
     MissingWeightsError : it is not there; names the file, its folder and the command to add it.
     DataError : a link in the folder of weights leads out of it.
     """
-    if name in registered():
-        weights = registered()[name]
+    if name in registry():
+        weights = registry()[name]
         path = next(files_of(weights), None)
         if path is None:
             raise MissingWeightsError(how_to_get(weights), names=[name])
@@ -179,7 +284,7 @@ def how_to_get(weights: Weights) -> str:
 
 def describe(name: str, path: Path) -> WeightsFile:
     """The checkpoint at a path, as it is now."""
-    with _reading(path):
+    with reading(path):
         states = [part.stat() for part in _parts(path)]
     size = sum(state.st_size for state in states)
     return WeightsFile(name, path, size, max(state.st_mtime_ns for state in states))
@@ -189,7 +294,7 @@ def describe(name: str, path: Path) -> WeightsFile:
 def sha256_of(file: WeightsFile) -> str:
     """sha256 of a checkpoint, hexadecimal; of a TensorFlow one, of its files one after another."""
     digest = hashlib.sha256()
-    with _reading(file.path):
+    with reading(file.path):
         for part in file.parts():
             with open(part, "rb") as content:
                 hashlib.file_digest(content, lambda: digest)
@@ -209,7 +314,7 @@ def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
 
 
 def _read(file: WeightsFile) -> dict[str, torch.Tensor]:
-    with _reading(file.path):
+    with reading(file.path):
         contents = {part: part.read_bytes() for part in file.parts()}
     digest = hashlib.sha256()
     for content in contents.values():
@@ -279,107 +384,6 @@ def check_sha256(file: WeightsFile, found: str) -> None:
         )
 
 
-def add_weights(
-    source: Path, *, name: str | None = None, force: bool = False, unverified: bool = False
-) -> WeightsFile:
-    """Copy a file into the folder of weights under the name it is looked for by.
-
-    Parameters
-    ----------
-    source : the file; never changed. Of a TensorFlow checkpoint its ``.index``.
-    name : the network it is for; found out by the sha256 or the file's name unless given.
-    force : replace a different file that stands there.
-    unverified : take it though it is not the published file, e.g. one trained anew. It is kept in
-        a folder of its own, ``unverified``, and is found where the published one is not there.
-
-    Raises
-    ------
-    DataError : it cannot be read safely, or is not the published file.
-    OptionError : what it is cannot be told.
-    OutputError : a different file stands there, or it cannot be written.
-    """
-    if not source.is_file():
-        raise DataError("no such file", path=source)
-    found = describe(source.name, source)
-    sha256 = sha256_of(found)
-    weights, target = _recognised(source, sha256, name)
-    expected = next((f for f in weights.files if f.name == target), None)
-    prove(found, sha256, None if unverified else expected, weights)
-    path = weights_folder() / (f"{UNVERIFIED}/{target}" if unverified else target)
-    if path.exists() and not force:
-        if sha256_of(describe(weights.name, path)) == sha256:
-            return describe(weights.name, path)
-        raise OutputError(f"{path}: a different file stands there; -f replaces it")
-    # the index comes last: with it the checkpoint is there
-    for part in reversed(found.parts()):
-        ending = part.name.removeprefix(source.stem)
-        beside = path if part == source else path.with_name(path.stem + ending)
-        with open(part, "rb") as content, atomic_write(beside) as copy:
-            shutil.copyfileobj(content, copy)
-    return describe(weights.name, path)
-
-
-def prove(
-    file: WeightsFile, sha256: str, published: PublishedFile | None, weights: Weights
-) -> None:
-    """Raise DataError unless a file is what is published, or can be read safely.
-
-    Parameters
-    ----------
-    sha256 : of the file.
-    published : what it should be; None: converted, of which no checksum is known.
-    """
-    known = published and published.sha256
-    if known and sha256 != known:
-        raise DataError(
-            f"is not the published {published.name if published else ''} of {weights.name}: "
-            f"sha256 {sha256} instead of {known}",
-            path=file.path,
-        )
-    read_weights(file)
-
-
-def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:
-    """Write all tensors of a checkpoint, with its sha256, and return their number.
-
-    The same file gives the same bytes.
-
-    Parameters
-    ----------
-    source : the checkpoint; never changed. Names and layouts of its tensors are kept.
-    output : the file to write, ``.safetensors``.
-    force : replace a file that stands there.
-
-    Raises
-    ------
-    DataError : it cannot be read safely.
-    OptionError : the ending is another one.
-    OutputError : a file stands there, or it cannot be written.
-    """
-    from safetensors.torch import save
-
-    if output.suffix != ".safetensors":
-        raise OptionError(f"{output}: the file to write must end in .safetensors")
-    if output.exists() and not force:
-        raise OutputError(f"{output}: stands there; -f replaces it")
-    if not source.is_file():
-        raise DataError("no such file", path=source)
-    file = describe(source.name, source)
-    # views of one memory are stored one by one
-    tensors = {name: tensor.contiguous().clone() for name, tensor in read_weights(file).items()}
-    # one key only: the library writes several in no fixed order
-    write_bytes(output, save(tensors, {SOURCE_KEY: sha256_of(file)}))
-    return len(tensors)
-
-
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise DataError(f"cannot read: {error.strerror or error}", path=path) from error
-
-
 def _parts(path: Path) -> list[Path]:
     if path.suffix != ".index":
         return [path]
@@ -394,27 +398,3 @@ def _in_folder(folder: Path, path: Path) -> Path:
             path=path,
         )
     return path
-
-
-def _recognised(source: Path, sha256: str, name: str | None) -> tuple[Weights, str]:
-    """The network, and the name the file gets."""
-    if name is None:
-        found = by_sha256(sha256) or by_file_name(source.name)
-        if found is not None:
-            return found[0], found[1].name
-        if source.suffix == ".safetensors" and source.stem in registered():
-            return registered()[source.stem], source.name
-        raise OptionError(
-            f"{source}: neither its sha256 nor its name is in the registry; say what it is with "
-            "--name (megloc weights list)"
-        )
-    weights = lookup(name)
-    if source.suffix == ".safetensors":
-        return weights, weights.converted
-    same = [file for file in weights.files if file.sha256 == sha256]
-    named = [file for file in weights.files if source.name in file.names]
-    alike = [file for file in weights.files if Path(file.name).suffix == source.suffix]
-    for file in (*same, *named, *alike):
-        return weights, file.name
-    names = ", ".join(file.name for file in weights.files)
-    raise OptionError(f"{source}: {name} is kept as {names} or {weights.converted}")

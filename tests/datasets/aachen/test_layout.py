@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from megloc_twins.model_files import write_query_list
 
-from megloc_kapture.datasets.aachen.layout import read_query_list
+from megloc_kapture.datasets.aachen import read_query_list
 from megloc_kapture.errors import DataError
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera
 

@@ -13,10 +13,10 @@ from megloc_twins.model_files import write_colmap_binary, write_colmap_text
 
 from megloc_kapture.datasets.formats.colmap_model import ColmapImage, ColmapModel
 from megloc_kapture.datasets.formats.colmap_reading import colmap_model_files, read_colmap_model
-from megloc_kapture.datasets.formats.sparse_points import SparsePoints
+from megloc_kapture.datasets.formats.sparse_models import SparsePoints
 from megloc_kapture.datasets.formats.text_lines import TextFile
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.colmap_cameras import px_from_cam
+from megloc_kapture.io.colmap import px_from_cam
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py

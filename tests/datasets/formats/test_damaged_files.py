@@ -13,14 +13,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from kapture.converter.colmap.database import COLMAPDatabase
 
-from megloc_kapture.datasets.aachen.layout import read_query_list
+from megloc_kapture.datasets import robotcar
+from megloc_kapture.datasets.aachen import read_query_list
 from megloc_kapture.datasets.formats import fourseasons_files
 from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
 from megloc_kapture.datasets.formats.colmap_reading import read_colmap_model, read_colmap_rigs
-from megloc_kapture.datasets.formats.nvm import read_nvm
+from megloc_kapture.datasets.formats.sparse_models import read_nvm
 from megloc_kapture.datasets.formats.text_lines import TextFile, read_rigid_matrix
-from megloc_kapture.datasets.inloc.layout import read_transformation, read_wrong_scans
-from megloc_kapture.datasets.robotcar import layout as robotcar_layout
+from megloc_kapture.datasets.inloc import read_transformation, read_wrong_scans
 from megloc_kapture.errors import DataError
 from megloc_kapture.values import RigidTransform
 
@@ -43,10 +43,10 @@ TEXTS: dict[Callable[[Path], Any], str] = {
     fourseasons_files.read_keyframe: f"# timestamp\n{TIME}\n\n# fx, fy\n1,1,1,1,8,4,1\n\n"
     f"# camToWorld:\n{POSE}\n\n# Exposure\n0.25\n\n# Point Cloud\n# u,v\n1.0,2.0,0.5,9,0,0,1\n"
     "1,2,3,4,5,6,7,8,\n",
-    robotcar_layout.read_intrinsics: "fx 400.0\nfy 400.0\ncx 508.2\ncy 498.187378\n",
-    robotcar_layout.read_query_location: "dawn/left/1418721355075498.jpg\ndawn/rear/14.jpg\n",
-    robotcar_layout.read_test_list: "rear/1418721355075498.png\nrear/1418721354984638.png\n",
-    robotcar_layout.read_train_poses: "dawn/rear/1.png 1 0 0 10.0 0 1 0 0.0 0 0 1 -2.0 0 0 0 1\n",
+    robotcar.read_intrinsics: "fx 400.0\nfy 400.0\ncx 508.2\ncy 498.187378\n",
+    robotcar.read_query_location: "dawn/left/1418721355075498.jpg\ndawn/rear/14.jpg\n",
+    robotcar.read_test_list: "rear/1418721355075498.png\nrear/1418721354984638.png\n",
+    robotcar.read_train_poses: "dawn/rear/1.png 1 0 0 10.0 0 1 0 0.0 0 0 1 -2.0 0 0 0 1\n",
     read_query_list: "query/day/a.jpg SIMPLE_RADIAL 1600 1200 1469.2 800 600 -0.0353\r\n"
     "query/b.jpg PINHOLE 768 1024 971.838 384 512 -0.00177789",
     read_transformation: f"Before general icp:\n{MATRIX}\nAfter general icp:\n{MATRIX}",

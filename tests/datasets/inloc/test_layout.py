@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from megloc_kapture.datasets.inloc.layout import (
+from megloc_kapture.datasets.inloc import (
     Cutout,
     parse_cutout_name,
     read_cutout_points,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from megloc_kapture.datasets.robotcar import ImageKey
 from megloc_kapture.datasets.robotcar.images import middle_transform, rig_of_model
-from megloc_kapture.datasets.robotcar.layout import ImageKey
 from megloc_kapture.values import RigidTransform
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from megloc_kapture.datasets.robotcar.layout import (
+from megloc_kapture.datasets.robotcar import (
     ImageKey,
     parse_image,
     read_intrinsics,

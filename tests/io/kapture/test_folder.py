@@ -14,6 +14,7 @@ from megloc_kapture.io.kapture import (
     FeatureWriter,
     KaptureData,
     KaptureFolder,
+    KaptureVectors,
     MatchesWriter,
     Observations,
     Sensor,
@@ -225,9 +226,9 @@ def test_features_that_are_not_finite_are_found_without_a_deep_check(root: Path)
     with FeatureWriter(root, "global_features", "G", FeatureConfig("g", FLOAT, 3)) as features:
         features.write("a.jpg", np.array([1, np.nan, 2]))
     refuse(root, r"a\.jpg\.gfeat: not all values are finite")
-    rows = np.zeros((1, 3), FLOAT)
+    vectors = KaptureVectors(KaptureFolder(root).global_features("G"), ["a.jpg"])
     with pytest.raises(DataError, match=r"a\.jpg\.gfeat: not all values are finite"):
-        KaptureFolder(root).global_features("G").read_rows(["a.jpg"], rows)
+        vectors.read(0, 1)
 
 
 def test_real_folders_are_read_and_valid(shared_data: Path) -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture.data import KaptureData, Sensor
+from megloc_kapture.io.kapture.format import KaptureData, Sensor
 from megloc_kapture.io.kapture.sensors import read_kapture_data, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
 

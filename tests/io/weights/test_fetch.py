@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError, OutputError
-from megloc_kapture.io.weights.fetch import CHUNK, SafeRedirects, TransferError, fetch
+from megloc_kapture.io.weights.adding import CHUNK, SafeRedirects, TransferError, fetch
 
 CONTENT = np.random.default_rng(0).bytes(3 * CHUNK + 1234)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()

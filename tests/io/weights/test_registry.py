@@ -11,7 +11,7 @@ import pytest
 from pydantic import ValidationError
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.weights.registry import (
+from megloc_kapture.io.weights import (
     PublishedFile,
     Weights,
     by_file_name,

@@ -1,8 +1,9 @@
-"""Downloads that go on where they stopped, and get their name only when they are right.
+"""Weights brought into their folder: downloaded, added from a file, converted.
 
-What has arrived lies beside the file (``.NAME.part``), with what tells one state of the file on
-the server from another (``.NAME.part.json``). The rest is asked for with ``Range`` and, so that two
-states are never joined, ``If-Range`` (RFC 9110, sections 13.1.5 and 14.2).
+A download goes on where it stopped, and gets its name only when it is right: what has arrived lies
+beside the file (``.NAME.part``), with what tells one state of the file on the server from another
+(``.NAME.part.json``). The rest is asked for with ``Range`` and, so that two states are never
+joined, ``If-Range`` (RFC 9110, sections 13.1.5 and 14.2).
 """
 
 from __future__ import annotations
@@ -23,9 +24,30 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from megloc_kapture.errors import DataError, MeglocError, OutputError
-from megloc_kapture.io.files import output_error, read_json_model, write_json_model
+from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError
+from megloc_kapture.io.files import (
+    atomic_write,
+    output_error,
+    read_json_model,
+    write_bytes,
+    write_json_model,
+)
+from megloc_kapture.io.weights import (
+    UNVERIFIED,
+    PublishedFile,
+    Weights,
+    WeightsFile,
+    by_file_name,
+    by_sha256,
+    describe,
+    lookup,
+    read_weights,
+    registry,
+    sha256_of,
+    weights_folder,
+)
 
+SOURCE_KEY = "source_sha256"  # of a converted file's metadata
 CHUNK = 1 << 20
 _TIMEOUT_S = 60.0
 # bytes that come, and how many chunks of them there will be; yields them again
@@ -222,3 +244,122 @@ def _check(file: io.BufferedRandom, url: str, size: int | None, sha256: str | No
     if not have:
         raise DataError("an empty file came", path=url)
     return found
+
+
+# ------------------------------------------------------------------------------- added, converted
+
+
+def add_weights(
+    source: Path, *, name: str | None = None, force: bool = False, unverified: bool = False
+) -> WeightsFile:
+    """Copy a file into the folder of weights under the name it is looked for by.
+
+    Parameters
+    ----------
+    source : the file; never changed. Of a TensorFlow checkpoint its ``.index``.
+    name : the network it is for; found out by the sha256 or the file's name unless given.
+    force : replace a different file that stands there.
+    unverified : take it though it is not the published file, e.g. one trained anew. It is kept in
+        a folder of its own, ``unverified``, and is found where the published one is not there.
+
+    Raises
+    ------
+    DataError : it cannot be read safely, or is not the published file.
+    OptionError : what it is cannot be told.
+    OutputError : a different file stands there, or it cannot be written.
+    """
+    if not source.is_file():
+        raise DataError("no such file", path=source)
+    found = describe(source.name, source)
+    sha256 = sha256_of(found)
+    weights, target = _recognised(source, sha256, name)
+    expected = next((f for f in weights.files if f.name == target), None)
+    prove(found, sha256, None if unverified else expected, weights)
+    path = weights_folder() / (f"{UNVERIFIED}/{target}" if unverified else target)
+    if path.exists() and not force:
+        if sha256_of(describe(weights.name, path)) == sha256:
+            return describe(weights.name, path)
+        raise OutputError(f"{path}: a different file stands there; -f replaces it")
+    # the index comes last: with it the checkpoint is there
+    for part in reversed(found.parts()):
+        ending = part.name.removeprefix(source.stem)
+        beside = path if part == source else path.with_name(path.stem + ending)
+        with open(part, "rb") as content, atomic_write(beside) as copy:
+            shutil.copyfileobj(content, copy)
+    return describe(weights.name, path)
+
+
+def prove(
+    file: WeightsFile, sha256: str, published: PublishedFile | None, weights: Weights
+) -> None:
+    """Raise DataError unless a file is what is published, or can be read safely.
+
+    Parameters
+    ----------
+    sha256 : of the file.
+    published : what it should be; None: converted, of which no checksum is known.
+    """
+    if published and published.sha256 and sha256 != published.sha256:
+        raise DataError(
+            f"is not the published {published.name} of {weights.name}: "
+            f"sha256 {sha256} instead of {published.sha256}",
+            path=file.path,
+        )
+    read_weights(file)
+
+
+def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:
+    """Write all tensors of a checkpoint, with its sha256, and return their number.
+
+    The same file gives the same bytes.
+
+    Parameters
+    ----------
+    source : the checkpoint; never changed. Names and layouts of its tensors are kept.
+    output : the file to write, ``.safetensors``.
+    force : replace a file that stands there.
+
+    Raises
+    ------
+    DataError : it cannot be read safely.
+    OptionError : the ending is another one.
+    OutputError : a file stands there, or it cannot be written.
+    """
+    from safetensors.torch import save
+
+    if output.suffix != ".safetensors":
+        raise OptionError(f"{output}: the file to write must end in .safetensors")
+    if output.exists() and not force:
+        raise OutputError(f"{output}: stands there; -f replaces it")
+    if not source.is_file():
+        raise DataError("no such file", path=source)
+    file = describe(source.name, source)
+    # views of one memory are stored one by one
+    tensors = {name: tensor.contiguous().clone() for name, tensor in read_weights(file).items()}
+    # one key only: the library writes several in no fixed order
+    write_bytes(output, save(tensors, {SOURCE_KEY: sha256_of(file)}))
+    return len(tensors)
+
+
+def _recognised(source: Path, sha256: str, name: str | None) -> tuple[Weights, str]:
+    """The network, and the name the file gets."""
+    if name is None:
+        found = by_sha256(sha256) or by_file_name(source.name)
+        if found is not None:
+            return found[0], found[1].name
+        if source.suffix == ".safetensors" and source.stem in registry():
+            return registry()[source.stem], source.name
+        raise OptionError(
+            f"{source}: neither its sha256 nor its name is in the registry; say what it is with "
+            "--name (megloc weights list)"
+        )
+    weights = lookup(name)
+    if source.suffix == ".safetensors":
+        return weights, weights.converted
+    same = [file for file in weights.files if file.sha256 == sha256]
+    named = [file for file in weights.files if source.name in file.names]
+    alike = [file for file in weights.files if Path(file.name).suffix == source.suffix]
+    for file in (*same, *named, *alike):
+        return weights, file.name
+    names = ", ".join(file.name for file in weights.files)
+    raise OptionError(f"{source}: {name} is kept as {names} or {weights.converted}")
