@@ -15,12 +15,12 @@ from pydantic import BaseModel, Field
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.pose_files import (
     poses_by_image,
+    read_confidences,
     read_mlad_file,
     read_pose_file,
     timestamp_of,
 )
 from megloc_kapture.evaluation.protocols import Benchmark
-from megloc_kapture.evaluation.provenance import read_confidences
 from megloc_kapture.io.dataset_tables import (
     METRES,
     PROTOCOL_FILE,
