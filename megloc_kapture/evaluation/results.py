@@ -103,6 +103,12 @@ class ResultContext:
         return [] if self.queries is None else self.queries.read().image_names()
 
 
+def first_map_poses(contexts: Iterable[ResultContext]) -> dict[str, RigidTransform]:
+    """``cam_from_world`` of the images of the first map with any; empty where there is none.
+    DataError: a map is broken."""
+    return next((poses for context in contexts if (poses := context.map_poses())), {})
+
+
 def workspace_of(result: Path | str) -> Path | None:
     """The workspace that a result (``localized/``, or a file in ``submissions/``) lies in."""
     for folder in Path(result).resolve().parents[:2]:
