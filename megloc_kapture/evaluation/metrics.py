@@ -282,20 +282,6 @@ def row_members(
     return {**members, ALL: np.ones(len(of_query), bool)}
 
 
-def recall_rows(
-    errors: PoseErrors,
-    thresholds: Sequence[Threshold],
-    members: Mapping[str, NDArray[np.bool_]],
-    *,
-    fallback: NDArray[np.bool_] | None = None,
-) -> tuple[RecallRow, ...]:
-    """The rows of a recall table, of the queries that :func:`row_members` puts into them."""
-    return tuple(
-        recall_row(name, errors, thresholds, members=chosen, fallback=fallback)
-        for name, chosen in members.items()
-    )
-
-
 def _check_free(name: str, taken: Mapping[str, object]) -> None:
     if name in taken:
         raise OptionError(f"two rows of the recall table would be called {name!r}; rename one")
