@@ -13,7 +13,7 @@ import tyro
 
 from megloc_kapture.cli.common import Common, Console, Force, Output
 from megloc_kapture.errors import MeglocError, OptionError, OutputError, missing_extra
-from megloc_kapture.evaluation.provenance import installed_version
+from megloc_kapture.evaluation.pose_files import installed_version
 from megloc_kapture.io.weights import (
     MissingWeightsError,
     PublishedFile,

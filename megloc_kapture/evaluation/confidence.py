@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.evaluation.metrics import PoseErrors, confidence_interval, within
+from megloc_kapture.evaluation.metrics import confidence_interval
 
 if TYPE_CHECKING:
     from megloc_kapture.evaluation.metrics import Threshold
@@ -93,14 +93,7 @@ def confidence_of(
     posed += [q for q in strays if q.confidence is not None]
     if not posed and not nowhere:
         return None
-    right = within(
-        PoseErrors(
-            tuple(q.image for q in posed),
-            np.array([q.position_m for q in posed], np.float64),
-            np.array([q.angle_deg for q in posed], np.float64),
-        ),
-        coarsest,
-    )
+    right = coarsest.holds([q.position_m for q in posed], [q.angle_deg for q in posed])
     values = np.array([q.confidence for q in posed], dtype=np.float64)
     num_queries, num_wrong = len(queries) + len(nowhere), int((~right).sum())
     lows, highs = confidence_interval(np.array([num_wrong]), max(len(posed), 1))

@@ -15,6 +15,7 @@ from megloc_kapture.evaluation.results import (
     ResultContext,
     context_of,
     distinct_labels,
+    first_map_poses,
     read_result,
     result_in_memory,
     side_tables_near,
@@ -112,7 +113,12 @@ def evaluate_results(
     contexts = [_context(source, mapping) for source in results]
     _check_metres(contexts)
     relative = benchmark.protocol.pose_file == "mlad" and bool(benchmark.pairs)
-    references = _references(contexts, benchmark, mapping) if relative else {}
+    references = first_map_poses(contexts) if relative else {}
+    if relative and not references:
+        raise DataError(
+            f"the {len(benchmark.pairs)} pairs to relocalize need the poses of their references, "
+            "which are the map's: give it with --map"
+        )
     limits = thresholds or benchmark.thresholds()
     evaluations = []
     for found in _read(results, benchmark, contexts, labels, true_poses, references):
@@ -173,7 +179,7 @@ def results_without_truth(
     if len(contexts) > 1:
         _check_metres(contexts)
     if map_poses is None:
-        map_poses = next((poses for context in contexts if (poses := context.map_poses())), {})
+        map_poses = first_map_poses(contexts)
     known = {image for context in contexts for image in context.query_images()}
     found = _read(results, benchmark, contexts, labels, known, map_poses)
     queries = set(benchmark.names) or {pair.query for pair in benchmark.pairs}
@@ -242,18 +248,3 @@ def _labels(results: Sequence[Localized]) -> list[str]:
         (f"result {number}" if results[1:] else "") if isinstance(source, Mapping) else str(source)
         for number, source in enumerate(results, start=1)
     ]
-
-
-def _references(
-    contexts: Sequence[ResultContext], benchmark: Benchmark, mapping: Path | str | None
-) -> Poses:
-    """Poses of the reference keyframes: of the map that is given, or of a result's workspace."""
-    given = [] if mapping is None else [ResultContext(mapping=KaptureFolder(Path(mapping)))]
-    for context in (*given, *contexts):
-        poses = context.map_poses()
-        if poses:
-            return poses
-    raise DataError(
-        f"the {len(benchmark.pairs)} pairs to relocalize need the poses of their references, which "
-        "are the map's: give it with --map"
-    )

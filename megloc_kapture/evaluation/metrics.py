@@ -43,6 +43,13 @@ class Threshold(Options):
                 f"threshold {text!r} is not METRES,DEGREES (both at or above 0), such as 0.25,2"
             ) from error
 
+    def holds(self, position_m: ArrayLike, angle_deg: ArrayLike) -> NDArray[np.bool_]:
+        """Whether errors (...) lie at or below (``<=``) both bounds; infinite ones do not."""
+        inside = np.asarray(np.asarray(position_m) <= self.position_m)
+        if self.angle_deg is None:
+            return inside
+        return inside & (np.asarray(angle_deg) <= self.angle_deg)
+
     def __str__(self) -> str:
         position = f"{self.position_m:g} m"
         return position if self.angle_deg is None else f"{position}, {self.angle_deg:g} deg"
@@ -195,10 +202,7 @@ class RecallRow(Options):
 
 def within(errors: PoseErrors, threshold: Threshold) -> NDArray[np.bool_]:
     """(N,) whether each query is at or below (``<=``) both bounds; one without a pose never is."""
-    inside = errors.has_pose & (errors.position_m <= threshold.position_m)
-    if threshold.angle_deg is not None:
-        inside &= errors.angle_deg <= threshold.angle_deg
-    return inside
+    return threshold.holds(errors.position_m, errors.angle_deg)
 
 
 def recall_row(
@@ -276,20 +280,6 @@ def row_members(
             members[pool] = pooled
     _check_free(ALL, members)
     return {**members, ALL: np.ones(len(of_query), bool)}
-
-
-def recall_rows(
-    errors: PoseErrors,
-    thresholds: Sequence[Threshold],
-    members: Mapping[str, NDArray[np.bool_]],
-    *,
-    fallback: NDArray[np.bool_] | None = None,
-) -> tuple[RecallRow, ...]:
-    """The rows of a recall table, of the queries that :func:`row_members` puts into them."""
-    return tuple(
-        recall_row(name, errors, thresholds, members=chosen, fallback=fallback)
-        for name, chosen in members.items()
-    )
 
 
 def _check_free(name: str, taken: Mapping[str, object]) -> None:

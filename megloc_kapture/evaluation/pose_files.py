@@ -1,4 +1,4 @@
-"""Pose files: the text formats that challenges take, and their numbers checked.
+"""Pose files: the text formats that challenges take, their numbers checked, and their provenance.
 
 visuallocalization.net (LTVL) has one line ``name qw qx qy qz tx ty tz`` per query. The pose is
 ``cam_from_world`` and ``t`` its translation, not the camera centre. Single spaces, no header, every
@@ -9,21 +9,33 @@ The MLAD challenges (4Seasons) have ``src_ts tgt_ts tx ty tz qx qy qz qw`` per p
 stands first and the quaternion's w last, unlike everywhere else here. A file has the name of the
 relocalization file it answers, and every pair of that one; the relocalization file has the same
 rows without poses, or, for training recordings, with the true ones.
+
+Beside a pose file stands where it comes from: versions, options, counts; no dates.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path, PurePosixPath
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, Field
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import MAX_QUATERNION_NORM_ERROR, PoseFileNames
-from megloc_kapture.io.files import read_text, write_bytes
+from megloc_kapture.io.files import (
+    read_content,
+    read_json_model,
+    read_text,
+    write_bytes,
+    write_json,
+)
 from megloc_kapture.io.kapture.format import FLOAT_PATTERN
 from megloc_kapture.values import RigidTransform
 
@@ -45,19 +57,13 @@ def names_in_pose_file(images: Iterable[str], names: Names) -> dict[str, str]:
     DataError : two images would bear one name (names both), or a name holds white space, which
         the format cannot express.
     """
-    if isinstance(names, str):
-        called = {i: i if names == "full" else i.rsplit("/", 1)[-1] for i in sorted(set(images))}
-        _check_names(called)
-        return dict(sorted(called.items(), key=lambda item: item[1]))
     wanted = set(images)
-    called = {image: name for image, name in names.items() if image in wanted}
-    _check_names(called)
-    return called
-
-
-def _check_names(names: Mapping[str, str]) -> None:
+    if isinstance(names, str):
+        called = {i: i if names == "full" else i.rsplit("/", 1)[-1] for i in sorted(wanted)}
+    else:
+        called = {image: name for image, name in names.items() if image in wanted}
     bearer: dict[str, str] = {}
-    for image, name in names.items():
+    for image, name in called.items():
         if not name or name.split() != [name]:
             raise DataError(f"image {image!r}: a pose file cannot hold the name {name!r}")
         if name in bearer:
@@ -66,6 +72,9 @@ def _check_names(names: Mapping[str, str]) -> None:
                 "file; use full names"
             )
         bearer[name] = image
+    if isinstance(names, str):
+        called = dict(sorted(called.items(), key=lambda item: item[1]))
+    return called
 
 
 def format_pose_file(poses: Poses, *, names: Names = "full") -> str:
@@ -304,3 +313,89 @@ def _row(fields: list[str], columns: int) -> RelativePose:
     tx, ty, tz, qx, qy, qz, qw = (parse_number(field) for field in fields[2:])
     pose = checked_pose((qw, qx, qy, qz), (tx, ty, tz), f"pair {reference} {query}")
     return RelativePose(reference, query, pose)
+
+
+# what can change a pose or a figure of the report
+_PACKAGES = (
+    "megloc-kapture",
+    "numpy",
+    "scipy",
+    "opencv-python-headless",
+    "pycolmap",
+    "poselib",
+    "torch",
+    "matplotlib",
+)
+
+
+def installed_version(package: str) -> str | None:
+    """Installed version of a package, None where it is absent."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def package_versions() -> dict[str, str]:
+    """Package -> installed version, for those that are installed."""
+    found = ((package, installed_version(package)) for package in _PACKAGES)
+    return {package: version for package, version in found if version is not None}
+
+
+def provenance_path(target: Path | str) -> Path:
+    """Path of the provenance: ``x.txt.json`` of a file ``x.txt``, ``x.json`` of a folder ``x``."""
+    path = Path(target)
+    return path.with_name(f"{path.name}.json")
+
+
+def write_provenance(
+    target: Path | str,
+    provenance: Mapping[str, Any],
+    *,
+    counts: Mapping[str, int],
+    files: Sequence[str] | None = None,
+) -> Path:
+    """Write the provenance of a pose file that has been written; returns its path.
+
+    The JSON holds the SHA-256 of each file, so that they can be told to belong together, the
+    package versions, ``counts`` and the entries of ``provenance`` (options, preset, inputs). It
+    holds no date and no duration: the same run gives the same bytes.
+
+    Parameters
+    ----------
+    target : the pose file, or the folder of a challenge that takes several.
+    files : names of the pose files below the folder ``target``; None: it is a file.
+
+    Raises
+    ------
+    DataError : a pose file cannot be read.
+    ValueError : an entry of ``provenance`` would replace one of ours, or is not JSON.
+    OutputError : the file cannot be written.
+    """
+    target = Path(target)
+    paths = {target.name: target} if files is None else {name: target / name for name in files}
+    ours: dict[str, Any] = {
+        "files": {
+            name: hashlib.sha256(read_content(path)).hexdigest()
+            for name, path in sorted(paths.items())
+        },
+        "versions": package_versions(),
+        "counts": dict(counts),
+    }
+    taken = sorted(ours.keys() & provenance.keys())
+    if taken:
+        raise ValueError(f"provenance entries are already ours: {', '.join(taken)}")
+    path = provenance_path(target)
+    write_json(path, ours | dict(provenance))
+    return path
+
+
+class _Scores(BaseModel):
+    confidence: dict[str, Annotated[float, Field(ge=0, le=1)]] = {}
+
+
+def read_confidences(target: Path | str) -> dict[str, float]:
+    """Image -> confidence of its pose, as the provenance beside a pose file has it under
+    ``confidence``; empty where there is none. DataError: it is broken, or has something else."""
+    path = provenance_path(target)
+    return read_json_model(path, _Scores).confidence if path.is_file() else {}

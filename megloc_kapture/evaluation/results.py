@@ -15,12 +15,12 @@ from pydantic import BaseModel, Field
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.pose_files import (
     poses_by_image,
+    read_confidences,
     read_mlad_file,
     read_pose_file,
     timestamp_of,
 )
 from megloc_kapture.evaluation.protocols import Benchmark
-from megloc_kapture.evaluation.provenance import read_confidences
 from megloc_kapture.io.dataset_tables import (
     METRES,
     PROTOCOL_FILE,
@@ -101,6 +101,12 @@ class ResultContext:
     def query_images(self) -> list[str]:
         """Names of the queries; empty where they are not known. DataError: the folder is broken."""
         return [] if self.queries is None else self.queries.read().image_names()
+
+
+def first_map_poses(contexts: Iterable[ResultContext]) -> dict[str, RigidTransform]:
+    """``cam_from_world`` of the images of the first map with any; empty where there is none.
+    DataError: a map is broken."""
+    return next((poses for context in contexts if (poses := context.map_poses())), {})
 
 
 def workspace_of(result: Path | str) -> Path | None:

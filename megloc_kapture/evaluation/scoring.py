@@ -26,7 +26,7 @@ from megloc_kapture.evaluation.metrics import (
     RecallRow,
     Threshold,
     pose_errors,
-    recall_rows,
+    recall_row,
     row_members,
 )
 from megloc_kapture.evaluation.results import Poses, ResultContext
@@ -215,7 +215,6 @@ def evaluate_poses(
     condition_order: Sequence[str] = (),
     pools: Mapping[str, Sequence[str]] | None = None,
     label: str = "",
-    errors: PoseErrors | None = None,
     nowhere: Collection[str] = (),
     confidences: Mapping[str, float] | None = None,
 ) -> Evaluation:
@@ -232,8 +231,6 @@ def evaluate_poses(
     statuses : rows of ``status.csv``: reasons, inliers, and which poses are fallbacks.
     condition_order, pools : see :func:`megloc_kapture.evaluation.metrics.row_members`.
     label : what to call this result.
-    errors : of exactly the counted queries, sorted by name, where they are measured in another
-        way than by camera centres and rotation angle.
     nowhere : images that are known to show nothing of the map.
     confidences : of poses, where ``statuses`` do not say them.
 
@@ -251,8 +248,7 @@ def evaluate_poses(
     if not counted:
         raise DataError("no query with a true pose to count: is this the right ground truth?")
     wanted = set(estimated) if scored is None else set(estimated) | set(scored)
-    if errors is None:
-        errors = pose_errors(estimated, truth, counted)
+    errors = pose_errors(estimated, truth, counted)
 
     def result(name: str, position_m: float, angle_deg: float) -> QueryResult:
         status = (statuses or {}).get(name)
@@ -270,11 +266,10 @@ def evaluate_poses(
     members = row_members(
         [query.condition for query in queries], order=condition_order, pools=pools
     )
-    guessed = np.array([query.outcome == "fallback" for query in queries])
     return Evaluation(
         label=label,
         thresholds=tuple(thresholds),
-        rows=recall_rows(errors, thresholds, members, fallback=guessed),
+        rows=_rows(queries, errors, thresholds, members),
         members=members,
         queries=queries,
         errors=errors,
@@ -283,6 +278,19 @@ def evaluate_poses(
         nowhere=tuple(result(name, np.inf, np.inf) for name in sorted(nowhere)),
         without_truth=tuple(sorted(wanted - set(truth) - set(nowhere))),
         not_scored=tuple(sorted(set(truth) - set(counted))),
+    )
+
+
+def _rows(
+    queries: Sequence[QueryResult],
+    errors: PoseErrors,
+    thresholds: Sequence[Threshold],
+    members: Mapping[str, NDArray[np.bool_]],
+) -> tuple[RecallRow, ...]:
+    guessed = np.array([query.outcome == "fallback" for query in queries])
+    return tuple(
+        recall_row(name, errors, thresholds, members=chosen, fallback=guessed)
+        for name, chosen in members.items()
     )
 
 
@@ -411,19 +419,16 @@ def evaluate_pairs(
         stack_poses(truth[named[name].query] for name in posed),
         stack_poses(references[named[name].reference] for name in posed),
     )
-    relative = evaluate_poses(
-        by_center.estimated,
-        by_center.truth,
-        conditions={query.image: query.condition for query in by_center.queries},
-        thresholds=thresholds,
-        statuses=of_pairs,
-        condition_order=list(by_center.members),
-        label=label,
-        errors=PoseErrors(names, position_m, by_center.errors.angle_deg),
+    errors = PoseErrors(names, position_m, by_center.errors.angle_deg)
+    queries = tuple(
+        replace(query, position_m=error_m)
+        for query, error_m in zip(by_center.queries, position_m.tolist(), strict=True)
     )
     return replace(
-        relative,
-        without_truth=by_center.without_truth,
+        by_center,
+        errors=errors,
+        queries=queries,
+        rows=_rows(queries, errors, thresholds, by_center.members),
         pairs={name: named[name] for name in names},
         by_center=by_center,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,11 +22,12 @@ from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.evaluation.without_truth import ResultWithoutTruth
 from megloc_kapture.geometry.cameras import focal_px, principal_point_px
 from megloc_kapture.io.files import write_bytes
-from megloc_kapture.io.images import read_image_rgb
+from megloc_kapture.io.images import read_depth_map, read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import Camera, RigidTransform
 
 if TYPE_CHECKING:
+    from megloc_kapture.evaluation.report.queries import ShownQuery
     from megloc_kapture.evaluation.report.scene import Scene
 
 # what the files begin with, or have near their beginning
@@ -34,6 +35,8 @@ _OURS, _RECORDING = b'content="megloc view"', b"RRF"
 _HEAD_BYTES = 1000
 # images that are put into a recording, of map and queries each: about 20 kB
 _MAX_IMAGES, _WIDTH = 200, 480
+# 15 kB each, so that the page stays below 3 MB
+_MAX_RENDERED, _RENDERED_BOX = 40, (240, 240)
 _GREY, _WHITE = "#8fa6bf", "#ffffff"
 
 
@@ -75,7 +78,6 @@ def write_view(
     OutputError : a file cannot be written, or is another one than a view.
     ModuleNotFoundError : for ``rerun``, where the extra of that name is not installed.
     """
-    from megloc_kapture.evaluation.report.panels import rendered_queries
     from megloc_kapture.evaluation.report.queries import StoredInliers, shown_queries
     from megloc_kapture.evaluation.report.scene import render_view, scene_of
 
@@ -101,7 +103,7 @@ def write_view(
         raise DataError("no image has a pose, so there is nothing to see", path=folder.root)
     if rendered is not None:
         views = rendered if isinstance(rendered, KaptureFolder) else KaptureFolder(rendered)
-        pictures, notes = rendered_queries(views, scene.queries, context.queries)
+        pictures, notes = _rendered_queries(views, scene.queries, context.queries)
         scene = replace(scene, rendered=pictures, notes=(*scene.notes, *notes))
     if rerun is not None:
         _write_recording(Path(rerun), scene, context)
@@ -118,6 +120,56 @@ def _judged(
         judged = results_without_truth([result], benchmark, mapping=folder.root, labels=labels)
         return judged.results[0]
     return evaluate_results([result], truth, benchmark, mapping=folder.root, labels=labels)[0]
+
+
+def _rendered_queries(
+    rendered: KaptureFolder, queries: Sequence[ShownQuery], photographs: KaptureFolder | None
+) -> tuple[dict[str, list[tuple[str, str]]], list[str]]:
+    """What the poses of queries show, beside their photographs.
+
+    Parameters
+    ----------
+    rendered : as :func:`megloc_kapture.stages.neural_field.render_along` writes it: an image of a
+        query's name, whatever it ends in, and its depth.
+    photographs : the queries; what cannot be read of them is left out.
+
+    Returns
+    -------
+    Query's name -> caption and data address of each picture, of at most 40, in the order of
+    ``queries``; and sentences on what is left out.
+
+    Raises
+    ------
+    DataError : an image or a depth map is broken, or there is none of any query.
+    """
+    from megloc_kapture.evaluation.report.pictures import colored, encoded, read_small, subsampled
+    from megloc_kapture.stages.rigs import depth_records
+
+    data = rendered.read()
+    images = {Path(name).with_suffix(""): name for name in data.image_names()}
+    depths, found, notes = depth_records(data), dict[str, list[tuple[str, str]]](), list[str]()
+    shown = [q for q in queries if Path(q.image).with_suffix("") in images and q.estimated]
+    if not shown:
+        raise DataError("no image here is a query of the result with a pose", path=rendered.root)
+    if len(shown) > _MAX_RENDERED:
+        notes.append(f"Renderings are shown of {_MAX_RENDERED} of {len(shown)} queries.")
+    for query in shown[:_MAX_RENDERED]:
+        name = images[Path(query.image).with_suffix("")]
+        panels = found.setdefault(query.name, [])
+        with contextlib.suppress(DataError):
+            if photographs is not None:
+                path = photographs.image_path(query.image)
+                panels.append(("photograph", read_small(path, _RENDERED_BOX).address))
+        picture = read_small(rendered.image_path(name), _RENDERED_BOX)
+        panels.append(("rendered at the pose", picture.address))
+        if (record := depths.get(name)) is not None:
+            size = {"width": record.camera.width, "height": record.camera.height}
+            depth = read_depth_map(rendered.depth_path(record.path), **size)
+            metres = subsampled(depth, _RENDERED_BOX)
+            known = metres > 0
+            near = colored(1 / np.where(known, metres, 1), known)
+            panels.append(("its depth", encoded(near, 1.0).address))
+    return found, notes
 
 
 def _check_output(path: Path, mark: bytes, *, force: bool) -> None:

@@ -29,7 +29,7 @@ from distributed.client import ClosedClientError
 from distributed.comm.core import CommClosedError
 
 from megloc_kapture.errors import MeglocError, OptionError
-from megloc_kapture.evaluation.provenance import installed_version
+from megloc_kapture.evaluation.pose_files import installed_version
 from megloc_kapture.io.files import clear_leftovers, owned_name
 from megloc_kapture.io.weights import describe, files_of, registry, sha256_of, share_weights
 from megloc_kapture.pipeline.executors import enter_single_threaded, starting_processes

@@ -9,8 +9,8 @@ from typing import Any
 from megloc_kapture.datasets.kapture_folders import import_mapping, mapping_files
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.evaluate import evaluate, results_without_truth
+from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.evaluation.protocols import benchmark_of
-from megloc_kapture.evaluation.provenance import package_versions
 from megloc_kapture.evaluation.report.reports import write_report
 from megloc_kapture.evaluation.results import context_of
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol

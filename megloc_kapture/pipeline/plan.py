@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from megloc_kapture.errors import OptionError, suggestion
-from megloc_kapture.evaluation.provenance import package_versions
+from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.io.files import clear_temporary, hard_link, write_bytes, write_json_model
 from megloc_kapture.pipeline.manifests import (
     FileHashes,

@@ -17,10 +17,11 @@ from megloc_kapture.evaluation.pose_files import (
     RelativePose,
     format_mlad_file,
     format_pose_file,
+    provenance_path,
     relative_pose,
     timestamp_of,
+    write_provenance,
 )
-from megloc_kapture.evaluation.provenance import provenance_path, write_provenance
 from megloc_kapture.io.dataset_tables import (
     PROTOCOL_FILE,
     RELOCALIZATION_FILE,

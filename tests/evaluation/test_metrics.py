@@ -20,7 +20,6 @@ from megloc_kapture.evaluation.metrics import (
     confidence_interval,
     pose_errors,
     recall_row,
-    recall_rows,
     row_members,
     within,
 )
@@ -150,7 +149,7 @@ def test_rows_by_condition_pool_and_all() -> None:
     conditions = ["noon", "noon", "noon", "dawn", "night", ""]
     pools = {"day": ("dawn", "noon"), "wet": ("rain",)}
     members = row_members(conditions, order=("noon", "rain"), pools=pools)
-    rows = recall_rows(errors, [QUARTER], members)
+    rows = [recall_row(n, errors, [QUARTER], members=own) for n, own in members.items()]
     assert [row.name for row in rows] == ["noon", "dawn", "night", "", "day", "all"]
     recall = {row.name: row.recall[0].recall for row in rows}
     # pooled: 3 of 4 queries, not the mean 0.5 of the two recalls

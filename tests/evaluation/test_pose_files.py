@@ -21,14 +21,15 @@ from megloc_kapture.evaluation.pose_files import (
     format_mlad_file,
     format_pose_file,
     names_in_pose_file,
+    package_versions,
     poses_by_image,
     read_mlad_file,
     read_pose_file,
     relative_pose,
     timestamp_of,
     write_pose_file,
+    write_provenance,
 )
-from megloc_kapture.evaluation.provenance import package_versions, write_provenance
 from megloc_kapture.values import RigidTransform
 
 HERE = RigidTransform.identity()

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.provenance import write_provenance
+from megloc_kapture.evaluation.pose_files import write_provenance
 from megloc_kapture.pipeline.submission import keep_submission
 
 NAME = "Aachen_v1_1_eval_megloc-classic"

@@ -20,9 +20,9 @@ from corner import CAMERA, depth_m
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.report import panels
+from megloc_kapture.evaluation.report import pictures
 from megloc_kapture.evaluation.report.document import Paragraph, Pictures
-from megloc_kapture.evaluation.report.panels import depth_blocks
+from megloc_kapture.evaluation.report.pictures import depth_blocks
 from megloc_kapture.evaluation.report.queries import StoredInliers
 from megloc_kapture.evaluation.report.scene import render_view, scene_of
 from megloc_kapture.evaluation.results import ResultContext
@@ -275,7 +275,7 @@ def test_pictures_show_the_depth_that_is_there(
         # what is seen faces the camera
         assert np.median(normals[..., 2][known]) > 150
     # many are shown in part, and broken ones left out
-    monkeypatch.setattr(panels, "MAX_IMAGES", 3)
+    monkeypatch.setattr(pictures, "MAX_IMAGES", 3)
     told, some = shown_of(densified)
     assert told.endswith(" 3 are shown.") and list(some) == sorted(poses)[::2]
     broken = KaptureFolder(shutil.copytree(densified.root, tmp_path / "map", symlinks=True))

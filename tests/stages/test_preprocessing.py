@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from megloc_kapture.errors import DataError, OptionError, OutputError, PluginError
-from megloc_kapture.evaluation.report.panels import SegmentedClasses
+from megloc_kapture.evaluation.report.pictures import SegmentedClasses
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.images import (

@@ -3,7 +3,7 @@ are far, on another floor or a storey off."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +25,7 @@ from megloc_kapture.evaluation.check.reading import (
     Finding,
     MapCameras,
     Reference,
+    Rows,
     Severity,
     camera_sets,
     plural,
@@ -140,12 +141,11 @@ class Neighbourhood:
 def _scales(centers: NDArray[np.float64]) -> tuple[float, float, float]:
     """Spacing, the distance that is near, and the extent of the cameras of one set."""
     extent = _extent(centers, np.median(centers, axis=0))
-    if extent > 0.0:
-        apart = _one_of_each(centers, extent)
-        if len(apart) > 1:
-            spacing = float(np.median(cKDTree(apart).query(apart, k=2)[0][:, 1]))
-            return spacing, max(_NEAR_SPACINGS * spacing, _NEAR_EXTENT * extent), extent
-    return np.inf, np.inf, np.inf
+    apart = _one_of_each(centers, extent) if extent > 0.0 else centers[:1]
+    if len(apart) < 2:
+        return np.inf, np.inf, np.inf
+    spacing = float(np.median(cKDTree(apart).query(apart, k=2)[0][:, 1]))
+    return spacing, max(_NEAR_SPACINGS * spacing, _NEAR_EXTENT * extent), extent
 
 
 def _one_of_each(centers: NDArray[np.float64], extent: float) -> NDArray[np.float64]:
@@ -169,15 +169,13 @@ def storey_offset(cameras: MapCameras, centers: NDArray[np.float64]) -> float | 
     """
     up = -rotation_matrices(cameras.quats)[:, 1, :].mean(axis=0)
     length = float(np.linalg.norm(up))
-    centers = centers[np.isfinite(centers).all(axis=1) & (np.abs(centers) < _INFINITE).all(axis=1)]
-    if length < _UPRIGHT or not len(centers):
+    centers = centers[(np.abs(centers) < _INFINITE).all(axis=1)]
+    middle = np.median(cameras.centers, axis=0)
+    extent = _extent(cameras.centers, middle)
+    if length < _UPRIGHT or not len(centers) or not extent > 0:
         return None
     up /= length
     level = np.linalg.svd(up[None])[2][1:].T  # two directions
-    middle = np.median(cameras.centers, axis=0)
-    extent = _extent(cameras.centers, middle)
-    if not extent > 0:
-        return None
     own, given = _one_of_each(cameras.centers - middle, extent), centers - middle
     count = min(_STOREY_NEIGHBOURS, len(own) - 1)
     if count < 1:
@@ -228,22 +226,11 @@ def path_scores(
     return scores
 
 
-def compare_poses(
-    keys: Sequence[str],
-    quats: NDArray[np.float64],
-    translations: NDArray[np.float64],
-    queries: Sequence[str | None],
-    reference: Reference,
-) -> list[Finding]:
-    """Findings about the poses of a file (one per query, absolute), compared with the map.
-
-    Parameters
-    ----------
-    keys, queries : per row its name in the file, and its query, None where the name is unknown.
-    quats, translations : float64 (N, 4) and (N, 3), in the order of the file's columns.
-    """
-    cameras, world = reference.cameras, reference.world
-    if cameras is None or not len(keys):
+def compare_poses(rows: Rows, queries: Sequence[str | None], reference: Reference) -> list[Finding]:
+    """Findings about the poses of a file (one per query, absolute), compared with the map;
+    ``queries`` has per row its query, None where the name is unknown."""
+    cameras, world, keys = reference.cameras, reference.world, rows.keys
+    if cameras is None or not keys:
         return []
     if len(cameras.images) < MIN_POSES:
         message = f"the map has {plural(len(cameras.images), 'camera')}: too few to compare with"
@@ -253,18 +240,18 @@ def compare_poses(
     # spread evenly over the file: its conditions and drives all have a part in them
     spread = np.linspace(0, len(keys) - 1, min(len(keys), _SAMPLE))
     sample = np.unique(spread.round().astype(np.int64))
-    floors = bool(sets.has_other[sample].mean() > _MOST)
-    everything = np.arange(len(keys))
 
-    def look(hypothesis: Hypothesis, rows: NDArray[np.int64], *, other: bool = False) -> Nearness:
-        poses = restore_absolute(hypothesis, quats[rows], translations[rows], world)
+    def look(hypothesis: Hypothesis, at: NDArray[np.int64], *, other: bool = False) -> Nearness:
+        poses = restore_absolute(hypothesis, rows.quats[at], rows.translations[at], world)
         own = sets.other if other or "floor" in hypothesis else sets.own
-        return hood.look(*poses, own[rows])
+        return hood.look(*poses, own[at])
 
+    floors = bool(sets.has_other[sample].mean() > _MOST)
     hypotheses = absolute_hypotheses(frames=world != World(), floors=floors)
-    findings, explained = _explained(hypotheses, lambda own: look(own, sample), len(keys))
-    if explained:
+    findings = _explained(hypotheses, [look(own, sample) for own in hypotheses], len(keys))
+    if any(finding.severity == "error" for finding in findings):
         return findings
+    everything = np.arange(len(keys))
     as_is = look(Hypothesis(), everything)
     frames = {reference.groups[i].frame for i in cameras.images if i in reference.groups}
     if sets.has_other.any():
@@ -282,89 +269,78 @@ def compare_poses(
         )
         findings.append(Finding("warning", "orientation", message))
     if world.unit == "m":
-        _, centers = restore_absolute(Hypothesis(), quats, translations, world)
+        _, centers = restore_absolute(Hypothesis(), rows.quats, rows.translations, world)
         findings += _storeys(cameras, centers, sets)
     return findings
 
 
 def compare_relative(
-    keys: Sequence[str],
-    quats: NDArray[np.float64],
-    translations: NDArray[np.float64],
-    pairs: Sequence[tuple[str, str | None]],
-    reference: Reference,
+    rows: Rows, pairs: Sequence[tuple[str, str | None]], reference: Reference
 ) -> list[Finding]:
-    """Findings about the rows of an MLAD file, compared with the map.
-
-    Parameters
-    ----------
-    keys : per row its two timestamps.
-    quats, translations : float64 (N, 4) and (N, 3), in the order of the file's columns.
-    pairs : per row the reference's image (of the map) and the query's, None where it is unknown.
-    """
+    """Findings about the rows of an MLAD file, compared with the map; ``pairs`` has per row the
+    reference's image (of the map) and the query's, None where it is unknown."""
     cameras = reference.cameras
-    if cameras is None or not len(keys):
+    if cameras is None or not rows.keys:
         return []
     position = {image: number for number, image in enumerate(cameras.images)}
-    rows = np.array([i for i, (image, _) in enumerate(pairs) if image in position], dtype=np.int64)
+    known = [row for row, (image, _) in enumerate(pairs) if image in position]
     findings = []
-    if left := len(keys) - len(rows):
+    if left := len(pairs) - len(known):
         message = f"{plural(left, 'row')} not compared: the map has no pose of the reference"
         findings.append(Finding("note", "no-reference", message))
-    if not len(rows):
+    if not known:
         return findings
-    where = np.array([position[pairs[i][0]] for i in rows])
+    rows, pairs = rows.only(np.array(known)), [pairs[row] for row in known]
+    where = [position[image] for image, _ in pairs]
     references = (cameras.quats[where], cameras.centers[where])
-    sets = camera_sets(reference, cameras, [pairs[i][1] for i in rows])
+    sets = camera_sets(reference, cameras, [query for _, query in pairs])
     hood = Neighbourhood(cameras, sets.members)
-    stamps = [int(keys[i].split(" ")[1]) for i in rows]
+    stamps = [int(key.split(" ")[1]) for key in rows.keys]
     times = np.array([float(stamp - min(stamps)) for stamp in stamps])
     scale = _PATH_SCALE * hood.spacing[sets.own]
-    quats, translations = quats[rows], translations[rows]
 
-    def look(hypothesis: Hypothesis) -> Nearness:
-        poses = restore_relative(hypothesis, quats, translations, references, reference.world)
+    def look(own: Hypothesis) -> Nearness:
+        poses = restore_relative(own, rows.quats, rows.translations, references, reference.world)
         found = hood.look(*poses, sets.own)
         return replace(found, score=found.score + path_scores(poses[1], times, scale))
 
-    about_all, explained = _explained(relative_hypotheses(), look, len(rows))
-    findings += about_all
-    if not explained:
-        findings += _far([keys[i] for i in rows], look(Hypothesis()), reference.world.unit)
+    hypotheses = relative_hypotheses()
+    looks = [look(own) for own in hypotheses]
+    findings += _explained(hypotheses, looks, len(known))
+    if not any(finding.severity == "error" for finding in findings):
+        findings += _far(rows.keys, looks[0], reference.world.unit)
     return findings
 
 
 def _explained(
-    hypotheses: Sequence[Hypothesis], look: Callable[[Hypothesis], Nearness], number: int
-) -> tuple[list[Finding], bool]:
-    """The mistake that explains the file, or what cannot be ruled out; and whether one does."""
-    found = [look(hypothesis) for hypothesis in hypotheses]
-    scores = np.array([nearness.score for nearness in found])
-    fits = np.array([nearness.fits for nearness in found])
-    explanation = explain(scores, fits, [hypothesis.cost for hypothesis in hypotheses])
-    if explanation is not None:
-        best = hypotheses[explanation.best]
+    hypotheses: Sequence[Hypothesis], looks: Sequence[Nearness], number: int
+) -> list[Finding]:
+    """The mistake that explains the file as an error, else what cannot be ruled out."""
+    scores = np.array([nearness.score for nearness in looks])
+    fits = np.array([nearness.fits for nearness in looks])
+    best = explain(scores, fits, [hypothesis.cost for hypothesis in hypotheses])
+    if best:
+        said, *others = (str(hypotheses[h]) for h in best)
         message = (
-            f"{best} (read so, {explanation.fitting:.0%} of the poses fit the map, as they stand "
-            f"{explanation.fitting_as_is:.0%})"
+            f"{said} (read so, {fits[best[0]].mean():.0%} of the poses fit the map, as they stand "
+            f"{fits[0].mean():.0%})"
         )
-        others = [str(hypotheses[other]) for other in explanation.as_good]
         if others:
             message += f"; what the map cannot tell from it: {'; or: '.join(others[:3])}"
             message += f", and {len(others) - 3} more readings" if len(others) > 3 else ""
-        return [Finding("error", best.kind, message)], True
+        return [Finding("error", hypotheses[best[0]].kind, message)]
     if number < MIN_POSES:
         message = f"{plural(number, 'pose')}: too few to tell whether they are all wrong in one way"
-        return [Finding("note", "too-few", message)], False
+        return [Finding("note", "too-few", message)]
     simple = [i for i, hypothesis in enumerate(hypotheses) if hypothesis.cost <= 1]
     kinds = [hypotheses[simple[i]].kind for i in undecided(scores[simple])]
     if not kinds:
-        return [], False
+        return []
     message = (
         "the map's cameras do not rule out every mistake; the poses fit as well when they are "
         f"taken for: {', '.join(kinds)}"
     )
-    return [Finding("note", "undecided", message)], False
+    return [Finding("note", "undecided", message)]
 
 
 def _other_floor(

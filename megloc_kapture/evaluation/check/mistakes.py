@@ -235,8 +235,7 @@ def restore_relative(
     if "wxyz" not in hypothesis:
         quats = np.roll(quats, 1, axis=1)
     if "absolute" in hypothesis:
-        axes = Hypothesis((_AXES,) if "axes" in hypothesis else ())
-        return restore_absolute(axes, quats, translations, world)
+        return restore_absolute(hypothesis, quats, translations, world)
     if "axes" in hypothesis:
         quats = multiply_quats(multiply_quats(_OPENGL_QUAT, quats), _OPENGL_QUAT)
         translations = translations * _OPENGL_SIGNS
@@ -251,31 +250,24 @@ def restore_relative(
     return quats, -rotate(invert_quats(quats), translations)
 
 
-@dataclass(frozen=True)
-class Explanation:
-    """A hypothesis that explains the file: its index ``best``, and those of others that do as well;
-    the share of poses that fit the map under it, and when read rightly."""
-
-    best: int
-    as_good: tuple[int, ...]
-    fitting: float
-    fitting_as_is: float
-
-
 def explain(
     scores: NDArray[np.float64], fits: NDArray[np.bool_], costs: Sequence[float]
-) -> Explanation | None:
-    """The hypothesis that explains the poses clearly better than the right reading, or None.
+) -> list[int]:
+    """Hypotheses that explain the poses clearly better than the right reading; empty: none does.
 
     Parameters
     ----------
     scores : float64 (H, N) of N poses under H hypotheses; the first is the right reading.
     fits : bool (H, N), whether a pose could be one under a hypothesis.
     costs : of each hypothesis; ascending.
+
+    Returns
+    -------
+    The one that does, then what cannot be told from it and is as simple.
     """
     number = scores.shape[1]
     if number < MIN_POSES:
-        return None
+        return []
     gains = _gains(scores, scores[0])
     mean = gains.mean(axis=1)
     uncertain = gains.std(axis=1, ddof=1) / np.sqrt(number)
@@ -285,21 +277,19 @@ def explain(
     cost = np.array(costs)
     wanted = np.where(cost > 1, _SHARE_FITTING_RARE, _SHARE_FITTING)
     good &= (share >= _SHARE_BETTER) & (fitting >= wanted) & (fitting >= fitting[0])
-    found = np.flatnonzero(good)
-    if not len(found):
-        return None
+    found = np.flatnonzero(good).tolist()
+    if not found:
+        return []
     # compared with one another, not with the right reading, over which they may all gain the most
     # that counts; what is left out is worse than all of these
-    base = scores[found[np.argmax(scores[found].clip(-_FLOOR).mean(axis=1))]]
-    worth = np.array([_gains(own, base).mean() for own in scores])
+    base = max(found, key=lambda h: scores[h].clip(-_FLOOR).mean())
+    worth = _gains(scores, scores[base]).mean(axis=1)
     worth -= cost * max(_PER_MISTAKE / number, _PER_MISTAKE_AND_POSE)
-    best = int(found[np.argmax(worth[found])])
-    as_good = [int(h) for h in found if _is_as_good(scores[h], scores[best])]
+    best = max(found, key=lambda h: worth[h])
+    as_good = [h for h in found if _is_as_good(scores[h], scores[best])]
     # of what cannot be told apart the simplest, and of equally simple ones the best
     as_good.sort(key=lambda h: (cost[h], -worth[h]))
-    first, *others = as_good
-    others = [h for h in others if cost[h] <= cost[first]]
-    return Explanation(first, tuple(others), float(fitting[first]), float(fitting[0]))
+    return [h for h in as_good if cost[h] == cost[as_good[0]]]
 
 
 def undecided(scores: NDArray[np.float64]) -> list[int]:

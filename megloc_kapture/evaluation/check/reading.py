@@ -15,21 +15,14 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation import pose_files
+from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of
 from megloc_kapture.geometry.poses import camera_centers, stack_poses
 from megloc_kapture.io.dataset_tables import (
     MAX_QUATERNION_NORM_ERROR,
     SIDE_TABLES,
     ImageGroup,
     PoseFileFormat,
-    Protocol,
-    RelocalizationPair,
-    World,
-    read_groups,
-    read_names,
     read_priors,
-    read_protocol,
-    read_relocalization,
-    read_world,
 )
 from megloc_kapture.io.files import read_text
 from megloc_kapture.io.kapture import KaptureFolder
@@ -43,11 +36,11 @@ _RANK: dict[Severity, int] = {"error": 0, "warning": 1, "note": 2}
 _SHOWN_OF_A_KIND = 10
 _NAMES_SHOWN = 3
 
-_MAPPING, _QUERY = "mapping", "query"
-_KEYS: dict[PoseFileFormat, int] = {"ltvl": 1, "mlad": 2}
-_COLUMNS = {"ltvl": pose_files.COLUMNS, "mlad": pose_files.MLAD_COLUMNS}
-# where the quaternion begins among the seven numbers
-_QUATERNION_AT: dict[PoseFileFormat, int] = {"ltvl": 0, "mlad": 3}
+# columns before the pose, all columns, and where the quaternion begins among the seven numbers
+_FORMATS: dict[PoseFileFormat, tuple[int, str, int]] = {
+    "ltvl": (1, pose_files.COLUMNS, 0),
+    "mlad": (2, pose_files.MLAD_COLUMNS, 3),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,9 +74,9 @@ class CheckReport:
 
     Parameters
     ----------
+    reference : what the file was compared with; empty: nothing.
     poses : rows with a pose that can be used.
     expected : queries, or rows, that the challenge counts; None where that is not known.
-    reference : what the file was compared with; empty: nothing.
     findings : in no particular order; :attr:`sorted_findings` has them by severity.
     """
 
@@ -109,23 +102,24 @@ class CheckReport:
 
     def lines(self) -> list[str]:
         """The report as text, a problem per line; the last line is the outcome."""
-        shown, counts = [], Counter[tuple[str, str]]()
+        by_kind: dict[tuple[str, str], list[Finding]] = {}
+        shown = []
         for finding in self.sorted_findings:
-            counts[finding.severity, finding.kind] += 1
-            if counts[finding.severity, finding.kind] <= _SHOWN_OF_A_KIND:
+            alike = by_kind.setdefault((finding.severity, finding.kind), [])
+            alike.append(finding)
+            if len(alike) <= _SHOWN_OF_A_KIND:
                 shown.append(str(finding))
         shown += [
-            f"{severity}: {count - _SHOWN_OF_A_KIND} more of kind {kind!r}; --json lists all"
-            for (severity, kind), count in counts.items()
-            if count > _SHOWN_OF_A_KIND
+            f"{severity}: {len(alike) - _SHOWN_OF_A_KIND} more of kind {kind!r}; --json lists all"
+            for (severity, kind), alike in by_kind.items()
+            if len(alike) > _SHOWN_OF_A_KIND
         ]
+        counts = Counter(finding.severity for finding in self.findings)
         of = "" if self.expected is None else f" of {self.expected} queries"
-        errors, warnings = (
-            sum(finding.severity == severity for finding in self.findings)
-            for severity in ("error", "warning")
-        )
-        outcome = plural(errors, "problem") + " found" if errors else "no problem found"
-        also = f", {plural(warnings, 'warning')}" if warnings else ""
+        outcome = "no problem found"
+        if counts["error"]:
+            outcome = f"{plural(counts['error'], 'problem')} found"
+        also = f", {plural(counts['warning'], 'warning')}" if counts["warning"] else ""
         return [*shown, f"{self.poses} poses{of}: {outcome}{also}"]
 
     def to_json(self) -> dict[str, Any]:
@@ -153,6 +147,14 @@ def some(names: Iterable[str]) -> str:
     return text if len(listed) <= _NAMES_SHOWN else f"{text} and {len(listed) - _NAMES_SHOWN} more"
 
 
+def about(
+    severity: Severity, kind: str, names: Sequence[str], noun: str, said: str, advice: str = ""
+) -> Finding:
+    """The finding that something is the matter with so many names, the first of them told."""
+    message = f"{plural(len(names), noun)} {said}: {some(names)}{advice}"
+    return Finding(severity, kind, message, names=tuple(names))
+
+
 @dataclass(frozen=True, eq=False)
 class Rows:
     """The rows of one pose file that have a name and a pose.
@@ -169,102 +171,101 @@ class Rows:
     keys: tuple[str, ...]
     quats: NDArray[np.float64]
     translations: NDArray[np.float64]
-    named: dict[str, int]
-    findings: tuple[Finding, ...]
+    named: Mapping[str, int] = field(default_factory=dict)
+    findings: Sequence[Finding] = ()
+
+    def only(self, chosen: NDArray[np.int64]) -> Rows:
+        """The keys and poses of some rows, int64 (K,)."""
+        keys = tuple(self.keys[row] for row in chosen.tolist())
+        return Rows(keys, self.quats[chosen], self.translations[chosen])
 
 
 def read_rows(path: Path, kind: PoseFileFormat) -> Rows:
     """Read what can be read of a pose file; DataError: nothing can, or it is no text in UTF-8."""
-    scan = _Scan(kind)
-    lines = read_text(path).split("\n")
-    if lines[-1] and kind == "ltvl":
-        message = "the last line is not ended: the file may be cut short"
-        scan.problem(len(lines), "cut", message, severity="warning")
-    for number, line in enumerate(lines, start=1):
-        if line.strip():
-            scan.add(number, line)
-    numbers = np.array(scan.numbers, dtype=np.float64).reshape(-1, 7)
-    at = _QUATERNION_AT[kind]
+    _, columns, at = _FORMATS[kind]
+    poses, named, findings = _scan(read_text(path).split("\n"), kind)
+    keys = tuple(poses)
+    numbers = np.array(list(poses.values()), dtype=np.float64).reshape(-1, 7)
     norms, off = _norms(numbers[:, at : at + 4])
     other_norms, other_off = _norms(numbers[:, 3 - at : 7 - at])
     if len(numbers) and off.mean() > 0.5 and (~other_off).mean() > 0.5:
         there, first = ("translation", "quaternion")[:: -1 if at else 1]
         message = (
             f"the {there} stands before the {first} in {plural(int(off.sum()), 'row')}; "
-            f"the columns are {_COLUMNS[kind]}"
+            f"the columns are {columns}"
         )
-        scan.findings.append(Finding("error", "column-order", message))
+        findings.append(Finding("error", "column-order", message))
         at, norms, off = 3 - at, other_norms, other_off
-    for position in np.flatnonzero(off).tolist():
-        key = scan.keys[position]
-        message = f"{key}: quaternion of length {norms[position]:g}, not 1"
-        scan.problem(scan.named[key], "quaternion", message)
+    for row in np.flatnonzero(off).tolist():
+        message = f"{keys[row]}: quaternion of length {norms[row]:g}, not 1"
+        findings.append(Finding("error", "quaternion", message, line=named[keys[row]]))
     usable = np.isfinite(norms) & (norms > 1e-6)
     return Rows(
-        keys=tuple(compress(scan.keys, usable)),
+        keys=tuple(compress(keys, usable)),
         quats=numbers[usable, at : at + 4] / norms[usable, None],
         translations=numbers[usable][:, (4, 5, 6) if at == 0 else (0, 1, 2)],
-        named=scan.named,
-        findings=tuple(scan.findings),
+        named=named,
+        findings=findings,
     )
 
 
-class _Scan:
-    """Collects rows and problems."""
+def _scan(
+    lines: Sequence[str], kind: PoseFileFormat
+) -> tuple[dict[str, list[float]], dict[str, int], list[Finding]]:
+    """Key -> the seven numbers of its pose, key -> its line, and what is wrong with the lines."""
+    num_keys, columns, _ = _FORMATS[kind]
+    wanted = num_keys + 7
+    poses, named, findings = dict[str, list[float]](), dict[str, int](), list[Finding]()
 
-    def __init__(self, kind: PoseFileFormat) -> None:
-        self.kind = kind
-        self.num_keys = _KEYS[kind]
-        self.keys: list[str] = []
-        self.numbers: list[list[float]] = []
-        self.named: dict[str, int] = {}
-        self.findings: list[Finding] = []
+    def problem(line: int, kind: str, message: str, severity: Severity = "error") -> None:
+        findings.append(Finding(severity, kind, message, line=line))
 
-    def problem(self, line: int, kind: str, message: str, severity: Severity = "error") -> None:
-        self.findings.append(Finding(severity, kind, message, line=line))
-
-    def add(self, number: int, line: str) -> None:
-        """Take one line."""
+    if lines[-1] and kind == "ltvl":
+        message = "the last line is not ended: the file may be cut short"
+        problem(len(lines), "cut", message, "warning")
+    for number, line in enumerate(lines, start=1):
         fields = line.split()
-        wanted = self.num_keys + 7
-        if "," in line and len(fields) != wanted or any(field.endswith(",") for field in fields):
+        if "," in line and (len(fields) != wanted or any(f.endswith(",") for f in fields)):
             separated = [field.strip() for field in line.split(",")]
             if len(separated) != wanted:
                 separated = line.replace(",", " ").split()
             if len(separated) == wanted:
-                self.problem(number, "separator", "commas; the format has single spaces")
+                problem(number, "separator", "commas; the format has single spaces")
                 fields = separated
+        if not fields:
+            continue
         if len(fields) != wanted:
-            if line.lstrip().startswith("#"):
-                return self.problem(
-                    number, "comment", "a comment; the format has none, and no header"
-                )
-            message = f"{plural(len(fields), 'column')} instead of {wanted} ({_COLUMNS[self.kind]})"
-            self.problem(number, "columns", message)
-            if len(fields) < self.num_keys:
-                return None
-        key, numbers = " ".join(fields[: self.num_keys]), fields[self.num_keys :]
+            if fields[0].startswith("#"):
+                problem(number, "comment", "a comment; the format has none, and no header")
+                continue
+            told = f"{plural(len(fields), 'column')} instead of {wanted} ({columns})"
+            problem(number, "columns", told)
+            if len(fields) < num_keys:
+                continue
+        key = " ".join(fields[:num_keys])
         try:
-            for stamp in fields[:2] if self.kind == "mlad" else ():
+            for stamp in fields[:2] if kind == "mlad" else ():
                 pose_files.parse_timestamp(stamp)
         except DataError:
-            message = f"{key} are not two timestamps (whole numbers)"
-            return self.problem(number, "timestamp", message)
-        if key in self.named:
-            message = f"{key} is given twice, first on line {self.named[key]}"
-            return self.problem(number, "duplicate", message)
-        self.named[key] = number
+            problem(number, "timestamp", f"{key} are not two timestamps (whole numbers)")
+            continue
+        if key in named:
+            told = f"{key} is given twice, first on line {named[key]}"
+            problem(number, "duplicate", told)
+            continue
+        named[key] = number
         if len(fields) != wanted:
-            return None
+            continue
         try:
-            values = [pose_files.parse_number(field) for field in numbers]
+            values = [pose_files.parse_number(field) for field in fields[num_keys:]]
         except DataError as error:
-            return self.problem(number, "number", f"{key}: {error.message}")
-        if not all(math.isfinite(value) for value in values):
-            return self.problem(number, "not-finite", f"{key}: the pose is not finite")
-        self.keys.append(key)
-        self.numbers.append(values)
-        return None
+            problem(number, "number", f"{key}: {error.message}")
+            continue
+        if all(map(math.isfinite, values)):
+            poses[key] = values
+        else:
+            problem(number, "not-finite", f"{key}: the pose is not finite")
+    return poses, named, findings
 
 
 def _norms(quats: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -290,29 +291,24 @@ class MapCameras:
     centers: NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Reference:
-    """An imported dataset, which a pose file is compared with.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reference(Benchmark):
+    """An imported dataset, which a pose file is compared with, and the rules of its benchmark.
 
     Parameters
     ----------
-    folder : its path, as it is told to people.
+    folder : its path, as it is told to people; empty: there is none.
+    priors : query -> what it may be matched with.
     expected : what each scored query is called in the pose file -> the query; in the order of the
-        challenge's list where it has one (``listed``).
-    queries : all query images, also those that are not scored; None where they are not known.
-    relocalization : the pairs of an MLAD challenge.
+        challenge's list where it has one.
+    queries : all query images, also those that are not scored.
     cameras : of the map; None where there is no map.
     """
 
-    folder: str
-    protocol: Protocol = field(default_factory=Protocol)
-    world: World = field(default_factory=World)
-    groups: Mapping[str, ImageGroup] = field(default_factory=dict)
+    folder: str = ""
     priors: Mapping[str, Sequence[str]] = field(default_factory=dict)
     expected: Mapping[str, str] = field(default_factory=dict)
-    listed: bool = False
-    queries: frozenset[str] | None = None
-    relocalization: Sequence[RelocalizationPair] = ()
+    queries: frozenset[str] = frozenset()
     cameras: MapCameras | None = None
 
 
@@ -320,34 +316,32 @@ def read_reference(folder: Path) -> Reference:
     """Read what is there of an import or workspace: ``mapping/``, ``query/``, ``megloc/``.
     DataError: none of the three is there, or one is broken."""
     tables = folder / SIDE_TABLES
-    parts = [folder / name for name in (_MAPPING, _QUERY)]
-    there = [part for part in parts if (part / "sensors" / "sensors.txt").is_file()]
-    if not there and not tables.is_dir():
+    mapping, query = (
+        KaptureFolder(path) if (path / "sensors" / "sensors.txt").is_file() else None
+        for path in (folder / "mapping", folder / "query")
+    )
+    if mapping is None and query is None and not tables.is_dir():
         raise DataError(
             "no imported dataset: it has none of mapping/, query/ and megloc/", path=folder
         )
-    protocol, groups, names = read_protocol(tables), read_groups(tables), read_names(tables)
-    listed = bool(names)
-    queries: frozenset[str] | None = None
-    if folder / _QUERY in there:
-        queries = frozenset(KaptureFolder(folder / _QUERY).read().records_camera.values())
-        if not listed:
-            scored = [image for image in queries if groups.get(image, ImageGroup()).scored]
-            names = pose_files.names_in_pose_file(scored, protocol.pose_file_names)
+    rules = benchmark_of(tables)
+    queries = frozenset[str]()
+    names = rules.names
+    if query is not None:
+        queries = frozenset(query.read().records_camera.values())
+        if not names:
+            scored = rules.scored(queries)
+            names = pose_files.names_in_pose_file(scored, rules.protocol.pose_file_names)
     cameras = None
-    if folder / _MAPPING in there and (poses := KaptureFolder(folder / _MAPPING).read().poses()):
+    if mapping is not None and (poses := mapping.read().poses()):
         quats, translations = stack_poses(poses.values())
         cameras = MapCameras(tuple(poses), quats, camera_centers(quats, translations))
     return Reference(
+        **vars(rules),
         folder=str(folder),
-        protocol=protocol,
-        world=read_world(tables),
-        groups=groups,
         priors=read_priors(tables),
         expected={name: image for image, name in names.items()},
-        listed=listed,
         queries=queries,
-        relocalization=read_relocalization(tables),
         cameras=cameras,
     )
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from itertools import compress
 from pathlib import Path, PurePosixPath
+
+import numpy as np
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.check.comparison import compare_poses, compare_relative
@@ -16,13 +17,14 @@ from megloc_kapture.evaluation.check.reading import (
     Reference,
     Rows,
     Severity,
+    about,
     plural,
     read_rows,
     some,
 )
-from megloc_kapture.io.dataset_tables import ImageGroup, RelocalizationPair
+from megloc_kapture.evaluation.protocols import PROTOCOLS
+from megloc_kapture.io.dataset_tables import ImageGroup, Protocol, RelocalizationPair
 
-_MLAD_DATASETS = ("4seasons",)
 # datasets whose server is known to take either of two endings
 _ENDINGS_DO_NOT_MATTER = ("robotcar",)
 # whether names hold a folder, and their endings
@@ -31,13 +33,10 @@ _SHAPES: dict[str, tuple[bool, tuple[str, ...]]] = {
     "inloc": (False, (".JPG",)),
     "robotcar": (True, (".jpg", ".png")),
 }
-_FOLDERS_SAID = {
-    "": "",
-    "name-folder": "without the folder before them",
-    "name-path": "with more of the path than the list",
-    "name-folders": "with other folders than the list",
-}
-_OTHER_FOLDERS = "name-folders"
+# how the folders of a name differ from those of the list
+_NO_FOLDER = "name-folder", "without the folder before them"
+_MORE_FOLDERS = "name-path", "with more of the path than the list"
+_OTHER_FOLDERS = "name-folders", "with other folders than the list"
 
 
 def check_submission(
@@ -54,52 +53,44 @@ def check_submission(
     ------
     DataError : the file cannot be read, is no text, or is a folder where a file is asked for.
     """
-    mlad = dataset in _MLAD_DATASETS
-    if reference is not None:
-        mlad = reference.protocol.pose_file == "mlad"
-    poses, expected, findings = (_check_mlad if mlad else _check_file)(path, dataset, reference)
-    folder = "" if reference is None else reference.folder
+    if reference is None:
+        reference = Reference(protocol=PROTOCOLS.get(dataset, Protocol()))
+    if reference.protocol.pose_file == "mlad":
+        poses, expected, findings = _check_mlad(path, reference)
+    else:
+        poses, expected, findings = _check_file(path, dataset, reference)
     return CheckReport(
         dataset=dataset,
         file=str(path),
-        reference=folder,
+        reference=reference.folder,
         poses=poses,
-        expected=expected,
+        expected=expected or None,
         findings=tuple(findings),
     )
 
 
-def _check_file(
-    path: Path, dataset: str, reference: Reference | None
-) -> tuple[int, int | None, list[Finding]]:
+def _check_file(path: Path, dataset: str, reference: Reference) -> tuple[int, int, list[Finding]]:
     """Poses, queries that count, and findings of a file of absolute poses."""
     if path.is_dir():
         raise DataError("a folder; the pose file of this challenge is one file", path=path)
     rows = read_rows(path, "ltvl")
-    findings = _empty(rows)
-    expected: int | None = None
-    images: Mapping[str, str] = {}
-    if reference is None or not reference.expected:
-        findings += [*check_shape(rows.named, dataset), _not_checked("names", reference)]
-    else:
-        expected = len(reference.expected)
+    if reference.expected:
         images, of_names = match_names(rows.named, reference, dataset)
-        findings += of_names
-    if reference is None or reference.cameras is None:
-        findings.append(_not_checked("poses", reference))
     else:
-        queries = [images.get(key) for key in rows.keys]
-        # what is wrong with the whole file is told first
-        findings[:0] = compare_poses(rows.keys, rows.quats, rows.translations, queries, reference)
-    return len(rows.keys), expected, _in_file(path.name, [*findings, *rows.findings])
+        images = {}
+        of_names = [*check_shape(rows.named, dataset), *_not_checked("names", reference)]
+    # what is wrong with the whole file is told first
+    findings = compare_poses(rows, [images.get(key) for key in rows.keys], reference)
+    findings += [*_empty(rows), *of_names, *rows.findings]
+    if reference.cameras is None:
+        findings += _not_checked("poses", reference)
+    return len(rows.keys), len(reference.expected), _in_file(path.name, findings)
 
 
-def _check_mlad(
-    path: Path, dataset: str, reference: Reference | None
-) -> tuple[int, int | None, list[Finding]]:
+def _check_mlad(path: Path, reference: Reference) -> tuple[int, int, list[Finding]]:
     """Poses, pairs that are asked for, and findings of the files of an MLAD challenge."""
     wanted: dict[str, list[RelocalizationPair]] = {}
-    for pair in () if reference is None else reference.relocalization:
+    for pair in reference.pairs:
         wanted.setdefault(pair.file, []).append(pair)
     findings: list[Finding] = []
     if path.is_dir():
@@ -108,10 +99,10 @@ def _check_mlad(
         absent = [name for name in wanted if name not in there]
         others = [name for name in there if name not in files]
         if absent:
-            findings.append(_about("error", "missing-file", absent, "file", "missing"))
+            findings.append(about("error", "missing-file", absent, "file", "missing"))
         if others:
             said = "that no relocalization file asks for"
-            findings.append(_about("warning", "unknown-file", others, "file", said))
+            findings.append(about("warning", "unknown-file", others, "file", said))
         if not files and not absent:
             raise DataError("there is no pose file (*.txt) in the folder", path=path)
     else:
@@ -128,14 +119,14 @@ def _check_mlad(
         of_pairs = _check_pairs(rows, wanted.get(name), reference)
         findings += _in_file(name, [*rows.findings, *_empty(rows), *of_pairs])
     if not wanted:
-        findings.append(_not_checked("pairs", reference))
-    if reference is None or reference.cameras is None:
-        findings.append(_not_checked("poses", reference))
-    return poses, sum(map(len, wanted.values())) if wanted else None, findings
+        findings += _not_checked("pairs", reference)
+    if reference.cameras is None:
+        findings += _not_checked("poses", reference)
+    return poses, len(reference.pairs), findings
 
 
 def _check_pairs(
-    rows: Rows, pairs: Sequence[RelocalizationPair] | None, reference: Reference | None
+    rows: Rows, pairs: Sequence[RelocalizationPair] | None, reference: Reference
 ) -> list[Finding]:
     findings: list[Finding] = []
     images: dict[str, tuple[str, str | None]] = {
@@ -148,16 +139,15 @@ def _check_pairs(
     # a dummy is no pose, and says nothing about how the others are meant
     is_dummy = (abs(abs(rows.quats) - [0, 0, 0, 1]).max(axis=1) < 1e-12) & ~rows.translations.any(1)
     if is_dummy.any():
-        dummies = list(compress(rows.keys, is_dummy))
+        dummies = rows.only(np.flatnonzero(is_dummy)).keys
         said = "hold the identity, a dummy that is no pose"
-        findings.append(_about("note", "dummies", dummies, "row", said))
-    if reference is None or reference.cameras is None or swapped:
+        findings.append(about("note", "dummies", dummies, "row", said))
+    if reference.cameras is None or swapped:
         return findings
     by_stem = {_stem(image): image for image in reference.cameras.images}
-    keys = list(compress(rows.keys, ~is_dummy))
-    named = [images.get(key, (by_stem.get(key.split(" ")[0], ""), None)) for key in keys]
-    poses = rows.quats[~is_dummy], rows.translations[~is_dummy]
-    return findings + compare_relative(keys, *poses, named, reference)
+    rows = rows.only(np.flatnonzero(~is_dummy))
+    named = [images.get(key, (by_stem.get(key.split(" ")[0], ""), None)) for key in rows.keys]
+    return findings + compare_relative(rows, named, reference)
 
 
 def match_pairs(named: Mapping[str, int], expected: Collection[str]) -> tuple[bool, list[Finding]]:
@@ -203,7 +193,7 @@ def match_names(
     """
     expected = reference.expected
     by_stem = _by_stem(expected)
-    unscored = _by_stem(sorted(set(reference.queries or ()) - set(expected.values())))
+    unscored = _by_stem(sorted(reference.queries - set(expected.values())))
     images: dict[str, str] = {}
     # kind and words of a difference -> names and the right ones
     wrong: dict[tuple[str, str], list[tuple[str, str]]] = {}
@@ -213,7 +203,7 @@ def match_names(
             images[name] = expected[name]
             continue
         found = _closest(name, by_stem.get(_stem(name), ()))
-        elsewhere = found is None or found[1][0] == _OTHER_FOLDERS
+        elsewhere = found is None or found[1][0] == _OTHER_FOLDERS[0]
         if elsewhere and _ends_alike(name, unscored.get(_stem(name), ())):
             not_scored.append(name)
         elif found is not None:
@@ -233,7 +223,7 @@ def match_names(
         findings.append(Finding(severity, kind, message, names=tuple(name for name, _ in pairs)))
     if not_scored:
         said = "of images that are not scored and will be ignored"
-        findings.append(_about("note", "not-scored", not_scored, "row", said))
+        findings.append(about("note", "not-scored", not_scored, "row", said))
     first: dict[str, str] = {}
     for name, image in images.items():
         other = first.setdefault(image, name)
@@ -242,7 +232,7 @@ def match_names(
             names = (other, name)
             findings.append(Finding("error", "duplicate", message, line=named[name], names=names))
     findings += _missing_names(expected, set(images.values()), reference.groups)
-    if reference.listed:
+    if reference.names:
         findings += _order(named, expected, "challenge's list")
     return images, findings
 
@@ -253,19 +243,16 @@ def check_shape(named: Iterable[str], dataset: str) -> list[Finding]:
         return []
     with_folder, endings = _SHAPES[dataset]
     findings = []
-    flat = tuple(name for name in named if ("/" in name) != with_folder)
-    if flat:
+    if flat := [name for name in named if ("/" in name) != with_folder]:
         kind, problem = "name-path", "with a folder"
-        advice = "the server looks for the last part of the path alone"
+        advice = "; the server looks for the last part of the path alone"
         if with_folder:
             kind, problem = "name-folder", "without the camera's folder"
-            advice = "the server looks for rear/..., and finds none of them"
-        message = f"{plural(len(flat), 'name')} {problem}: {some(flat)}; {advice}"
-        findings.append(Finding("error", kind, message, names=flat))
-    others = tuple(name for name in named if not name.endswith(endings))
-    if others:
+            advice = "; the server looks for rear/..., and finds none of them"
+        findings.append(about("error", kind, flat, "name", problem, advice))
+    if others := [name for name in named if not name.endswith(endings)]:
         said = f"not ending in {' or '.join(endings)}"
-        findings.append(_about("error", "name-ending", others, "name", said))
+        findings.append(about("error", "name-ending", others, "name", said))
     return findings
 
 
@@ -305,7 +292,7 @@ def _closest(name: str, candidates: Sequence[str]) -> tuple[str, tuple[str, str]
     """The name of the list that ``name`` was meant to be, of those with its stem, and kind and
     words of the difference; None: unclear."""
     compared = [(right, _difference(name, right)) for right in candidates]
-    likely = [pair for pair in compared if pair[1][0] != _OTHER_FOLDERS]
+    likely = [pair for pair in compared if pair[1][0] != _OTHER_FOLDERS[0]]
     return next((group[0] for group in (likely, compared) if len(group) == 1), None)
 
 
@@ -314,23 +301,22 @@ def _difference(name: str, right: str) -> tuple[str, str]:
     given, wanted = PurePosixPath(name), PurePosixPath(right)
     own = tuple(part for part in given.parts[:-1] if part != "/")
     other = wanted.parts[:-1]
-    folders = ""
-    if own != other:
-        folders = _OTHER_FOLDERS
-        if other[len(other) - len(own) :] == own:
-            folders = "name-folder"
-        elif own[len(own) - len(other) :] == other:
-            folders = "name-path"
-    elif "/".join((*own, given.name)) != name:
-        folders = "name-path"  # "./x.jpg", "/x.jpg"
-    kinds, said = [folders], [_FOLDERS_SAID[folders]]
+    differences = []
+    if own == other:
+        if "/".join((*own, given.name)) != name:  # "./x.jpg", "/x.jpg"
+            differences.append(_MORE_FOLDERS)
+    elif other[len(other) - len(own) :] == own:
+        differences.append(_NO_FOLDER)
+    elif own[len(own) - len(other) :] == other:
+        differences.append(_MORE_FOLDERS)
+    else:
+        differences.append(_OTHER_FOLDERS)
     if given.suffix.lower() != wanted.suffix.lower():
-        kinds.append("name-ending")
-        said.append(f"ending in {given.suffix!r} instead of {wanted.suffix!r}")
-    elif given.name != wanted.name:
-        kinds.append("name-letters")
-        said.append("with other upper and lower case letters")
-    return next(filter(None, kinds), "name-letters"), " and ".join(filter(None, said))
+        said = f"ending in {given.suffix!r} instead of {wanted.suffix!r}"
+        differences.append(("name-ending", said))
+    elif given.name != wanted.name or not differences:
+        differences.append(("name-letters", "with other upper and lower case letters"))
+    return differences[0][0], " and ".join(said for _, said in differences)
 
 
 def _ends_alike(name: str, images: Iterable[str]) -> bool:
@@ -354,21 +340,15 @@ def _stem(name: str) -> str:
     return PurePosixPath(name).stem.lower()
 
 
-def _about(severity: Severity, kind: str, names: Sequence[str], noun: str, said: str) -> Finding:
-    """What is said of so many names, the first of them told."""
-    message = f"{plural(len(names), noun)} {said}: {some(names)}"
-    return Finding(severity, kind, message, names=tuple(names))
-
-
 def _empty(rows: Rows) -> list[Finding]:
     return [] if rows.named else [Finding("error", "empty", "there is no pose in the file")]
 
 
-def _not_checked(things: str, reference: Reference | None) -> Finding:
+def _not_checked(things: str, reference: Reference) -> list[Finding]:
     why = "no imported dataset to compare with; give one with --data"
-    if reference is not None:
+    if reference.folder:
         why = f"{reference.folder} does not have what they are compared with"
-    return Finding("note", "not-checked", f"the {things} are not checked: {why}")
+    return [Finding("note", "not-checked", f"the {things} are not checked: {why}")]
 
 
 def _in_file(name: str, findings: Iterable[Finding]) -> list[Finding]:

@@ -18,7 +18,7 @@ import numpy as np
 from markupsafe import Markup
 from pydantic import BaseModel
 
-from megloc_kapture.evaluation.provenance import package_versions
+from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.files import write_bytes, write_json
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -103,11 +103,13 @@ class DrawnQuery:
     anchor : where its line starts: the true pose; without truth, that of its first candidate.
     estimate : its pose; None: it has none.
     guessed : whether that is a fallback.
+    frame : the coordinate frame that it stands in.
     """
 
     anchor: RigidTransform | None
     estimate: RigidTransform | None
     guessed: bool = False
+    frame: str = ""
 
 
 def views_of(
@@ -122,30 +124,30 @@ def views_of(
     Without truth lines lead from the first candidate to the pose, where candidates were ranked,
     and there is no view without poses.
     """
-    drawn, of_query = {}, dict(frames)
+    drawn = []
     if isinstance(result, Evaluation):
         for query in result.queries:
             name, guessed = query.image, query.outcome == "fallback"
-            drawn[name] = DrawnQuery(result.truth[name], result.estimated.get(name), guessed)
-            of_query[name] = frames.get(result.image(name), query.condition)
-        return views_from_above(drawn, map_poses, of_query, prefix=prefix)
+            frame = frames.get(result.image(name), query.condition)
+            poses = result.truth[name], result.estimated.get(name)
+            drawn.append(DrawnQuery(*poses, guessed, frame))
+        return views_from_above(drawn, map_poses, frames, prefix=prefix)
     ranked = are_ranked(query.candidates for query in result.queries)
     for query in result.queries:
         name, guessed = query.image, query.outcome == "fallback"
         first = next((c for c in query.candidates if c in map_poses), "")
         anchor = map_poses.get(first) if ranked else None
-        drawn[name] = DrawnQuery(anchor, result.poses.get(name), guessed)
         # a pose stands in the frame of the images it was estimated from
-        if first in of_query:
-            of_query[name] = of_query[first]
-    if not any(one.estimate for one in drawn.values()):
+        frame = frames.get(first, frames.get(name, ""))
+        drawn.append(DrawnQuery(anchor, result.poses.get(name), guessed, frame))
+    if not any(one.estimate for one in drawn):
         return []
     unit = result.context.unit
-    return views_from_above(drawn, map_poses, of_query, prefix=prefix, with_truth=False, unit=unit)
+    return views_from_above(drawn, map_poses, frames, prefix=prefix, with_truth=False, unit=unit)
 
 
 def views_from_above(
-    drawn: Mapping[str, DrawnQuery],
+    drawn: Sequence[DrawnQuery],
     map_poses: Poses,
     frames: Mapping[str, str],
     *,
@@ -157,20 +159,17 @@ def views_from_above(
 
     Parameters
     ----------
-    frames : image -> frame, of queries and map images; queries of a frame without map images are
-        drawn on the page of all that have none.
+    drawn : those of a frame without map images are drawn on the page of all that have none.
+    frames : map image -> frame.
     prefix : of the figures' ids, different for each call on one HTML page.
     """
-    of_map = {image: frames.get(image, "") for image in map_poses}
-    known = set(of_map.values()) or {""}
-    of_query = {image: frames.get(image, "") for image in drawn}
-    of_query = {i: frame if frame in known else min(known) for i, frame in of_query.items()}
+    known = sorted({frames.get(image, "") for image in map_poses} or {""})
     blocks: list[Block] = []
-    for number, frame in enumerate(sorted(known)):
-        mine = [one for image, one in drawn.items() if of_query[image] == frame]
+    for number, frame in enumerate(known):
+        mine = [one for one in drawn if (one.frame if one.frame in known else known[0]) == frame]
         if not mine:
             continue
-        mapped = [pose for image, pose in map_poses.items() if of_map[image] == frame]
+        mapped = [pose for image, pose in map_poses.items() if frames.get(image, "") == frame]
         name = prefix if len(known) == 1 else f"{prefix}{number}"
         svg, num_outside = _draw(mine, mapped, name, with_truth=with_truth, unit=unit)
         if len(known) > 1 and frame:
@@ -207,10 +206,9 @@ def _draw(
     guessed = np.array([one.guessed for one in drawn if one.estimate is not None], dtype=bool)
     estimated = seen(estimates)
     outside = ~((estimated >= low) & (estimated <= high)).all(axis=1)
-    joined = [one for one in drawn if one.anchor is not None and one.estimate is not None]
-    starts = seen([one.anchor for one in joined if one.anchor is not None])
-    ends = seen([one.estimate for one in joined if one.estimate is not None])
-    lines = np.stack([starts, ends], axis=1)
+    joined = [(one.anchor, one.estimate) for one in drawn if one.anchor and one.estimate]
+    starts, ends = (seen([both[side] for both in joined]) for side in (0, 1))
+    lost = [one.anchor for one in drawn if one.anchor and not one.estimate]
     # in a crowd dots are smaller, and pixels
     number = len(map_poses) + len(drawn)
     shrink, raster = float(np.clip(np.sqrt(800 / max(number, 1)), 0.3, 1.0)), number > RASTER_ABOVE
@@ -226,7 +224,7 @@ def _draw(
             dots(seen(map_poses), "map cameras", 10, c="#b8c4d0")
         axes.add_collection(
             LineCollection(
-                list(lines),
+                list(np.stack([starts, ends], axis=1)),
                 colors=MISS if with_truth else MUTED,
                 linewidths=max(shrink, 0.5),
                 alpha=0.3 if raster else 0.8,
@@ -234,9 +232,7 @@ def _draw(
             )
         )
         if with_truth:
-            found = [one.anchor for one in drawn if one.anchor and one.estimate is not None]
-            lost = [one.anchor for one in drawn if one.anchor and one.estimate is None]
-            dots(seen(found), "truth", 26, facecolors="none", edgecolors="#009e73")
+            dots(starts, "truth", 26, facecolors="none", edgecolors="#009e73")
         dots(estimated[~guessed], "estimated", 7, c="#0072b2", linewidths=0)
         if guessed.any():
             dots(estimated[guessed], "fallback pose", 20, c=MISS, marker="x")

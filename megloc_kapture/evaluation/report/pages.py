@@ -27,7 +27,7 @@ from megloc_kapture.evaluation.report.gallery import (
     query_table,
 )
 from megloc_kapture.evaluation.report.map_view import views_of
-from megloc_kapture.evaluation.report.panels import depth_blocks, mask_blocks
+from megloc_kapture.evaluation.report.pictures import depth_blocks, mask_blocks
 from megloc_kapture.evaluation.report.queries import (
     StoredInliers,
     disputed_queries,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.metrics import PoseErrors, Threshold, within
+from megloc_kapture.evaluation.metrics import Threshold, within
 from megloc_kapture.evaluation.report.wording import format_degrees, format_metres
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
@@ -107,12 +107,9 @@ def shown_queries(result: Evaluation | ResultWithoutTruth) -> list[ShownQuery]:
 def _color(query: QueryResult, thresholds: Sequence[Threshold]) -> tuple[str, str]:
     """Colour of a query with a pose, and its meaning."""
     if thresholds:
-        error = PoseErrors(
-            (query.image,), np.array([query.position_m]), np.array([query.angle_deg])
-        )
         shown = thresholds[: len(_SCALE) - 1]
         for color, threshold in zip(_SCALE, shown, strict=False):
-            if within(error, threshold)[0]:
+            if threshold.holds(query.position_m, query.angle_deg):
                 return color, f"within {threshold}"
         return _SCALE[-1], f"beyond {shown[-1]}"
     if query.confidence is None:

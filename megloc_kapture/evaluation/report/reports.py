@@ -35,7 +35,7 @@ from megloc_kapture.evaluation.report.wording import (
     notes,
     retrieval_note,
 )
-from megloc_kapture.evaluation.results import Poses
+from megloc_kapture.evaluation.results import Poses, first_map_poses
 from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.evaluation.statistics import Comparison, MedianDifference, PairedTest, Seeds
 from megloc_kapture.evaluation.without_truth import CAUTION, ResultWithoutTruth, WithoutTruth
@@ -82,7 +82,7 @@ def report_of(
         results = reported.results if isinstance(reported, WithoutTruth) else reported.evaluations
     title = " and ".join(result.label for result in results)
     if map_poses is None:
-        map_poses = next((poses for own in results if (poses := own.context.map_poses())), {})
+        map_poses = first_map_poses(own.context for own in results)
     # the gallery and the view show the same inliers
     stored = StoredInliers(results[0].context)
     if isinstance(reported, Evaluation):

@@ -184,7 +184,7 @@ def test_plain_folders(imported: Path) -> None:
     found = read_reference(imported)
     queries = KaptureFolder(imported / "query").read().image_names()
     assert list(found.expected) == list(found.expected.values()) == queries
-    assert not found.listed and found.queries == set(queries)
+    assert not found.names and found.queries == set(queries)
     assert found.cameras is not None and len(found.cameras.images) == 7
     poses = KaptureFolder(imported / "mapping").read().poses()
     assert found.cameras.images == tuple(poses)
@@ -193,7 +193,7 @@ def test_plain_folders(imported: Path) -> None:
 
 
 def test_rules_and_lists(imported: Path) -> None:
-    first, second, *_ = sorted(read_reference(imported).queries or ())
+    first, second, *_ = sorted(read_reference(imported).queries)
     write_protocol(imported / "megloc", Protocol(pose_file_names="basename"))
     write_groups(imported / "megloc", {first: ImageGroup(scored=False)})
     found = read_reference(imported)
@@ -201,7 +201,7 @@ def test_rules_and_lists(imported: Path) -> None:
     write_names(imported / "megloc", {second: "b.png", first: "a.png"})
     found = read_reference(imported)
     assert list(found.expected.items()) == [("b.png", second), ("a.png", first)]
-    assert found.listed and found.queries is not None and len(found.queries) == 4
+    assert found.names and len(found.queries) == 4
 
 
 def test_parts_that_are_not_there(imported: Path, tmp_path: Path) -> None:
@@ -212,7 +212,7 @@ def test_parts_that_are_not_there(imported: Path, tmp_path: Path) -> None:
         read_reference(imported)
     write_protocol(imported / "megloc", Protocol(dataset="aachen"))
     found = read_reference(imported)
-    assert (found.protocol.dataset, found.queries, dict(found.expected)) == ("aachen", None, {})
+    assert (found.protocol.dataset, found.queries, found.expected) == ("aachen", set(), {})
     (tmp_path / "away").rename(imported / "mapping")
     (imported / "mapping" / "sensors" / "trajectories.txt").write_text("broken\n")
     with pytest.raises(DataError, match="trajectories.txt"):

@@ -87,7 +87,7 @@ def drive(number: int = 120) -> Drive:
         folder="import",
         protocol=Protocol(dataset="4seasons", pose_file="mlad"),
         queries=frozenset(queries),
-        relocalization=pairs,
+        pairs=tuple(pairs),
         cameras=MapCameras(images, quats, map_centers),
     )
     stamps = [f"{Path(p.reference).stem} {Path(p.query).stem}" for p in pairs]
@@ -126,7 +126,7 @@ def test_mistakes_of_mlad_files(check: Check) -> None:
     # between keyframes some metres apart a car hardly turns: what cannot be told apart is said
     (error,) = check(DRIVE.lines("centre")).findings
     assert "centre stands where the translation belongs" in error.message
-    few = replace(DRIVE.reference, relocalization=DRIVE.reference.relocalization[:12])
+    few = replace(DRIVE.reference, pairs=DRIVE.reference.pairs[:12])
     assert told(check(DRIVE.lines()[:12], few)) in ([], [("note", "undecided")])
     assert told(check(DRIVE.lines("wxyz")[:12], few)) == [("error", "wxyz")]
 
@@ -135,9 +135,8 @@ def test_absolute_poses_in_an_mlad_file(check: Check) -> None:
     cameras = DRIVE.reference.cameras
     quats = Rotation.from_quat(np.roll(cameras.quats, -1, axis=1))
     translations = -quats.apply(cameras.centers)
-    chosen = [
-        DRIVE.reference.cameras.images.index(p.reference) for p in DRIVE.reference.relocalization
-    ]
+    images = DRIVE.reference.cameras.images
+    chosen = [images.index(pair.reference) for pair in DRIVE.reference.pairs]
     rows = [
         f"{pair} {' '.join(repr(float(v)) for v in (*translations[i], *quats.as_quat()[i]))}\n"
         for pair, i in zip(DRIVE.stamps, chosen, strict=True)
@@ -168,8 +167,9 @@ def test_dummies_are_noted_and_prove_nothing(check: Check) -> None:
 
 
 def test_a_folder_of_mlad_files(tmp_path: Path, check: Check) -> None:
-    pairs = [replace(p, file="second.txt") for p in DRIVE.reference.relocalization[60:]]
-    both = replace(DRIVE.reference, relocalization=[*DRIVE.reference.relocalization[:60], *pairs])
+    asked = DRIVE.reference.pairs
+    second = [replace(pair, file="second.txt") for pair in asked[60:]]
+    both = replace(DRIVE.reference, pairs=(*asked[:60], *second))
     folder = tmp_path / "submission"
     folder.mkdir()
 
@@ -279,7 +279,7 @@ def match(
         expected=expected,
         queries=frozenset(queries or expected.values()),
         groups=groups or {},
-        listed=listed,
+        names={image: name for name, image in expected.items()} if listed else {},
     )
     return NamedRows(*match_names(named, reference, dataset))
 

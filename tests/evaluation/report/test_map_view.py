@@ -111,6 +111,6 @@ def test_one_frame_needs_no_name(world: Any) -> None:
 
 
 def test_without_truth_estimates_span_the_page_where_there_is_no_map() -> None:
-    placed = {f"{i}.jpg": DrawnQuery(None, moved(10.0 * i)) for i in range(4)}
+    placed = [DrawnQuery(None, moved(10.0 * i)) for i in range(4)]
     (view,) = views_from_above(placed, {}, {}, with_truth=False)
     assert "truth" not in re.sub(r"<[^>]*>", "", view.svg)

@@ -17,7 +17,7 @@ import pytest
 from megloc_kapture.evaluation.evaluate import results_without_truth
 from megloc_kapture.evaluation.protocols import benchmark_of
 from megloc_kapture.evaluation.report.document import Paragraph, Pictures
-from megloc_kapture.evaluation.report.panels import SegmentedClasses, class_colors, mask_blocks
+from megloc_kapture.evaluation.report.pictures import SegmentedClasses, class_colors, mask_blocks
 from megloc_kapture.evaluation.report.reports import render_report
 from megloc_kapture.evaluation.results import ResultContext, context_of
 from megloc_kapture.evaluation.scoring import evaluate_poses
