@@ -16,9 +16,8 @@ from images import Image, texture
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.aliked import Aliked
 from megloc_kapture.features.aslfeat import AslFeat
-from megloc_kapture.features.colmap_sift import ColmapSift
 from megloc_kapture.features.r2d2 import R2D2
-from megloc_kapture.features.rootsift import RootSift
+from megloc_kapture.features.rootsift import ColmapSift, RootSift
 from megloc_kapture.features.superpoint import SuperPoint
 from megloc_kapture.features.xfeat import XFeat
 from megloc_kapture.io.weights import MissingWeightsError

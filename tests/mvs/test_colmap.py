@@ -19,8 +19,7 @@ from megloc_kapture.io.colmap_mapping import (
     write_map,
     write_workspace,
 )
-from megloc_kapture.mvs.colmap import ColmapStereo
-from megloc_kapture.mvs.sweep import as_estimate, planes_of
+from megloc_kapture.mvs.sweep import ColmapStereo, as_estimate, planes_of
 
 POSES = [pose_at((x, 0.0, 0.0), 0.0, 0.0) for x in (-0.3, 0.0, 0.3)]
 NAMES = ["a/0.png", "a/1.png", "b/2.png"]

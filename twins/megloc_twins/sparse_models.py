@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.nvm import NvmModel
 from megloc_kapture.datasets.formats.sparse_points import SparsePoints
-from megloc_kapture.features.colmap_sift import ColmapSift
+from megloc_kapture.features.rootsift import ColmapSift
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.colmap import DatabaseFeatures, MapImage, triangulate, write_feature_database
 from megloc_kapture.io.colmap_cameras import px_from_cam
