@@ -8,6 +8,8 @@ detector (IJCV 2004) as VLFeat has it, descriptors stored as bytes.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -83,8 +85,8 @@ class RootSift:
         )
 
 
-def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Square root of L1-normalised SIFT, (N, 128) float32: Euclidean distance becomes Hellinger."""
+def root_sift(descriptors: NDArray[Any]) -> NDArray[np.float32]:
+    """Square root of L1-normalised SIFT, float32 (N, 128): Euclidean distance becomes Hellinger."""
     values = np.asarray(descriptors, dtype=np.float32)
     total = values.sum(axis=1, keepdims=True)
     return np.sqrt(values / np.maximum(total, np.finfo(np.float32).tiny))

@@ -20,6 +20,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import (
     bearing_rays,
     focal_px,
+    in_image,
     pixel_rays,
     px_from_cam,
     scaled_camera,
@@ -169,11 +170,11 @@ def _look_up(
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Colours uint8 (N, 3) of world points in a reference, and which it sees, bool (N,)."""
     image, mask, shrink = _at_resolution(source, focal)
-    in_image = source.cam_from_world.apply(points)
-    px = px_from_cam(source.camera, in_image)
+    in_camera = source.cam_from_world.apply(points)
+    px = px_from_cam(source.camera, in_camera)
     usable = np.asarray(np.isfinite(px).all(axis=1))
     if np.linalg.norm(source.image_from_depth.translation) > _SAME_CENTRE_M:
-        usable &= _not_hidden(source, in_image, px)
+        usable &= _not_hidden(source, in_camera, px)
     # OpenCV's coordinates have the centre of the first pixel at (0, 0)
     in_array = np.where(usable[:, None], px, -1e4) * shrink - 0.5
     x, y = np.ascontiguousarray(in_array.T, np.float32)
@@ -213,12 +214,12 @@ def _at_resolution(
     return image, mask, np.array(size) / (width, height)
 
 
-def _not_hidden(source: WarpSource, in_image: Floats, px: Floats) -> NDArray[np.bool_]:
+def _not_hidden(source: WarpSource, in_camera: Floats, px: Floats) -> NDArray[np.bool_]:
     """Mask of the points (N, 3) of the depth sensor beside an image that the image sees too."""
     own, _ = _seen_depth(source, source.camera, source.cam_from_world)
     inside = in_image(source.camera, px)
     columns, rows = np.floor(np.where(inside[:, None], px, 0)).astype(np.int64).T
-    return inside & (in_image[:, 2] <= (1.0 + _SAME_SURFACE) * own[rows, columns])
+    return inside & (in_camera[:, 2] <= (1.0 + _SAME_SURFACE) * own[rows, columns])
 
 
 def _cost(points: Floats, view_centre: Floats, source_centre: Floats) -> Floats:
