@@ -109,9 +109,17 @@ def backbone_of(keys: Collection[str], where: str) -> Backbone:
 
 
 def _activated(
-    channels: int, out: int, size: int, kind: type[nn.ReLU | nn.ReLU6] = nn.ReLU, **convolution: int
+    channels: int,
+    out: int,
+    size: int,
+    kind: type[nn.ReLU | nn.ReLU6] = nn.ReLU,
+    *,
+    stride: int = 1,
+    padding: int = 0,
+    dilation: int = 1,
+    groups: int = 1,
 ) -> nn.Sequential:
-    layer = nn.Conv2d(channels, out, size, bias=False, **convolution)
+    layer = nn.Conv2d(channels, out, size, stride, padding, dilation, groups, bias=False)
     return nn.Sequential(layer, nn.BatchNorm2d(out), kind(inplace=True))
 
 
@@ -122,7 +130,10 @@ class Pooling(nn.Sequential):
         super().__init__(nn.AdaptiveAvgPool2d(1), *_activated(channels, _WIDTH, 1))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return super().forward(x).expand(-1, -1, *x.shape[-2:])
+        pooled = x
+        for layer in self:
+            pooled = layer(pooled)
+        return pooled.expand(-1, -1, *x.shape[-2:])
 
 
 class AtrousPyramid(nn.Module):
