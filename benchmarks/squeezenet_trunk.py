@@ -18,8 +18,8 @@ import torch
 from retrieval_networks import SqueezeNet
 from safetensors.torch import save_file
 
+from megloc_kapture.nets.lpips import SqueezeNetFeatures
 from megloc_kapture.nets.runtime import load_strictly
-from megloc_kapture.nets.trunks import SqueezeNetFeatures
 
 _BGR_MEAN = (103.939, 116.779, 123.68)  # of Keras' networks, for values from 0 to 255
 # of torchvision, for RGB in [0, 1]

@@ -28,14 +28,14 @@ from scipy.io import savemat
 from tensorflow_checkpoints import write_saved_model, write_tensorflow_checkpoint
 from torch import nn
 
+from megloc_kapture.features.aslfeat import AslFeatNet
+from megloc_kapture.features.superpoint import SuperPointNet
 from megloc_kapture.io.weights import UNVERIFIED, registry
-from megloc_kapture.nets.aslfeat import AslFeatNet
-from megloc_kapture.nets.deeplabv3plus import DeepLabV3Plus
 from megloc_kapture.nets.delg import DelgNet
 from megloc_kapture.nets.global_descriptors import ApGemNet, VggNetVlad
 from megloc_kapture.nets.lpips import Lpips
 from megloc_kapture.nets.superglue import SuperGlueNet
-from megloc_kapture.nets.superpoint import SuperPointNet
+from megloc_kapture.preprocessing.deeplab import DeepLabV3Plus
 
 _PCA_MODULE = "sklearn.decomposition.pca"
 _MEAN_RGB = (123.68, 116.779, 103.939)

@@ -25,9 +25,9 @@ from kornia.feature.aliked.deform_conv2d import deform_conv2d as kornia_deform_c
 from timing import table
 from torch.nn import functional
 
+from megloc_kapture.features.aliked import AlikedNet, aliked_from
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.weights import find_weights, read_weights
-from megloc_kapture.nets.aliked import AlikedNet, aliked_from
 from megloc_kapture.nets.runtime import image_tensor, inference
 from megloc_kapture.nets.score_maps import deform_conv2d
 
@@ -58,7 +58,7 @@ def convolutions(sizes: Sequence[tuple[int, int]], rounds: int) -> list[tuple[st
         mask = torch.rand(1, 9, height, width, generator=generator)
         weight = torch.randn(128, 128, 3, 3, generator=generator) / 34  # outputs of about one
         plain = partial(functional.conv2d, last, weight, padding=1)
-        ours = partial(deform_conv2d, last, offset, weight, None, mask, padding=1)
+        ours = partial(deform_conv2d, last, offset, weight, None, mask)
         theirs = partial(kornia_deform_conv2d, x, offset, weight, None, 1, 1, 1, mask)
         with inference(CPU):
             difference = float((ours() - theirs()).abs().max())

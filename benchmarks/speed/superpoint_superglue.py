@@ -29,12 +29,16 @@ import torch
 from timing import table
 from torch.nn import functional
 
-from megloc_kapture.features.superpoint import SuperPoint, SuperPointOptions
+from megloc_kapture.features.superpoint import (
+    SuperPoint,
+    SuperPointNet,
+    SuperPointOptions,
+    sample_descriptors,
+)
 from megloc_kapture.matching.superglue import SuperGlue, SuperGlueOptions
 from megloc_kapture.nets.runtime import inference
-from megloc_kapture.nets.score_maps import select_pixels, suppress_non_maxima
+from megloc_kapture.nets.score_maps import pixel_scores, select_pixels, suppress_non_maxima
 from megloc_kapture.nets.superglue import ImageKeypoints, SuperGlueNet, mutual_matches
-from megloc_kapture.nets.superpoint import SuperPointNet, pixel_scores, sample_descriptors
 from megloc_kapture.values import Device, ImageFeatures
 
 WIDTH, HEIGHT = 1600, 1200

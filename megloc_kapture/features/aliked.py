@@ -1,18 +1,31 @@
-"""ALIKED local features (Zhao et al., IEEE TIM 2023), with the official checkpoints."""
+"""ALIKED local features (Zhao et al., IEEE TIM 2023), with the keys of the official checkpoints.
+
+The network is run as it is defined, but nothing of its 128 channels is ever made in the image's own
+resolution: the score head's first layer is a matrix product with each pixel, so it is applied to
+every level before that is enlarged, and the descriptor head reads features where it looks for them.
+Batch normalisation is folded into the convolutions, so the module is for inference only.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
+from torch import nn
+from torch.nn import functional
 
+from megloc_kapture.errors import DataError
 from megloc_kapture.features.network import Images, LocalNetwork, LocalNetworkOptions, Masks
-from megloc_kapture.nets.aliked import AlikedMaps, AlikedNet, aliked_from
-from megloc_kapture.nets.runtime import image_tensor, inference
+from megloc_kapture.nets.runtime import image_tensor, inference, load_strictly
 from megloc_kapture.nets.score_maps import (
+    corners_around,
+    deform_conv2d,
+    pixel_table,
     read_bilinear,
     select_pixels,
     soft_argmax,
@@ -21,6 +34,10 @@ from megloc_kapture.nets.score_maps import (
 from megloc_kapture.values import LocalFeatures
 
 _TEMPERATURE = 0.1  # of the sub-pixel position, the one the network was trained with
+_MULTIPLE = 32  # image sides are padded to multiples of it, the coarsest level's stride
+_STRIP_ROWS = 2  # of the image, at once in the score head's first layer: what a cache holds
+_PATCH = 3  # side of the square of pixels that says where to look, in pixels
+_VALUES_AT_ONCE = {"cpu": 1 << 23, "cuda": 1 << 28}
 
 
 class AlikedOptions(LocalNetworkOptions):
@@ -77,6 +94,243 @@ class Aliked(LocalNetwork[AlikedOptions]):
             np.column_stack([xy_px, score]),
             score,
             lambda rows: net.desc_head(maps, xy[rows.to(xy.device)]),
-            scores.shape,
             mask,
         )
+
+
+class AlikedNet(nn.Module):
+    """Image to score map and features; the keys are those of ``aliked-*.pth``.
+
+    ``channels``: of the four blocks; the last one is that of the descriptors; ``positions``: number
+    of positions that a descriptor is gathered from.
+    """
+
+    def __init__(self, channels: tuple[int, int, int, int], positions: int) -> None:
+        super().__init__()
+        first, *others = channels
+        self.descriptor_size = channels[-1]
+        self.block1 = _Block(3, first, deformable=False, residual=False)
+        self.block2 = _Block(first, others[0], deformable=False)
+        self.block3 = _Block(others[0], others[1], deformable=True)
+        self.block4 = _Block(others[1], others[2], deformable=True)
+        quarter = self.descriptor_size // 4
+        self.conv1 = nn.Conv2d(first, quarter, 1, bias=False)
+        self.conv2 = nn.Conv2d(others[0], quarter, 1, bias=False)
+        self.conv3 = nn.Conv2d(others[1], quarter, 1, bias=False)
+        self.conv4 = nn.Conv2d(others[2], quarter, 1, bias=False)
+        self.score_head = nn.Sequential(
+            nn.Conv2d(self.descriptor_size, 8, 1, bias=False),
+            nn.SELU(inplace=True),
+            nn.Conv2d(8, 4, 3, padding=1, bias=False),
+            nn.SELU(inplace=True),
+            nn.Conv2d(4, 4, 3, padding=1, bias=False),
+            nn.SELU(inplace=True),
+            nn.Conv2d(4, 1, 3, padding=1, bias=False),
+        )
+        self.desc_head = DescriptorHead(self.descriptor_size, positions)
+
+    def forward(self, images: torch.Tensor) -> list[AlikedMaps]:
+        """The maps of RGB images, (B, 3, H, W) in [0, 1]."""
+        height, width = images.shape[2:]
+        extra_y, extra_x = -height % _MULTIPLE, -width % _MULTIPLE
+        top, left = extra_y // 2, extra_x // 2
+        margins = (left, extra_x - left, top, extra_y - top)
+        padded = functional.pad(images, margins, mode="replicate")
+        level1 = self.block1(padded.contiguous(memory_format=torch.channels_last))
+        level2 = self.block2(functional.avg_pool2d(level1, 2))
+        level3 = self.block3(functional.avg_pool2d(level2, 4))
+        level4 = self.block4(functional.avg_pool2d(level3, 4))
+        coarse = [
+            functional.selu(tap(level), inplace=True)
+            for tap, level in ((self.conv2, level2), (self.conv3, level3), (self.conv4, level4))
+        ]
+        found = []
+        for k in range(len(images)):
+            own = [level[k : k + 1] for level in coarse]
+            fine = _level(level1[k : k + 1])
+            scores = torch.sigmoid(self._score_logits(fine, own)[0, 0].float())
+            scores = scores[top : top + height, left : left + width]
+            found.append(AlikedMaps(self, scores, (top, left), fine, [_level(one) for one in own]))
+        return found
+
+    def _score_logits(self, fine: _Level, coarse: list[torch.Tensor]) -> torch.Tensor:
+        # the first layer's weights, apart for the channels of each level
+        first, *others = (
+            weight[:, :, 0, 0].T
+            for weight in self.get_parameter("score_head.0.weight").chunk(4, dim=1)
+        )
+        sums: torch.Tensor | None = None
+        for level, weight in zip(coarse, others, strict=True):
+            reduced = (level.permute(0, 2, 3, 1) @ weight).permute(0, 3, 1, 2)
+            enlarged = functional.interpolate(
+                reduced.float(), fine.size, mode="bilinear", align_corners=True
+            )
+            sums = enlarged if sums is None else sums.add_(enlarged)
+        assert sums is not None
+        by_pixel = sums.permute(0, 2, 3, 1).reshape(len(fine.table), -1)
+        at_once = _STRIP_ROWS * fine.size[1]
+        for strip, into in zip(
+            torch.split(fine.table, at_once), torch.split(by_pixel, at_once), strict=True
+        ):
+            into += self.fine_tap(strip) @ first
+        return self.score_head[1:](by_pixel.view(1, *fine.size, -1).permute(0, 3, 1, 2))
+
+    def fine_tap(self, level1: torch.Tensor) -> torch.Tensor:
+        """Features (N, D / 4) of the finest level for rows of the first block's, (N, C)."""
+        return functional.selu(level1 @ self.conv1.weight[:, :, 0, 0].T, inplace=True)
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """Features of one level: (h w, channels), and (h, w)."""
+
+    table: torch.Tensor
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class AlikedMaps:
+    """The maps of one image: scores float32 (H, W) in (0, 1), and features, read at pixels."""
+
+    _net: AlikedNet
+    scores: torch.Tensor
+    _origin: tuple[int, int]  # row and column of the image's first pixel in the padded levels
+    _fine: _Level  # before its 1x1 convolution, which is cheap where only some pixels are asked for
+    _coarse: list[_Level]
+
+    def features_at(self, rows: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
+        """Unit features (N, D) of pixels of the image, int64 (N,) rows and columns."""
+        row, column = rows + self._origin[0], columns + self._origin[1]
+        height, width = self._fine.size
+        parts = [self._net.fine_tap(self._fine.table[row * width + column])]
+        for level in self._coarse:
+            h, w = level.size
+            # corners aligned: the first and last pixels of both maps lie on one another
+            y = row.to(level.table.dtype) * ((h - 1) / (height - 1))
+            x = column.to(level.table.dtype) * ((w - 1) / (width - 1))
+            parts.append(read_bilinear(level.table, y.clamp(max=h - 1), x.clamp(max=w - 1), (h, w)))
+        return functional.normalize(torch.cat(parts, dim=1), dim=1)
+
+
+def _level(features: torch.Tensor) -> _Level:
+    return _Level(pixel_table(features[0]), (features.shape[2], features.shape[3]))
+
+
+class _Block(nn.Module):
+    """Two convolutions, each batch-normalised, with SELU; residual but for the first block."""
+
+    def __init__(
+        self, inputs: int, outputs: int, *, deformable: bool, residual: bool = True
+    ) -> None:
+        super().__init__()
+        kind = _DeformableConv if deformable else _Conv
+        self.conv1 = kind(inputs, outputs)
+        self.bn1 = nn.BatchNorm2d(outputs)
+        self.conv2 = kind(outputs, outputs)
+        self.bn2 = nn.BatchNorm2d(outputs)
+        self.downsample = nn.Conv2d(inputs, outputs, 1) if residual else None
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        inner = functional.selu(self.conv1.normalised(x, self.bn1), inplace=True)
+        result = self.conv2.normalised(inner, self.bn2)
+        if self.downsample is not None:
+            result = result + self.downsample(x)
+        return functional.selu(result, inplace=True)
+
+
+class _Conv(nn.Conv2d):
+    """3x3 convolution without bias."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(inputs, outputs, 3, padding=1, bias=False)
+
+    def normalised(self, x: torch.Tensor, norm: nn.BatchNorm2d) -> torch.Tensor:
+        """The convolution and the batch normalisation after it, in one."""
+        return functional.conv2d(x, *_folded(self.weight, norm), padding=1)
+
+
+class _DeformableConv(nn.Module):
+    """3x3 deformable convolution without amplitudes."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.offset_conv = nn.Conv2d(inputs, 18, 3, padding=1)
+        self.regular_conv = nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
+
+    def normalised(self, x: torch.Tensor, norm: nn.BatchNorm2d) -> torch.Tensor:
+        """The convolution and the batch normalisation after it, in one."""
+        limit = max(x.shape[2:]) / 4
+        offset = self.offset_conv(x).clamp(-limit, limit)
+        return deform_conv2d(x, offset, *_folded(self.regular_conv.weight, norm))
+
+
+def _folded(weight: torch.Tensor, norm: nn.BatchNorm2d) -> tuple[torch.Tensor, torch.Tensor]:
+    assert norm.running_mean is not None and norm.running_var is not None
+    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+    return weight * scale[:, None, None, None], norm.bias - norm.running_mean * scale
+
+
+def aliked_from(tensors: Mapping[str, torch.Tensor], where: str) -> AlikedNet:
+    """The network of a checkpoint, its variant read from the shapes; in eval mode.
+
+    Raises DataError that names keys that are missing, unexpected or of another shape.
+    """
+    try:
+        first = tensors["block1.conv1.weight"].shape[0]
+        second, third, fourth = (tensors[f"conv{level}.weight"].shape[1] for level in (2, 3, 4))
+        positions = tensors["desc_head.agg_weights"].shape[0]
+    except (KeyError, IndexError) as error:
+        raise DataError(f"this file is no ALIKED checkpoint: {error}", path=where) from error
+    net = AlikedNet((first, second, third, fourth), positions)
+    return load_strictly(net, tensors, where).eval()
+
+
+class DescriptorHead(nn.Module):
+    """Features around a keypoint to the positions that its descriptor is gathered from."""
+
+    def __init__(self, size: int, positions: int) -> None:
+        super().__init__()
+        self.positions = positions
+        self.agg_weights = nn.Parameter(torch.zeros(positions, size, size))
+        self.offset_conv = nn.Sequential(
+            nn.Conv2d(size, 2 * positions, _PATCH),
+            nn.SELU(inplace=True),
+            nn.Conv2d(2 * positions, 2 * positions, 1),
+        )
+        self.sf_conv = nn.Conv2d(size, size, 1, bias=False)
+
+    def forward(self, maps: AlikedMaps, xy: torch.Tensor) -> torch.Tensor:
+        """Descriptors of unit length, float32 (N, D), at xy (N, 2); a pixel's centre is an integer.
+
+        The map has at least 4 pixels a side.
+        """
+        size = self.agg_weights.shape[1]
+        at_once = _VALUES_AT_ONCE[xy.device.type] // (4 * self.positions * size)
+        parts = [self._describe(maps, part) for part in torch.split(xy, max(at_once, 1))]
+        return torch.cat(parts)
+
+    def _describe(self, maps: AlikedMaps, xy: torch.Tensor) -> torch.Tensor:
+        height, width = maps.scores.shape
+        number, size = len(xy), self.agg_weights.shape[1]
+        # the patch is centred on the pixel the keypoint lies in. As published, it keeps off the
+        # last row and column
+        left = (xy[:, 0].long() - 1).clamp(0, width - 1 - _PATCH)
+        top = (xy[:, 1].long() - 1).clamp(0, height - 1 - _PATCH)
+        side = torch.arange(_PATCH, device=xy.device)
+        rows = (top[:, None, None] + side[:, None]).expand(-1, -1, _PATCH)
+        columns = (left[:, None, None] + side).expand(-1, _PATCH, -1)
+        patch = maps.features_at(rows.reshape(-1), columns.reshape(-1))
+        patch = patch.view(number, _PATCH, _PATCH, size).permute(0, 3, 1, 2)
+        limit = max(height, width) / 4
+        offsets = (
+            self.offset_conv(patch).float().clamp(-limit, limit).view(number, 2, self.positions)
+        )
+        x, y = (xy[:, :, None] + offsets).unbind(1)
+        indices, weights = corners_around(y, x, (height, width))
+        corners = maps.features_at(
+            indices.reshape(-1).div(width, rounding_mode="floor"), indices.reshape(-1) % width
+        )
+        read = torch.einsum("nkc,nk->nc", corners.view(-1, 4, size), weights)
+        mixed = functional.selu(read @ self.sf_conv.weight[:, :, 0, 0].T)
+        gathered = mixed.view(number, self.positions * size) @ self.agg_weights.view(-1, size)
+        return functional.normalize(gathered.float(), dim=1)

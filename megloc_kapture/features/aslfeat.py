@@ -1,27 +1,45 @@
-"""ASLFeat local features (Luo et al., CVPR 2020), with the official checkpoint."""
+"""ASLFeat local features (Luo et al., CVPR 2020), with the variables of the official checkpoint.
+
+The published checkpoint is TensorFlow's. The module's keys are its variables' names with dots for
+slashes, and torch's words for the last part:
+
+    conv0/kernel                            conv0.weight, (in, out last) -> (out, in first)
+    conv0/bn/moving_mean, moving_variance   conv0.bn.running_mean, running_var
+    deform_param/conv6/offset/kernel, bias  deform_param.conv6.offset.weight, bias
+    tower/conv1/instance_max                tower.conv1.instance_max
+
+Batch normalisation is folded into the convolutions, so the module is for inference only.
+"""
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
+from torch import nn
 from torch.nn import functional
 
-from megloc_kapture.features.network import Images, Level, LocalNetwork, LocalNetworkOptions, Masks
-from megloc_kapture.nets.aslfeat import (
-    DESCRIPTOR_SIZE,
-    STRIDE,
-    AslFeatMaps,
-    aslfeat_from,
-    on_no_edge,
+from megloc_kapture.errors import DataError
+from megloc_kapture.features.network import (
+    Images,
+    Level,
+    LocalNetwork,
+    LocalNetworkOptions,
+    Masks,
+    in_image_px,
 )
-from megloc_kapture.nets.runtime import inference
+from megloc_kapture.nets.runtime import inference, load_strictly
 from megloc_kapture.nets.score_maps import (
+    conv_same,
+    deform_conv2d,
+    on_no_edge,
     parabola_peak,
     pixel_table,
     read_bilinear,
@@ -30,6 +48,19 @@ from megloc_kapture.nets.score_maps import (
 )
 from megloc_kapture.values import LocalFeatures
 
+DESCRIPTOR_SIZE = 128
+STRIDE = 4  # of the features; their pixel (i, j) is read at the image's (4 i, 4 j)
+# layers whose raw outputs are scored: dilation of the neighbourhood, and weight in the sum
+_SCORED = {"conv1": (3, 1 / 6), "conv3": (2, 2 / 6), "conv6": (1, 3 / 6)}
+_DEFORMABLE = ("conv6_0", "conv6_1", "conv6")
+_NORM_EPSILON = 1e-5
+# what optimisers keep beside a variable, under its name, and beside all of them
+_LEFT_OUT = (
+    *("Adam", "Adam_1", "Momentum", "RMSProp", "RMSProp_1", "ExponentialMovingAverage"),
+    *("global_step", "beta1_power", "beta2_power", "learning_rate"),
+)
+_TORCH_WORDS = {"kernel": "weight", "moving_mean": "running_mean", "moving_variance": "running_var"}
+_VALUES_AT_ONCE = {"cpu": 1 << 19, "cuda": 1 << 27}
 _BORDER_PX = 5
 _NOTHING = (np.zeros((0, 3), np.float32), np.zeros(0, np.float32), torch.zeros(0, DESCRIPTOR_SIZE))
 # the image pyramid of the authors
@@ -61,31 +92,26 @@ class AslFeat(LocalNetwork[AslFeatOptions]):
     Options = AslFeatOptions
 
     def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
-        size = images[0].shape[0], images[0].shape[1]
         grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in images]
         # without contrast the network would see nothing but the zeros around the image
         usable = [k for k, gray in enumerate(grays) if gray.min() != gray.max()]
         of_image = [_scales(grays[k]) if self.options.multi_scale else [grays[k]] for k in usable]
         found: list[list[Level]] = [[] for _ in images]
         for levels in zip(*of_image, strict=True):
-            if min(levels[0].shape) > 2 * _BORDER_PX:
-                for k, own in zip(usable, self._extract_level(levels, size), strict=True):
-                    found[k].append(own)
+            if min(levels[0].shape) <= 2 * _BORDER_PX:
+                continue
+            net, device = self.network(aslfeat_from)
+            stacked = torch.from_numpy(np.stack(levels))[:, None].to(device)
+            with inference(device, self.options.half_precision):
+                maps = net(stacked)
+            for k, own in zip(usable, maps, strict=True):
+                found[k].append(self._selected(own, images[0].shape))
         return [
-            self._best_of_levels(each or [_NOTHING], size, mask)
+            self._best_of_levels(each or [_NOTHING], mask)
             for each, mask in zip(found, masks, strict=True)
         ]
 
-    def _extract_level(
-        self, grays: Sequence[NDArray[np.float32]], full_size: tuple[int, int]
-    ) -> list[Level]:
-        """Keypoints of gray images of one size."""
-        net, device = self.network(aslfeat_from)
-        with inference(device, self.options.half_precision):
-            found = net(torch.stack([torch.from_numpy(gray) for gray in grays])[:, None].to(device))
-        return [self._selected(maps, full_size) for maps in found]
-
-    def _selected(self, maps: AslFeatMaps, full_size: tuple[int, int]) -> Level:
+    def _selected(self, maps: AslFeatMaps, full_size: Sequence[int]) -> Level:
         options = self.options
         with inference(maps.scores.device):
             candidates = select_pixels(
@@ -101,11 +127,7 @@ class AslFeat(LocalNetwork[AslFeatOptions]):
             # the border keeps all of them inside the features
             read = read_bilinear(pixel_table(maps.features), y, x, coarse)
             descriptors = functional.normalize(read, dim=1)
-        # the network puts the centre of the first pixel at (0, 0), COLMAP at (0.5, 0.5), where
-        # the pixels of a resized image are those of the whole one times a factor
-        height, width = maps.scores.shape
-        ratio = np.array([full_size[1] / width, full_size[0] / height])
-        xy_px = ((xy.cpu().numpy() + 0.5) * ratio).astype(np.float32)
+        xy_px = in_image_px(xy.cpu().numpy(), maps.scores.shape, full_size)
         values = scores.cpu().numpy()
         return np.column_stack([xy_px, values]), values, descriptors
 
@@ -122,3 +144,238 @@ def _scales(gray: NDArray[np.float32]) -> list[NDArray[np.float32]]:
         resized = cv2.resize(blurred, (width, height))
         levels.append(np.asarray(resized, dtype=np.float32))
     return levels
+
+
+@dataclass(frozen=True, eq=False)
+class AslFeatMaps:
+    """The maps of one image.
+
+    ``scores`` float32 (H, W) are of its size and not negative; ``features`` (128, ceil(ceil(H / 2)
+    / 2), the same of W) are the descriptors before normalisation.
+    """
+
+    scores: torch.Tensor
+    features: torch.Tensor
+
+
+class AslFeatNet(nn.Module):
+    """Gray image to score map and features; 821,745 weights in kernels and biases."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv0 = _Conv(1, 32)
+        self.conv1 = _Conv(32, 32)
+        self.conv2 = _Conv(32, 64, stride=2)
+        self.conv3 = _Conv(64, 64)
+        self.conv4 = _Conv(64, 128, stride=2)
+        self.conv5 = _Conv(128, 128)
+        self.conv6_0 = _Conv(128, 128)
+        self.conv6_1 = _Conv(128, 128)
+        self.conv6 = _Conv(128, 128, normalised=False)
+        self.deform_param = nn.ModuleDict({name: _Deformation(128) for name in _DEFORMABLE})
+        self.tower = nn.ModuleDict({name: _Scale() for name in _SCORED})
+
+    def forward(self, images: torch.Tensor) -> list[AslFeatMaps]:
+        """The maps of gray images, (B, 1, H, W) in 0 to 255, of at least 11 pixels a side."""
+        height, width = images.shape[2:]
+        normalised = []
+        for image in torch.split(images, 1):
+            variance, mean = torch.var_mean(image, correction=0)
+            normalised.append((image - mean) * torch.rsqrt(variance + 1e-5))
+        x = torch.cat(normalised).contiguous(memory_format=torch.channels_last)
+        scores = images.new_zeros(len(images), height, width)
+        x = self.conv0.normalised(x)
+        for scored, strided in (("conv1", self.conv2), ("conv3", self.conv4)):
+            conv: _Conv = getattr(self, scored)
+            x = conv(x)
+            assert conv.bn is not None
+            scores += self._scores(scored, x, (height, width))
+            x = strided.normalised(conv.bn.rectified_(x))
+        x = self.conv5.normalised(x)
+        for name in _DEFORMABLE:
+            x = self._deformable(name, x)
+        scores = scores + self._scores("conv6", x, (height, width))
+        return [AslFeatMaps(*own) for own in zip(scores, x, strict=True)]
+
+    def _deformable(self, name: str, x: torch.Tensor) -> torch.Tensor:
+        conv: _Conv = getattr(self, name)
+        offset, amplitude = self.deform_param[name](x)
+        if conv.bn is None:
+            return deform_conv2d(x, offset, conv.weight, None, amplitude)
+        weight, bias = conv.bn.folded_into(conv.weight)
+        return deform_conv2d(x, offset, weight, bias, amplitude).relu_()
+
+    def _scores(self, name: str, features: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+        dilation, weight = _SCORED[name]
+        scale = self.get_buffer(f"tower.{name}.instance_max")
+        peaky = (peakiness(own, dilation, scale) for own in features)
+        return torch.stack([weight * resize_as_tensorflow_1(own, size) for own in peaky])
+
+
+class _Norm(nn.Module):
+    """Batch normalisation without scale and offset, as it is used after the training."""
+
+    running_mean: torch.Tensor
+    running_var: torch.Tensor
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.register_buffer("running_mean", torch.zeros(channels))
+        self.register_buffer("running_var", torch.ones(channels))
+
+    def folded_into(self, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Weight and bias of a convolution that normalises what one of this weight gives."""
+        scale, shift = self._line()
+        return weight * scale[:, None, None, None], shift
+
+    def rectified_(self, x: torch.Tensor) -> torch.Tensor:
+        """Normalise and rectify (B, C, H, W) in its own memory."""
+        scale, shift = self._line()
+        return x.mul_(scale[:, None, None]).add_(shift[:, None, None]).relu_()
+
+    def _line(self) -> tuple[torch.Tensor, torch.Tensor]:
+        scale = torch.rsqrt(self.running_var + _NORM_EPSILON)
+        return scale, -self.running_mean * scale
+
+
+class _Conv(nn.Module):
+    """3x3 convolution without bias, padded as TensorFlow's SAME, and the normalisation after it."""
+
+    def __init__(
+        self, inputs: int, outputs: int, *, stride: int = 1, normalised: bool = True
+    ) -> None:
+        super().__init__()
+        self.stride = stride
+        self.weight = nn.Parameter(torch.zeros(outputs, inputs, 3, 3))
+        self.bn = _Norm(outputs) if normalised else None
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """The convolution alone."""
+        return conv_same(x, self.weight, None, self.stride)
+
+    def normalised(self, x: torch.Tensor) -> torch.Tensor:
+        """Convolution, normalisation and rectification in one."""
+        assert self.bn is not None
+        return conv_same(x, *self.bn.folded_into(self.weight), self.stride).relu_()
+
+
+class _Deformation(nn.Module):
+    """Offsets and amplitudes of a deformable convolution's nine readings."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.offset = nn.Conv2d(channels, 18, 3, padding=1)
+        self.amplitude = nn.Conv2d(channels, 9, 3, padding=1)
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.offset(x), torch.sigmoid(self.amplitude(x))
+
+
+class _Scale(nn.Module):
+    """The value that a layer's outputs are divided by before they are scored."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("instance_max", torch.ones(()))
+
+
+def aslfeat_state(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """A state dict for :class:`AslFeatNet` of a TensorFlow checkpoint's variables, name -> values.
+
+    Names and layouts are changed as the module's text says, what an optimiser keeps is left out;
+    a name without slashes stays as it is, so that a state dict of the module passes unchanged.
+    """
+    left_out = set(optimiser_variables(tensors))
+    state = {}
+    for name, values in tensors.items():
+        if name in left_out:
+            continue
+        scope, _, word = name.rpartition("/")
+        if word == "kernel" and values.ndim == 4:
+            values = values.permute(3, 2, 0, 1).contiguous()
+        key = f"{scope}/{_TORCH_WORDS.get(word, word)}" if scope else name
+        state[key.replace("/", ".")] = values
+    return state
+
+
+def optimiser_variables(names: Iterable[str]) -> list[str]:
+    """Those of a checkpoint's variables that only its training needs, sorted."""
+    return sorted(name for name in names if name.rpartition("/")[2] in _LEFT_OUT)
+
+
+def aslfeat_from(tensors: Mapping[str, torch.Tensor], where: str) -> AslFeatNet:
+    """The network of a checkpoint, in eval mode; a note in the log names what was left out.
+
+    ``tensors`` are as of :func:`aslfeat_state`. Raises DataError for variables that are missing,
+    unexpected or of another shape, and for a scale that is not positive.
+    """
+    if left_out := optimiser_variables(tensors):
+        logging.getLogger(__name__).info(
+            "%s: left out, needed in training only: %s", where, ", ".join(left_out)
+        )
+    net = AslFeatNet()
+    load_strictly(net, aslfeat_state(tensors), where)
+    for name in _SCORED:
+        scale = float(net.get_buffer(f"tower.{name}.instance_max"))
+        if not 0 < scale < float("inf"):
+            raise DataError(f"tower/{name}/instance_max is {scale}, not positive", path=where)
+    return net.eval()
+
+
+def peakiness(features: torch.Tensor, dilation: int, scale: torch.Tensor) -> torch.Tensor:
+    """Peakiness of each pixel in space and among channels, of its best channel (eq. 6 to 8).
+
+    max over channels of softplus(y - its mean over a 3x3 neighbourhood) times
+    softplus(y - its mean over the channels), where y = features / scale. Returns (H, W), at least
+    float32.
+
+    Parameters
+    ----------
+    features : (C, H, W), both sides longer than the dilation; fastest in channels-last memory.
+    dilation : distance of the neighbours in pixels; the map is reflected at its border.
+    scale : ().
+    """
+    channels, height, width = features.shape
+    pixels = features.permute(1, 2, 0)
+    columns = _reflected(-dilation, width + dilation, width, features.device)
+    at_once = max(_VALUES_AT_ONCE[features.device.type] // (width * channels), 1)
+    strips = []
+    for start in range(0, height, at_once):
+        stop = min(start + at_once, height)
+        rows = _reflected(start - dilation, stop + dilation, height, features.device)
+        padded = pixels.index_select(0, rows).index_select(1, columns)
+        padded = padded.to(torch.promote_types(padded.dtype, torch.float32)) / scale
+        step, number = dilation, stop - start
+        inner = padded[step : step + number, step : step + width]
+        three = padded[:number] + padded[step : step + number] + padded[2 * step :]
+        nine = three[:, :width] + three[:, step : step + width] + three[:, 2 * step :]
+        in_space = functional.softplus(inner - nine / 9)
+        among_channels = functional.softplus(inner - inner.mean(dim=2, keepdim=True))
+        strips.append((in_space * among_channels).amax(dim=2))
+    return torch.cat(strips)
+
+
+def _reflected(start: int, stop: int, size: int, device: torch.device) -> torch.Tensor:
+    """Indices from start to stop of a row of some size that is mirrored at its end pixels."""
+    index = torch.arange(start, stop, device=device).abs()
+    return size - 1 - (size - 1 - index).abs()
+
+
+def resize_as_tensorflow_1(values: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    """Resize (h, w) to (H, W) bilinearly with TensorFlow 1's sampling.
+
+    Pixel i of the result lies at i * (input / output) of the input, with no half pixels; what would
+    lie beyond the last row or column is that one.
+    """
+    for axis, wanted in enumerate(size):
+        given = values.shape[axis]
+        if given == wanted:
+            continue
+        index = torch.arange(wanted, device=values.device, dtype=values.dtype)
+        position = index * (given / wanted)
+        lower = position.long().clamp(max=given - 1)
+        upper = (lower + 1).clamp(max=given - 1)
+        share = (position - lower).unsqueeze(1 - axis)
+        first = values.index_select(axis, lower)
+        values = first + (values.index_select(axis, upper) - first) * share
+    return values

@@ -98,3 +98,14 @@ def _scaled(features: LocalFeatures, ratio: NDArray[np.float32]) -> LocalFeature
     keypoints_px = features.keypoints_px.copy()
     keypoints_px[:, :2] *= ratio
     return replace(features, keypoints_px=keypoints_px)
+
+
+def on_mask(mask: NDArray[np.bool_], points_px: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
+    """Points (N, 2) that lie on True pixels of a mask (H, W); beyond it the nearest pixel counts.
+
+    The first pixel's centre is (0.5, 0.5). Rounding may put a keypoint of a resized image onto the
+    image's last edge.
+    """
+    last = np.array(mask.shape[::-1]) - 1
+    column, row = np.clip(points_px.astype(np.int64), 0, last).T
+    return mask[row, column]

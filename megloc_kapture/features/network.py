@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.features.image_bound import BoundedOptions
+from megloc_kapture.features.image_bound import BoundedOptions, on_mask
 from megloc_kapture.nets.runtime import Checkpointed, NetworkOptions
-from megloc_kapture.nets.score_maps import select_keypoints
 from megloc_kapture.values import LocalFeatures
 
 Images = Sequence[NDArray[np.uint8]]
@@ -61,28 +60,38 @@ class LocalNetwork(Checkpointed[LocalOptions], ABC):
         table: NDArray[np.float32],
         scores: NDArray[np.float32],
         describe: Callable[[torch.Tensor], torch.Tensor],
-        size: tuple[int, ...],
         mask: NDArray[np.bool_] | None,
     ) -> LocalFeatures:
         """The best of an image's keypoints (N, 3): x and y in its pixels, and a third column.
 
-        ``describe`` gives descriptors (K, D) of rows of the table; ``size`` is (H, W) and perhaps
-        more.
+        Ties by y, then x; the mask (H, W) comes first. ``describe`` gives descriptors (K, D) of
+        rows of the table.
         """
-        rows, num_masked = select_keypoints(
-            table[:, :2],
-            scores,
-            size=(size[0], size[1]),
-            mask=mask,
-            max_keypoints=self.options.max_keypoints,
-        )
+        x, y = table[:, 0], table[:, 1]
+        usable = np.arange(len(table))
+        if mask is not None:
+            usable = np.flatnonzero(on_mask(mask, table[:, :2]))
+        order = np.lexsort((x[usable], y[usable], -scores[usable]))
+        rows = usable[order[: self.options.max_keypoints]]
         descriptors = describe(torch.from_numpy(rows)).cpu().numpy()
-        return LocalFeatures(table[rows], scores[rows], descriptors, num_masked)
+        return LocalFeatures(table[rows], scores[rows], descriptors, len(table) - len(usable))
 
     def _best_of_levels(
-        self, levels: Sequence[Level], size: tuple[int, ...], mask: NDArray[np.bool_] | None
+        self, levels: Sequence[Level], mask: NDArray[np.bool_] | None
     ) -> LocalFeatures:
         """The same of the keypoints of several scales."""
         tables, scores, descriptors = zip(*levels, strict=True)
         rows_of = torch.cat(descriptors).cpu().__getitem__
-        return self._best(np.concatenate(tables), np.concatenate(scores), rows_of, size, mask)
+        return self._best(np.concatenate(tables), np.concatenate(scores), rows_of, mask)
+
+
+def in_image_px(
+    xy: NDArray[Any], size: Sequence[int], image_size: Sequence[int]
+) -> NDArray[np.float32]:
+    """Positions (N, 2) in a map whose first pixel's centre is (0, 0) as pixels of the whole image.
+
+    There it is at (0.5, 0.5), as COLMAP has it, so that sizes, height and width first, scale as a
+    whole.
+    """
+    ratio = np.array([image_size[1] / size[1], image_size[0] / size[0]])
+    return ((xy + 0.5) * ratio).astype(np.float32)

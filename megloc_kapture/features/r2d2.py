@@ -1,21 +1,41 @@
-"""R2D2 local features (Revaud et al., NeurIPS 2019), the kind that kapture's own tools make."""
+"""R2D2 local features (Revaud et al., NeurIPS 2019, section 3): kapture's own tools make them.
+
+The network has the keys of the official checkpoints. It is an L2-Net whose strides became
+dilations, so that all maps have the image's resolution; a last convolution 8 by 8 is replaced by
+three of 2 by 2.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
+from torch import nn
 from torch.nn import functional
 
-from megloc_kapture.features.network import Images, Level, LocalNetwork, LocalNetworkOptions, Masks
-from megloc_kapture.nets.r2d2 import DESCRIPTOR_SIZE, R2D2Maps, load_r2d2, pyramid_levels
-from megloc_kapture.nets.runtime import image_tensor, inference
+from megloc_kapture.errors import DataError
+from megloc_kapture.features.network import (
+    Images,
+    Level,
+    LocalNetwork,
+    LocalNetworkOptions,
+    Masks,
+    in_image_px,
+)
+from megloc_kapture.nets.runtime import image_tensor, inference, load_strictly
 from megloc_kapture.nets.score_maps import window_maximum
+from megloc_kapture.nets.trunks import imagenet_normalised
 from megloc_kapture.values import LocalFeatures
 
+DESCRIPTOR_SIZE = 128
+# kernel, width in units of the base width, dilation; ReLU after those of 3 by 3
+_LAYERS = ((3, 1, 1), (3, 1, 1), (3, 2, 1), (3, 2, 2), (3, 4, 2), (3, 4, 4), (2, 4, 4), (2, 4, 8))
+_STEPS_PER_OCTAVE = 4
+_TOLERANCE = 0.001  # of a scale: a side that rounding leaves a pixel short is still large enough
 _DEFAULT_WEIGHTS = "r2d2_WASF_N16"
 _PATCH_PX = 32.0  # the scale of a keypoint found at the image's own size, as the authors write it
 
@@ -67,35 +87,100 @@ class R2D2(LocalNetwork[R2D2Options]):
             )
             for level in levels:
                 maps = network(level.contiguous(memory_format=torch.channels_last))
-                for k, image in enumerate(images):
-                    own = R2D2Maps(*(values[k : k + 1] for values in maps))
-                    yx = _maxima(own, options)
-                    at = 0, slice(None), yx[:, 0], yx[:, 1]
-                    scores = own.reliability[at] * own.repeatability[at]
-                    xys = _in_image_pixels(yx.cpu().numpy(), level.shape[-2:], image)
-                    descriptors = functional.normalize(own.features[at].float(), dim=0).T
-                    found[k].append((xys, scores[0].cpu().numpy(), descriptors))
+                scale = np.float32(_PATCH_PX * max(images[0].shape[:2]) / max(level.shape[-2:]))
+                told = maps.features, maps.reliability[:, 0], maps.repeatability[:, 0]
+                for own, features, reliability, repeatability in zip(found, *told, strict=True):
+                    # section 3.3 of the paper
+                    rows, columns = torch.nonzero(
+                        (repeatability == window_maximum(repeatability, 1))
+                        & (repeatability >= options.min_repeatability)
+                        & (reliability >= options.min_reliability)
+                    ).unbind(1)
+                    xy = torch.stack([columns, rows], dim=1).cpu().numpy()
+                    xy_px = in_image_px(xy, level.shape[-2:], images[0].shape)
+                    scores = reliability[rows, columns] * repeatability[rows, columns]
+                    descriptors = functional.normalize(features[:, rows, columns].float(), dim=0).T
+                    table = np.column_stack([xy_px, np.full(len(xy_px), scale)])
+                    own.append((table, scores.cpu().numpy(), descriptors))
         return [
-            self._best_of_levels(levels, image.shape, mask)
-            for levels, image, mask in zip(found, images, masks, strict=True)
+            self._best_of_levels(levels, mask) for levels, mask in zip(found, masks, strict=True)
         ]
 
 
-def _maxima(maps: R2D2Maps, options: R2D2Options) -> torch.Tensor:
-    """Rows and columns (N, 2) of the keypoints of one level (section 3.3 of the paper)."""
-    repeatability, reliability = maps.repeatability[0, 0], maps.reliability[0, 0]
-    return torch.nonzero(
-        (repeatability == window_maximum(repeatability, 1))
-        & (repeatability >= options.min_repeatability)
-        & (reliability >= options.min_reliability)
-    )
+class R2D2Maps(NamedTuple):
+    """Maps of images, each (B, C, H, W)."""
+
+    features: torch.Tensor  # C = 128; a descriptor is one pixel of it, normalised
+    reliability: torch.Tensor  # C = 1, in [0, 1]: how surely the pixel's descriptor will be matched
+    repeatability: torch.Tensor  # C = 1, in [0, 1]: how surely a local maximum is found again
 
 
-def _in_image_pixels(
-    yx: NDArray[np.int64], size: torch.Size, image: NDArray[np.uint8]
-) -> NDArray[np.float32]:
-    """x, y, scale (N, 3) in the image's pixels, the first one's centre at (0.5, 0.5)."""
-    ratio = np.array([image.shape[1] / size[1], image.shape[0] / size[0]])
-    scale = _PATCH_PX * max(image.shape[:2]) / max(size)
-    xy = (yx[:, ::-1] + 0.5) * ratio
-    return np.column_stack([xy, np.full(len(xy), scale)]).astype(np.float32)
+class R2D2Network(nn.Module):
+    """Dense features, reliability and repeatability.
+
+    ``base_width`` is of the first layer: 32 channels or, in the big model, 48.
+    """
+
+    def __init__(self, base_width: int = 32) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        inputs = 3
+        for kernel, width, dilation in _LAYERS:
+            outputs = width * base_width
+            margin = dilation * (kernel - 1) // 2
+            layers += [
+                nn.Conv2d(inputs, outputs, kernel, padding=margin, dilation=dilation),
+                nn.BatchNorm2d(outputs, affine=False),
+            ]
+            if kernel == 3:
+                layers.append(nn.ReLU(inplace=True))
+            inputs = outputs
+        layers.append(nn.Conv2d(inputs, DESCRIPTOR_SIZE, 2, padding=8, dilation=16))
+        self.ops = nn.Sequential(*layers)
+        self.clf = nn.Conv2d(DESCRIPTOR_SIZE, 2, 1)
+        self.sal = nn.Conv2d(DESCRIPTOR_SIZE, 1, 1)
+
+    def forward(self, images: torch.Tensor) -> R2D2Maps:
+        """Maps of RGB images, float (B, 3, H, W) in [0, 1]."""
+        features = self.ops(imagenet_normalised(images))
+        squared = features**2
+        positive = functional.softplus(self.sal(squared).float())
+        return R2D2Maps(
+            features, self.clf(squared).float().softmax(dim=1)[:, 1:], positive / (1 + positive)
+        )
+
+
+def load_r2d2(tensors: Mapping[str, torch.Tensor], where: str) -> R2D2Network:
+    """The network of a checkpoint, for inference; its width is the file's.
+
+    Raises DataError that names the keys that do not fit.
+    """
+    first = tensors.get("ops.0.weight")
+    if first is None or first.ndim != 4:
+        raise DataError(
+            "this file does not fit R2D2Network; 1 missing keys: ops.0.weight", path=where
+        )
+    return load_strictly(R2D2Network(base_width=len(first)), tensors, where).eval()
+
+
+def pyramid_levels(image: torch.Tensor, *, min_size: int, max_size: int) -> Iterator[torch.Tensor]:
+    """Yield an image at scales 1, 2^-1/4, 2^-1/2 and so on, each level resized from the one before.
+
+    This is R2D2's pyramid (Revaud et al., 2019, section 4), largest first; a pixel of one level is
+    w'/w of the pixels of another, both having their origin at the image's corner. ``image``: float
+    (B, C, H, W); ``min_size`` and ``max_size``: the levels' longer side in pixels; larger ones are
+    made but left out. An image that is itself smaller than ``min_size`` is the only level.
+    """
+    height, width = image.shape[-2:]
+    longer = max(height, width)
+    smallest = min(1.0, min_size / longer)
+    level, step = image, 0
+    while (scale := 2.0 ** (-step / _STEPS_PER_OCTAVE)) + _TOLERANCE >= smallest:
+        size = round(height * scale), round(width * scale)
+        if min(size) == 0:
+            return
+        if step:
+            level = functional.interpolate(level, size, mode="bilinear", align_corners=False)
+        if scale - _TOLERANCE <= max_size / longer:
+            yield level
+        step += 1

@@ -1,18 +1,25 @@
-"""RootSIFT local features (Arandjelovic and Zisserman, CVPR 2012, section 3).
+"""SIFT with descriptors normalised as RootSIFT (Arandjelovic and Zisserman, CVPR 2012, section 3).
 
-OpenCV's SIFT is used rather than pycolmap's: 2 to 5 times faster per image, with matches that fit
-the true poses as well (docs/experiments/features.md; measured by benchmarks/speed/sift.py).
+``rootsift`` uses OpenCV's SIFT rather than pycolmap's: 2 to 5 times faster per image, with matches
+that fit the true poses as well (docs/experiments/features.md, benchmarks/speed/sift.py).
+``sift`` is COLMAP's: the features that official models and their databases are made of, Lowe's
+detector (IJCV 2004) as VLFeat has it, descriptors stored as bytes.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.features.image_bound import BoundedOptions
+from megloc_kapture.features.image_bound import BoundedOptions, on_mask
+from megloc_kapture.io.colmap_mapping import extract_sift
 from megloc_kapture.values import LocalFeatures
+
+_NO_LIMIT = 2**31 - 1
 
 
 class RootSiftOptions(BoundedOptions):
@@ -59,39 +66,86 @@ class RootSift:
             True,  # precise upscaling: without it the first octave is shifted by a quarter pixel
         )
         keypoints, descriptors = sift.detectAndCompute(gray, None)
-
-        def strongest_first(k: int) -> tuple[float, ...]:
-            point = keypoints[k]
-            return -point.response, point.pt[1], point.pt[0], point.size, point.angle
-
-        usable = (k for k, one in enumerate(keypoints) if mask is None or _is_on(mask, one))
-        order = sorted(usable, key=strongest_first)
-        if descriptors is None or not order:
-            return LocalFeatures(
-                np.zeros((0, 2), np.float32),
-                np.zeros(0, np.float32),
-                np.zeros((0, self.descriptor_size), np.float32),
-                num_masked=len(keypoints) - len(order),
-            )
+        if descriptors is None:
+            descriptors = np.zeros((0, self.descriptor_size), np.float32)
+        found = [(*one.pt, one.response, one.size, one.angle) for one in keypoints]
+        x, y, response, size, angle = np.array(found, np.float64).reshape(-1, 5).T
+        # OpenCV puts the centre of the first pixel at (0, 0), COLMAP at (0.5, 0.5)
+        xy_px = np.stack([x, y], axis=1) + 0.5
+        order = np.lexsort((angle, size, x, y, -response))
+        if mask is not None:
+            order = order[on_mask(mask, xy_px[order])]
         num_masked = len(keypoints) - len(order)
         order = order[: options.max_keypoints]
-        xy = np.array([keypoints[k].pt for k in order], dtype=np.float32)
-        scores = np.array([keypoints[k].response for k in order], dtype=np.float32)
-        # OpenCV puts the centre of the first pixel at (0, 0), COLMAP at (0.5, 0.5)
-        values = np.asarray(descriptors[order], dtype=np.float32)
-        return LocalFeatures(xy + np.float32(0.5), scores, root_sift(values), num_masked)
+        return LocalFeatures(
+            xy_px[order].astype(np.float32),
+            response[order].astype(np.float32),
+            root_sift(descriptors[order]),
+            num_masked,
+        )
 
 
-def _is_on(mask: NDArray[np.bool_], keypoint: cv2.KeyPoint) -> bool:
-    height, width = mask.shape
-    # the keypoint is still in OpenCV's coordinates, where a pixel's centre is an integer
-    column = min(max(int(keypoint.pt[0] + 0.5), 0), width - 1)
-    row = min(max(int(keypoint.pt[1] + 0.5), 0), height - 1)
-    return bool(mask[row, column])
-
-
-def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Square root of L1-normalised SIFT, (N, 128) float32: Euclidean distance becomes Hellinger."""
+def root_sift(descriptors: NDArray[Any]) -> NDArray[np.float32]:
+    """Square root of L1-normalised SIFT, float32 (N, 128): Euclidean distance becomes Hellinger."""
     values = np.asarray(descriptors, dtype=np.float32)
     total = values.sum(axis=1, keepdims=True)
     return np.sqrt(values / np.maximum(total, np.finfo(np.float32).tiny))
+
+
+class ColmapSiftOptions(BoundedOptions):
+    """Options of COLMAP's SIFT; the defaults are COLMAP's, and so what official models have."""
+
+    max_keypoints: int = Field(
+        default=8192,
+        gt=0,
+        description="coarsest kept; COLMAP keeps whole scale levels, the last may exceed it",
+    )
+    first_octave: int = Field(
+        default=-1, ge=-1, le=5, description="-1 doubles the image first, 0 is the image's own"
+    )
+    peak_threshold: float = Field(
+        default=0.02 / 3, gt=0, description="smallest difference of Gaussians, of grey in 0..1"
+    )
+
+
+class ColmapSift:
+    """The extractor ``sift``; descriptors uint8 (N, 128), about 512 long."""
+
+    name = "sift"
+    descriptor_size = 128
+    descriptor_dtype = "uint8"
+    metric = "L2"
+    Options = ColmapSiftOptions
+
+    def __init__(self, options: ColmapSiftOptions | None = None) -> None:
+        self.options = options or ColmapSiftOptions()
+
+    def extract(
+        self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
+    ) -> LocalFeatures:
+        """Extract from an RGB image, uint8 (H, W, 3); scores are scales, by which COLMAP selects.
+
+        Keypoints on False pixels of the mask (H, W) are dropped before the coarsest are selected,
+        exactly ``max_keypoints`` of them where there are so many.
+        """
+        options = self.options
+        masked = mask is not None and not mask.all()
+        keypoints, descriptors = extract_sift(
+            image,
+            max_keypoints=_NO_LIMIT if masked else options.max_keypoints,
+            first_octave=options.first_octave,
+            peak_threshold=options.peak_threshold,
+        )
+        # several orientations at one position keep their order
+        order = np.argsort(-keypoints[:, 2], kind="stable")
+        num_masked = 0
+        if mask is not None and masked:
+            allowed = on_mask(mask, keypoints[order, :2])
+            num_masked = int((~allowed).sum())
+            order = order[allowed][: options.max_keypoints]
+        return LocalFeatures(
+            np.ascontiguousarray(keypoints[order, :2]),
+            np.ascontiguousarray(keypoints[order, 2]),
+            descriptors[order],
+            num_masked,
+        )

@@ -1,4 +1,4 @@
-"""Projection under COLMAP's camera models, and the pixel origin of intrinsics."""
+"""Cameras of COLMAP's models: their parameters, their images' sizes, and projection."""
 
 from __future__ import annotations
 
@@ -11,10 +11,26 @@ from numpy.typing import NDArray
 
 from megloc_kapture.io.colmap import normalized_from_px as normalized_from_px
 from megloc_kapture.io.colmap import px_from_cam as px_from_cam
-from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
+from megloc_kapture.values import (
+    CAMERA_MODEL_NUM_PARAMS,
+    ONE_FOCAL_MODELS,
+    Camera,
+    RigidTransform,
+)
 
+PINHOLE_MODELS = frozenset({"PINHOLE", "SIMPLE_PINHOLE"})
 # models whose first distortion parameter multiplies the squared radius
 RADIAL_MODELS = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"})
+
+
+# the model with two focal lengths that has each one's distortion among its own, in the same order
+_TWO_FOCAL_MODEL = {
+    "SIMPLE_PINHOLE": "PINHOLE",
+    "SIMPLE_RADIAL": "OPENCV",
+    "RADIAL": "OPENCV",
+    "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "RADIAL_FISHEYE": "OPENCV_FISHEYE",
+}
 
 
 def focal_px(camera: Camera) -> float:
@@ -68,6 +84,42 @@ def swap_principal_point(camera: Camera) -> Camera:
     return replace(camera, params=(*camera.params[:k], cy, cx, *camera.params[k + 2 :]))
 
 
+def with_two_focals(camera: Camera) -> Camera:
+    """The same camera in a model with two focal lengths; itself where it has them already."""
+    if camera.model not in ONE_FOCAL_MODELS:
+        return camera
+    model = _TWO_FOCAL_MODEL[camera.model]
+    params = (camera.params[0], *camera.params)
+    rest = (0.0,) * (CAMERA_MODEL_NUM_PARAMS[model] - len(params))
+    return replace(camera, model=model, params=params + rest)
+
+
+def same_lens(first: Camera, second: Camera) -> bool:
+    """True if two cameras differ by their focal lengths and principal points at most."""
+    a, b = with_two_focals(first), with_two_focals(second)
+    return a.model == b.model and a.params[4:] == b.params[4:]
+
+
+def scaled_camera(camera: Camera, scale: float) -> Camera:
+    """The same view in an image of another size, rounded to whole pixels, at least one.
+
+    Everything scales by what its side really scales by; one focal length for both sides by the
+    mean of the two.
+    """
+    width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+    x, y = width / camera.width, height / camera.height
+    params = list(camera.params)
+    by = [0.5 * (x + y), x, y] if camera.model in ONE_FOCAL_MODELS else [x, y, x, y]
+    params[: len(by)] = [p * b for p, b in zip(params, by, strict=False)]
+    return replace(camera, width=width, height=height, params=tuple(params))
+
+
+def reduced_camera(camera: Camera, max_side_px: int) -> Camera:
+    """The camera of the image reduced to a longer side; itself where it is no larger."""
+    longer = max(camera.width, camera.height)
+    return camera if longer <= max_side_px else scaled_camera(camera, max_side_px / longer)
+
+
 def bearing_rays(camera: Camera, points_px: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     """Homogeneous rays (x/z, y/z, 1) in the camera frame of pixels (N, 2); float64 (N, 3)."""
     xy = normalized_from_px(camera, points_px)
@@ -91,3 +143,9 @@ def project(
 ) -> NDArray[np.float64]:
     """Pixels (N, 2) float64 of world points (N, 3); NaN for points behind the camera."""
     return px_from_cam(camera, cam_from_world.apply(points_world))
+
+
+def in_image(camera: Camera, px: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
+    """Mask (N,) of the pixels (N, 2) that are inside of a camera's image; NaN is not."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(((px >= 0) & (px < (camera.width, camera.height))).all(axis=1))

@@ -8,7 +8,7 @@ references that see that surface.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -17,8 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import bearing_rays, focal_px, pixel_rays, px_from_cam
-from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
+from megloc_kapture.geometry.cameras import (
+    bearing_rays,
+    focal_px,
+    in_image,
+    pixel_rays,
+    px_from_cam,
+    scaled_camera,
+)
+from megloc_kapture.values import Camera, RigidTransform
 
 _NEAR_M = 0.02
 # two references see one surface where their depths in the view differ by less
@@ -86,20 +93,6 @@ class WarpedView:
     valid: NDArray[np.bool_]
     depth_m: NDArray[np.float32]
     source: NDArray[np.int16]
-
-
-def scaled_camera(camera: Camera, scale: float) -> Camera:
-    """The same view in an image of another size, rounded to whole pixels, at least one.
-
-    Everything scales by what its side really scales by; one focal length for both sides by the
-    mean of the two.
-    """
-    width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-    x, y = width / camera.width, height / camera.height
-    params = list(camera.params)
-    by = [0.5 * (x + y), x, y] if camera.model in ONE_FOCAL_MODELS else [x, y, x, y]
-    params[: len(by)] = [p * b for p, b in zip(params, by, strict=False)]
-    return replace(camera, width=width, height=height, params=tuple(params))
 
 
 def warp_to_view(
@@ -177,11 +170,11 @@ def _look_up(
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Colours uint8 (N, 3) of world points in a reference, and which it sees, bool (N,)."""
     image, mask, shrink = _at_resolution(source, focal)
-    in_image = source.cam_from_world.apply(points)
-    px = px_from_cam(source.camera, in_image)
+    in_camera = source.cam_from_world.apply(points)
+    px = px_from_cam(source.camera, in_camera)
     usable = np.asarray(np.isfinite(px).all(axis=1))
     if np.linalg.norm(source.image_from_depth.translation) > _SAME_CENTRE_M:
-        usable &= _not_hidden(source, in_image, px)
+        usable &= _not_hidden(source, in_camera, px)
     # OpenCV's coordinates have the centre of the first pixel at (0, 0)
     in_array = np.where(usable[:, None], px, -1e4) * shrink - 0.5
     x, y = np.ascontiguousarray(in_array.T, np.float32)
@@ -221,14 +214,12 @@ def _at_resolution(
     return image, mask, np.array(size) / (width, height)
 
 
-def _not_hidden(source: WarpSource, in_image: Floats, px: Floats) -> NDArray[np.bool_]:
+def _not_hidden(source: WarpSource, in_camera: Floats, px: Floats) -> NDArray[np.bool_]:
     """Mask of the points (N, 3) of the depth sensor beside an image that the image sees too."""
     own, _ = _seen_depth(source, source.camera, source.cam_from_world)
-    height, width = own.shape
-    with np.errstate(invalid="ignore"):
-        inside = (px >= 0).all(axis=1) & (px[:, 0] < width) & (px[:, 1] < height)
+    inside = in_image(source.camera, px)
     columns, rows = np.floor(np.where(inside[:, None], px, 0)).astype(np.int64).T
-    return inside & (in_image[:, 2] <= (1.0 + _SAME_SURFACE) * own[rows, columns])
+    return inside & (in_camera[:, 2] <= (1.0 + _SAME_SURFACE) * own[rows, columns])
 
 
 def _cost(points: Floats, view_centre: Floats, source_centre: Floats) -> Floats:

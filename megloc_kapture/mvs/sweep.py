@@ -1,16 +1,19 @@
-"""Depth by plane sweep, semi-global matching and slanted planes; no network, no GPU.
+"""Depth by plane sweep, semi-global matching and slanted planes; COLMAP's, judged alike.
 
-The reference is compared with its sources under planes parallel to it, evenly spaced in inverse
-depth (Collins, CVPR 1996; Gallup et al., CVPR 2007), by the mean of the two best zero-mean
-normalised cross-correlations of small windows. Semi-global matching (Hirschmueller, PAMI 2008)
-makes a surface of it, at half the size; PatchMatch (Bleyer et al., BMVC 2011) tilts and sharpens it
-at the whole. A pixel ``p`` (homogeneous) of inverse depth ``w`` lies in a source at
+The sweep needs no network and no GPU. The reference is compared with its sources under planes
+parallel to it, evenly spaced in inverse depth (Collins, CVPR 1996; Gallup et al., CVPR 2007), by
+the mean of the two best zero-mean normalised cross-correlations of small windows. Semi-global
+matching (Hirschmueller, PAMI 2008) makes a surface of it, at half the size; PatchMatch (Bleyer et
+al., BMVC 2011) tilts and sharpens it at the whole. A pixel ``p`` (homogeneous) of inverse depth
+``w`` lies in a source at
 ``infinity p + w baseline``, with ``infinity = K_s R K^-1`` and ``baseline = K_s t``.
 """
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -18,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.geometry.warping import scaled_camera
+from megloc_kapture.errors import PluginError
+from megloc_kapture.geometry.cameras import scaled_camera
 from megloc_kapture.mvs.views import Projections, pinhole_matrix, pixel_step, relative_projection
 from megloc_kapture.plugins import DepthEstimate, StereoView
 from megloc_kapture.values import Camera, Options
@@ -77,6 +81,59 @@ class Sweep:
         deviations = refine(reference, sources, planes, limits, 0.5 * step, self.options.passes)
         # what lies at the far end may lie beyond it: the sky
         deviations[planes[..., 0] <= limits[0] + 0.5 * step] = 0.0
+        return as_estimate(reference.camera, planes, deviations)
+
+
+class ColmapStereo:
+    """COLMAP's own PatchMatch (Schoenberger et al., ECCV 2016), where pycolmap has CUDA.
+
+    Deviations are as of the sweep, by the matching of its planes.
+    """
+
+    name = "colmap"
+
+    def __init__(self) -> None:
+        from megloc_kapture.io.colmap_mapping import has_cuda
+
+        if not has_cuda():
+            raise PluginError(
+                "the installed pycolmap has no CUDA, which COLMAP's stereo needs: install "
+                "pycolmap-cuda12 in its place, or take the estimator sweep"
+            )
+
+    def estimate(
+        self,
+        reference: StereoView,
+        sources: Sequence[StereoView],
+        depth_range_m: tuple[float, float],
+    ) -> DepthEstimate:
+        """Depth of the reference; see :class:`~megloc_kapture.plugins.DepthEstimator`."""
+        from megloc_kapture.io.colmap import MapImage
+        from megloc_kapture.io.colmap_mapping import (
+            map_path,
+            read_map,
+            run_patch_match,
+            write_workspace,
+        )
+
+        names = [f"{number}.png" for number in range(1 + len(sources))]
+        views = (reference, *sources)
+        pixels = [view.image for view in views]
+        images = [
+            MapImage(name, view.camera, view.cam_from_world, np.zeros((0, 2), np.float32))
+            for name, view in zip(names, views, strict=True)
+        ]
+        nothing = [(np.zeros(0, np.int64), np.zeros(0, np.int64))] * len(views)
+        with tempfile.TemporaryDirectory() as folder:
+            root = Path(folder)
+            write_workspace(root, images, pixels, nothing, np.zeros((0, 3)))
+            run_patch_match(root, names[0], names[1:], depth_range_m)
+            depth = read_map(map_path(root, "depth", names[0]))
+            normals = read_map(map_path(root, "normal", names[0]))
+        known = (depth > 0) & (normals[..., 2] < 0)
+        planes = planes_of(reference.camera, np.where(known, depth, 1), normals)
+        deviations = matching_deviations(reference, sources, planes, CALIBRATION)
+        deviations[~known] = 0.0
         return as_estimate(reference.camera, planes, deviations)
 
 

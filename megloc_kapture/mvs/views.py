@@ -10,11 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.geometry.cameras import px_from_cam
-from megloc_kapture.geometry.warping import scaled_camera
+from megloc_kapture.geometry.cameras import (
+    PINHOLE_MODELS,
+    px_from_cam,
+    reduced_camera,
+    with_two_focals,
+)
 from megloc_kapture.io.colmap import undistorted_pinhole
 from megloc_kapture.plugins import DepthEstimate, StereoView
-from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, Options, RigidTransform
+from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
 Projections = Sequence[tuple[Floats, Floats]]
@@ -28,13 +32,9 @@ _MIN_REGION_PX = 40  # smaller islands of one surface are chance agreements
 
 def stereo_camera(camera: Camera, max_size_px: int) -> Camera:
     """The PINHOLE camera of the undistorted image whose longer side is at most ``max_size_px``."""
-    if camera.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
+    if camera.model not in PINHOLE_MODELS:
         camera = undistorted_pinhole(camera)
-    elif camera.model in ONE_FOCAL_MODELS:
-        focal, cx, cy = camera.params
-        camera = replace(camera, model="PINHOLE", params=(focal, focal, cx, cy))
-    camera = scaled_camera(camera, min(1.0, max_size_px / max(camera.width, camera.height)))
-    return replace(camera, focal_deviation=0.0)
+    return replace(reduced_camera(with_two_focals(camera), max_size_px), focal_deviation=0.0)
 
 
 def pinhole_matrix(camera: Camera) -> Floats:
@@ -85,7 +85,7 @@ def stereo_view(
     """
     pinhole = stereo_camera(camera, max_size_px)
     size = pinhole.width, pinhole.height
-    if camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
+    if camera.model in PINHOLE_MODELS:
         small = image
         if size != (camera.width, camera.height):
             small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
@@ -93,8 +93,7 @@ def stereo_view(
             mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
         return StereoView(small, pinhole, cam_from_world, mask)
     # reduced first, so that nothing is aliased
-    scale = min(1.0, max(size) / max(camera.width, camera.height))
-    lens = scaled_camera(camera, scale)
+    lens = reduced_camera(camera, max(size))
     x, y = _undistortion(lens, pinhole)
     reduced = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
     small = np.asarray(cv2.remap(reduced, x, y, cv2.INTER_LINEAR), np.uint8)

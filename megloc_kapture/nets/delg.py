@@ -31,9 +31,9 @@ there is not public; it is known by its shape, which nothing else in the network
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import product
 from string import ascii_lowercase
 from typing import Literal
 
@@ -43,8 +43,8 @@ from torch import nn
 from torch.nn import functional
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.nets.aslfeat import conv_same
 from megloc_kapture.nets.runtime import batch_counters, first_few, load_strictly
+from megloc_kapture.nets.score_maps import conv_same
 from megloc_kapture.nets.trunks import (
     RESNET_BLOCKS,
     RESNET_DEPTHS,
@@ -61,42 +61,26 @@ _POWER = 3.0  # section 3.2 of the paper: fixed
 _EPSILONS: dict[Form, float] = {"keras": 1e-3, "slim": 1e-5}
 _LEAST_PX = 5  # a smaller side leaves the pooling without margin nothing
 _ATTRIBUTE = "/.ATTRIBUTES/VARIABLE_VALUE"
-_WORD = r"/(?P<word>kernel|bias|gamma|beta|moving_mean|moving_variance)$"
-_OBJECTS = re.compile(
-    r"(?:^|/)backbone/(?:l(?P<stage>[2-5])(?P<block>[a-z])/)?"
-    r"(?P<layer>conv1|bn_conv1|embedding_layer|(?:conv|bn)(?:2[abc]|_shortcut))" + _WORD
-)
-_NUMBERED = re.compile(
-    r"(?:^|/)backbone/l(?P<stage>[2-5])(?P<block>[a-z])/variables/(?P<number>1?\d|2[0-3])$"
-)
-_LAYERS = re.compile(
-    r"(?:^|/)(?:(?P<layer>conv1|bn_conv1|embedding_layer)"
-    r"|(?P<kind>res|bn)(?P<stage>[2-5])(?P<block>[a-z])_branch(?P<branch>2[abc]|1))" + _WORD
-)
-_SLIM = re.compile(
-    r"(?:^|/)resnet_v1_(?:50|101)/"
-    r"(?:block(?P<stage>[1-4])/unit_(?P<unit>\d+)/bottleneck_v1/)?"
-    r"(?P<layer>conv[123]|shortcut)/"
-    r"(?P<norm>BatchNorm/)?(?P<word>weights|biases|gamma|beta|moving_mean|moving_variance)$"
-)
-_TORCH_WORDS = {
-    "kernel": "weight",
-    "weights": "weight",
-    "biases": "bias",
+_CONVOLUTION = {"kernel": "weight", "bias": "bias"}
+_SLIM_CONVOLUTION = {"weights": "weight", "biases": "bias"}
+_NORM = {
     "gamma": "weight",
     "beta": "bias",
     "moving_mean": "running_mean",
     "moving_variance": "running_var",
 }
-# of the objects' attributes and the layers' branches to torchvision's, convolution and norm
+# of a block, convolution and norm: the branch in Keras' names to torchvision's attributes
 _PARTS = {
     "2a": ("conv1", "bn1"),
     "2b": ("conv2", "bn2"),
     "2c": ("conv3", "bn3"),
     "1": ("downsample.0", "downsample.1"),
 }
-# of a convolution and the norm after it, in the order that Keras counts them
-_NUMBERED_WORDS = ("kernel", "bias", "gamma", "beta", "moving_mean", "moving_variance")
+_STEM = (
+    ("conv1", "conv1", _CONVOLUTION),
+    ("bn_conv1", "bn1", _NORM),
+    ("embedding_layer", "embedding", _CONVOLUTION),
+)
 
 
 class DelgNet(nn.Module):
@@ -191,10 +175,20 @@ def delg_state(
 ) -> tuple[Form, dict[str, torch.Tensor]]:
     """The form of the network, and a state dict for it, of a checkpoint's variables."""
     variables = {name.removesuffix(_ATTRIBUTE): values for name, values in tensors.items()}
-    for form, key_of in _KINDS:
+    kinds: tuple[tuple[Form, Iterator[tuple[str, str]]], ...] = (
+        ("keras", _keras_names(layers=False)),
+        ("keras", _keras_names(layers=True)),
+        ("slim", _slim_names()),
+    )
+    for form, names in kinds:
+        keys = dict(names)
         state: dict[str, torch.Tensor] = {}
         for name, values in variables.items():
-            key = key_of(name)
+            if "attention/" in name:  # the local branch, which has a bn_conv1 of its own
+                continue
+            parts = name.split("/")
+            scoped = ("/".join(parts[start:]) for start in range(len(parts)))
+            key = next((keys[inner] for inner in scoped if inner in keys), None)
             if key is None:
                 continue
             if key in state:
@@ -212,61 +206,43 @@ def delg_state(
     )
 
 
-def _key_of_object(name: str) -> str | None:
-    if numbered := _NUMBERED.search(name):
-        turn, row = divmod(int(numbered["number"]), len(_NUMBERED_WORDS))
-        part, word = list(_PARTS)[turn], _NUMBERED_WORDS[row]
-        return _key(numbered["stage"], numbered["block"], part, row > 1, word)
-    found = _OBJECTS.search(name)
-    if found is None:
-        return None
-    layer, stage = found["layer"], found["stage"]
-    if stage is None:
-        return _key_of_stem(layer, found["word"])
-    is_norm = layer.startswith("bn")
-    part = layer.removeprefix("bn").removeprefix("conv").replace("_shortcut", "1")
-    return None if part not in _PARTS else _key(stage, found["block"], part, is_norm, found["word"])
+def _keras_names(*, layers: bool) -> Iterator[tuple[str, str]]:
+    """Names of the kind ``objects`` or ``layers``, without a scope, and the module's keys.
+
+    Of all blocks that there may be: a stage's are named by the letters.
+    """
+    above = "" if layers else "backbone/"
+    for layer, key, words in _STEM:
+        yield from ((f"{above}{layer}/{word}", f"{key}.{own}") for word, own in words.items())
+    for stage, (number, letter) in product(range(1, 5), enumerate(ascii_lowercase)):
+        block, place, count = f"{stage + 1}{letter}", f"layer{stage}.{number}", 0
+        for branch, keys in _PARTS.items():
+            part = "_shortcut" if branch == "1" else branch
+            names = f"backbone/l{block}/conv{part}", f"backbone/l{block}/bn{part}"
+            if layers:
+                names = f"res{block}_branch{branch}", f"bn{block}_branch{branch}"
+            for name, key, words in zip(names, keys, (_CONVOLUTION, _NORM), strict=True):
+                for word, own in words.items():
+                    yield f"{name}/{word}", f"{place}.{key}.{own}"
+                    if not layers:
+                        yield f"backbone/l{block}/variables/{count}", f"{place}.{key}.{own}"
+                    count += 1
 
 
-def _key_of_layer(name: str) -> str | None:
-    found = _LAYERS.search(name)
-    if found is None or "attention/" in name:  # the local branch has a bn_conv1 of its own
-        return None
-    if found["layer"] is not None:
-        return _key_of_stem(found["layer"], found["word"])
-    is_norm = found["kind"] == "bn"
-    return _key(found["stage"], found["block"], found["branch"], is_norm, found["word"])
-
-
-def _key(stage: str, block: str, part: str, is_norm: bool, word: str) -> str:
-    block_name = f"layer{int(stage) - 1}.{ascii_lowercase.index(block)}"
-    return f"{block_name}.{_PARTS[part][is_norm]}.{_TORCH_WORDS.get(word, word)}"
-
-
-def _key_of_stem(layer: str, word: str) -> str | None:
-    names = {"conv1": "conv1", "bn_conv1": "bn1", "embedding_layer": "embedding"}
-    return f"{names[layer]}.{_TORCH_WORDS.get(word, word)}" if layer in names else None
-
-
-def _key_of_slim(name: str) -> str | None:
-    found = _SLIM.search(name)
-    if found is None:
-        return None
-    layer, is_norm = found["layer"], found["norm"] is not None
-    if layer == "shortcut":
-        part = f"downsample.{int(is_norm)}"
-    else:
-        part = f"bn{layer[-1]}" if is_norm else layer
-    if found["stage"] is not None:
-        part = f"layer{found['stage']}.{int(found['unit']) - 1}.{part}"
-    return f"{part}.{_TORCH_WORDS[found['word']]}"
-
-
-_KINDS: tuple[tuple[Form, Callable[[str], str | None]], ...] = (
-    ("keras", _key_of_object),
-    ("keras", _key_of_layer),
-    ("slim", _key_of_slim),
-)
+def _slim_names() -> Iterator[tuple[str, str]]:
+    """The same of the kind ``slim``."""
+    layers = list(zip(("conv1", "conv2", "conv3", "shortcut"), _PARTS.values(), strict=True))
+    places = [("", "", layers[:1])]
+    for stage, unit in product(range(1, 5), range(len(ascii_lowercase))):
+        scope = f"block{stage}/unit_{unit + 1}/bottleneck_v1/"
+        places.append((scope, f"layer{stage}.{unit}.", layers))
+    for depth, (scope, place, here) in product(RESNET_BLOCKS, places):
+        for layer, (convolution, norm) in here:
+            name = f"resnet_v1_{depth}/{scope}{layer}"
+            for word, own in _SLIM_CONVOLUTION.items():
+                yield f"{name}/{word}", f"{place}{convolution}.{own}"
+            for word, own in _NORM.items():
+                yield f"{name}/BatchNorm/{word}", f"{place}{norm}.{own}"
 
 
 def _embedding_by_shape(

@@ -11,9 +11,55 @@ from torch import nn
 from torch.nn import functional as F
 
 from megloc_kapture.nets.runtime import load_strictly
-from megloc_kapture.nets.trunks import AlexNetFeatures, SqueezeNetFeatures, Vgg16Features
+from megloc_kapture.nets.trunks import Vgg16Features
 
 Trunk = Literal["alex", "vgg", "squeeze"]
+
+
+class AlexNetFeatures(nn.Sequential):
+    """AlexNet up to the ReLU of its fifth convolution, layer 11 of torchvision's ``features``.
+
+    Krizhevsky, "One weird trick for parallelizing convolutional neural networks", arXiv 1404.5997,
+    one tower. Takes (B, 3, H, W), at least 63 x 63 pixels.
+    """
+
+    def __init__(self) -> None:
+        layers = [
+            *(nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, stride=2)),
+            *(nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, stride=2)),
+        ]
+        for channels, out in ((192, 384), (384, 256), (256, 256)):
+            layers += [nn.Conv2d(channels, out, 3, padding=1), nn.ReLU()]
+        super().__init__(*layers)
+
+
+class Fire(nn.Module):
+    """A fire module: 1x1 convolutions to few channels, then 1x1 and 3x3 beside each other."""
+
+    def __init__(self, channels: int, squeezed: int, expanded: int) -> None:
+        super().__init__()
+        self.squeeze = nn.Conv2d(channels, squeezed, 1)
+        self.expand1x1 = nn.Conv2d(squeezed, expanded, 1)
+        self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        x = F.relu(self.squeeze(x))
+        return F.relu(torch.cat([self.expand1x1(x), self.expand3x3(x)], dim=1))
+
+
+class SqueezeNetFeatures(nn.Sequential):
+    """SqueezeNet 1.1 up to its eighth fire module, layer 12 of torchvision's ``features``.
+
+    Iandola et al., arXiv 1602.07360. Takes (B, 3, H, W), at least 17 x 17 pixels.
+    """
+
+    def __init__(self) -> None:
+        first = nn.Conv2d(3, 64, 3, stride=2), nn.ReLU()
+        pool = nn.MaxPool2d(3, stride=2, ceil_mode=True)
+        middle = Fire(64, 16, 64), Fire(128, 16, 64), pool, Fire(128, 32, 128), Fire(256, 32, 128)
+        last = Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256)
+        super().__init__(*first, pool, *middle, pool, *last)
+
 
 # layers whose outputs are compared, by their numbers, and their channels
 _TAPS: dict[Trunk, tuple[tuple[int, int], ...]] = {

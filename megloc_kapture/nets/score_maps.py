@@ -1,4 +1,4 @@
-"""Dense maps of networks: maxima of scores, readings between pixels, deformable convolution.
+"""Dense maps of networks: maxima of scores, readings between pixels, special convolutions.
 
 Non-maximum suppression is SuperPoint's as SuperGlue's authors publish it (and ALIKED's and others'
 after it): local maxima stay, their neighbourhoods are struck out, and what is a maximum of the rest
@@ -24,8 +24,8 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
-from megloc_kapture.errors import DataError
-
+CELL_PX = 8  # side of the cells that detectors tell the scores of
+_EDGE_STEP = 3  # pixels between the samples of the second differences that tell edges
 # values gathered at once: what a processor's cache holds; on a GPU what is worth a launch
 _VALUES_AT_ONCE = {"cpu": 1 << 20, "cuda": 1 << 27}
 
@@ -38,6 +38,16 @@ class SelectedPixels:
     xy: torch.Tensor
     scores: torch.Tensor
     num_masked: int  # pixels that would have been candidates but for the mask
+
+
+def pixel_scores(logits: torch.Tensor) -> torch.Tensor:
+    """Scores (B, 8h, 8w) from a detector's logits (B, 65, h, w) of cells of 8 x 8 pixels.
+
+    SuperPoint's, and XFeat's after it. Channel c of a cell is its pixel (c // 8, c % 8), row first;
+    the last channel is "no keypoint".
+    """
+    probabilities = functional.softmax(logits.float(), dim=1)
+    return functional.pixel_shuffle(probabilities[:, :-1], CELL_PX)[:, 0]
 
 
 def window_maximum(values: torch.Tensor, radius: int) -> torch.Tensor:
@@ -137,15 +147,9 @@ def parabola_peak(scores: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
     at the map's border. Returns (N, 2) of the scores' type; a pixel's centre is an integer.
     """
     x, y = xy.unbind(1)
-
-    def at(dx: int, dy: int) -> torch.Tensor:
-        return scores[y + dy, x + dx]
-
-    gradient_x = (at(1, 0) - at(-1, 0)) / 2
-    gradient_y = (at(0, 1) - at(0, -1)) / 2
-    xx = at(1, 0) - 2 * at(0, 0) + at(-1, 0)
-    yy = at(0, 1) - 2 * at(0, 0) + at(0, -1)
-    mixed = (at(-1, -1) + at(1, 1) - at(1, -1) - at(-1, 1)) / 4
+    gradient_x = (scores[y, x + 1] - scores[y, x - 1]) / 2
+    gradient_y = (scores[y + 1, x] - scores[y - 1, x]) / 2
+    xx, yy, mixed = _second_differences(scores, xy, 1)
     determinant = xx * yy - mixed * mixed
     safe = torch.where(determinant == 0, torch.inf, determinant)
     step_x = (mixed * gradient_y - yy * gradient_x) / safe
@@ -153,33 +157,34 @@ def parabola_peak(scores: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
     return xy + torch.stack([step_x, step_y], dim=1).clamp(-0.5, 0.5)
 
 
-def select_keypoints(
-    xy_px: NDArray[np.float32],
-    scores: NDArray[np.float32],
-    *,
-    size: tuple[int, int],
-    mask: NDArray[np.bool_] | None,
-    max_keypoints: int,
-) -> tuple[NDArray[np.int64], int]:
-    """Rows of the best keypoints, best first, ties by y, then x; and how many the mask removed.
+def on_no_edge(scores: torch.Tensor, xy: torch.Tensor, max_ratio: float) -> torch.Tensor:
+    """Mask (N,) of the pixels where the score map peaks both ways (Lowe, IJCV 2004, section 4.1).
 
     Parameters
     ----------
-    xy_px, scores : float32 (N, 2), the first pixel's centre at (0.5, 0.5), and (N,).
-    size : (H, W) of the image.
-    mask : bool (H, W), True where keypoints may be, or None; applied before the best are selected.
+    scores : (H, W).
+    xy : int64 (N, 2), columns and rows, 3 pixels or more from the map's border.
+    max_ratio : of the larger principal curvature to the smaller.
     """
-    rows = np.arange(len(xy_px))
-    num_masked = 0
-    if mask is not None:
-        # rounding may put a keypoint of a resized image onto the image's last edge
-        last = np.array([size[1] - 1, size[0] - 1])
-        column, row = np.clip(xy_px.astype(np.int64), 0, last).T
-        allowed = mask[row, column]
-        rows = rows[allowed]
-        num_masked = len(allowed) - len(rows)
-    order = np.lexsort((xy_px[rows, 0], xy_px[rows, 1], -scores[rows]))
-    return rows[order[:max_keypoints]], num_masked
+    xx, yy, mixed = _second_differences(scores, xy, _EDGE_STEP)
+    determinant = xx * yy - mixed * mixed
+    trace = xx + yy
+    return (determinant > 0) & (trace * trace <= determinant * ((max_ratio + 1) ** 2 / max_ratio))
+
+
+def _second_differences(
+    scores: torch.Tensor, xy: torch.Tensor, step: int
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Along x, along y and mixed, (N,) each, between samples that are ``step`` pixels apart."""
+    x, y = xy.unbind(1)
+
+    def at(dx: int, dy: int) -> torch.Tensor:
+        return scores[y + dy, x + dx]
+
+    xx = at(step, 0) - 2 * at(0, 0) + at(-step, 0)
+    yy = at(0, step) - 2 * at(0, 0) + at(0, -step)
+    mixed = (at(-step, -step) + at(step, step) - at(step, -step) - at(-step, step)) / 4
+    return xx, yy, mixed
 
 
 def corners_around(
@@ -242,72 +247,65 @@ def pixel_table(values: torch.Tensor) -> torch.Tensor:
     return exact.permute(1, 2, 0).reshape(-1, len(values))
 
 
+def conv_same(
+    x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, stride: int
+) -> torch.Tensor:
+    """Convolution with TensorFlow's padding SAME, which depends on the image's size.
+
+    A 3x3 kernel of stride 2 pads an odd size at both ends, an even one only at the lower and the
+    right end.
+    """
+    margins: list[int] = []
+    for size, kernel in zip(x.shape[:1:-1], weight.shape[:1:-1], strict=True):
+        total = max((-(-size // stride) - 1) * stride + kernel - size, 0)
+        margins += [total // 2, total - total // 2]
+    left, right, top, bottom = margins
+    if left == right and top == bottom:
+        return functional.conv2d(x, weight, bias, stride, padding=(top, left))
+    return functional.conv2d(functional.pad(x, margins), weight, bias, stride)
+
+
 def deform_conv2d(
     x: torch.Tensor,
     offset: torch.Tensor,
     weight: torch.Tensor,
     bias: torch.Tensor | None = None,
     mask: torch.Tensor | None = None,
-    *,
-    stride: int = 1,
-    padding: int = 0,
-    dilation: int = 1,
 ) -> torch.Tensor:
-    """Deformable convolution with torchvision's meaning of every argument.
+    """Deformable convolution by a kernel of 3x3, padded by one, as torchvision's.
 
-    Returns (B, D, H', W'). Positions and weights of the readings are never in half precision.
-    Raises DataError for shapes that do not belong together.
+    Returns (B, D, H, W). Positions and weights of the readings are never in half precision.
 
     Parameters
     ----------
     x : (B, C, H, W); fastest in channels-last memory, which is also that of the result.
-    offset : (B, 2 K, H', W'), pixels of the input: (dy, dx) of one tap after the other, the K taps
+    offset : (B, 18, H, W), pixels of the input: (dy, dx) of one tap after the other, the nine taps
         of the kernel row by row.
-    weight, bias : (D, C, kernel height, kernel width), and (D,) or None.
-    mask : (B, K, H', W') or None, the amplitude that each reading is multiplied by.
+    weight, bias : (D, C, 3, 3), and (D,) or None.
+    mask : (B, 9, H, W) or None, the amplitude that each reading is multiplied by.
     """
     batch, channels, height, width = x.shape
-    kernel_height, kernel_width = weight.shape[2:]
-    taps = kernel_height * kernel_width
-    out_height = _out_size(height, kernel_height, stride, padding, dilation)
-    out_width = _out_size(width, kernel_width, stride, padding, dilation)
-    for name, tensor, expected in (
-        ("weight", weight, (len(weight), channels, kernel_height, kernel_width)),
-        ("offset", offset, (batch, 2 * taps, out_height, out_width)),
-        ("mask", mask, (batch, taps, out_height, out_width)),
-    ):
-        if tensor is not None and tuple(tensor.shape) != expected:
-            raise DataError(
-                f"deformable convolution: {name} is {tuple(tensor.shape)}, not {expected}"
-            )
     exact = torch.promote_types(x.dtype, torch.float32)
-    tap = torch.arange(taps, device=x.device)
-    row, column = (
-        torch.arange(count, device=x.device)[:, None] * stride - padding
-        for count in (out_height, out_width)
-    )
-    tap_rows = (row + tap // kernel_width * dilation).to(exact)  # (H', K), without the offsets
-    tap_columns = (column + tap % kernel_width * dilation).to(exact)  # (W', K)
-    matrix = weight.permute(2, 3, 1, 0).reshape(taps * channels, -1)
-    by_tap = offset.to(exact).view(batch, taps, 2, out_height, out_width).permute(0, 2, 3, 4, 1)
-    rows_at_once = max(_VALUES_AT_ONCE[x.device.type] // (out_width * taps * channels), 1)
+    tap = torch.arange(9, device=x.device)
+    row, column = (torch.arange(count, device=x.device)[:, None] for count in (height, width))
+    tap_rows = (row + tap // 3 - 1).to(exact)  # (H, 9), without the offsets
+    tap_columns = (column + tap % 3 - 1).to(exact)  # (W, 9)
+    matrix = weight.permute(2, 3, 1, 0).reshape(9 * channels, -1)
+    by_tap = offset.to(exact).view(batch, 9, 2, height, width).permute(0, 2, 3, 4, 1)
+    rows_at_once = max(_VALUES_AT_ONCE[x.device.type] // (width * 9 * channels), 1)
     images = []
     for b in range(batch):
         table = pixel_table(x[b])
         strips = []
-        for start in range(0, out_height, rows_at_once):
+        for start in range(0, height, rows_at_once):
             part = slice(start, start + rows_at_once)
             places_y = by_tap[b, 0, part] + tap_rows[part, None]
             places_x = by_tap[b, 1, part] + tap_columns
             amplitude = None if mask is None else mask[b, :, part].to(exact).permute(1, 2, 0)
             read = read_bilinear(table, places_y, places_x, (height, width), amplitude)
-            strips.append(read.view(-1, taps * channels) @ matrix)
-        images.append(torch.cat(strips).view(out_height, out_width, -1))
+            strips.append(read.view(-1, 9 * channels) @ matrix)
+        images.append(torch.cat(strips).view(height, width, -1))
     result = torch.stack(images)
     if bias is not None:
         result = result + bias
     return result.permute(0, 3, 1, 2)
-
-
-def _out_size(size: int, kernel: int, stride: int, padding: int, dilation: int) -> int:
-    return (size + 2 * padding - dilation * (kernel - 1) - 1) // stride + 1

@@ -1,16 +1,23 @@
-"""DeepLabV3+ trained on Cityscapes as a segmenter: people and vehicles are what moves."""
+"""DeepLabV3+ trained on Cityscapes as a segmenter: people and vehicles are what moves.
+
+Chen et al., ECCV 2018, at output stride 16, under the keys of VainF's checkpoints: ResNet-101 or
+MobileNetV2 below; the head's convolutions are plain ones, as those of all public checkpoints are.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from typing import Literal
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
+from torch import nn
+from torch.nn import functional as F
 
-from megloc_kapture.nets.deeplabv3plus import DeepLabV3Plus, backbone_of, most_likely
+from megloc_kapture.errors import DataError
 from megloc_kapture.nets.runtime import (
     Checkpointed,
     NetworkOptions,
@@ -18,31 +25,27 @@ from megloc_kapture.nets.runtime import (
     inference,
     load_strictly,
 )
+from megloc_kapture.nets.trunks import ResNet, imagenet_normalised
 
-# by train id, as cityscapesScripts numbers them
+Backbone = Literal["resnet101", "mobilenet"]
+
+# by train id, as cityscapesScripts numbers them; the categories human and vehicle are the last
 CITYSCAPES_CLASSES = (
-    "road",
-    "sidewalk",
-    "building",
-    "wall",
-    "fence",
-    "pole",
-    "traffic light",
-    "traffic sign",
-    "vegetation",
-    "terrain",
-    "sky",
-    "person",
-    "rider",
-    "car",
-    "truck",
-    "bus",
-    "train",
-    "motorcycle",
-    "bicycle",
+    *("road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign"),
+    *("vegetation", "terrain", "sky"),
+    *("person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle"),
 )
-# Cityscapes' categories human and vehicle
 CITYSCAPES_DYNAMIC = frozenset(CITYSCAPES_CLASSES[11:])
+_WIDTH = 256
+_LOW_LEVEL_WIDTH = 48
+_DILATIONS = (6, 12, 18)
+# of MobileNetV2: expansion, channels, blocks (table 2 of the paper); stride and dilation of the
+# first, dilation of the others: the sixth stage's stride is a dilation of all that follows it
+_MOBILENET_STAGES = (
+    *((1, 16, 1, 1, 1, 1), (6, 24, 2, 2, 1, 1), (6, 32, 3, 2, 1, 1), (6, 64, 4, 2, 1, 1)),
+    *((6, 96, 3, 1, 1, 1), (6, 160, 3, 1, 1, 2), (6, 320, 1, 1, 2, 2)),
+)
+_NUM_LOW_LEVEL = 4  # the stem and the blocks down to a quarter of the size
 
 
 class DeepLabOptions(NetworkOptions):
@@ -89,3 +92,174 @@ def _deeplab(tensors: Mapping[str, torch.Tensor], where: str) -> DeepLabV3Plus:
     network = DeepLabV3Plus(backbone_of(tensors, where), num_classes=len(CITYSCAPES_CLASSES))
     load_strictly(network, tensors, where)
     return network.eval()
+
+
+def backbone_of(keys: Collection[str], where: str) -> Backbone:
+    """Trunk that the keys of a checkpoint are of; raises DataError that names the file."""
+    for key in keys:
+        if key.startswith("backbone.layer1."):
+            return "resnet101"
+        if key.startswith("backbone.low_level_features."):
+            return "mobilenet"
+    raise DataError(
+        "no DeepLabV3+: keys backbone.layer1.* (ResNet-101) or backbone.low_level_features.* "
+        "(MobileNetV2) expected",
+        path=where,
+    )
+
+
+def _activated(
+    channels: int,
+    out: int,
+    size: int,
+    kind: type[nn.ReLU | nn.ReLU6] = nn.ReLU,
+    *,
+    stride: int = 1,
+    padding: int = 0,
+    dilation: int = 1,
+    groups: int = 1,
+) -> nn.Sequential:
+    layer = nn.Conv2d(channels, out, size, stride, padding, dilation, groups, bias=False)
+    return nn.Sequential(layer, nn.BatchNorm2d(out), kind(inplace=True))
+
+
+class Pooling(nn.Sequential):
+    """The mean of the whole map, projected and spread over the map again."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__(nn.AdaptiveAvgPool2d(1), *_activated(channels, _WIDTH, 1))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        pooled = x
+        for layer in self:
+            pooled = layer(pooled)
+        return pooled.expand(-1, -1, *x.shape[-2:])
+
+
+class AtrousPyramid(nn.Module):
+    """Atrous spatial pyramid pooling: five branches of different dilation, projected together."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        branches = [_activated(channels, _WIDTH, 1)]
+        branches += [
+            _activated(channels, _WIDTH, 3, padding=rate, dilation=rate) for rate in _DILATIONS
+        ]
+        self.convs = nn.ModuleList([*branches, Pooling(channels)])
+        self.project = _activated(len(self.convs) * _WIDTH, _WIDTH, 1)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.project(torch.cat([branch(x) for branch in self.convs], dim=1))
+
+
+class Head(nn.Module):
+    """The pyramid, brought to a quarter of the image's size and sharpened by low-level features."""
+
+    def __init__(self, channels: int, low_level_channels: int, num_classes: int) -> None:
+        super().__init__()
+        self.project = _activated(low_level_channels, _LOW_LEVEL_WIDTH, 1)
+        self.aspp = AtrousPyramid(channels)
+        self.classifier = _activated(_LOW_LEVEL_WIDTH + _WIDTH, _WIDTH, 3, padding=1)
+        self.classifier.append(nn.Conv2d(_WIDTH, num_classes, 1))
+
+    def forward(self, low_level: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
+        fine = self.project(low_level)
+        coarse = F.interpolate(
+            self.aspp(features), size=fine.shape[-2:], mode="bilinear", align_corners=False
+        )
+        return self.classifier(torch.cat([fine, coarse], dim=1))
+
+
+class InvertedResidual(nn.Module):
+    """Expansion by 1x1, depthwise 3x3, projection by 1x1 without activation."""
+
+    def __init__(
+        self, channels: int, out: int, *, expansion: int, stride: int, dilation: int
+    ) -> None:
+        super().__init__()
+        wide = channels * expansion
+        layers: list[nn.Module] = []
+        if expansion != 1:
+            layers.append(_activated(channels, wide, 1, nn.ReLU6))
+        layers += [
+            _activated(wide, wide, 3, nn.ReLU6, stride=stride, dilation=dilation, groups=wide),
+            nn.Conv2d(wide, out, 1, bias=False),
+            nn.BatchNorm2d(out),
+        ]
+        self.conv = nn.Sequential(*layers)
+        self._frame = dilation
+        self._residual = stride == 1 and channels == out
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        y = self.conv(F.pad(x, (self._frame,) * 4))
+        return x + y if self._residual else y
+
+
+class MobileNetV2(nn.Module):
+    """MobileNetV2 (Sandler et al., CVPR 2018) before the classifier, at output stride 16.
+
+    Two things differ from the usual one, and the weights were trained with them: the first
+    convolution has no padding, and a block pads its input before the expansion rather than its
+    depthwise convolution, so that the frame around an expanded map is not zero but what the
+    expansion makes of zeros.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        channels = 32
+        layers: list[nn.Module] = [_activated(3, channels, 3, nn.ReLU6, stride=2)]
+        for expansion, out, blocks, stride, first, others in _MOBILENET_STAGES:
+            for block in range(blocks):
+                steps, reach = (1, others) if block else (stride, first)
+                sizes = {"expansion": expansion, "stride": steps, "dilation": reach}
+                layers.append(InvertedResidual(channels, out, **sizes))
+                channels = out
+        # a slice of a Sequential keeps the numbers of its layers, as the checkpoint has them
+        everything = nn.Sequential(*layers)
+        self.low_level_features = everything[:_NUM_LOW_LEVEL]
+        self.high_level_features = everything[_NUM_LOW_LEVEL:]
+
+    def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Features at a quarter and a sixteenth of the size, 24 and 320 channels.
+
+        ``image`` is (B, 3, H, W), see :func:`~megloc_kapture.nets.trunks.imagenet_normalised`.
+        """
+        low_level = self.low_level_features(image)
+        return low_level, self.high_level_features(low_level)
+
+
+class DeepLabV3Plus(nn.Module):
+    """Image to a logit per class, at about a quarter of its size."""
+
+    def __init__(self, backbone: Backbone, *, num_classes: int) -> None:
+        super().__init__()
+        self.backbone: nn.Module
+        if backbone == "resnet101":
+            self.backbone = ResNet(101, dilated=True)
+            self.classifier = Head(2048, 256, num_classes)
+        else:
+            self.backbone = MobileNetV2()
+            self.classifier = Head(320, 24, num_classes)
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        """Logits (B, classes, h, w) of an RGB image (B, 3, H, W) in [0, 1]."""
+        features = self.backbone(imagenet_normalised(image))
+        return self.classifier(features[0], features[-1])
+
+
+def most_likely(logits: torch.Tensor, height: int, width: int) -> torch.Tensor:
+    """Class of each pixel: the largest of logits (C, h, w), scaled bilinearly; of equals the first.
+
+    Class by class: of a full-size map for every class, which is the largest thing there is in
+    memory where the image is large, only two are held. Returns uint8 (height, width).
+    """
+    best = logits.new_full((height, width), -torch.inf)
+    label = torch.zeros((height, width), dtype=torch.uint8, device=logits.device)
+    for number, one in enumerate(logits):
+        scaled = F.interpolate(
+            one[None, None], size=(height, width), mode="bilinear", align_corners=False
+        )[0, 0]
+        better = scaled > best
+        label[better] = number
+        torch.maximum(best, scaled, out=best)
+    return label

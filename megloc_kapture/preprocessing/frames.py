@@ -18,6 +18,7 @@ from pydantic import Field
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.geometry.cameras import (
+    PINHOLE_MODELS,
     RADIAL_MODELS,
     bearing_rays,
     focal_px,
@@ -25,12 +26,14 @@ from megloc_kapture.geometry.cameras import (
     principal_point_px,
     px_from_cam,
     radial_distortion,
+    same_lens,
     scale_focal,
     shift_principal_point,
     with_distortion,
+    with_two_focals,
 )
 from megloc_kapture.io.colmap import undistorted_pinhole
-from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, ONE_FOCAL_MODELS, Camera, Options
+from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, Options
 
 # what lies between two points that belong to each other does so too: the models fold slowly
 _CHECKED_EVERY = 16
@@ -42,15 +45,6 @@ _ROUNDING_PX = 1e-6
 # two that are one up to what COLMAP's iterations leave
 _SAME_PX = 1e-3
 Floats = NDArray[np.float64]
-# the model with two focal lengths that has each one's distortion among its own, in the same order
-_TWO_FOCAL_MODEL = {
-    "SIMPLE_PINHOLE": "PINHOLE",
-    "SIMPLE_RADIAL": "OPENCV",
-    "RADIAL": "OPENCV",
-    "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
-    "RADIAL_FISHEYE": "OPENCV_FISHEYE",
-}
-PINHOLE_MODELS = frozenset({"PINHOLE", "SIMPLE_PINHOLE"})
 # models whose distortion is a polynomial of the tangent: without coefficients there is none (the
 # fisheye models' is one of the angle)
 _POLYNOMIAL_MODELS = frozenset({"OPENCV", "FULL_OPENCV"})
@@ -255,12 +249,6 @@ def plan_frame(camera: Camera, options: FrameOptions) -> FramePlan:
     return FramePlan(camera, processed, (width, height), shrink)
 
 
-def same_lens(first: Camera, second: Camera) -> bool:
-    """True if two cameras differ by their focal lengths and principal points at most."""
-    a, b = with_two_focals(first), with_two_focals(second)
-    return a.model == b.model and a.params[4:] == b.params[4:]
-
-
 def carry_points(source: Camera, target: Camera, points_px: NDArray[np.floating[Any]]) -> Floats:
     """Carry points (N, 2) of one camera's image into another's, in double precision; (N, 2).
 
@@ -321,16 +309,6 @@ def cropped_size(width: int, height: int, multiple_of: int) -> tuple[int, int]:
             f"an image of {width}x{height} cannot be cropped to multiples of {multiple_of}"
         )
     return width - width % multiple_of, height - height % multiple_of
-
-
-def with_two_focals(camera: Camera) -> Camera:
-    """The same camera in a model with two focal lengths; itself where it has them already."""
-    if camera.model not in ONE_FOCAL_MODELS:
-        return camera
-    model = _TWO_FOCAL_MODEL[camera.model]
-    params = (camera.params[0], *camera.params)
-    rest = (0.0,) * (CAMERA_MODEL_NUM_PARAMS[model] - len(params))
-    return replace(camera, model=model, params=params + rest)
 
 
 def scaled_camera(camera: Camera, width: int, height: int) -> Camera:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from megloc_kapture.geometry.cameras import focal_px, px_from_cam
+from megloc_kapture.geometry.cameras import focal_px, in_image, px_from_cam
 from megloc_kapture.geometry.poses import rotation_angles_deg
 from megloc_kapture.plugins import DepthView, PoseRefinement, RankingScene
 from megloc_kapture.refinement.icp_surface import (
@@ -365,9 +365,7 @@ def _different_views(
 def _agrees(view: DepthView, points_in_depth: Floats, tolerance_m: float) -> NDArray[np.bool_]:
     """Mask (N,) of points (N, 3) in the depth camera's frame that lie near a measured depth."""
     pixels = px_from_cam(view.camera, points_in_depth)
-    height, width = view.depth_m.shape
-    with np.errstate(invalid="ignore"):
-        inside = (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
+    inside = in_image(view.camera, pixels)
     column, row = pixels[inside].astype(np.int64).T
     depth = view.depth_m[row, column].astype(np.float64)
     with np.errstate(invalid="ignore"):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.geometry.cameras import pixel_rays, px_from_cam
+from megloc_kapture.geometry.cameras import in_image, pixel_rays, px_from_cam
 from megloc_kapture.geometry.poses import deviation_by_median
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, Options, RigidTransform
@@ -101,8 +101,7 @@ def _on_edge(
 def _hidden(points: Floats, camera: Camera, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Points (N,) in the camera's frame that lie on False pixels of the mask."""
     pixels = px_from_cam(camera, points)
-    with np.errstate(invalid="ignore"):
-        inside = (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+    inside = in_image(camera, pixels)
     column, row = pixels[inside].astype(np.int64).T
     hidden = np.zeros(len(points), bool)
     hidden[inside] = ~mask[row, column]

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import pixel_rays
-from megloc_kapture.geometry.warping import WarpSource, scaled_camera, warp_to_view
+from megloc_kapture.geometry.cameras import PINHOLE_MODELS, pixel_rays, reduced_camera
+from megloc_kapture.geometry.warping import WarpSource, warp_to_view
 from megloc_kapture.nets.gaussians import DEFAULT_COUNT, Gaussians
 from megloc_kapture.nets.radiance import NerfW, Rays, Rendered, TriPlane
 from megloc_kapture.plugins import DepthView
@@ -153,7 +153,7 @@ class NeuralField:
         ``appearance`` is an embedding (A,), the mean of all images' unless given; ``max_side_px``
         of the rendering, the camera's own unless given.
         """
-        camera = reduced(camera, max_side_px or max(camera.width, camera.height))
+        camera = reduced_camera(camera, max_side_px or max(camera.width, camera.height))
         shape = camera.height, camera.width
         if self._is_rasterized(camera):
             colours, depths, opacity = self._rasterized(camera, cam_from_world, appearance)
@@ -166,7 +166,7 @@ class NeuralField:
 
     def _is_rasterized(self, camera: Camera) -> bool:
         """Whether gsplat renders a view of that camera; the same by rays takes longer."""
-        pinhole = camera.model in ("PINHOLE", "SIMPLE_PINHOLE")
+        pinhole = camera.model in PINHOLE_MODELS
         is_here = self.device.type == "cuda" and find_spec("gsplat") is not None
         return pinhole and is_here and isinstance(self.module, Gaussians)
 
@@ -266,12 +266,6 @@ def select(rays: Rays, rows: slice | torch.Tensor) -> Rays:
     return replace(rays, **chosen)
 
 
-def reduced(camera: Camera, max_side_px: int) -> Camera:
-    """The camera of the image reduced to a longer side; never enlarged."""
-    longer = max(camera.width, camera.height)
-    return camera if longer <= max_side_px else scaled_camera(camera, max_side_px / longer)
-
-
 def pixels_of(
     view: FieldView, max_side_px: int
 ) -> tuple[Camera, NDArray[np.uint8], NDArray[np.bool_], Floats | None]:
@@ -279,7 +273,7 @@ def pixels_of(
     if view.image.shape != (view.camera.height, view.camera.width, 3):
         size = f"{view.camera.width}x{view.camera.height}"
         raise DataError(f"image {view.name}: {view.image.shape} does not fit a camera of {size}")
-    camera = reduced(view.camera, max_side_px)
+    camera = reduced_camera(view.camera, max_side_px)
     pixels = camera.width, camera.height
     image = view.image
     if camera is not view.camera:

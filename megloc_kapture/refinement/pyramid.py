@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import bearing_rays, project
+from megloc_kapture.geometry.cameras import bearing_rays, in_image, project
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -91,7 +91,7 @@ def lift_points(camera: Camera, cam_from_world: RigidTransform, depth: DepthView
     else:
         points = depth.image_from_depth.apply(points)
         px = project(camera, RigidTransform.identity(), points)
-        inside = ((px >= 0) & (px < (camera.width, camera.height))).all(1)
+        inside = in_image(camera, px)
         points, px = points[inside], px[inside]
         # what the depth camera sees past an edge may be hidden from the image
         alone = DepthPoints(points, px)

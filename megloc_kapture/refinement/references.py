@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import project
+from megloc_kapture.geometry.cameras import in_image, project
 from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, stack_poses
 from megloc_kapture.plugins import DepthView, RankingScene
 from megloc_kapture.refinement.acceptance import CHI2_OF_CHANCE
@@ -383,8 +383,7 @@ def _share_inside(points: NDArray[np.float64], name: str, scene: RankingScene) -
     """Share of points (N, 3) that a map image would show, were nothing in front of them."""
     camera, pose = scene.map_camera(name), scene.map_pose(name)
     ahead = points[pose.apply(points)[:, 2] > 0]
-    px = project(camera, pose, ahead)
-    return float(((px >= 0) & (px < (camera.width, camera.height))).all(1).sum() / len(points))
+    return float(in_image(camera, project(camera, pose, ahead)).sum() / len(points))
 
 
 def _share_seen(view: RenderingReference, own: DepthPoints, other: RenderingReference) -> float:

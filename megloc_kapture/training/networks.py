@@ -18,8 +18,13 @@ from numpy.typing import NDArray
 from torch import nn
 
 from megloc_kapture.errors import OptionError
-from megloc_kapture.features.superpoint import SuperPoint, gray_tensor
-from megloc_kapture.features.xfeat import XFeat, network_image
+from megloc_kapture.features.superpoint import (
+    SuperPoint,
+    SuperPointNet,
+    gray_tensor,
+    sample_descriptors,
+)
+from megloc_kapture.features.xfeat import XFeat, descriptors_at, load_xfeat, network_image
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px
 from megloc_kapture.geometry.poses import rotation_angles_deg
 from megloc_kapture.io.weights import find_weights, read_weights
@@ -32,8 +37,6 @@ from megloc_kapture.nets.superglue import (
     log_optimal_transport,
     mutual_matches,
 )
-from megloc_kapture.nets.superpoint import SuperPointNet, sample_descriptors
-from megloc_kapture.nets.xfeat import descriptors_at, load_xfeat
 from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.training.labels import IGNORED, UNMATCHED, Labels
 from megloc_kapture.training.pairs import TrainingPair

@@ -20,10 +20,10 @@ from safetensors.torch import load_file, save_file
 import megloc_kapture as megloc_package
 from megloc_kapture.cli.main import main
 from megloc_kapture.errors import OptionError
+from megloc_kapture.features.xfeat import XFeatNetwork
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import read_status
-from megloc_kapture.nets.xfeat import XFeatNetwork
 from megloc_kapture.refinement import field_training
 from megloc_kapture.stages.rigs import depth_records
 

@@ -11,8 +11,8 @@ from images import Image
 from published import random_tensors
 from torch import nn
 
+from megloc_kapture.features.superpoint import SuperPointNet
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.nets.superpoint import SuperPointNet
 
 
 def random_superpoint(seed: int) -> SuperPointNet:

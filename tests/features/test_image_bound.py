@@ -18,6 +18,7 @@ from megloc_kapture.features.image_bound import (
     bounded_image,
     bounded_size,
     extract_bounded,
+    on_mask,
 )
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.plugins import LOCAL_FEATURES
@@ -102,3 +103,12 @@ def test_memory_does_not_grow_with_the_image(megapixels: int) -> None:
         [sys.executable, "-c", script], check=True, capture_output=True, text=True
     )
     assert int(done.stdout) < 2.2e6  # kB
+
+
+def test_a_keypoint_stands_in_the_pixel_that_holds_it() -> None:
+    # (2, 1) begins the pixel of column 2 and row 1; the image's far edge belongs to its last pixel
+    xy_px = np.array([[1.99, 0.99], [2.0, 1.0], [4.0, 3.0]], np.float32)
+    for row, pixel in enumerate([(0, 1), (1, 2), (2, 3)]):
+        mask = np.zeros((3, 4), bool)
+        mask[pixel] = True
+        assert on_mask(mask, xy_px).tolist() == [row == k for k in range(3)]

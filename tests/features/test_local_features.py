@@ -6,6 +6,7 @@ import hashlib
 import pickle
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,9 @@ from images import Image, texture
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.aliked import Aliked
 from megloc_kapture.features.aslfeat import AslFeat
-from megloc_kapture.features.colmap_sift import ColmapSift
+from megloc_kapture.features.network import LocalNetwork
 from megloc_kapture.features.r2d2 import R2D2
-from megloc_kapture.features.rootsift import RootSift
+from megloc_kapture.features.rootsift import ColmapSift, RootSift
 from megloc_kapture.features.superpoint import SuperPoint
 from megloc_kapture.features.xfeat import XFeat
 from megloc_kapture.io.weights import MissingWeightsError
@@ -131,6 +132,23 @@ def test_the_best_come_first_and_are_kept(name: str, make: Make, image: Image) -
         np.testing.assert_array_equal(every.keypoints_px[:, 2], every.scores)
     if name != "sift":  # keeps whole levels
         assert_same(make(max_keypoints=40).extract(image), every, slice(40))
+
+
+def test_equal_scores_are_ordered_by_y_then_x() -> None:
+    xy_px = np.array([[3.5, 1.5], [0.5, 1.5], [2.5, 0.5], [1.5, 2.5]], np.float32)
+    scores = np.array([0.5, 0.5, 0.9, 0.5], np.float32)
+    table = np.column_stack([xy_px, scores])
+
+    def best(mask: Image | None, most: int) -> tuple[list[int], int]:
+        network: Any = SimpleNamespace(options=SimpleNamespace(max_keypoints=most))
+        found = LocalNetwork._best(network, table, scores, lambda rows: rows, mask)
+        return found.descriptors.tolist(), found.num_masked
+
+    assert best(None, 10) == ([2, 1, 0, 3], 0)
+    assert best(None, 2) == ([2, 1], 0)
+    mask = np.ones((3, 4), bool)
+    mask[0, 2] = mask[1, 0] = mask[2, 1] = False
+    assert best(mask, 2) == ([0], 3)
 
 
 def test_the_mask_comes_before_the_limit(name: str, make: Make, image: Image) -> None:

@@ -13,8 +13,13 @@ from images import blobs, texture
 from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
-from megloc_kapture.features.colmap_sift import ColmapSift, ColmapSiftOptions
-from megloc_kapture.features.rootsift import RootSift, RootSiftOptions, root_sift
+from megloc_kapture.features.rootsift import (
+    ColmapSift,
+    ColmapSiftOptions,
+    RootSift,
+    RootSiftOptions,
+    root_sift,
+)
 from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES

@@ -3,17 +3,31 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from images import texture
+from published import Tensors, random_tensors
+from torch.nn import functional
 from transformers import SuperPointConfig, SuperPointForKeypointDetection
 
-from megloc_kapture.errors import OptionError
-from megloc_kapture.features.superpoint import SuperPoint, SuperPointOptions, gray_tensor
-from megloc_kapture.nets.superpoint import SuperPointBatchNormNet, SuperPointNet
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.features.superpoint import (
+    DescriptorSampling,
+    SplitSuperPoint,
+    SuperPoint,
+    SuperPointBatchNormNet,
+    SuperPointNet,
+    SuperPointOptions,
+    gray_tensor,
+    sample_descriptors,
+    superpoint_from,
+    superpoint_with_descriptor,
+)
+from megloc_kapture.nets.score_maps import pixel_scores
 
 CPU = torch.device("cpu")
 
@@ -134,3 +148,183 @@ def test_the_batch_norm_variant_is_known_by_its_keys(
     assert len(official.scores) > 10
     with pytest.raises(OptionError, match="descriptor_weights"):
         extractor(path, descriptor_weights=str(superpoint_weights)).extract(image)
+
+
+BACKBONE = ("conv1", "conv2", "conv3", "conv4")
+
+
+def random_gray(height: int, width: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand((1, 1, height, width), generator=torch.Generator().manual_seed(seed))
+
+
+def transformers_model(weights: Tensors) -> SuperPointForKeypointDetection:
+    """With the weights under its own names, and no suppression."""
+    names = {}
+    for letter in "ab":
+        names[f"convP{letter}"] = f"keypoint_decoder.conv_score_{letter}"
+        names[f"convD{letter}"] = f"descriptor_decoder.conv_descriptor_{letter}"
+        for block in range(4):
+            names[f"conv{block + 1}{letter}"] = f"encoder.conv_blocks.{block}.conv_{letter}"
+    model = SuperPointForKeypointDetection(SuperPointConfig(nms_radius=0)).eval()
+    renamed = {}
+    for key, value in weights.items():
+        layer, kind = key.split(".")
+        renamed[f"{names[layer]}.{kind}"] = value
+    model.load_state_dict(renamed)
+    return model
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("size", [(63, 70), (64, 65), (66, 64), (130, 67), (131, 64), (197, 80)])
+def test_maps_of_any_size_are_transformers(size: tuple[int, int]) -> None:
+    weights = random_tensors("superpoint", 2)
+    gray = random_gray(*size)
+    scores, descriptors = superpoint_from(weights, "w.pth").eval()(gray)
+    assert scores.shape == (1, size[0] // 8 * 8, size[1] // 8 * 8)
+    assert descriptors.shape == (1, 256, size[0] // 8, size[1] // 8)
+    model = transformers_model(weights)
+    features = model.encoder(gray)[0]
+    expected = model.keypoint_decoder._get_pixel_scores(features)
+    assert scores.std() > 0.1 * scores.mean()  # not the same everywhere
+    torch.testing.assert_close(scores, expected, rtol=0, atol=1e-6)
+    decoder = model.descriptor_decoder
+    expected = decoder.conv_descriptor_b(decoder.relu(decoder.conv_descriptor_a(features)))
+    expected = functional.normalize(expected, dim=1)
+    torch.testing.assert_close(descriptors, expected, rtol=0, atol=1e-6)
+
+
+def test_a_hot_channel_is_its_pixel_of_the_cell() -> None:
+    for channel in range(0, 65, 7):
+        logits = torch.zeros(1, 65, 3, 4)
+        logits[0, channel, 1, 2] = 50.0
+        scores = pixel_scores(logits)[0]
+        hot = torch.nonzero(scores > 0.9).tolist()
+        assert hot == ([[8 + channel // 8, 16 + channel % 8]] if channel < 64 else [])
+        assert scores[8:16, 16:24].sum() == pytest.approx(float(channel < 64), abs=1e-6)
+        assert scores[0, 0] == pytest.approx(1 / 65)
+
+
+def cells_at(
+    xy: torch.Tensor, height: int, width: int, sampling: DescriptorSampling
+) -> torch.Tensor:
+    """Where in cells descriptors are read: a map that is linear in the cell gives it away."""
+    v, u = torch.meshgrid(torch.arange(height) + 1.0, torch.arange(width) + 1.0, indexing="ij")
+    sampled = sample_descriptors(torch.stack([u, v, torch.ones_like(u)]), xy, sampling)
+    torch.testing.assert_close(sampled.norm(dim=1), torch.ones(len(xy)))
+    return sampled[:, :2] / sampled[:, 2:] - 1
+
+
+def test_exact_sampling_reads_a_linear_map() -> None:
+    x = torch.arange(4, 80 - 4)
+    xy = torch.stack([x, torch.full_like(x, 20)], dim=1)
+    found = cells_at(xy, 6, 10, "exact")
+    torch.testing.assert_close(found, (xy - 3.5) / 8, rtol=0, atol=1e-5)
+
+
+def test_official_sampling_drifts_by_its_formula() -> None:
+    height, width = 75, 100
+    x = torch.tensor([4, 100, 400, 799])
+    y = torch.tensor([4, 75, 300, 599])
+    found = cells_at(torch.stack([x, y], dim=1), height, width, "official")
+    expected = torch.stack(
+        [
+            (x - 3.5) * (width - 1) / (8 * width - 4.5),
+            (y - 3.5) * (height - 1) / (8 * height - 4.5),
+        ],
+        dim=1,
+    )
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
+    drift_px = 8 * (found[-1, 0] - (799 - 3.5) / 8)
+    assert drift_px == pytest.approx(-3.5, abs=0.05)
+
+
+def test_no_keypoints_no_descriptors() -> None:
+    empty = torch.zeros((0, 2), dtype=torch.int64)
+    assert sample_descriptors(torch.ones(256, 3, 4), empty, "official").shape == (0, 256)
+
+
+def parts(weights: Tensors, *prefixes: str) -> Tensors:
+    return {key: value for key, value in weights.items() if key.startswith(prefixes)}
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("kept", [(*BACKBONE, "convD"), ("conv",)])
+def test_a_descriptor_network_of_its_own(kept: tuple[str, ...]) -> None:
+    frozen, tuned = random_tensors("superpoint", 3), random_tensors("superpoint", 4)
+    net = superpoint_with_descriptor(
+        frozen, parts(tuned, *kept), detector_where="a.pth", descriptor_where="b.pth"
+    )
+    assert isinstance(net, SplitSuperPoint)
+    gray = random_gray(40, 48)
+    scores, descriptors = net.eval()(gray)
+    assert torch.equal(scores, superpoint_from(frozen, "a.pth").eval()(gray)[0])
+    assert torch.equal(descriptors, superpoint_from(tuned, "b.pth").eval()(gray)[1])
+
+
+@torch.inference_mode()
+def test_a_descriptor_head_on_the_detectors_features() -> None:
+    frozen, tuned = random_tensors("superpoint", 3), random_tensors("superpoint", 4)
+    net = superpoint_with_descriptor(
+        parts(frozen, *BACKBONE, "convP"),
+        parts(tuned, "convD"),
+        detector_where="a.pth",
+        descriptor_where="b.pth",
+    )
+    gray = random_gray(40, 48)
+    scores, descriptors = net.eval()(gray)
+    whole = superpoint_from(frozen, "a.pth").eval()
+    assert torch.equal(scores, whole(gray)[0])
+    head = SuperPointNet(detector=False).eval()
+    head.load_state_dict({**parts(frozen, *BACKBONE), **parts(tuned, "convD")})
+    assert torch.equal(descriptors, head.describe(whole.encode(gray)))
+    assert not torch.allclose(descriptors, whole(gray)[1], atol=0.1)
+
+
+def test_a_checkpoint_that_does_not_fit_is_named() -> None:
+    weights = random_tensors("superpoint", 5)
+    with pytest.raises(DataError, match=r"a\.pth: .*convPa\.bias"):
+        superpoint_with_descriptor(
+            parts(weights, *BACKBONE), weights, detector_where="a.pth", descriptor_where="b.pth"
+        )
+    for wrong in (
+        parts(weights, "conv4", "convD"),  # half a backbone
+        parts(weights, *BACKBONE),
+        {**parts(weights, "convD"), "scale": torch.ones(1)},
+    ):
+        with pytest.raises(DataError, match=re.escape("b.pth: ")):
+            superpoint_with_descriptor(
+                weights, wrong, detector_where="a.pth", descriptor_where="b.pth"
+            )
+
+
+@torch.inference_mode()
+def test_the_normalisation_follows_the_activation() -> None:
+    # float64: activations grow, and float32 differs between processors by as much as the bound
+    net = superpoint_from(random_tensors("superpoint-batchnorm", 1), "w.pth").eval().double()
+    weights = net.state_dict()
+
+    def block(x: torch.Tensor, name: str, *, relu: bool = True) -> torch.Tensor:
+        kernel = weights[f"{name}.conv.weight"]
+        x = functional.conv2d(
+            x, kernel, weights[f"{name}.conv.bias"], padding=kernel.shape[-1] // 2
+        )
+        x = x.clamp(min=0) if relu else x
+        mean, var, gain, bias = (
+            weights[f"{name}.bn.{kind}"][:, None, None]
+            for kind in ("running_mean", "running_var", "weight", "bias")
+        )
+        return (x - mean) / (var + 1e-3).sqrt() * gain + bias
+
+    gray = random_gray(61, 74).double()
+    x = gray
+    for stage in range(4):
+        x = block(block(x, f"backbone.{stage}.0"), f"backbone.{stage}.1")
+        x = functional.max_pool2d(x, 2) if stage < 3 else x
+    logits = block(block(x, "detector.0"), "detector.1", relu=False)
+    described = block(block(x, "descriptor.0"), "descriptor.1", relu=False)
+    scores, descriptors = net(gray)
+    probabilities = logits.softmax(dim=1)[0, :64].view(8, 8, 7, 9)
+    expected = probabilities.permute(2, 0, 3, 1).reshape(56, 72)
+    torch.testing.assert_close(scores[0], expected.float(), rtol=0, atol=1e-5)
+    expected = described / described.norm(dim=1, keepdim=True)
+    torch.testing.assert_close(descriptors, expected, rtol=0, atol=1e-5)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import bearing_rays, project
-from megloc_kapture.geometry.warping import WarpedView, WarpSource, scaled_camera, warp_to_view
+from megloc_kapture.geometry.cameras import bearing_rays, project, scaled_camera
+from megloc_kapture.geometry.warping import WarpedView, WarpSource, warp_to_view
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERAS = [

@@ -12,8 +12,7 @@ from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.io.colmap import MapImage
 from megloc_kapture.io.colmap_mapping import has_cuda, map_path, read_map, write_workspace
-from megloc_kapture.mvs.colmap import ColmapStereo
-from megloc_kapture.mvs.sweep import as_estimate, planes_of
+from megloc_kapture.mvs.sweep import ColmapStereo, as_estimate, planes_of
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from corner import CAMERA, WALLS, depth_m, pose_at, render
 
-from megloc_kapture.geometry.warping import scaled_camera
+from megloc_kapture.geometry.cameras import scaled_camera
 from megloc_kapture.mvs.sweep import (
     CALIBRATION,
     Sweep,

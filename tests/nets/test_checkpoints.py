@@ -13,10 +13,17 @@ from published import published_shapes, shapes_of
 from torch import nn
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.features.aliked import aliked_from
+from megloc_kapture.features.aslfeat import aslfeat_from
+from megloc_kapture.features.r2d2 import R2D2Network, load_r2d2
+from megloc_kapture.features.superpoint import (
+    SuperPointBatchNormNet,
+    SuperPointNet,
+    superpoint_from,
+)
+from megloc_kapture.features.xfeat import XFeatNetwork, load_xfeat
 from megloc_kapture.io.weights import find_weights, read_weights, sha256_of
-from megloc_kapture.nets.aliked import aliked_from
-from megloc_kapture.nets.aslfeat import aslfeat_from
-from megloc_kapture.nets.deeplabv3plus import DeepLabV3Plus
+from megloc_kapture.mvs.learned import patchmatchnet_from
 from megloc_kapture.nets.global_descriptors import (
     ApGemNet,
     EigenPlacesNet,
@@ -26,17 +33,9 @@ from megloc_kapture.nets.global_descriptors import (
     openibl,
 )
 from megloc_kapture.nets.megaloc import MegaLocNet, megaloc_from
-from megloc_kapture.nets.patchmatchnet import patchmatchnet_from
-from megloc_kapture.nets.r2d2 import R2D2Network, load_r2d2
 from megloc_kapture.nets.runtime import load_strictly
 from megloc_kapture.nets.superglue import SuperGlueNet, superglue
-from megloc_kapture.nets.superpoint import (
-    SuperPointBatchNormNet,
-    SuperPointNet,
-    superpoint,
-    superpoint_batchnorm,
-)
-from megloc_kapture.nets.xfeat import XFeatNetwork, load_xfeat
+from megloc_kapture.preprocessing.deeplab import DeepLabV3Plus
 
 Load = Callable[[Mapping[str, torch.Tensor], str], nn.Module]
 
@@ -79,8 +78,8 @@ LOADERS: dict[str, tuple[Load, str, bool]] = {
     "openibl": (openibl, "net_vlad.conv.weight", False),
     "r2d2_WASF_N16": (load_r2d2, "ops.12.bias", False),
     "superglue": (superglue, "gnn.layers.7.mlp.1.running_mean", False),
-    "superpoint": (superpoint, "convDb.bias", False),
-    "superpoint-batchnorm": (superpoint_batchnorm, "detector.1.bn.running_var", True),
+    "superpoint": (superpoint_from, "convDb.bias", False),
+    "superpoint-batchnorm": (superpoint_from, "detector.1.bn.running_var", True),
     "xfeat": (load_xfeat, "block4.1.layer.0.weight", True),
 }
 ALIKED = {

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import OptionError
+from megloc_kapture.geometry.cameras import with_two_focals
 from megloc_kapture.io.colmap import px_from_cam
 from megloc_kapture.preprocessing.frames import (
     FrameOptions,
@@ -29,7 +30,6 @@ from megloc_kapture.preprocessing.frames import (
     resized,
     scaled_camera,
     undistorted_camera,
-    with_two_focals,
 )
 from megloc_kapture.values import Camera
 

@@ -26,8 +26,7 @@ from megloc_kapture.evaluation.report.pictures import depth_blocks
 from megloc_kapture.evaluation.report.queries import StoredInliers
 from megloc_kapture.evaluation.report.scene import render_view, scene_of
 from megloc_kapture.evaluation.results import ResultContext
-from megloc_kapture.geometry.cameras import project
-from megloc_kapture.geometry.warping import scaled_camera
+from megloc_kapture.geometry.cameras import project, scaled_camera
 from megloc_kapture.io.kapture import KaptureFolder, read_point_covariances, write_sensors
 from megloc_kapture.io.tables import read_depth_rows
 from megloc_kapture.localization.map_index import observed_matches

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from megloc_kapture.errors import OptionError, PluginError
+from megloc_kapture.features.aslfeat import AslFeatNet
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
+from megloc_kapture.features.superpoint import SuperPointNet
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import ImagePair
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import TwoViewOptions
-from megloc_kapture.nets.aslfeat import AslFeatNet
 from megloc_kapture.nets.runtime import pick_device
-from megloc_kapture.nets.superpoint import SuperPointNet
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import options_of_preset

@@ -14,8 +14,12 @@ from hypothesis import strategies as st
 from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.features.colmap_sift import ColmapSift, ColmapSiftOptions
-from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
+from megloc_kapture.features.rootsift import (
+    ColmapSift,
+    ColmapSiftOptions,
+    RootSift,
+    RootSiftOptions,
+)
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import (
     FeatureConfig,

@@ -10,9 +10,9 @@ from corner import pose_at, render, write_kapture
 from safetensors.torch import save_file
 from torch import nn
 
+from megloc_kapture.features.superpoint import SuperPointNet
+from megloc_kapture.features.xfeat import XFeatNetwork
 from megloc_kapture.io.images import write_image
-from megloc_kapture.nets.superpoint import SuperPointNet
-from megloc_kapture.nets.xfeat import XFeatNetwork
 
 POSES = {f"{k}.png": pose_at((-2.4 + 0.8 * k, 0, 0), 24.0 - 12.0 * k, 0) for k in range(5)}
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.sparse_models import NvmModel, SparsePoints
-from megloc_kapture.features.colmap_sift import ColmapSift
+from megloc_kapture.features.rootsift import ColmapSift
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.colmap import MapImage, px_from_cam, triangulate
 from megloc_kapture.io.colmap_mapping import DatabaseFeatures, write_feature_database

@@ -11,18 +11,19 @@ import torch
 from corner import CAMERA, depth_m, pose_at, render
 from published import shapes_of
 
-from megloc_kapture.mvs.learned import LearnedStereo, LearnedStereoOptions
-from megloc_kapture.mvs.views import stereo_view
-from megloc_kapture.nets.patchmatchnet import (
+from megloc_kapture.mvs.learned import (
+    LearnedStereo,
+    LearnedStereoOptions,
     PatchmatchNet,
     _warped,
 )
+from megloc_kapture.mvs.views import stereo_view
 
 POSES = [pose_at((x, 0.1 * (-1) ** i, 0.0), 0.5 * i, 0.0) for i, x in enumerate((0, -0.5, 0.5))]
 
 
 def test_depth_is_the_authors() -> None:
-    published = Path(__file__).parent / "data" / "patchmatchnet"
+    published = Path(__file__).parent.parent / "nets" / "data" / "patchmatchnet"
     script = runpy.run_path(str(published / "make_reference.py"))
     outputs = np.load(published / "reference.npz")
     network = PatchmatchNet().eval()
