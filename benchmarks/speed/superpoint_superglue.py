@@ -30,7 +30,7 @@ from timing import table
 from torch.nn import functional
 
 from megloc_kapture.features.superpoint import SuperPoint, SuperPointOptions
-from megloc_kapture.matching.superglue import SuperGlue, SuperGlueOptions
+from megloc_kapture.matching.networks import SuperGlue, SuperGlueOptions
 from megloc_kapture.nets.runtime import inference
 from megloc_kapture.nets.score_maps import select_pixels, suppress_non_maxima
 from megloc_kapture.nets.superglue import ImageKeypoints, SuperGlueNet, mutual_matches

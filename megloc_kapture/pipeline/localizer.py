@@ -37,7 +37,7 @@ from megloc_kapture.stages.matches import FeatureCache, Features, VerifiedMatche
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import MapRefiners
 from megloc_kapture.stages.query_poses import in_turn, localize_unit
-from megloc_kapture.stages.ranking_scene import KaptureScene
+from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import ordered_map
 from megloc_kapture.values import Camera, Device, Failure, Pose, RigidTransform
 

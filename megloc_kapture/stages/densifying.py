@@ -46,8 +46,9 @@ from megloc_kapture.plugins import (
     StereoView,
 )
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.given_map import copy_features
 from megloc_kapture.stages.local_features import read_frame
-from megloc_kapture.stages.rigs import depth_records
+from megloc_kapture.stages.scene import depth_records
 from megloc_kapture.stages.shared_index import index_map, with_noise, write_array
 from megloc_kapture.stages.stage import MAP, Layout, PipelineStage, StageWork
 from megloc_kapture.stages.stereo_depth import (
@@ -60,7 +61,6 @@ from megloc_kapture.stages.stereo_depth import (
     with_depth_sensors,
     write_points,
 )
-from megloc_kapture.stages.triangulation import copy_features
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Camera, Options
 

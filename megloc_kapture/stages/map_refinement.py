@@ -45,9 +45,9 @@ from megloc_kapture.mapping.uncertainty import (
     too_uncertain,
     track_lengths,
 )
-from megloc_kapture.stages.rigs import DepthRecord, depth_records, read_depth
+from megloc_kapture.stages.given_map import copy_features
+from megloc_kapture.stages.scene import DepthRecord, depth_records, read_depth
 from megloc_kapture.stages.stage import UNREFINED, Layout, PipelineStage, StageWork
-from megloc_kapture.stages.triangulation import copy_features
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Options
 

@@ -45,6 +45,7 @@ from megloc_kapture.matching.verification import (
     known_pose_of_variants,
 )
 from megloc_kapture.plugins import LocalFeatureExtractor
+from megloc_kapture.stages.given_map import matched_images
 from megloc_kapture.stages.guided_pyramid import (
     MatchedVariants,
     MatchSpool,
@@ -58,7 +59,6 @@ from megloc_kapture.stages.guided_pyramid import (
     write_tried,
 )
 from megloc_kapture.stages.local_features import image_inputs, read_frame
-from megloc_kapture.stages.map_points import matched_images
 from megloc_kapture.stages.matches import (
     MATCHING_OPTIONS,
     Features,

@@ -40,8 +40,7 @@ from megloc_kapture.stages.localized_folder import (
     write_localized,
 )
 from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.stages.ranking_scene import KaptureScene, image_inputs
-from megloc_kapture.stages.rigs import Unit, query_units
+from megloc_kapture.stages.scene import KaptureScene, Unit, image_inputs, query_units
 from megloc_kapture.stages.shared_index import index_map, open_index, shared_index, with_noise
 from megloc_kapture.stages.stage import (
     FEATURES,

@@ -25,8 +25,7 @@ from megloc_kapture.retrieval.fusion import (
     fuse_rankings,
     greedy_coverage,
 )
-from megloc_kapture.retrieval.search import FusedSearch, rank_by_similarity
-from megloc_kapture.retrieval.vectors import ConcatenatedBlocks
+from megloc_kapture.retrieval.search import ConcatenatedBlocks, FusedSearch
 
 needs_kapture_localization = pytest.mark.skipif(
     importlib.util.find_spec("kapture_localization") is None,
@@ -253,7 +252,8 @@ def test_blocks_of_several_features_rank_as_the_mean_does() -> None:
     queries, database = [unit(1, 20, 16), unit(2, 20, 8)], [unit(3, 300, 16), unit(4, 300, 8)]
     blocks = ConcatenatedBlocks(database, [2, 1])
     assert len(blocks) == 300 and blocks.dimension == 24
-    early = rank_by_similarity(concatenate(queries, [2, 1]), blocks, 10)
+    alone = FusedSearch(10, FusionOptions())
+    (early,) = alone.lists([concatenate(queries, [2, 1])], [blocks])
     search = FusedSearch(10, FusionOptions(method="mean"), [2, 1])
     late = search.ranking([search.lists(queries, database)])
     np.testing.assert_array_equal(early[0], late[0])

@@ -33,7 +33,7 @@ from megloc_kapture.stages.query_poses import (
     localize_from_matches,
     localize_unit,
 )
-from megloc_kapture.stages.ranking_scene import KaptureScene
+from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 

@@ -246,7 +246,7 @@ def depth_blocks(context: ResultContext) -> tuple[Block, ...]:
 
 def _with_depth(folder: KaptureFolder, row: DepthRow, unit: str) -> Pictures:
     """The panels of an image; raises DataError where it or its depth cannot be read."""
-    from megloc_kapture.stages.rigs import depth_records, read_depth
+    from megloc_kapture.stages.scene import depth_records, read_depth
     from megloc_kapture.stages.stereo_depth import read_beside
 
     record = depth_records(folder.read()).get(row.image)
@@ -321,7 +321,7 @@ def rendered_queries(
     ------
     DataError : an image or a depth map is broken, or there is none of any query.
     """
-    from megloc_kapture.stages.rigs import depth_records
+    from megloc_kapture.stages.scene import depth_records
 
     data = rendered.read()
     images = {Path(name).with_suffix(""): name for name in data.image_names()}
