@@ -37,12 +37,7 @@ from megloc_kapture.localization.focal_length import (
     is_uncertain,
     refine_with_intrinsics,
 )
-from megloc_kapture.localization.map_index import (
-    Correspondences,
-    MapIndex,
-    PoseProblem,
-    QueryView,
-)
+from megloc_kapture.localization.map_index import Correspondences, MapIndex, PoseProblem, QueryView
 from megloc_kapture.localization.ranking import poses_agree
 from megloc_kapture.localization.structure import displacements_rad
 from megloc_kapture.plugins import HypothesisView, PoseHypothesis, RankingScene

@@ -21,11 +21,7 @@ from megloc_kapture.geometry.cameras import focal_px
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.files import remove, safe_join
 from megloc_kapture.io.images import write_depth_map
-from megloc_kapture.io.kapture import (
-    KaptureData,
-    KaptureFolder,
-    write_sensors,
-)
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.tables import DepthRow, write_depth_rows
 from megloc_kapture.mapping.depth import LiftingOptions, lift_with_covariances
 from megloc_kapture.mvs.views import (

@@ -29,13 +29,7 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.kapture.features import SUFFIX, ArrayKind
 from megloc_kapture.matching.guided_pyramid import base_type
-from megloc_kapture.stages.stage import (
-    FEATURES,
-    MAP,
-    REFERENCE,
-    PipelineStage,
-    StageWork,
-)
+from megloc_kapture.stages.stage import FEATURES, MAP, REFERENCE, PipelineStage, StageWork
 
 # other implementations of a detector differ by some tenths of a pixel; by chance few are so near
 _MAX_SHIFT_PX = 1.0
