@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder
+from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.stages.local_features import mask_path, read_image_of, read_mask
+from megloc_kapture.stages.shared_index import index_map
 from megloc_kapture.stages.work import Digest
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
@@ -148,6 +150,9 @@ def _between(
     return None
 
 
+_NO_POINTS = np.zeros(0, np.int64)
+
+
 class _Images:
     """Pixels, masks, depth and points of the images of one folder; what is looked up stays."""
 
@@ -172,28 +177,16 @@ class _Images:
         return DepthView(record.camera, depth_m, record.image_from_depth)
 
     def points(self, name: str) -> NDArray[np.float64]:
-        ids = [
-            point_ids[starts[row] : starts[row + 1]]
-            for rows, starts, point_ids in self._observed
-            if (row := rows.get(name)) is not None
-        ]
-        xyz = self.folder.points3d()[:, :3]
-        return xyz[np.unique(np.concatenate([np.zeros(0, np.int64), *ids]))]
+        seen = [index.observed(name)[1] for index in self._indices]
+        return self.folder.points3d()[:, :3][np.unique(np.concatenate([_NO_POINTS, *seen]))]
 
     @cached_property
     def _depth_records(self) -> dict[str, DepthRecord]:
         return depth_records(self.folder.read())
 
     @cached_property
-    def _observed(self) -> list[tuple[dict[str, int], NDArray[np.int64], NDArray[np.int64]]]:
-        """Of each keypoints type: image to its row, where each row's points begin, the points."""
-        found = []
-        for _, observed in sorted(self.folder.observations().items()):
-            order = np.argsort(observed.image_ids, kind="stable")
-            rows = {name: row for row, name in enumerate(observed.image_names)}
-            starts = np.searchsorted(observed.image_ids[order], np.arange(len(rows) + 1))
-            found.append((rows, starts, observed.point_ids[order]))
-        return found
+    def _indices(self) -> list[MapIndex]:
+        return [index_map(self.folder, name) for name in self.folder.observations()]
 
 
 @lru_cache(maxsize=4)
