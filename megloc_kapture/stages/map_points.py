@@ -87,7 +87,7 @@ def triangulate_map(
     if not images:
         raise DataError("no mapping image has a pose", path=mapping.root)
     asked = None if pairs is None else {tuple(sorted((pair.query, pair.map))) for pair in pairs}
-    of_type = {name: _matched_pairs(matches.matches(name), images, asked) for name in types}
+    of_type = {name: matched_pairs(matches.matches(name), images, asked) for name in types}
     for name in types:
         mapping.keypoints(name)  # refused before any work
     specs = FolderSpec(mapping), FolderSpec(matches)
@@ -130,23 +130,17 @@ def triangulate_map(
     }
 
 
-def verified_matches(
-    reader: MatchesReader, images: Sequence[str], asked: Collection[tuple[str, ...]] | None = None
-) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """Matches by pairs of rows of ``images``; of the pairs asked for alone (first name first)."""
-    return _read(reader, images, _matched_pairs(reader, images, asked))
-
-
-def _read(
+def matches_of(
     reader: MatchesReader, images: Sequence[str], pairs: NDArray[np.int64]
 ) -> dict[tuple[int, int], NDArray[np.int64]]:
+    """Matches by pairs (P, 2) of rows of ``images``."""
     return {(a, b): reader.read(images[a], images[b])[0] for a, b in pairs.tolist()}
 
 
-def _matched_pairs(
+def matched_pairs(
     reader: MatchesReader, images: Sequence[str], asked: Collection[tuple[str, ...]] | None
 ) -> NDArray[np.int64]:
-    """Pairs (P, 2) of rows of ``images`` that have a match."""
+    """Pairs (P, 2) of rows of ``images`` with a match, of those asked for (first name first)."""
     row_of = {image: row for row, image in enumerate(images)}
     pairs = [
         (row_of[a], row_of[b])
@@ -209,7 +203,7 @@ def _triangulate_part(
         for image in names
         if (pose := data.cam_from_world(image)) is not None  # all have one
     ]
-    verified = _read(reader, names, pairs)
+    verified = matches_of(reader, names, pairs)
     return triangulate(images, verified, options, num_threads=num_threads, scratch=scratch)
 
 
