@@ -11,10 +11,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -29,7 +30,7 @@ from megloc_kapture.io.files import (
 )
 from megloc_kapture.io.images import write_depth_map, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.io.weights import WeightsFile, describe, read_weights
+from megloc_kapture.io.weights import WeightsFile, describe, read_weights, sha256_of
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
 from megloc_kapture.mapping.depth import sample_depth
 from megloc_kapture.mapping.pairs import PairsByPosesOptions, pairs_by_poses
@@ -49,6 +50,7 @@ from megloc_kapture.refinement.acceptance import RenderingOptions
 from megloc_kapture.refinement.field_training import FieldTrainer, FieldTrainingOptions
 from megloc_kapture.refinement.neural_field import (
     FieldFrame,
+    FieldRendering,
     FieldView,
     Kind,
     NeuralField,
@@ -61,16 +63,15 @@ from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, Device, Failure, ImageFeatures, Options, RigidTransform
 
-if TYPE_CHECKING:
-    import torch
-
-    from megloc_kapture.refinement.neural_field import FieldRendering
-
-
 FIELD_FILE, MANIFEST_FILE = "field.safetensors", "field.json"
 STATE_FILE = "field.state.pt"  # while it is trained
 # of views between cameras: to how many others, and how far these may look elsewhere
 _NEIGHBOURS, _MAX_ANGLE_DEG = 2, 45.0
+# of the pose that was solved, each by a rendering from where the last one led
+_ALIGNMENTS = 2
+# neighbouring rendered depths that differ by more, a share, are of an edge: not lifted
+_MAX_JUMP = 0.05
+_MAX_ERROR_PX = 3.0
 
 
 class FieldManifest(BaseModel):
@@ -302,13 +303,6 @@ def render_along(
     return len(written.records_camera)
 
 
-# of the pose that was solved, each by a rendering from where the last one led
-_ALIGNMENTS = 2
-# neighbouring rendered depths that differ by more, a share, are of an edge: not lifted
-_MAX_JUMP = 0.05
-_MAX_ERROR_PX = 3.0
-
-
 class FieldRefinerOptions(Options):
     """Options of the refinement by a neural field."""
 
@@ -333,7 +327,15 @@ class FieldRefinerOptions(Options):
 
 
 class FieldRefiner:
-    """Plugin ``field``: see the module."""
+    """Plugin ``field``: the query is matched with what a neural field shows at its pose.
+
+    Render, match, solve: colour and depth are rendered at the initial pose, local features of query
+    and rendering matched, lifted by the rendered depth, and the pose solved (as GS-CPR, Liu et al.,
+    ICLR 2025, does with splats). Renderings from there are aligned with the query as map images are
+    by ``rendering``, and the pose is accepted by its rules. The query's light is fitted on every
+    other square of it, and the others are what its pose is accepted by. Descending on colours from
+    the initial pose is slower and heals less.
+    """
 
     name = "field"
     Options = FieldRefinerOptions
@@ -355,9 +357,6 @@ class FieldRefiner:
 
     def weights(self) -> dict[str, str]:
         """The field's tensors, and those of features and matcher."""
-        from megloc_kapture.io.weights import sha256_of
-        from megloc_kapture.stages.neural_field import weights_file
-
         file = weights_file(Path(self.options.field))
         return {
             file.name: sha256_of(file),
@@ -377,9 +376,6 @@ class FieldRefiner:
 
         Raises DataError: the query's pixels or the field cannot be read.
         """
-        from megloc_kapture.refinement.neural_field import FieldView
-        from megloc_kapture.stages.neural_field import open_field
-
         field = open_field(Path(self.options.field), self.options.device)
         image, mask = scene.query_image(query), scene.query_mask(query)
         fitted = _checkers(image.shape[:2])
