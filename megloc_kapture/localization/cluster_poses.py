@@ -169,7 +169,7 @@ def localize_in_clusters(
     centers: Mapping[str, NDArray[np.float64]] | None = None,
     min_confidence: float | None = None,
     scene: RankingScene | None = None,
-) -> tuple[Pose, PoseProblem] | tuple[Failure, None]:
+) -> tuple[Pose | Failure, PoseProblem | None]:
     """Localize a query in each cluster by itself, rank the poses, and refine the best.
 
     Clusters whose poses explain each other are joined (images that look to different sides share no
@@ -189,7 +189,7 @@ def localize_in_clusters(
 
     Returns
     -------
-    The pose and the problem that it solves; or why there is none.
+    The pose and the problem that it solves; or why there is none, and None.
     """
     clock = Clock()
     matched = interleave([view.matched_images() for view in views])

@@ -235,11 +235,15 @@ class TypedMatches:
 
     def correspondences(self, images: Sequence[str] | None = None) -> Correspondences:
         """2D-3D matches, see :func:`resolve_conflicts`; only these images have a say, or all."""
-        parts = [*self.observed, self.index.seen_once[self.observed[1]]]
-        if images is not None:
-            mask = self.are_with(images)
-            parts = [part[mask] for part in parts]
-        return resolve_conflicts(*parts)
+        taken: Any = slice(None) if images is None else self.are_with(images)
+        keypoint_ids, point_ids, similarities, image_rows = self.observed
+        return resolve_conflicts(
+            keypoint_ids[taken],
+            point_ids[taken],
+            similarities[taken],
+            image_rows[taken],
+            self.index.seen_once[point_ids[taken]],
+        )
 
 
 @dataclass(frozen=True, eq=False)

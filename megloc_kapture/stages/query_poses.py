@@ -130,9 +130,7 @@ def localize_unit(
     as_rig : one result for all cameras, whose pose is ``rig_from_world``.
     """
 
-    def localize(
-        together: Sequence[QueryView],
-    ) -> tuple[Pose, PoseProblem] | tuple[Failure, None]:
+    def localize(together: Sequence[QueryView]) -> tuple[Pose | Failure, PoseProblem | None]:
         matched = {image for view in together for image in view.matched_images()}
         frame_of = dict(zip(candidates, frames, strict=True))
         images = [image for image in candidates if image in matched]
@@ -160,13 +158,13 @@ def localize_unit(
             min_confidence=options.min_confidence,
             scene=scene,
         )
-        return replace(result, seconds=seconds | result.seconds), problem
+        return replace(result, seconds={**seconds, **result.seconds}), problem
 
     if len(views) > 1 or as_rig:
         result, problem = localize(views)
         if as_rig:
             return [result]
-        if isinstance(result, Pose):
+        if isinstance(result, Pose) and problem is not None:
             return poses_of_cameras(views, result, problem)
     return [localize([QueryView(v.name, v.camera, v.matches)])[0] for v in views]
 

@@ -127,7 +127,7 @@ def open_index(folder: Path) -> MapIndex:
     except (OSError, ValueError) as error:
         raise DataError(f"cannot read a map's index: {error}", path=folder) from error
     # plain views: the compiled loops know no other kind of array
-    arrays = {name: np.asarray(array) for name, array in files.items()}
+    arrays: dict[str, Any] = {name: np.asarray(array) for name, array in files.items()}
     rows = {name: row for row, name in enumerate(images)}
     return MapIndex(row_of_image=rows, **arrays, **others)
 
