@@ -37,7 +37,6 @@ from scenes import megloc
 
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
 from megloc_kapture.localization.cluster_poses import ClusterOptions
-from megloc_kapture.localization.map_index import observed_matches
 from megloc_kapture.localization.ranking import (
     DistinctiveInliers,
     InlierCount,
@@ -45,7 +44,7 @@ from megloc_kapture.localization.ranking import (
     ReprojectionScore,
 )
 from megloc_kapture.plugins import PoseHypothesis, PoseRanker
-from megloc_kapture.stages.query_poses import LocalizationOptions, localize_views
+from megloc_kapture.stages.query_poses import LocalizationOptions, localize_unit
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
 sys.path.append(str(Path(__file__).resolve().parent / "speed"))
@@ -161,7 +160,7 @@ def localize(scene: Scene, query: Query, method: Method) -> Pose | Failure:
     pose = AbsolutePoseOptions(max_error_px=method.max_error_px)
     if method.keep_all:
         return _localize_with_all(query, pose)
-    return localize_views(
+    return localize_unit(
         [query.view],
         query.candidates,
         [""] * len(query.candidates),
@@ -169,13 +168,12 @@ def localize(scene: Scene, query: Query, method: Method) -> Pose | Failure:
         centers=scene.centers,
         ranker=RANKERS[method.ranker],
         scene=scene.pixels,
-    ).result
+    )[0]
 
 
 def _localize_with_all(query: Query, options: AbsolutePoseOptions) -> Pose | Failure:
     typed = query.view.matches[0]
-    observed = observed_matches(typed.index, typed.matches)
-    matches = np.unique(np.stack([observed.keypoint_ids, observed.point_ids], axis=1), axis=0)
+    matches = np.unique(np.stack(typed.observed[:2], axis=1), axis=0)
     return absolute_pose(
         typed.keypoints_px[matches[:, 0], :2].astype(np.float64),
         typed.index.xyz[matches[:, 1]],

@@ -51,10 +51,10 @@ from megloc_kapture.plugins import (
 )
 from megloc_kapture.stages.guided_pyramid import COLUMNS, PyramidMethod, table_path
 from megloc_kapture.stages.local_features import extract_local_features
+from megloc_kapture.stages.map_points import triangulate_map
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.pyramid_mapping import pyramid_mapping, pyramid_queries
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
-from megloc_kapture.stages.triangulation import triangulate_map
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Pose, RigidTransform
 

@@ -36,7 +36,7 @@ from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
 from megloc_kapture.plugins import DepthView, PoseRefinement  # noqa: E402
 from megloc_kapture.refinement.icp import Icp, IcpOptions  # noqa: E402
 from megloc_kapture.refinement.icp_surface import DepthCloudOptions, depth_cloud  # noqa: E402
-from megloc_kapture.stages.ranking_scene import KaptureScene  # noqa: E402
+from megloc_kapture.stages.scene import KaptureScene  # noqa: E402
 from megloc_kapture.values import RigidTransform  # noqa: E402
 
 Floats = NDArray[np.float64]

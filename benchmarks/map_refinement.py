@@ -56,7 +56,7 @@ from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
 from megloc_kapture.pipeline.presets import options_of_preset  # noqa: E402
 from megloc_kapture.stages.map_refinement import MapRefinementOptions, refine_map  # noqa: E402
 from megloc_kapture.stages.query_poses import localize_from_matches  # noqa: E402
-from megloc_kapture.stages.rigs import depth_records  # noqa: E402
+from megloc_kapture.stages.scene import depth_records  # noqa: E402
 from megloc_kapture.values import Camera, Pose, RigidTransform  # noqa: E402
 
 Floats = NDArray[np.float64]

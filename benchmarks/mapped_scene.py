@@ -22,7 +22,7 @@ from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.plugins import PoseHypothesis
 from megloc_kapture.stages.candidates import Restrictions
 from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.stages.ranking_scene import KaptureScene
+from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.shared_index import index_map
 from megloc_kapture.values import RigidTransform
 

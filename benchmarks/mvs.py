@@ -48,7 +48,7 @@ from megloc_kapture.plugins import (
     StereoView,
 )
 from megloc_kapture.stages.densifying import DensifyOptions, densify_map
-from megloc_kapture.stages.rigs import depth_records, read_depth
+from megloc_kapture.stages.scene import depth_records, read_depth
 from megloc_kapture.stages.stereo_depth import read_beside
 from megloc_kapture.values import Camera, RigidTransform
 

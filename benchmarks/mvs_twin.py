@@ -31,7 +31,7 @@ from megloc_kapture.mvs.views import AgreementOptions
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import DEPTH_ESTIMATORS
-from megloc_kapture.stages.rigs import depth_records, read_depth
+from megloc_kapture.stages.scene import depth_records, read_depth
 from megloc_kapture.stages.stereo_depth import read_beside
 
 CLASSES = ("facade", "ground", "thin", "textureless", "none")

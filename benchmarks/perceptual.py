@@ -35,9 +35,8 @@ from inloc_rooms import HARDER, InLocRooms
 from mapped_scene import Query, Scene, read_scene
 from numpy.typing import NDArray
 
-from megloc_kapture.localization.ranking import DistinctiveInliers, InlierCount
+from megloc_kapture.localization.ranking import DistinctiveInliers, InlierCount, PerceptualRanker
 from megloc_kapture.plugins import PluginChoice, PoseHypothesis, PoseRanker
-from megloc_kapture.stages.perceptual_ranking import PerceptualRanker
 
 sys.path.append(str(Path(__file__).resolve().parent / "speed"))
 from timing import table  # noqa: E402

@@ -41,12 +41,12 @@ from megloc_kapture.io.kapture import (  # noqa: E402
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours  # noqa: E402
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions  # noqa: E402
 from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
+from megloc_kapture.stages.map_points import triangulate_map  # noqa: E402
 from megloc_kapture.stages.matches import match_pairs  # noqa: E402
 from megloc_kapture.stages.query_poses import (  # noqa: E402
     LocalizationOptions,
     localize_from_matches,
 )
-from megloc_kapture.stages.triangulation import triangulate_map  # noqa: E402
 from megloc_kapture.values import Camera, Pose, RigidTransform  # noqa: E402
 
 TYPE, FLOAT = "sift", np.dtype("float32")

@@ -83,8 +83,7 @@ from megloc_kapture.localization.cluster_poses import (  # noqa: E402
 from megloc_kapture.localization.map_index import (  # noqa: E402
     MapIndex,  # noqa: E402
     QueryView,
-    TypedMatches,
-    observed_matches,  # noqa: E402
+    TypedMatches,  # noqa: E402
 )
 from megloc_kapture.values import Pose  # noqa: E402
 
@@ -209,23 +208,22 @@ def ours(index: MapIndex, query: Query) -> Centre:
         indices=[index],
     )
     view = QueryView("query", CAMERA, (TypedMatches(index, query.keypoints_px, query.matches),))
-    found = localize_in_clusters(
+    found, _ = localize_in_clusters(
         [view],
         clusters,
         OPTIONS,
         rank=lambda poses: np.array([float(p.views[0].inliers.sum()) for p in poses]),
         max_clusters=len(clusters),
     )
-    return found.result.cam_from_world.center() if isinstance(found.result, Pose) else None
+    return found.cam_from_world.center() if isinstance(found, Pose) else None
 
 
 def gather(index: MapIndex, query: Query) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Pixels and points of each place's 2D-3D matches."""
-    observed = observed_matches(index, query.matches)
+    typed = TypedMatches(index, query.keypoints_px, query.matches)
     found = []
     for place in query.places:
-        rows = np.array([image in place for image, _, _ in query.matches])
-        pairs = observed.resolve(rows)
+        pairs = typed.correspondences(tuple(place))
         px = query.keypoints_px[pairs.keypoint_ids].astype(np.float64)
         found.append((px, index.xyz[pairs.point_ids]))
     return found

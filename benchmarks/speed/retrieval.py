@@ -54,7 +54,6 @@ from megloc_kapture.retrieval.fusion import FusionOptions
 from megloc_kapture.retrieval.search import (
     FusedSearch,
     QuantizedRows,
-    rank_by_similarity,
     short_lists,
 )
 from megloc_kapture.values import Camera, RigidTransform
@@ -133,7 +132,8 @@ class Ours:
     def _search(self, images: Sequence[str], queries: Sequence[str]) -> Any:
         of_map = KaptureVectors(KaptureFolder(self.mapping).global_features(TYPE), images)
         of_queries = KaptureVectors(KaptureFolder(self.query).global_features(TYPE), queries)
-        return rank_by_similarity(of_queries.read(0, len(queries)), of_map, self.top_k)
+        search = FusedSearch(self.top_k, FusionOptions())
+        return search.lists([of_queries.read(0, len(queries))], [of_map])[0]
 
 
 def pairs_of(path: Path) -> Pairs:
@@ -310,7 +310,8 @@ def million(options: argparse.Namespace) -> None:
     queries = random_vectors([1], options.queries, options.dimension)
     database = GeneratedVectors(options.million_images, queries)
     start = time.perf_counter()
-    indices, _ = rank_by_similarity(queries, database, options.top_k)
+    search = FusedSearch(options.top_k, FusionOptions())
+    ((indices, _),) = search.lists([queries], [database])
     spent = time.perf_counter() - start
     planted = np.arange(len(queries)) * (len(database) // len(queries))
     found = int((indices[:, 0] == planted).sum())
@@ -383,10 +384,10 @@ def measure_short_lists(count: int, options: argparse.Namespace) -> bool:
         return KaptureVectors(mapping.global_features(TYPE), sorted(mapping.read().poses()))
 
     rows = step("open kapture folder and tar", opened)
-    search = partial(rank_by_similarity, queries, rows, options.top_k)
-    exact, _ = step("exact", search, len(queries))
-    codes = [step("codes made", lambda: QuantizedRows(rows))]
     exactly = FusedSearch(options.top_k, FusionOptions())
+    search = partial(exactly.lists, [queries], [rows])
+    ((exact, _),) = step("exact", search, len(queries))
+    codes = [step("codes made", lambda: QuantizedRows(rows))]
     for length in LENGTHS:
         among = partial(short_lists, exactly, [queries], [rows], codes, length=length)
         ((found, _),) = step(f"short lists of {length}", among, len(queries))

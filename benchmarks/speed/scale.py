@@ -53,12 +53,12 @@ from megloc_kapture.stages.image_pairs import (  # noqa: E402
     pair_map_images,
     pair_queries,
 )
+from megloc_kapture.stages.map_points import triangulate_map  # noqa: E402
 from megloc_kapture.stages.matches import match_pairs  # noqa: E402
 from megloc_kapture.stages.query_poses import (  # noqa: E402
     LocalizationOptions,
     localize_from_matches,
 )
-from megloc_kapture.stages.triangulation import triangulate_map  # noqa: E402
 from megloc_kapture.values import Pose, RigidTransform  # noqa: E402
 
 TYPE = "planted"

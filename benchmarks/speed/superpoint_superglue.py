@@ -35,7 +35,7 @@ from megloc_kapture.features.superpoint import (
     SuperPointOptions,
     sample_descriptors,
 )
-from megloc_kapture.matching.superglue import SuperGlue, SuperGlueOptions
+from megloc_kapture.matching.networks import SuperGlue, SuperGlueOptions
 from megloc_kapture.nets.runtime import inference
 from megloc_kapture.nets.score_maps import pixel_scores, select_pixels, suppress_non_maxima
 from megloc_kapture.nets.superglue import ImageKeypoints, SuperGlueNet, mutual_matches

@@ -35,9 +35,9 @@ from megloc_kapture.plugin_loading import load_plugin, plugin_class
 from megloc_kapture.plugins import MATCHERS, STAGES, chosen_by_name
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.local_features import extract_local_features
+from megloc_kapture.stages.map_points import triangulate_map
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.stages.triangulation import triangulate_map
 
 FEATURES, MAP = "features", "map"
 

@@ -143,7 +143,7 @@ def _rendered_queries(
     DataError : an image or a depth map is broken, or there is none of any query.
     """
     from megloc_kapture.evaluation.report.pictures import colored, encoded, read_small, subsampled
-    from megloc_kapture.stages.rigs import depth_records
+    from megloc_kapture.stages.scene import depth_records
 
     data = rendered.read()
     images = {Path(name).with_suffix(""): name for name in data.image_names()}

@@ -124,6 +124,7 @@ def absolute_pose(
 
 def rig_pose(views: Sequence[View], options: AbsolutePoseOptions | None = None) -> Pose | Failure:
     """Estimate ``rig_from_world`` of a rig, see :func:`estimate_pose` and :func:`refine_pose`."""
+    options = options or AbsolutePoseOptions()
     problem = PoseProblem.of(views)
     estimate = estimate_pose(problem, options)
     if isinstance(estimate, Failure):
@@ -131,14 +132,11 @@ def rig_pose(views: Sequence[View], options: AbsolutePoseOptions | None = None) 
     return refine_pose(problem, estimate, options)
 
 
-def estimate_pose(
-    problem: PoseProblem, options: AbsolutePoseOptions | None = None
-) -> PoseEstimate | Failure:
+def estimate_pose(problem: PoseProblem, options: AbsolutePoseOptions) -> PoseEstimate | Failure:
     """Estimate ``rig_from_world`` from the matches of one camera or several.
 
     A view without matches, or whose matches are all wrong, is no harm.
     """
-    options = options or AbsolutePoseOptions()
     count = len(problem.points)
     if count < options.min_inliers:
         return Failure(
@@ -249,7 +247,7 @@ def _rigid_from_poselib(found: Any) -> RigidTransform:
 
 
 def refine_pose(
-    problem: PoseProblem, estimate: PoseEstimate, options: AbsolutePoseOptions | None = None
+    problem: PoseProblem, estimate: PoseEstimate, options: AbsolutePoseOptions
 ) -> Pose | Failure:
     """Refine an estimate of ``rig_from_world`` of the same problem.
 
@@ -261,7 +259,6 @@ def refine_pose(
     """
     from megloc_kapture.localization import kernels
 
-    options = options or AbsolutePoseOptions()
     count = len(problem.points)
     problem = replace(problem, covariances=problem.covariances * options.map_noise**2)
     start = undo_recentring(estimate.rig_from_world, -problem.offset)

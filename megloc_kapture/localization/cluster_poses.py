@@ -37,13 +37,7 @@ from megloc_kapture.localization.focal_length import (
     is_uncertain,
     refine_with_intrinsics,
 )
-from megloc_kapture.localization.map_index import (
-    Correspondences,
-    MapIndex,
-    PoseProblem,
-    QueryView,
-    observed_matches,
-)
+from megloc_kapture.localization.map_index import Correspondences, MapIndex, PoseProblem, QueryView
 from megloc_kapture.localization.ranking import poses_agree
 from megloc_kapture.localization.structure import displacements_rad
 from megloc_kapture.plugins import HypothesisView, PoseHypothesis, RankingScene
@@ -164,14 +158,6 @@ def interleave(rankings: Sequence[Sequence[str]]) -> list[str]:
     return list(dict.fromkeys(name for rank in ranks for name in rank if name is not None))
 
 
-@dataclass(frozen=True, eq=False)
-class ClusterLocalization:
-    """A pose, or why there is none, and the number of 2D-3D matches of each view behind it."""
-
-    result: Pose | Failure
-    matches_of_views: tuple[int, ...]
-
-
 def localize_in_clusters(
     views: Sequence[QueryView],
     clusters: Sequence[Sequence[str]],
@@ -183,7 +169,7 @@ def localize_in_clusters(
     centers: Mapping[str, NDArray[np.float64]] | None = None,
     min_confidence: float | None = None,
     scene: RankingScene | None = None,
-) -> ClusterLocalization:
+) -> tuple[Pose | Failure, PoseProblem | None]:
     """Localize a query in each cluster by itself, rank the poses, and refine the best.
 
     Clusters whose poses explain each other are joined (images that look to different sides share no
@@ -200,23 +186,23 @@ def localize_in_clusters(
     centers : of the map images, (3,) each; needed for ``min_confidence``.
     min_confidence : a pose of less is a failure; None: poses have no confidence.
     scene : looked at where the confidence is in doubt; None: nothing is.
+
+    Returns
+    -------
+    The pose and the problem that it solves; or why there is none, and None.
     """
     clock = Clock()
     matched = interleave([view.matched_images() for view in views])
     rank_of = {image: rank for rank, image in enumerate(matched)}
     clusters = [[image for image in cluster if image in rank_of] for cluster in clusters]
-    gathered = [[(m, observed_matches(m.index, m.matches)) for m in v.matches] for v in views]
-    every = [both for own in gathered for both in own]
-    counts = [
-        sum(int(typed.rows_of(cluster)[found.image_rows].sum()) for typed, found in every)
-        for cluster in clusters
-    ]
+    every = [typed for view in views for typed in view.matches]
+    counts = [sum(int(typed.are_with(cluster).sum()) for typed in every) for cluster in clusters]
     by_matches = sorted(range(len(clusters)), key=lambda at: (-counts[at], at))
     tried = sorted(at for at in by_matches[:max_clusters] if counts[at])
     clock.lap("correspondences")
 
     def attempt(cluster: Sequence[str], frame: str) -> _Attempt:
-        found = [[one.resolve(typed.rows_of(cluster)) for typed, one in own] for own in gathered]
+        found = [[typed.correspondences(cluster) for typed in view.matches] for view in views]
         problem = PoseProblem.of([view.view(own) for view, own in zip(views, found, strict=True)])
         clock.lap("correspondences")
         if is_uncertain(problem):
@@ -232,8 +218,7 @@ def localize_in_clusters(
     attempts = [attempt(clusters[at], frames[at] if frames else "") for at in tried]
     attempts = _join_agreeing(attempts, attempt, rank_of.__getitem__)
     if not attempts:
-        failure = Failure("no match is with a point of the map", seconds=clock.seconds)
-        return ClusterLocalization(failure, (0,) * len(views))
+        return Failure("no match is with a point of the map", seconds=clock.seconds), None
     hypotheses = [each.hypothesis for each in attempts if each.hypothesis is not None]
     scores = iter(rank(hypotheses).tolist() if hypotheses else ())
     ranked = tuple(
@@ -264,14 +249,15 @@ def localize_in_clusters(
                 result = replace(result, remarks=(remark,) if remark else ())
             clock.lap("confidence")
     result = replace(result, candidates=ranked[best].images, clusters=ranked, seconds=clock.seconds)
-    if isinstance(result, Pose):
-        result = replace(
-            result,
-            cluster=best,
-            inlier_points_px=problem.points_px[result.inliers],
-            inlier_points_world=problem.points[result.inliers] + problem.offset,
-        )
-    return ClusterLocalization(result, tuple(len(view.points_px) for view in problem.views))
+    if isinstance(result, Failure):
+        return result, None
+    pose = replace(
+        result,
+        cluster=best,
+        inlier_points_px=problem.points_px[result.inliers],
+        inlier_points_world=problem.points[result.inliers] + problem.offset,
+    )
+    return pose, problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -381,31 +367,30 @@ class Clock:
 
 
 def poses_of_cameras(
-    views: Sequence[QueryView], found: ClusterLocalization
+    views: Sequence[QueryView], rig: Pose, problem: PoseProblem
 ) -> list[Pose | Failure]:
     """One result per camera of a localized rig, with its own matches and inliers.
 
-    A camera without any inlier has not been localized, whatever the others say: it fails, and it
-    is for who asked to give it its pose through the rig.
+    Of the rig's pose and the problem that it solves, see :func:`localize_in_clusters`. A camera
+    without any inlier has not been localized, whatever the others say: it fails, and it is for who
+    asked to give it its pose through the rig.
     """
-    result = found.result
-    if not isinstance(result, Pose) or result.inliers is None:
-        raise ValueError("the rig has no pose, or its inliers are not known")
-    masks = np.split(result.inliers, np.cumsum(found.matches_of_views)[:-1])
+    if rig.inliers is None:
+        raise ValueError("the inliers of the rig's pose are not known")
     cameras: list[Pose | Failure] = []
     end = 0
-    for view, inliers in zip(views, masks, strict=True):
+    for view, inliers in zip(views, problem.split(rig.inliers), strict=True):
         start, end = end, end + int(inliers.sum())
         clusters = tuple(
             one
             if one.cam_from_world is None
             else replace(one, cam_from_world=view.cam_from_rig @ one.cam_from_world)
-            for one in result.clusters
+            for one in rig.clusters
         )
-        px, points = result.inlier_points_px, result.inlier_points_world
+        px, points = rig.inlier_points_px, rig.inlier_points_world
         own = replace(
-            result,
-            cam_from_world=view.cam_from_rig @ result.cam_from_world,
+            rig,
+            cam_from_world=view.cam_from_rig @ rig.cam_from_world,
             clusters=clusters,
             num_matches=len(inliers),
             num_inliers=end - start,
@@ -419,9 +404,9 @@ def poses_of_cameras(
         failure = Failure(
             "no inlier in this camera; others of its rig were localized",
             num_matches=len(inliers),
-            candidates=result.candidates,
+            candidates=rig.candidates,
             clusters=clusters,
-            seconds=result.seconds,
+            seconds=rig.seconds,
         )
         cameras.append(own if start < end else failure)
     return cameras

@@ -143,96 +143,107 @@ class Correspondences:
     image_rows: NDArray[np.int64]
 
 
-@dataclass(frozen=True, eq=False)
-class ObservedMatches:
-    """Matches of a query with map keypoints that observe a point, conflicts and all.
+def resolve_conflicts(
+    keypoint_ids: NDArray[np.int64],
+    point_ids: NDArray[np.int64],
+    similarities: Floats,
+    image_rows: NDArray[np.int64],
+    seen_once: NDArray[np.bool_] | None = None,
+) -> Correspondences:
+    """One point per keypoint and one keypoint per point, of matches (M,) with conflicts and all.
 
-    Attributes
-    ----------
-    keypoint_ids, point_ids : int64 (M,), rows of the query's keypoints and of the map's points.
-    similarities : float64 (M,), higher is better.
-    image_rows : int64 (M,), which of ``num_images`` map images the match is with, from 0.
-    seen_once : bool (M,), of the points; None: none is.
-    """
-
-    keypoint_ids: NDArray[np.int64]
-    point_ids: NDArray[np.int64]
-    similarities: Floats
-    image_rows: NDArray[np.int64]
-    num_images: int
-    seen_once: NDArray[np.bool_] | None = None
-
-    def resolve(self, rows: NDArray[np.bool_] | None = None) -> Correspondences:
-        """One point per keypoint and one keypoint per point, of the matches with some images.
-
-        The same keypoint can meet several points through different map images, and the reverse. A
-        point that several images observe comes before one that was lifted through one's depth; then
-        what most images say wins; then the best score; then the smaller ids. Conflicts are settled
-        greedily from the best on, so that a loser may still get its second choice. Only the images
-        of the mask ``rows`` (num_images,) have a say; all where it is None.
-        """
-        from megloc_kapture.localization import kernels
-
-        if rows is None:
-            rows = np.ones(self.num_images, dtype=np.bool_)
-        elif rows.shape != (self.num_images,):
-            raise ValueError(f"rows has shape {rows.shape}, expected ({self.num_images},)")
-        taken = np.flatnonzero(rows[self.image_rows])
-        if len(taken) == 0:
-            none = np.zeros(0, dtype=np.int64)
-            return Correspondences(none, none, none, none)
-        # both in one number: equals are the same pair, and their order does not matter
-        taken = taken[np.argsort((self.keypoint_ids[taken] << 32) | self.point_ids[taken])]
-        keypoints, points = self.keypoint_ids[taken], self.point_ids[taken]
-        # every distinct pair once, sorted by keypoint, then point
-        first = np.flatnonzero(np.diff(keypoints, prepend=-1) | np.diff(points, prepend=-1))
-        best = np.maximum.reduceat(self.similarities[taken], first)
-        support = np.diff(first, append=len(taken))
-        keypoints, points = keypoints[first], points[first]
-        order = [-best, -support]
-        if self.seen_once is not None:
-            order.append(self.seen_once[taken][first])
-        chosen = kernels.choose(
-            np.lexsort(order),
-            np.cumsum(np.diff(keypoints, prepend=keypoints[0]) != 0),
-            np.unique(points, return_inverse=True)[1],
-        )
-        return Correspondences(
-            keypoints[chosen],
-            points[chosen],
-            support[chosen],
-            self.image_rows[taken][np.repeat(chosen, support)],
-        )
-
-
-def observed_matches(
-    index: MapIndex, matches: Sequence[tuple[str, Integers, NDArray[np.floating[Any]]]]
-) -> ObservedMatches:
-    """The matches whose map keypoint observes a point.
-
-    Of each map image: its name, rows of query and map keypoints (K, 2), scores (K,). One that is
-    not in the map has nothing to say.
+    The same keypoint can meet several points through different map images, and the reverse. A point
+    that several images observe comes before one that was lifted through one's depth (``seen_once``;
+    None: there is none); then what most images say wins; then the best similarity, higher is
+    better; then the smaller ids. Conflicts are settled greedily from the best on, so that a loser
+    may still get its second choice. ``image_rows`` are the map images that the matches are with.
     """
     from megloc_kapture.localization import kernels
 
-    if not matches:
-        empty = np.zeros(0, dtype=np.int64)
-        return ObservedMatches(empty, empty, np.zeros(0), empty, 0)
-    starts = np.zeros(len(matches) + 1, dtype=np.int64)
-    np.cumsum([len(pairs) for _, pairs, _ in matches], out=starts[1:])
-    keypoint_ids, point_ids, similarities, image_rows = kernels.observed(
-        index.offsets,
-        index.keypoint_ids,
-        index.point_ids,
-        index.rows_of([image for image, _, _ in matches]),
-        starts,
-        np.concatenate([pairs for _, pairs, _ in matches], dtype=np.int64),
-        np.concatenate([scores for _, _, scores in matches], dtype=np.float64),
+    if len(keypoint_ids) == 0:
+        none = np.zeros(0, dtype=np.int64)
+        return Correspondences(none, none, none, none)
+    # both in one number: equals are the same pair, and their order does not matter
+    order = np.argsort((keypoint_ids << 32) | point_ids)
+    keypoints, points = keypoint_ids[order], point_ids[order]
+    # every distinct pair once, sorted by keypoint, then point
+    first = np.flatnonzero(np.diff(keypoints, prepend=-1) | np.diff(points, prepend=-1))
+    best = np.maximum.reduceat(similarities[order], first)
+    support = np.diff(first, append=len(order))
+    keypoints, points = keypoints[first], points[first]
+    worth = [-best, -support]
+    if seen_once is not None:
+        worth.append(seen_once[order][first])
+    chosen = kernels.choose(
+        np.lexsort(worth),
+        np.cumsum(np.diff(keypoints, prepend=keypoints[0]) != 0),
+        np.unique(points, return_inverse=True)[1],
     )
-    seen_once = index.seen_once[point_ids]
-    return ObservedMatches(
-        keypoint_ids, point_ids, similarities, image_rows, len(matches), seen_once
+    return Correspondences(
+        keypoints[chosen],
+        points[chosen],
+        support[chosen],
+        image_rows[order][np.repeat(chosen, support)],
     )
+
+
+@dataclass(frozen=True, eq=False)
+class TypedMatches:
+    """Matches of one query image in one keypoints type, and the map's points of the type.
+
+    Of the query's keypoints, float32 (N, 2 or more), with each candidate: its name, rows of query
+    and map keypoints (K, 2), scores (K,). A candidate that is not in the map has nothing to say.
+    """
+
+    index: MapIndex
+    keypoints_px: NDArray[np.float32]
+    matches: Sequence[tuple[str, Integers, NDArray[np.floating]]]
+
+    @cached_property
+    def observed(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats, NDArray[np.int64]]:
+        """The matches whose map keypoint observes a point, conflicts and all.
+
+        Rows of the query's keypoints and of the map's points, scores, and which of the candidates
+        each is with; (M,) each.
+        """
+        from megloc_kapture.localization import kernels
+
+        if not self.matches:
+            empty = np.zeros(0, dtype=np.int64)
+            return empty, empty, np.zeros(0), empty
+        images, pairs, scores = zip(*self.matches, strict=True)
+        starts = np.zeros(len(images) + 1, dtype=np.int64)
+        np.cumsum([len(own) for own in pairs], out=starts[1:])
+        index = self.index
+        found: tuple[NDArray[np.int64], NDArray[np.int64], Floats, NDArray[np.int64]]
+        found = kernels.observed(
+            index.offsets,
+            index.keypoint_ids,
+            index.point_ids,
+            index.rows_of(images),
+            starts,
+            np.concatenate(pairs, dtype=np.int64),
+            np.concatenate(scores, dtype=np.float64),
+        )
+        return found
+
+    def are_with(self, images: Sequence[str]) -> NDArray[np.bool_]:
+        """Mask (M,) of the observed matches that are with some images."""
+        members = set(images)
+        asked = np.array([image in members for image, _, _ in self.matches], bool)
+        return np.asarray(asked[self.observed[3]])
+
+    def correspondences(self, images: Sequence[str] | None = None) -> Correspondences:
+        """2D-3D matches, see :func:`resolve_conflicts`; only these images have a say, or all."""
+        taken: Any = slice(None) if images is None else self.are_with(images)
+        keypoint_ids, point_ids, similarities, image_rows = self.observed
+        return resolve_conflicts(
+            keypoint_ids[taken],
+            point_ids[taken],
+            similarities[taken],
+            image_rows[taken],
+            self.index.seen_once[point_ids[taken]],
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,24 +353,6 @@ def undo_recentring(pose: RigidTransform, offset: Floats) -> RigidTransform:
     """``rig_from_world`` of a pose in a world that was moved by minus ``offset`` (3,)."""
     t = np.array(pose.translation) - pose.rotation_matrix() @ offset
     return RigidTransform(pose.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
-
-
-@dataclass(frozen=True, eq=False)
-class TypedMatches:
-    """Matches of one query image in one keypoints type, and the map's points of the type.
-
-    Of the query's keypoints, float32 (N, 2 or more), with each candidate: its name, rows of query
-    and map keypoints (K, 2), scores (K,).
-    """
-
-    index: MapIndex
-    keypoints_px: NDArray[np.float32]
-    matches: Sequence[ImageMatches]
-
-    def rows_of(self, images: Sequence[str]) -> NDArray[np.bool_]:
-        """Mask of the candidates that are some of these images."""
-        members = set(images)
-        return np.array([image in members for image, _, _ in self.matches], bool)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,18 +1,35 @@
-"""Pose rankers: scores of the candidate poses of a query by their inliers."""
+"""Pose rankers: scores of the candidate poses of a query, by inliers or by what is seen there.
+
+MegLoc, section "Cluster-wise localization", indoor strategy: a view near the query is rendered at
+each cluster's pose, and the one that looks most alike wins. The ranker ``perceptual`` warps that
+view from the cluster's map images with depth.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache, partial
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial import cKDTree
 
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.plugins import HypothesisView, PoseHypothesis, RankingScene
-from megloc_kapture.values import Options
+from megloc_kapture.geometry.warping import WarpedView, WarpSource, warp_to_view
+from megloc_kapture.plugin_loading import load_plugin, weights_of
+from megloc_kapture.plugins import (
+    IMAGE_DISTANCES,
+    HypothesisView,
+    ImageDistance,
+    PluginChoice,
+    PoseHypothesis,
+    RankingScene,
+)
+from megloc_kapture.values import Camera, Options, RigidTransform
 
 
 class _SumOfViews(ABC):
@@ -139,3 +156,281 @@ def _explains(this: PoseHypothesis, other: PoseHypothesis) -> bool:
         close += int((errors <= this.max_error_px).sum())
         total += len(points)
     return 2 * close >= total
+
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_ANOTHER_VIEW = 0.2  # of references, how unlike; radians: with equal centres, 11 degrees
+
+
+class AlignedViewOptions(Options):
+    """How map images are brought to a pose."""
+
+    references: int = Field(
+        default=5,
+        ge=1,
+        le=1000,
+        description="map images with depth per view: those nearest that differ",
+    )
+    long_side: int = Field(
+        default=320, ge=16, description="of the views compared, pixels; never enlarged"
+    )
+
+
+class PerceptualOptions(AlignedViewOptions):
+    """Options of the ranker ``perceptual``."""
+
+    distance: PluginChoice = Field(
+        default=PluginChoice(name="structure"),
+        description="how different two aligned images look: structure, lpips, or another's",
+    )
+    min_inlier_share: float = Field(
+        default=0.05,
+        ge=0,
+        le=1,
+        description="inliers over the most of any cluster; with less a cluster is hopeless",
+    )
+    min_valid: float = Field(
+        default=0.15,
+        ge=0,
+        le=1,
+        description="share of the query's pixels that must be comparable to tell anything",
+    )
+    finalists: int = Field(
+        default=6,
+        ge=1,
+        description="clusters of the least distance that are compared with each other where both "
+        "show something",
+    )
+
+
+class _Compared(NamedTuple):
+    """One view of a query and what a cluster shows at its pose."""
+
+    query: NDArray[np.uint8]
+    aligned: NDArray[np.uint8]
+    valid: Mask
+
+
+class PerceptualRanker:
+    """Plugin ``perceptual``: the least distance of the query to the view warped to its pose.
+
+    Clusters whose inliers are a fair share of the most are compared. Distances over different
+    parts of an image say little about each other: so the few best by their own distance (the
+    finalists) are compared pair by pair, over the pixels that both show, and a finalist's score is
+    by how much its distance is less than the others', on average. The rest follow by their own
+    distances, then come clusters that cannot be told: without depth, or hopeless.
+
+    Where the place that the ranker ``distinctive`` would choose cannot be told, pictures decide
+    nothing: its scores are the result then. One cluster alone needs no comparing and has score 0.
+    """
+
+    Options = PerceptualOptions
+
+    def __init__(self, options: PerceptualOptions | None = None) -> None:
+        self.options = options or PerceptualOptions()
+        choice = self.options.distance
+        self._distance: ImageDistance = load_plugin(IMAGE_DISTANCES, choice.name, choice.options)
+
+    def plugins(self) -> tuple[object, ...]:
+        """Those it is made of."""
+        return (self._distance,)
+
+    def weights(self) -> dict[str, str]:
+        """Those of the image distance."""
+        return weights_of(self._distance)
+
+    def score(self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene) -> Floats:
+        """Scores (H,); raises DataError where the query's pixels or the map's cannot be read."""
+        if len(hypotheses) < 2:
+            return np.zeros(len(hypotheses))
+        otherwise = DistinctiveInliers().score(hypotheses, scene)
+        inliers = [sum(int(v.inliers.sum()) for v in each.views) for each in hypotheses]
+        enough = self.options.min_inlier_share * max(inliers)
+        shown = _Shown(scene, self.options)
+        compared = [
+            shown.views(each) if count >= enough else None
+            for each, count in zip(hypotheses, inliers, strict=True)
+        ]
+        own = np.array(
+            [
+                np.inf if v is None else self._mean_distance(v, [a.valid for a in v])
+                for v in compared
+            ]
+        )
+        told = np.flatnonzero(np.isfinite(own))
+        if not np.isfinite(own[int(np.argmax(otherwise))]):
+            return otherwise
+        by_own = told[np.argsort(own[told], kind="stable")]
+        scores = np.full(len(own), -np.inf)
+        finalists = by_own[: self.options.finalists]
+        scores[finalists] = self._against_each_other(
+            [compared[at] for at in finalists], own, finalists
+        )
+        rest = by_own[self.options.finalists :]
+        scores[rest] = scores[finalists].min() - own[rest]
+        untold = ~np.isfinite(own)
+        scores[untold] = scores[told].min() - 1.0 - 1.0 / (1.0 + otherwise[untold])
+        return scores
+
+    def _against_each_other(
+        self, finalists: Sequence[Sequence[_Compared] | None], own: Floats, at: NDArray[np.int64]
+    ) -> Floats:
+        """By how much each one's distance is less than the others', on average."""
+        margins = np.zeros(len(finalists))
+        for i, one in enumerate(finalists):
+            for j, other in enumerate(finalists[:i]):
+                if one is None or other is None:
+                    continue
+                both = [a.valid & b.valid for a, b in zip(one, other, strict=True)]
+                margin = self._mean_distance(other, both) - self._mean_distance(one, both)
+                if not np.isfinite(margin):  # they show nothing in common
+                    margin = own[at[j]] - own[at[i]]
+                margins[i] += margin
+                margins[j] -= margin
+        return margins / max(len(finalists) - 1, 1)
+
+    def _mean_distance(self, views: Sequence[_Compared], valid: Sequence[Mask]) -> float:
+        """Mean over a rig's views by their valid pixels; infinite with too few of them."""
+        counts = np.array([int(each.sum()) for each in valid])
+        if counts.sum() < max(1.0, self.options.min_valid * sum(each.size for each in valid)):
+            return float("inf")
+        distances = [
+            self._distance.distance(view.query, view.aligned, mask) if count else np.inf
+            for view, mask, count in zip(views, valid, counts, strict=True)
+        ]
+        known = np.isfinite(distances)
+        if not known.any():
+            return float("inf")
+        return float(np.average(np.array(distances)[known], weights=counts[known]))
+
+
+class _Shown:
+    """A query's images and what clusters show in their place; reads everything once."""
+
+    def __init__(self, scene: RankingScene, options: AlignedViewOptions) -> None:
+        self._scene, self._options = scene, options
+        self._queries: dict[str, tuple[NDArray[np.uint8], Mask | None]] = {}
+        self._source = cache(partial(warp_source, scene=scene))
+
+    def views(self, hypothesis: PoseHypothesis) -> list[_Compared]:
+        """The views of a hypothesis."""
+        return [self._view(view, hypothesis.images) for view in hypothesis.views]
+
+    def _view(self, view: HypothesisView, images: Sequence[str]) -> _Compared:
+        warped = aligned_view(
+            view.camera,
+            view.cam_from_world,
+            images,
+            self._scene,
+            self._options,
+            source_of=self._source,
+        )
+        height, width = warped.valid.shape
+        if view.name not in self._queries:
+            image, mask = self._scene.query_image(view.name), self._scene.query_mask(view.name)
+            self._queries[view.name] = (
+                query_at_size(image, width, height),
+                None if mask is None else _mask_at_size(mask, width, height),
+            )
+        query, usable = self._queries[view.name]
+        valid = warped.valid if usable is None else warped.valid & usable
+        return _Compared(query, warped.image, valid)
+
+
+def warp_source(name: str, scene: RankingScene) -> WarpSource | None:
+    """A map image to warp from; None where it has no depth. Raises DataError."""
+    depth = scene.map_depth(name)
+    if depth is None:
+        return None
+    return WarpSource(
+        image=scene.map_image(name),
+        camera=scene.map_camera(name),
+        cam_from_world=scene.map_pose(name),
+        depth_m=depth.depth_m,
+        depth_camera=depth.camera,
+        image_from_depth=depth.image_from_depth,
+        mask=scene.map_mask(name),
+    )
+
+
+def aligned_view(
+    camera: Camera,
+    cam_from_world: RigidTransform,
+    images: Sequence[str],
+    scene: RankingScene,
+    options: AlignedViewOptions | None = None,
+    *,
+    source_of: Callable[[str], WarpSource | None] | None = None,
+) -> WarpedView:
+    """What map images show of a query's view, at reduced size.
+
+    Parameters
+    ----------
+    camera, cam_from_world : of the query and where it may stand.
+    images : map images of the place, best first; those nearest to the pose that have depth are
+        warped.
+    source_of : reads a map image; default :func:`warp_source`.
+
+    Raises
+    ------
+    DataError : an image or its depth cannot be read.
+    """
+    options = options or AlignedViewOptions()
+    read = source_of or (lambda name: warp_source(name, scene))
+    sources: list[WarpSource] = []
+    for name in _nearest_first(images, cam_from_world, scene):
+        if len(sources) == options.references:
+            break
+        if (source := read(name)) is not None:
+            sources.append(source)
+    scale = min(1.0, options.long_side / max(camera.width, camera.height))
+    return warp_to_view(sources, camera, cam_from_world, scale=scale)
+
+
+def query_at_size(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """A query's pixels reduced to the size of an aligned view, uint8 (height, width, 3)."""
+    if image.shape[:2] == (height, width):
+        return image
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _mask_at_size(mask: Mask, width: int, height: int) -> Mask:
+    """True where every pixel below is."""
+    share = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(share > 0.999, np.bool_)
+
+
+def _nearest_first(
+    images: Sequence[str], cam_from_world: RigidTransform, scene: RankingScene
+) -> list[str]:
+    """Images by how much like the pose they look; those that show what an earlier one does, last.
+
+    How unlike two views are is the angle of their axes and the distance of their centres; a radian
+    weighs as much as the median distance to the pose, whatever the size of the place. The frames of
+    a film and repeated photographs show the same: a few of them would leave most of a view empty.
+    """
+    if not images:
+        return []
+    poses = [scene.map_pose(name) for name in images]
+    centres = np.array([pose.center() for pose in poses])
+    axes = np.array([pose.rotation_matrix()[2] for pose in poses])
+    distances = np.linalg.norm(centres - cam_from_world.center(), axis=1)
+    scale = max(float(np.median(distances)), 1e-9)
+
+    def unlike(centre: Floats, axis: Floats) -> Floats:
+        angles = np.arccos(np.clip(axes @ axis, -1.0, 1.0))
+        return np.asarray(angles + np.linalg.norm(centres - centre, axis=1) / scale)
+
+    nearest = unlike(cam_from_world.center(), cam_from_world.rotation_matrix()[2])
+    repeated = np.zeros(len(images), np.bool_)
+    waiting = []
+    order = []
+    for at in np.argsort(nearest, kind="stable"):
+        if repeated[at]:
+            waiting.append(at)
+            continue
+        order.append(at)
+        repeated |= unlike(centres[at], axes[at]) < _ANOTHER_VIEW
+    return [images[at] for at in (*order, *waiting)]

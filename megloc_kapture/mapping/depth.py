@@ -95,7 +95,7 @@ def lift_with_covariances(
     sigma_m: NDArray[np.float32],
     image_camera: Camera,
     depth_camera: Camera,
-    options: LiftingOptions | None = None,
+    options: LiftingOptions,
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """:func:`lift_keypoints` through a depth map of the image's own centre, with covariances.
 
@@ -214,7 +214,7 @@ def contradicted_by_depth(
     depth_m: NDArray[np.float32],
     depth_camera: Camera,
     image_from_depth: RigidTransform,
-    options: DepthVerificationOptions | None = None,
+    options: DepthVerificationOptions,
     *,
     deviations: Floats | None = None,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -233,7 +233,6 @@ def contradicted_by_depth(
     Masks (N,): contradicted, never where there is no depth; and where there is depth to compare
         with.
     """
-    options = options or DepthVerificationOptions()
     points = image_from_depth.inverse().apply(np.asarray(points_in_image, np.float64))
     contradicted, checked = np.zeros(len(points), bool), np.zeros(len(points), bool)
     if options.max_sigmas is None or not len(points):

@@ -160,14 +160,13 @@ class PairsBySequenceOptions(Options):
 
 
 def pairs_by_sequence(
-    cameras: Sequence[str], timestamps: Sequence[int], options: PairsBySequenceOptions | None = None
+    cameras: Sequence[str], timestamps: Sequence[int], options: PairsBySequenceOptions
 ) -> NDArray[np.int64]:
     """Pairs (P, 2) of each image with the next ones of its camera, i < j, sorted, each once.
 
     Of N images it is given which camera took each and when; images of one camera at the same time
     follow each other as they are given.
     """
-    options = options or PairsBySequenceOptions()
     sequences: dict[str, list[int]] = {}
     for image in sorted(range(len(cameras)), key=lambda image: timestamps[image]):
         sequences.setdefault(cameras[image], []).append(image)

@@ -36,13 +36,8 @@ from megloc_kapture.stages.localized_folder import unreadable_image
 from megloc_kapture.stages.matches import FeatureCache, Features, VerifiedMatches
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import MapRefiners
-from megloc_kapture.stages.query_poses import (
-    Solved,
-    in_turn,
-    localize_unit,
-    localize_views,
-)
-from megloc_kapture.stages.ranking_scene import KaptureScene
+from megloc_kapture.stages.query_poses import in_turn, localize_unit
+from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import ordered_map
 from megloc_kapture.values import Camera, Device, Failure, Pose, RigidTransform
 
@@ -224,7 +219,8 @@ class Localizer:
             )
         with single_threaded():
             images = [self._preprocessor.of(query) for query, _ in views]
-            return self._solve(localize_views, views, images, self._scene(images))[0].result
+            (found,), _ = self._solve(views, images, self._scene(images), as_rig=True)
+            return found
 
     # ------------------------------------------------------------------ the steps
 
@@ -242,7 +238,7 @@ class Localizer:
             scene = self._scene(images)
             found = []
             for image, result, matched in zip(
-                images, *self._solve(localize_unit, unit, images, scene), strict=True
+                images, *self._solve(unit, images, scene), strict=True
             ):
                 if isinstance(result, Pose):
                     camera = result.camera or image.camera
@@ -260,12 +256,13 @@ class Localizer:
 
     def _solve(
         self,
-        solve: Callable[..., Solved],
         unit: Sequence[tuple[Query, RigidTransform]],
         images: Sequence[QueryImage],
         scene: KaptureScene,
-    ) -> tuple[Solved, list[_Matched]]:
-        """What ``solve`` makes of the matches of all cameras, and these.
+        *,
+        as_rig: bool = False,
+    ) -> tuple[list[Pose | Failure], list[_Matched]]:
+        """What becomes of the matches of all cameras, see :func:`localize_unit`, and these.
 
         What orders candidates by their matches, and guided pyramids, need all matches at first;
         else no more candidates are matched than are taken.
@@ -274,12 +271,12 @@ class Localizer:
         whole = self.options.reranking.reranks() or self.options.matches_again()
         matched = [self._match(one, len(one.ranked) if whole else 0) for one in asked]
 
-        def localize(count: int) -> Solved:
+        def localize(count: int) -> list[Pose | Failure]:
             if not whole:
                 matched[:] = [self._match(one, count) for one in asked]
             first = [one.candidates[:count] for one in matched]
             candidates = interleave(first)
-            return solve(
+            return localize_unit(
                 [one.view.among(own) for one, own in zip(matched, first, strict=True)],
                 candidates,
                 [self.map.restrictions.frame(name) for name in candidates],
@@ -287,6 +284,7 @@ class Localizer:
                 centers=self._centers,
                 ranker=self._ranker,
                 scene=scene,
+                as_rig=as_rig,
             )
 
         lists = [one.candidates for one in matched] if whole else [one.ranked for one in asked]

@@ -32,8 +32,7 @@ from megloc_kapture.stages.global_features import describe_images
 from megloc_kapture.stages.image_masks import ClassMasks, MaskOptions, ProcessedFrame
 from megloc_kapture.stages.local_features import check_size, extract_all, mask_path, read_mask
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.stages.ranking_scene import depth_of
-from megloc_kapture.stages.rigs import query_units
+from megloc_kapture.stages.scene import depth_of, query_units
 from megloc_kapture.values import Camera, LocalFeatures, Pose, RigidTransform
 
 
@@ -226,7 +225,7 @@ class QueryImage:
 
 
 class QueryImages:
-    """Images by their names, as a :class:`~megloc_kapture.stages.ranking_scene.QueryScene`."""
+    """Images by their names, as a :class:`~megloc_kapture.stages.scene.QueryScene`."""
 
     def __init__(self, images: Iterable[QueryImage]) -> None:
         self._images = {image.query.name: image for image in images}

@@ -46,7 +46,7 @@ from megloc_kapture.pipeline.datasets import (
     dataset_names,
 )
 from megloc_kapture.pipeline.manifests import read_manifest
-from megloc_kapture.stages import rigs
+from megloc_kapture.stages import scene
 from megloc_kapture.values import Pose, RigidTransform
 
 # a row of MLAD for a query without a pose; kapture's own exporter writes the same
@@ -188,7 +188,7 @@ def poses_through_rig(
             localized[image] = Pose(pose, 0, 0)
         elif status.status == "localized":
             localized[image] = Pose(pose, status.num_matches, status.num_inliers)
-    return {image: pose for image, (_, pose) in rigs.poses_through_rig(data, localized).items()}
+    return {image: pose for image, (_, pose) in scene.poses_through_rig(data, localized).items()}
 
 
 def _read_result(localized: Path, beside: Path | None, *, from_rig: bool) -> _Result:

@@ -119,17 +119,15 @@ def fuse(
     options: FusionOptions,
     weights: Sequence[float] | None = None,
 ) -> Similarities:
-    """Fuse the similarities of several features, element by element.
-
-    Methods that fuse ranks look at whole rows: each row must hold all images there are. Their
-    result has no meaning but its order, in which ties are left to the order of the images.
+    """Fuse the similarities of several features, element by element, by a method that is not one of
+    RANK_METHODS, which :func:`fuse_rankings` is for.
 
     Parameters
     ----------
     similarities : per feature float (Q, M), finite; all of one shape and dtype, which is the
-        result's; that of ranks is float64.
-    weights : one per feature, positive; all equal by default. Maximum, minimum, ``min_and_max``,
-        ``villena_roman`` and ``round_robin`` have no use for them.
+        result's.
+    weights : one per feature, positive; all equal by default. Maximum, minimum, ``min_and_max`` and
+        ``villena_roman`` have no use for them.
 
     Raises
     ------
@@ -141,8 +139,6 @@ def fuse(
         shapes = ", ".join(str(matrix.shape) for matrix in similarities)
         raise DataError(f"similarities of different shapes: {shapes}")
     method, gamma, alpha = options.method, options.gamma, options.alpha
-    if options.fuses_ranks():
-        return _by_ranks(similarities, options, shares)
     if method in ("mean", "early"):
         return _mean(similarities, shares)
     if method == "power":
@@ -201,25 +197,6 @@ def _villena_roman(least: Similarities, largest: Similarities, alpha: float) -> 
     total = least + largest
     joint = np.divide(least * least, total, out=np.zeros_like(total), where=total > 0)
     return (1 - alpha) * largest + alpha * joint
-
-
-def _by_ranks(
-    similarities: Sequence[Similarities], options: FusionOptions, shares: Sequence[float]
-) -> NDArray[np.float64]:
-    features = len(similarities)
-    length = similarities[0].shape[1]
-    fused = np.full(similarities[0].shape, -np.inf if options.method == "round_robin" else 0.0)
-    for feature, (matrix, share) in enumerate(zip(similarities, shares, strict=True)):
-        order = np.argsort(-matrix, axis=1, kind="stable")
-        ranks = np.empty_like(order)
-        np.put_along_axis(ranks, order, np.arange(length)[None], axis=1)
-        if options.method == "round_robin":
-            np.maximum(fused, -(ranks * features + feature), out=fused)
-        elif options.method == "reciprocal_rank":
-            fused += share / (options.rank_constant + 1 + ranks)
-        else:
-            fused += share * (length - ranks)
-    return fused
 
 
 def normalized_weights(weights: Sequence[float] | None, count: int) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,20 +22,108 @@ from megloc_kapture.retrieval.fusion import (
     fuse_rankings,
     normalized_weights,
 )
-from megloc_kapture.retrieval.vectors import (
-    ConcatenatedBlocks,
-    VectorBlocks,
-    VectorSource,
-    as_blocks,
-    common_length,
-)
+
+
+class VectorBlocks(Protocol):
+    """Global descriptors of a database, of which no more than a block has to be in memory.
+
+    Rows are of unit length, so that the inner product is the cosine; a zero row, of an image
+    without features, is similar to nothing. A source that refuses values that are not finite may
+    have an attribute ``finite = True``: its rows are not looked at again.
+    """
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        ...
+
+    @property
+    def dimension(self) -> int:
+        """Length D of a row."""
+        ...
+
+    def read(
+        self, start: int, stop: int, out: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
+        """The rows from ``start`` to ``stop``, float32 (stop - start, D).
+
+        They may be in ``out``, a C-contiguous array of that shape: memory that is used again and
+        again is much faster than new memory. They are not written to.
+        """
+        ...
+
+
+VectorSource = VectorBlocks | NDArray[np.floating[Any]]
+
+
+class ArrayBlocks:
+    """An array (N, D) of unit or zero rows as a source of blocks; DataError if it is not 2-D."""
+
+    def __init__(self, rows: NDArray[np.floating[Any]]) -> None:
+        if rows.ndim != 2:
+            raise DataError(f"global descriptors {rows.shape} are of different dimensions")
+        self._rows = rows
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @property
+    def dimension(self) -> int:
+        return self._rows.shape[1]
+
+    def read(
+        self, start: int, stop: int, out: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
+        # a view where the array is float32 already
+        return np.ascontiguousarray(self._rows[start:stop], dtype=np.float32)
+
+
+class ConcatenatedBlocks:
+    """Several features of the same images as one: early fusion, block by block.
+
+    Raises DataError for sources of different lengths, OptionError for weights that cannot be used,
+    see :func:`.fusion.concatenate`.
+    """
+
+    def __init__(
+        self, sources: Sequence[VectorSource], weights: Sequence[float] | None = None
+    ) -> None:
+        self._sources = [as_blocks(source) for source in sources]
+        self._weights = weights
+        self._length = common_length(self._sources)
+        self.read(0, 0)  # refuses weights now, not in the middle of a search
+
+    def __len__(self) -> int:
+        return self._length
+
+    @property
+    def dimension(self) -> int:
+        return sum(source.dimension for source in self._sources)
+
+    def read(
+        self, start: int, stop: int, out: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
+        rows = [source.read(start, stop) for source in self._sources]
+        return concatenate(rows, self._weights, out=out)
+
+
+def as_blocks(source: VectorSource) -> VectorBlocks:
+    """The source itself, or the array as one."""
+    return ArrayBlocks(source) if isinstance(source, np.ndarray) else source
+
+
+def common_length(sources: Sequence[VectorBlocks]) -> int:
+    """Number of rows that all sources have; DataError where there is none, or they differ."""
+    lengths = {len(source) for source in sources}
+    if len(lengths) != 1:
+        raise DataError(f"features of one set of images have {sorted(lengths)} rows")
+    return lengths.pop()
+
 
 # products of large blocks are faster: the matrix library's threads wait for each other less often
 _BLOCK_ELEMENTS = 1 << 24  # similarities held at once, per feature: 64 MiB of float32
 _VECTOR_ELEMENTS = 1 << 25  # of a block of database rows, per feature: 128 MiB of float32
 _MOST_ROWS = 1 << 14  # of a block, however short they are
 _CACHED_ELEMENTS = 1 << 18  # of similarities ranked at once: 1 MiB, which a cache holds
-Permitted = NDArray[np.bool_] | Callable[[int, int], NDArray[np.bool_]] | None
 Matrices = Sequence[NDArray[np.floating[Any]]]
 Float32 = NDArray[np.float32]
 Found = tuple[NDArray[np.int64], Float32]
@@ -45,37 +133,6 @@ _SIGN = np.int32(0x7FFFFFFF)
 _SUBVECTOR = 16  # values that share a code of 4 bits, one of 16 centroids
 _SAMPLE = 16 * 39  # fewer rows than 39 for each centroid FAISS calls too few
 _LENGTH = 1000  # rows of a query whose exact similarity is found
-
-
-def rank_by_similarity(
-    queries: NDArray[np.floating[Any]],
-    database: VectorSource,
-    top_k: int,
-    *,
-    permitted: Permitted = None,
-) -> Found:
-    """The ``top_k`` most similar database rows of each query row, by inner product.
-
-    Parameters
-    ----------
-    queries : float (Q, D), rows of unit length for cosine similarity. A zero row, of an image
-        without features, has similarity 0 with everything.
-    database : float (M, D), or a source of blocks of them.
-    permitted : bool (Q, M), False for rows that a query must not get; or a function that gives (Q,
-        stop - start) of the database rows ``start`` to ``stop``; or None.
-
-    Returns
-    -------
-    indices : int64 (Q, min(top_k, M)), best first; equal scores keep the database's order; -1 where
-        fewer than ``top_k`` rows are permitted.
-    scores : float32 of the same shape; -inf where the index is -1.
-
-    Raises
-    ------
-    DataError : different dimensions, or values that are not finite.
-    """
-    (found,) = _search([queries], [database], [top_k], lambda matrices: matrices, permitted)
-    return found
 
 
 @dataclass(frozen=True)
@@ -91,42 +148,52 @@ class FusedSearch:
     weights: Sequence[float] | None = None
 
     def lists(
-        self,
-        queries: Sequence[NDArray[np.floating[Any]]],
-        database: Sequence[VectorSource],
-        permitted: Permitted = None,
+        self, queries: Sequence[NDArray[np.floating[Any]]], database: Sequence[VectorSource]
     ) -> list[Found]:
         """Rank the rows of a part: one ranking, or of methods that fuse ranks one per feature.
 
-        Per feature queries are float (Q, D_i), rows of unit length or zero, the database float
-        (M, D_i), or a source of blocks of them. Raises DataError for different dimensions or
-        numbers of rows, or values that are not finite; OptionError for weights that cannot be used,
-        or other features than those of the queries.
+        Parameters
+        ----------
+        queries : per feature float (Q, D_i), rows of unit length for cosine similarity. A zero row,
+            of an image without features, has similarity 0 with everything.
+        database : per feature float (M, D_i), or a source of blocks of them.
+
+        Returns
+        -------
+        Of each ranking indices, int64 (Q, min(K, M)), best first, where equal scores keep the
+        database's order, and scores float32; K is ``top_k``, or more of rankings that are fused.
+        -1 and -inf where a score is -inf.
+
+        Raises
+        ------
+        DataError : different dimensions or numbers of rows, or values that are not finite.
+        OptionError : weights that cannot be used, or other features than those of the queries.
         """
         if len(queries) == 0 or len(queries) != len(database):
             raise OptionError(
                 f"{len(queries)} global features of the queries, {len(database)} of the map"
             )
         normalized_weights(self.weights, len(queries))  # refused before anything is read
-        if len(queries) == 1:
-            return [rank_by_similarity(queries[0], database[0], self.top_k, permitted=permitted)]
-        if self.fusion.method == "early":
+        several = len(queries) > 1
+        if several and self.fusion.method == "early":
             rows = [np.asarray(rows, np.float32) for rows in queries]
-            joined = ConcatenatedBlocks(database, self.weights)
-            together = concatenate(rows, self.weights)
-            return [rank_by_similarity(together, joined, self.top_k, permitted=permitted)]
-
-        def fused(matrices: Matrices) -> Matrices:
-            return [fuse(matrices, self.fusion, self.weights)]
-
-        if not self.fusion.fuses_ranks():
-            return _search(queries, database, [self.top_k], fused, permitted)
-        lengths = [self._list_length()] * len(queries)
-        return _search(queries, database, lengths, lambda matrices: matrices, permitted)
+            queries = [concatenate(rows, self.weights)]
+            database = [ConcatenatedBlocks(database, self.weights)]
+        elif several and self.fusion.fuses_ranks():
+            lengths = [self._list_length()] * len(queries)
+            return _search(queries, database, lengths, lambda matrices: matrices)
+        elif several:
+            return _search(
+                queries,
+                database,
+                [self.top_k],
+                lambda matrices: [fuse(matrices, self.fusion, self.weights)],
+            )
+        return _search(queries, database, [self.top_k], lambda matrices: matrices)
 
     def ranking(self, parts: Sequence[Sequence[Found]]) -> Found:
-        """Rank the whole, as :func:`rank_by_similarity`, from the lists of its parts, whose rows
-        are the whole's; scores are as the fusion makes them."""
+        """Rank the whole from the lists of its parts, whose rows are the whole's; scores are as the
+        fusion makes them. Both are (Q, min(top_k, M))."""
         lists = [_merged(found, self._list_length()) for found in zip(*parts, strict=True)]
         if len(lists) == 1:
             indices, scores = lists[0]
@@ -156,7 +223,6 @@ def _search(
     database: Sequence[VectorSource],
     lengths: Sequence[int],
     combine: Callable[[Matrices], Matrices],
-    permitted: Permitted,
 ) -> list[Found]:
     """One ranking, of the length that is asked for, per matrix of scores that ``combine`` makes."""
     sources = [as_blocks(source) for source in database]
@@ -178,24 +244,17 @@ def _search(
             source.read(left, right, out=buffer[: right - left])
             for source, buffer in zip(sources, buffers, strict=True)
         ]
-        allowed = permitted(left, right) if callable(permitted) else permitted
-        if allowed is not None and not callable(permitted):
-            allowed = allowed[:, left:right]
         for first in range(0, num_queries, at_once):
             some = slice(first, first + at_once)
             matrices = [
                 _similarities(rows[some], block, left, out, finite)
                 for rows, block, out, finite in zip(vectors, blocks, products, finites, strict=True)
             ]
-            mask = None if allowed is None else allowed[some]
             count, width = matrices[0].shape
             few = max(1, _CACHED_ELEMENTS // width)
             for start in range(0, count, few):
-                part = slice(start, start + few)
-                fused = combine([matrix[part] for matrix in matrices])
+                fused = combine([matrix[start : start + few] for matrix in matrices])
                 for scores, ranking in zip(fused, best, strict=True):
-                    if mask is not None:
-                        scores = np.where(mask[part], scores, -np.inf)
                     ranking.add(first + start, left, scores)
     return [ranking.result() for ranking in best]
 

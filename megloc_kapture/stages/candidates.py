@@ -18,8 +18,15 @@ from megloc_kapture.io.dataset_tables import ImageGroup, read_groups, read_prior
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.io.kapture.vectors import KaptureVectors
 from megloc_kapture.retrieval.fusion import DiversityOptions, FusionOptions, diversify
-from megloc_kapture.retrieval.search import Found, FusedSearch, QuantizedRows, short_lists
-from megloc_kapture.retrieval.vectors import VectorBlocks, as_blocks, common_length
+from megloc_kapture.retrieval.search import (
+    Found,
+    FusedSearch,
+    QuantizedRows,
+    VectorBlocks,
+    as_blocks,
+    common_length,
+    short_lists,
+)
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Options, RigidTransform
 

@@ -21,11 +21,7 @@ from megloc_kapture.geometry.cameras import focal_px
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.files import remove, safe_join
 from megloc_kapture.io.images import write_depth_map
-from megloc_kapture.io.kapture import (
-    KaptureData,
-    KaptureFolder,
-    write_sensors,
-)
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.tables import DepthRow, write_depth_rows
 from megloc_kapture.mapping.depth import LiftingOptions, lift_with_covariances
 from megloc_kapture.mvs.views import (
@@ -46,8 +42,9 @@ from megloc_kapture.plugins import (
     StereoView,
 )
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.given_map import copy_features
 from megloc_kapture.stages.local_features import read_frame
-from megloc_kapture.stages.rigs import depth_records
+from megloc_kapture.stages.scene import depth_records
 from megloc_kapture.stages.shared_index import index_map, with_noise, write_array
 from megloc_kapture.stages.stage import MAP, Layout, PipelineStage, StageWork
 from megloc_kapture.stages.stereo_depth import (
@@ -60,7 +57,6 @@ from megloc_kapture.stages.stereo_depth import (
     with_depth_sensors,
     write_points,
 )
-from megloc_kapture.stages.triangulation import copy_features
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Camera, Options
 

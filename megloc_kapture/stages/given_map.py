@@ -1,13 +1,16 @@
-"""Stage: the map a dataset comes with as the map to localize in, alone or beside one of our own.
+"""Features of map images: of the map a dataset comes with, and as maps take them over.
 
 A published model names the keypoints that see its points; to match queries with them they need
 descriptors. Where these are published (a COLMAP database) they are taken as they are. Where not,
 the images' features are extracted again, and the observations move to those at the same places.
+Such a map is localized in alone, or beside one of our own.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import link_images
+from megloc_kapture.io.files import hard_link, link_images
 from megloc_kapture.io.kapture import (
     FeatureWriter,
     KaptureFolder,
@@ -24,8 +27,9 @@ from megloc_kapture.io.kapture import (
     write_points3d,
     write_sensors,
 )
+from megloc_kapture.io.kapture.features import SUFFIX, ArrayKind
 from megloc_kapture.matching.guided_pyramid import base_type
-from megloc_kapture.stages.triangulation import copy_features
+from megloc_kapture.stages.stage import FEATURES, MAP, REFERENCE, PipelineStage, StageWork
 
 # other implementations of a detector differ by some tenths of a pixel; by chance few are so near
 _MAX_SHIFT_PX = 1.0
@@ -52,6 +56,19 @@ def given_type(reference: KaptureFolder) -> str:
             path=reference.root,
         )
     return types[0]
+
+
+def check_given_type(reference: KaptureFolder, expected: str) -> None:
+    """Check that a given map is of the keypoints type that is extracted for it.
+
+    Raises DataError: it is of another one, or no map.
+    """
+    found = given_type(reference)
+    if found != expected:
+        raise DataError(
+            f"the given map is of keypoints type {found!r}, given_features extracts {expected!r}",
+            path=reference.root,
+        )
 
 
 def has_descriptors(reference: KaptureFolder) -> bool:
@@ -283,3 +300,88 @@ def rows_at_their_places(
     near = tree.query_ball_point(extracted[nearest[found]], _SAME_PLACE_PX, return_sorted=True)
     lengths = [len(rows) for rows in near]
     return np.repeat(found, lengths), np.concatenate([none, *near]).astype(np.int64)
+
+
+def is_given(stage: PipelineStage, local_type: str) -> bool:
+    """Whether points of a keypoints type are those of the given map."""
+    options = stage.options
+    return options.uses_given_map() and local_type == options.make_given_extractor().name
+
+
+def described_images(work: StageWork, stage: PipelineStage, local_type: str) -> KaptureFolder:
+    """The map's images with their features of a type, before there is a map."""
+    # descriptors of its own: those that were extracted for it lie in the workspace
+    if is_given(stage, local_type) and has_descriptors(work.folder(REFERENCE)):
+        return work.folder(REFERENCE, FEATURES)
+    return work.folder(stage.layout.mapping(), FEATURES)
+
+
+def matched_images(work: StageWork, stage: PipelineStage, local_type: str) -> KaptureFolder:
+    """The map's images with the features of a type that queries are matched with.
+
+    A given map has keypoints of its own, which are not all that its images' extraction gives.
+    """
+    if is_given(stage, local_type):
+        return work.folder(MAP)
+    return work.folder(stage.layout.mapping(), FEATURES, *stage.layout.mapping_matches())
+
+
+_READ = {
+    "keypoints": KaptureFolder.keypoints,
+    "descriptors": KaptureFolder.descriptors,
+    "global_features": KaptureFolder.global_features,
+}
+_KINDS: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_features")
+_VOCABULARY_FILES = ("vlad.json", "vocabulary.npy")
+
+
+def copy_features(
+    source: KaptureFolder,
+    output: Path,
+    local_types: Iterable[str] | None = None,
+    *,
+    link_own: bool = False,
+) -> None:
+    """Put the map images' features of ``source`` into the kapture at ``output``; what is there
+    stays.
+
+    Files of features folders are hard links where the file system has them: a map then stands alone
+    and takes no space twice. The kapture's own features, which come first as everywhere, are
+    somebody's data and copied, unless ``link_own`` says that they are ours; what comes out of a tar
+    is copied. ``local_types``: all types of local features unless given; of global features all are
+    copied.
+    """
+    wanted = None if local_types is None else set(local_types)
+    for kind in _KINDS:
+        for name in source.types(kind):
+            if kind == "global_features" or wanted is None or name in wanted:
+                _copy_type(source, output, kind, name, link_own=link_own)
+
+
+def _copy_type(
+    source: KaptureFolder, output: Path, kind: ArrayKind, type_name: str, *, link_own: bool
+) -> None:
+    copies, suffix = output / "reconstruction" / kind / type_name, SUFFIX[kind]
+    images, own = source.read().image_names(), source.with_features(())
+    kept = set(_READ[kind](own, type_name).names) if type_name in own.types(kind) else set()
+    parent = "global_features" if kind == "global_features" else "local_features"
+    beside = [source.root / "reconstruction" / kind / type_name]
+    for image in sorted(kept) if link_own else ():
+        if (file := beside[0] / f"{image}{suffix}").is_file():
+            hard_link(file, copies / f"{image}{suffix}")
+    for features_dir in source.features_dirs:
+        found = features_dir / parent / type_name / kind
+        beside.append(found.parent)
+        for image in images:
+            file, copy = found / f"{image}{suffix}", copies / f"{image}{suffix}"
+            if image not in kept and file.is_file() and not copy.exists():  # the first has it
+                hard_link(file, copy)
+    if kind == "global_features":
+        for folder, name in product(beside, _VOCABULARY_FILES):
+            if (folder / name).is_file() and not (copies / name).exists():
+                hard_link(folder / name, copies / name)
+    reader = _READ[kind](source, type_name)
+    with FeatureWriter(output, kind, type_name, reader.config) as writer:
+        for image in images:
+            if image not in writer and image in reader:
+                writer.write(image, reader.read(image))

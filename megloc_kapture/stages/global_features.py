@@ -27,8 +27,8 @@ from megloc_kapture.plugin_loading import load_plugin, plugin_names
 from megloc_kapture.plugins import GLOBAL_FEATURES as PLUGINS
 from megloc_kapture.plugins import GlobalFeatureExtractor, PluginChoice
 from megloc_kapture.stages.devices import in_batches
+from megloc_kapture.stages.given_map import described_images
 from megloc_kapture.stages.local_features import image_inputs, images_of, read_image_of
-from megloc_kapture.stages.map_points import described_images
 from megloc_kapture.stages.shared_index import write_array
 from megloc_kapture.stages.stage import (
     FEATURES,

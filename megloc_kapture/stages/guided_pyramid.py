@@ -16,10 +16,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import write_csv_table
@@ -38,11 +38,7 @@ from megloc_kapture.matching.guided_pyramid import (
     match_variants,
     pyramid_type,
 )
-from megloc_kapture.matching.pyramid_combination import (
-    Combined,
-    KeypointUnion,
-    combine,
-)
+from megloc_kapture.matching.pyramid_combination import Combined, KeypointUnion, combine
 from megloc_kapture.matching.verification import (
     KnownPoseOptions,
     TwoViewOptions,
@@ -264,26 +260,31 @@ class PyramidFeatures:
             self.write(image, px, descriptors)
 
 
-@dataclass(frozen=True)
-class Spooled:
-    """Where in the spool the matches of a variant begin, and how many they are."""
+class Spooled(NamedTuple):
+    """A variant's matches in the spool: the records of its image from one on, to another."""
 
     variant: ImageVariant
-    count: int
-    at: int
+    begin: int
+    end: int
 
 
 class MatchSpool:
     """Variants' matches on disk until all are there: a large map's are too many for memory.
 
-    A file per image below ``folder``: of each variant keypoints, rows, scores and descriptors.
+    A file per image below ``folder``, a record for each match.
     """
 
     def __init__(self, folder: Path, keypoints: FeatureReader, descriptors: FeatureReader) -> None:
         self.folder = folder
-        self._columns, self._values = keypoints.config.dsize, descriptors.config.dsize
-        self._descriptor_type = descriptors.config.dtype
-        self._row_bytes = descriptors.config.row_bytes
+        described = descriptors.config
+        self._record = np.dtype(
+            [
+                ("keypoint_px", np.float32, (keypoints.config.dsize,)),
+                ("other_row", np.int64),
+                ("score", np.float32),
+                ("descriptor", described.dtype, (described.dsize,)),
+            ]
+        )
 
     def write(
         self, image: str, found: Sequence[Sequence[VariantMatches]]
@@ -293,49 +294,44 @@ class MatchSpool:
         Returns the file, and for ``found`` the fields of :class:`Spooled`, as plain values. Raises
         OutputError: the disk is full.
         """
-        path, content = safe_join(self.folder, f"{image}.variants"), bytearray()
+        path, parts, end = safe_join(self.folder, f"{image}.variants"), [b""], 0
         told: list[list[Any]] = []
         for of_other in found:
             told.append([])
             for matches in of_other:
-                told[-1].append([astuple(matches.variant), len(matches), len(content)])
-                for part, kind in (
-                    (matches.keypoints_px, np.float32),
-                    (matches.other_rows, np.int64),
-                    (matches.scores, np.float32),
-                    (matches.descriptors, self._descriptor_type),
-                ):
-                    content += np.ascontiguousarray(part, kind).tobytes()
-        write_bytes(path, bytes(content))
+                records = np.empty(len(matches), self._record)
+                records["keypoint_px"] = matches.keypoints_px
+                records["other_row"] = matches.other_rows
+                records["score"] = matches.scores
+                records["descriptor"] = matches.descriptors
+                begin, end = end, end + len(records)
+                told[-1].append([astuple(matches.variant), begin, end])
+                parts.append(records.tobytes())
+        write_bytes(path, b"".join(parts))
         return path, told
 
-    def get(self, image: str, place: Spooled) -> VariantMatches:
-        """The matches that were put there, without their descriptors."""
-        count, at = place.count, place.at
-        rows_at = at + 4 * self._columns * count
+    def get(self, image: str, kept: Spooled) -> VariantMatches:
+        """The matches that were put there."""
+        records = self._read(image, kept.begin, kept.end)
         return VariantMatches(
-            place.variant,
-            self._read(image, at, (count, self._columns), np.float32),
-            np.zeros((count, 0), self._descriptor_type),
-            self._read(image, rows_at, (count,), np.int64),
-            self._read(image, rows_at + 8 * count, (count,), np.float32),
+            kept.variant,
+            np.ascontiguousarray(records["keypoint_px"]),
+            records["descriptor"],
+            np.ascontiguousarray(records["other_row"]),
+            np.ascontiguousarray(records["score"]),
         )
 
-    def descriptor_at(self, place: Spooled, match: int) -> int:
-        """Where the descriptor of one of a variant's matches begins."""
-        return place.at + (4 * self._columns + 8 + 4) * place.count + match * self._row_bytes
+    def descriptors(self, matches: Sequence[tuple[str, int]]) -> NDArray[Any]:
+        """Descriptors (N, D) by the image whose variant they are of, and the record."""
+        found = np.empty(len(matches), self._record)
+        for row, (image, at) in enumerate(matches):
+            found[row] = self._read(image, at, at + 1)[0]
+        return np.ascontiguousarray(found["descriptor"])
 
-    def descriptors(self, places: Sequence[tuple[str, int]]) -> NDArray[Any]:
-        """Descriptors (N, D) by the image whose variant they are of, and where they begin."""
-        found = np.empty((len(places), self._values), self._descriptor_type)
-        for row, (image, at) in enumerate(places):
-            found[row] = self._read(image, at, (self._values,), self._descriptor_type)
-        return found
-
-    def _read(self, image: str, at: int, shape: tuple[int, ...], kind: DTypeLike) -> NDArray[Any]:
+    def _read(self, image: str, begin: int, end: int) -> NDArray[Any]:
         path = safe_join(self.folder, f"{image}.variants")
-        count = int(np.prod(shape))
-        return np.fromfile(path, np.dtype(kind), count=count, offset=at).reshape(shape)
+        offset = begin * self._record.itemsize
+        return np.fromfile(path, self._record, count=end - begin, offset=offset)
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ from megloc_kapture.stages.candidates import (
     Retrieval,
     vectors_of,
 )
-from megloc_kapture.stages.map_points import described_images
+from megloc_kapture.stages.given_map import described_images
 from megloc_kapture.stages.matches import VerifiedMatches, iterate_candidates
 from megloc_kapture.stages.stage import (
     FEATURES,

@@ -26,8 +26,7 @@ from megloc_kapture.io.tables import write_mask_counts
 from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages.devices import in_batches
-from megloc_kapture.stages.given_map import has_descriptors
-from megloc_kapture.stages.map_points import check_given_type
+from megloc_kapture.stages.given_map import check_given_type, has_descriptors
 from megloc_kapture.stages.stage import (
     LOCAL_FEATURES,
     LOCAL_TYPES,

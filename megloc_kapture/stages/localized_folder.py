@@ -31,7 +31,7 @@ from megloc_kapture.io.tables import (
     write_status,
 )
 from megloc_kapture.stages.local_features import read_image_of
-from megloc_kapture.stages.rigs import poses_through_rig
+from megloc_kapture.stages.scene import poses_through_rig
 from megloc_kapture.stages.work import FolderSpec, Work
 from megloc_kapture.values import Camera, ClusterPose, Failure, Pose, RefinementRow, RigidTransform
 

@@ -1,40 +1,226 @@
-"""Stage: the points of the map: triangulated, lifted through depth, or of a given model."""
+"""Stage: the points of the map: triangulated, lifted through depth, or of a given model.
+
+A map is a kapture with points3d and observations; triangulated ones come from verified matches and
+known poses.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.colmap import MapImage, TriangulatedPoints, TriangulationOptions, triangulate
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import (
+    ImagePair,
     KaptureFolder,
     Observations,
     write_observations,
     write_points3d,
     write_sensors,
 )
+from megloc_kapture.io.kapture.matches import MatchesReader
 from megloc_kapture.mapping.depth import LiftingOptions, lift_keypoints
-from megloc_kapture.stages.given_map import given_map, given_type, has_descriptors, join_maps
-from megloc_kapture.stages.rigs import DepthRecord, depth_records, read_depth
+from megloc_kapture.matching.guided_pyramid import base_type
+from megloc_kapture.stages.given_map import check_given_type, copy_features, given_map, join_maps
+from megloc_kapture.stages.scene import DepthRecord, depth_records, read_depth
 from megloc_kapture.stages.stage import (
     FEATURES,
     GLOBAL_FEATURES,
     LOCAL_FEATURES,
     LOCAL_TYPES,
-    MAP,
     REFERENCE,
     UNREFINED,
     Layout,
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.triangulation import copy_features, triangulate_map
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
+
+_IMAGES_AT_ONCE = 1000  # that parts are put together to
+
+
+def triangulate_map(
+    mapping: KaptureFolder,
+    matches: KaptureFolder,
+    local_types: Sequence[str] | str,
+    output: Path,
+    options: TriangulationOptions,
+    *,
+    pairs: Sequence[ImagePair] | None = None,
+    num_threads: int = 1,
+    work: Work = HERE,
+) -> dict[str, float]:
+    """Triangulate and write the map: sensors, features of its types, points3d, observations.
+
+    Each type has points and observations of its own, those of the first type come first. Poses,
+    given per camera or per rig, and intrinsics stay exactly what they are. Parts of a large map
+    that no match connects are triangulated one by one, which loses nothing: a point is seen from
+    one part alone, and poses are known.
+
+    Parameters
+    ----------
+    mapping : images with poses, and their keypoints.
+    matches : where the verified matches of the types are.
+    local_types : keypoints types; a repeated one counts once.
+    pairs : use the matches of these pairs only.
+    num_threads : of COLMAP, where no workers share the parts.
+
+    Returns
+    -------
+    Counts for the log; of several types also ``points_T`` and ``observations_T`` for each.
+
+    Raises
+    ------
+    DataError : no image has a pose, or a type is not there.
+    """
+    types = tuple(dict.fromkeys([local_types] if isinstance(local_types, str) else local_types))
+    data = mapping.read()
+    images = sorted(data.poses())
+    if not images:
+        raise DataError("no mapping image has a pose", path=mapping.root)
+    asked = None if pairs is None else {tuple(sorted((pair.query, pair.map))) for pair in pairs}
+    of_type = {name: matched_pairs(matches.matches(name), images, asked) for name in types}
+    for name in types:
+        mapping.keypoints(name)  # refused before any work
+    specs = FolderSpec(mapping), FolderSpec(matches)
+    xyz, errors_px = np.zeros((0, 3)), np.zeros(0)
+    observations = {}
+    by_type: dict[str, float] = {}
+    for name, matched in of_type.items():
+        parts = _unconnected(len(images), matched)
+        threads = 1 if len(parts) > 1 and work.executor is not None else num_threads
+        part = partial(_triangulate_part, specs, name, options, threads, output.absolute())
+        found = _triangulate(part, images, matched, parts, work, f"triangulation of {name}")
+        observations[name] = Observations(
+            keypoints_type=name,
+            image_names=tuple(images),
+            point_ids=found.point_ids + len(xyz),
+            image_ids=found.image_ids.astype(np.int32),
+            keypoint_ids=found.keypoint_ids.astype(np.int32),
+        )
+        xyz = np.concatenate([xyz, found.xyz])
+        errors_px = np.concatenate([errors_px, found.errors_px])
+        by_type[f"points_{name}"] = len(found.xyz)
+        by_type[f"observations_{name}"] = len(found.point_ids)
+    write_sensors(output, data)
+    link_images(mapping.root, output)
+    # with a pyramid's type the one it begins with: queries are matched with that at first
+    there = mapping.types("keypoints")
+    copy_features(mapping, output, {*types, *map(base_type, types)}.intersection(there))
+    # kapture keeps a colour per point; black says that nobody looked it up
+    write_points3d(output, np.concatenate([xyz, np.zeros_like(xyz)], axis=1))
+    write_observations(output, observations)
+    num_observations = sum(map(len, observations.values()))
+    return {
+        "images": len(images),
+        "pairs": sum(map(len, of_type.values())),
+        "points": len(xyz),
+        "observations": num_observations,
+        **(by_type if len(types) > 1 else {}),
+        "mean_track_length": round(num_observations / max(len(xyz), 1), 3),
+        "mean_reprojection_error_px": round(float(errors_px.mean()), 4) if len(xyz) else 0.0,
+    }
+
+
+def matches_of(
+    reader: MatchesReader, images: Sequence[str], pairs: NDArray[np.int64]
+) -> dict[tuple[int, int], NDArray[np.int64]]:
+    """Matches by pairs (P, 2) of rows of ``images``."""
+    return {(a, b): reader.read(images[a], images[b])[0] for a, b in pairs.tolist()}
+
+
+def matched_pairs(
+    reader: MatchesReader, images: Sequence[str], asked: Collection[tuple[str, ...]] | None
+) -> NDArray[np.int64]:
+    """Pairs (P, 2) of rows of ``images`` with a match, of those asked for (first name first)."""
+    row_of = {image: row for row, image in enumerate(images)}
+    pairs = [
+        (row_of[a], row_of[b])
+        for a, b in reader.pairs
+        if a in row_of and b in row_of and (asked is None or (a, b) in asked)
+        if reader.length(a, b)
+    ]
+    return np.array(pairs, np.int64).reshape(-1, 2)
+
+
+_Part = tuple[list[str], NDArray[np.int64]]  # images, and pairs (P, 2) of them that match
+
+
+def _triangulate(
+    triangulate_part: Callable[[_Part], TriangulatedPoints],
+    images: list[str],
+    pairs: NDArray[np.int64],
+    members: Sequence[NDArray[np.int64]],
+    work: Work,
+    label: str,
+) -> TriangulatedPoints:
+    """Points of the images, part by part where no match connects them."""
+    if len(members) == 1:
+        return triangulate_part((images, pairs))
+    parts = [
+        (
+            [images[row] for row in rows.tolist()],
+            np.searchsorted(rows, pairs[np.isin(pairs[:, 0], rows)]),
+        )
+        for rows in members
+    ]
+    found = list(work.map(triangulate_part, parts, label))
+    before = np.cumsum([0, *(len(one.xyz) for one in found)]).tolist()
+    return TriangulatedPoints(
+        xyz=np.concatenate([one.xyz for one in found]),
+        errors_px=np.concatenate([one.errors_px for one in found]),
+        point_ids=np.concatenate(
+            [one.point_ids + offset for one, offset in zip(found, before, strict=False)]
+        ),
+        image_ids=np.concatenate(
+            [rows[one.image_ids] for one, rows in zip(found, members, strict=True)]
+        ),
+        keypoint_ids=np.concatenate([one.keypoint_ids for one in found]),
+    )
+
+
+def _triangulate_part(
+    specs: tuple[FolderSpec, FolderSpec],
+    local_type: str,
+    options: TriangulationOptions,
+    num_threads: int,
+    scratch: Path,
+    part: _Part,
+) -> TriangulatedPoints:
+    names, pairs = part
+    mapping, reader = specs[0].open(), specs[1].open().matches(local_type)
+    data, keypoints = mapping.read(), mapping.keypoints(local_type)
+    images = [
+        MapImage(image, data.camera_of(image), pose, keypoints.read(image)[:, :2])
+        for image in names
+        if (pose := data.cam_from_world(image)) is not None  # all have one
+    ]
+    verified = matches_of(reader, names, pairs)
+    return triangulate(images, verified, options, num_threads=num_threads, scratch=scratch)
+
+
+def _unconnected(num_images: int, pairs: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Rows of the images of parts that no pair connects; small ones are put together."""
+    links = csr_array((np.ones(len(pairs)), pairs.T), shape=(num_images, num_images))
+    _, part_of = connected_components(links, directed=False)
+    rows = np.argsort(part_of, kind="stable")
+    groups: list[list[NDArray[np.int64]]] = [[]]
+    size = 0
+    for part in np.split(rows, np.flatnonzero(np.diff(part_of[rows])) + 1):
+        if size and size + len(part) > _IMAGES_AT_ONCE:
+            groups.append([])
+            size = 0
+        groups[-1].append(part)
+        size += len(part)
+    return [np.sort(np.concatenate(group)) for group in groups]
 
 
 def lift_map(
@@ -108,43 +294,6 @@ def _lift(
         options,
     )
     return points[valid], np.flatnonzero(valid).astype(np.int32)
-
-
-def check_given_type(reference: KaptureFolder, expected: str) -> None:
-    """Check that a given map is of the keypoints type that is extracted for it.
-
-    Raises DataError: it is of another one, or no map.
-    """
-    found = given_type(reference)
-    if found != expected:
-        raise DataError(
-            f"the given map is of keypoints type {found!r}, given_features extracts {expected!r}",
-            path=reference.root,
-        )
-
-
-def is_given(stage: PipelineStage, local_type: str) -> bool:
-    """Whether points of a keypoints type are those of the given map."""
-    options = stage.options
-    return options.uses_given_map() and local_type == options.make_given_extractor().name
-
-
-def described_images(work: StageWork, stage: PipelineStage, local_type: str) -> KaptureFolder:
-    """The map's images with their features of a type, before there is a map."""
-    # descriptors of its own: those that were extracted for it lie in the workspace
-    if is_given(stage, local_type) and has_descriptors(work.folder(REFERENCE)):
-        return work.folder(REFERENCE, FEATURES)
-    return work.folder(stage.layout.mapping(), FEATURES)
-
-
-def matched_images(work: StageWork, stage: PipelineStage, local_type: str) -> KaptureFolder:
-    """The map's images with the features of a type that queries are matched with.
-
-    A given map has keypoints of its own, which are not all that its images' extraction gives.
-    """
-    if is_given(stage, local_type):
-        return work.folder(MAP)
-    return work.folder(stage.layout.mapping(), FEATURES, *stage.layout.mapping_matches())
 
 
 class GivenMap(PipelineStage):

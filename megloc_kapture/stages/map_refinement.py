@@ -45,9 +45,9 @@ from megloc_kapture.mapping.uncertainty import (
     too_uncertain,
     track_lengths,
 )
-from megloc_kapture.stages.rigs import DepthRecord, depth_records, read_depth
+from megloc_kapture.stages.given_map import copy_features
+from megloc_kapture.stages.scene import DepthRecord, depth_records, read_depth
 from megloc_kapture.stages.stage import UNREFINED, Layout, PipelineStage, StageWork
-from megloc_kapture.stages.triangulation import copy_features
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Options
 
@@ -277,7 +277,7 @@ class RefinementReport(BaseModel):
 def refine_map(
     source: KaptureFolder,
     output: Path,
-    options: MapRefinementOptions | None = None,
+    options: MapRefinementOptions,
     *,
     link_features: bool = False,
     work: Work = HERE,
@@ -291,7 +291,6 @@ def refine_map(
     observations after, and what each filter removed. Raises DataError: no points, or something
     broken; names the file.
     """
-    options = options or MapRefinementOptions()
     if not source.has_points():
         raise DataError(
             "no map to refine: reconstruction/points3d.txt or observations.txt is missing",

@@ -32,7 +32,7 @@ from megloc_kapture.matching.verification import (
 )
 from megloc_kapture.plugins import Matcher
 from megloc_kapture.stages.devices import in_batches
-from megloc_kapture.stages.map_points import matched_images
+from megloc_kapture.stages.given_map import matched_images
 from megloc_kapture.stages.stage import (
     FEATURES,
     LOCAL_FEATURES,

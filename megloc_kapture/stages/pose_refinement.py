@@ -51,7 +51,7 @@ from megloc_kapture.refinement.references import (
 )
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.localized_folder import plain_result, pose_of, write_timing
-from megloc_kapture.stages.ranking_scene import KaptureScene, image_inputs
+from megloc_kapture.stages.scene import KaptureScene, image_inputs
 from megloc_kapture.stages.stage import (
     LOCALIZED,
     MAP,

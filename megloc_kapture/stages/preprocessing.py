@@ -147,7 +147,7 @@ def read_report(root: Path) -> PreprocessingReport | None:
 def preprocess_images(
     folder: KaptureFolder,
     output: Path,
-    options: PreprocessingOptions | None = None,
+    options: PreprocessingOptions,
     *,
     segmenter: Segmenter | None = None,
     sequences: Sequence[KaptureFolder] = (),
@@ -177,7 +177,6 @@ def preprocess_images(
     DataError : an image or a mask is absent, broken, or not of its camera's size.
     OutputError : the output lies in the folder it is made from, or cannot be written.
     """
-    options = options or PreprocessingOptions()
     output = Path(output)
     if output.resolve().is_relative_to(folder.root.resolve()):
         raise OutputError(f"{output}: lies in the kapture that is read, which stays as it is")

@@ -29,22 +29,15 @@ from megloc_kapture.io.kapture import (
     read_pairs,
 )
 from megloc_kapture.mapping.pairs import views_can_overlap
-from megloc_kapture.matching.guided_pyramid import (
-    ImageVariant,
-    PairVerifier,
-    pyramid_type,
-)
-from megloc_kapture.matching.pyramid_combination import (
-    Combined,
-    KeypointUnion,
-    combine,
-)
+from megloc_kapture.matching.guided_pyramid import ImageVariant, PairVerifier, pyramid_type
+from megloc_kapture.matching.pyramid_combination import Combined, KeypointUnion, combine
 from megloc_kapture.matching.verification import (
     KnownPoseOptions,
     TwoViewOptions,
     known_pose_of_variants,
 )
 from megloc_kapture.plugins import LocalFeatureExtractor
+from megloc_kapture.stages.given_map import matched_images
 from megloc_kapture.stages.guided_pyramid import (
     MatchedVariants,
     MatchSpool,
@@ -58,7 +51,6 @@ from megloc_kapture.stages.guided_pyramid import (
     write_tried,
 )
 from megloc_kapture.stages.local_features import image_inputs, read_frame
-from megloc_kapture.stages.map_points import matched_images
 from megloc_kapture.stages.matches import (
     MATCHING_OPTIONS,
     Features,
@@ -144,7 +136,7 @@ def pyramid_mapping(
     features = PyramidFeatures(output, mapping, local_type)
     spool = MatchSpool(output / ".variants", keypoints, mapping.descriptors(local_type))
     images = sorted(others)
-    items = work.items(f"variants of {local_type}", images, inputs)
+    items = work.items(f"matched variants of {local_type}", images, inputs)
     todo = [(image, *others[image]) for image in images if image not in items.done]
     again = partial(_match_again, FolderSpec(mapping), local_type, method)
     plugins = method.extractor, method.matcher
@@ -215,7 +207,7 @@ def _match_again(
 
 @dataclass(eq=False)
 class _Added:
-    """What was added to an image: keypoints (A, C), and where their descriptors are spooled."""
+    """What was added to an image: keypoints (A, C), and the records of their descriptors."""
 
     px: NDArray[np.float32] | None = None
     descriptors_at: list[tuple[str, int]] = field(default_factory=list)
@@ -250,7 +242,7 @@ class _AllMatched:
         """Keep what the variants of one image came to; ``found`` as :meth:`MatchSpool.write`."""
         self.seconds += seconds
         for other, of_other, count in zip(others, found, num_variants, strict=True):
-            spooled = [Spooled(ImageVariant(*v), num, at) for v, num, at, *_ in of_other]
+            spooled = [Spooled(ImageVariant(*variant), *rows) for variant, *rows in of_other]
             self._found[image, other] = _Directed(spooled, count, skipped)
 
     def combine(
@@ -275,8 +267,7 @@ class _AllMatched:
                 self.added[image].px = union.added()
             for number, match in new.tolist():
                 side, one = spooled[number]
-                at = self._spool.descriptor_at(one, match)
-                self.added[image].descriptors_at.append((pair[side], at))
+                self.added[image].descriptors_at.append((pair[side], one.begin + match))
         best = ""
         if combined.best is not None:
             side, one = spooled[combined.best]

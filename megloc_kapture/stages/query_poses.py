@@ -12,7 +12,6 @@ from dataclasses import astuple, dataclass, replace
 from functools import cache, lru_cache, partial
 from itertools import chain
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +22,13 @@ from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.io.tables import Fallback
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import (
-    ClusterLocalization,
     ClusterOptions,
     cluster_candidates,
     interleave,
     localize_in_clusters,
     poses_of_cameras,
 )
-from megloc_kapture.localization.map_index import QueryView, TypedMatches
+from megloc_kapture.localization.map_index import PoseProblem, QueryView, TypedMatches
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, PoseRanker, RankingScene
@@ -42,8 +40,7 @@ from megloc_kapture.stages.localized_folder import (
     write_localized,
 )
 from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.stages.ranking_scene import KaptureScene, image_inputs
-from megloc_kapture.stages.rigs import Unit, query_units
+from megloc_kapture.stages.scene import KaptureScene, Unit, image_inputs, query_units
 from megloc_kapture.stages.shared_index import index_map, open_index, shared_index, with_noise
 from megloc_kapture.stages.stage import (
     FEATURES,
@@ -110,54 +107,6 @@ class LocalizationOptions(Options):
         return ranker
 
 
-def localize_views(
-    views: Sequence[QueryView],
-    candidates: Sequence[str],
-    frames: Sequence[str],
-    options: LocalizationOptions,
-    *,
-    centers: Mapping[str, NDArray[np.float64]],
-    ranker: PoseRanker,
-    scene: RankingScene,
-) -> ClusterLocalization:
-    """Localize one query, or the cameras of a rig, from verified matches.
-
-    Parameters
-    ----------
-    candidates : map images, best first, and ``frames``, the coordinate frame of each.
-    centers : of the candidates in the world, (3,) each.
-    """
-    matched = {image for view in views for image in view.matched_images()}
-    frame_of = dict(zip(candidates, frames, strict=True))
-    images = [image for image in candidates if image in matched]
-    if not images:
-        reason = "no map image matches" if candidates else "no map image is a candidate"
-        return ClusterLocalization(Failure(reason), (0,) * len(views))
-    started = time.perf_counter()
-    indices = {id(typed.index): typed.index for view in views for typed in view.matches}
-    clusters = cluster_candidates(
-        images,
-        [frame_of[image] for image in images],
-        options.clusters,
-        centers=centers,
-        indices=list(indices.values()),
-    )
-    seconds = {"clusters": time.perf_counter() - started}
-    found = localize_in_clusters(
-        views,
-        clusters,
-        options.pose,
-        rank=lambda hypotheses: ranker.score(hypotheses, scene),
-        max_clusters=options.clusters.max_clusters,
-        frames=[frame_of[cluster[0]] for cluster in clusters],
-        centers=centers,
-        min_confidence=options.min_confidence,
-        scene=scene,
-    )
-    seconds |= found.result.seconds
-    return replace(found, result=replace(found.result, seconds=seconds))
-
-
 def localize_unit(
     views: Sequence[QueryView],
     candidates: Sequence[str],
@@ -167,30 +116,62 @@ def localize_unit(
     centers: Mapping[str, NDArray[np.float64]],
     ranker: PoseRanker,
     scene: RankingScene,
+    as_rig: bool = False,
 ) -> list[Pose | Failure]:
     """Localize one query, or the cameras of a rig together, and say so of each camera.
 
-    A rig that has no pose is tried camera by camera. Parameters as of :func:`localize_views`.
+    A rig that has no pose is tried camera by camera.
+
+    Parameters
+    ----------
+    views : with verified matches.
+    candidates : map images, best first, and ``frames``, the coordinate frame of each.
+    centers : of the candidates in the world, (3,) each.
+    as_rig : one result for all cameras, whose pose is ``rig_from_world``.
     """
 
-    def localize(together: Sequence[QueryView]) -> ClusterLocalization:
-        return localize_views(
-            together, candidates, frames, options, centers=centers, ranker=ranker, scene=scene
+    def localize(together: Sequence[QueryView]) -> tuple[Pose | Failure, PoseProblem | None]:
+        matched = {image for view in together for image in view.matched_images()}
+        frame_of = dict(zip(candidates, frames, strict=True))
+        images = [image for image in candidates if image in matched]
+        if not images:
+            reason = "no map image matches" if candidates else "no map image is a candidate"
+            return Failure(reason), None
+        started = time.perf_counter()
+        indices = {id(typed.index): typed.index for view in together for typed in view.matches}
+        clusters = cluster_candidates(
+            images,
+            [frame_of[image] for image in images],
+            options.clusters,
+            centers=centers,
+            indices=list(indices.values()),
         )
+        seconds = {"clusters": time.perf_counter() - started}
+        result, problem = localize_in_clusters(
+            together,
+            clusters,
+            options.pose,
+            rank=lambda hypotheses: ranker.score(hypotheses, scene),
+            max_clusters=options.clusters.max_clusters,
+            frames=[frame_of[cluster[0]] for cluster in clusters],
+            centers=centers,
+            min_confidence=options.min_confidence,
+            scene=scene,
+        )
+        return replace(result, seconds={**seconds, **result.seconds}), problem
 
-    if len(views) > 1:
-        found = localize(views)
-        if found.result:
-            return poses_of_cameras(views, found)
-    return [localize([QueryView(v.name, v.camera, v.matches)]).result for v in views]
-
-
-Solved = TypeVar("Solved", ClusterLocalization, list[Pose | Failure])
+    if len(views) > 1 or as_rig:
+        result, problem = localize(views)
+        if as_rig:
+            return [result]
+        if isinstance(result, Pose) and problem is not None:
+            return poses_of_cameras(views, result, problem)
+    return [localize([QueryView(v.name, v.camera, v.matches)])[0] for v in views]
 
 
 def in_turn(
-    solve: Callable[[int], Solved], num_candidates: int, options: LocalizationOptions
-) -> Solved:
+    solve: Callable[[int], list[Pose | Failure]], num_candidates: int, options: LocalizationOptions
+) -> list[Pose | Failure]:
     """What ``solve`` makes of the best few candidates where that is sure, else of all.
 
     ``solve``: localizes with so many of the candidates, best first.
@@ -198,10 +179,9 @@ def in_turn(
     sure, few = options.sure_confidence, _FIRST_TURN
     while sure is not None and few < num_candidates:
         solved = solve(few)
-        results = solved if isinstance(solved, list) else [solved.result]
         if all(
             isinstance(r, Pose) and (r.confidence or 0.0) >= sure and r.num_inliers >= _SURE_INLIERS
-            for r in results
+            for r in solved
         ):
             return solved
         few *= 2

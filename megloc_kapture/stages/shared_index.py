@@ -26,15 +26,7 @@ from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.mapping.map_check import ObservedKeypoints
 
-_IMAGES = "images.json"
-# name -> numbers per row (0: a plain list) and type
-_ARRAYS: dict[str, tuple[int, type[Any]]] = {
-    "xyz": (3, np.float64),
-    "offsets": (0, np.int64),
-    "keypoint_ids": (0, np.int32),
-    "point_ids": (0, np.int32),
-}
-_COVARIANCES = (6, np.float64)
+_ARRAYS = ("xyz", "offsets", "keypoint_ids", "point_ids", "covariances")
 _SAMPLED_IMAGES = 32
 
 
@@ -115,45 +107,29 @@ def write_index(index: MapIndex, folder: Path) -> None:
 
     Raises OutputError: cannot be written.
     """
-    for name in _ARRAYS:
+    arrays = [name for name in _ARRAYS if getattr(index, name) is not None]
+    for name in arrays:
         write_array(folder / f"{name}.npy", getattr(index, name))
-    if index.covariances is not None:
-        write_array(folder / "covariances.npy", index.covariances)
     names = sorted(index.row_of_image, key=index.row_of_image.__getitem__)
-    noise = [None if math.isnan(one) else one for one in (index.noise_rad, index.noise_px)]
-    content = {"images": names, "local_type": index.local_type, "noise": noise}
-    write_bytes(folder / _IMAGES, json.dumps(content).encode())
+    noise = {"noise_rad": index.noise_rad, "noise_px": index.noise_px}
+    content = [arrays, names, {"local_type": index.local_type, **noise}]
+    write_bytes(folder / "index.json", json.dumps(content).encode())
 
 
 def open_index(folder: Path) -> MapIndex:
     """Open what :func:`write_index` wrote: arrays are mapped, not read, and cannot be written to.
 
-    Raises DataError: a file is missing or is not what was written; names it.
+    Raises DataError: a file is missing or cut.
     """
-    arrays = {name: _open_array(folder / f"{name}.npy", *kind) for name, kind in _ARRAYS.items()}
-    covariances = None
-    if (folder / "covariances.npy").is_file():
-        covariances = _open_array(folder / "covariances.npy", *_COVARIANCES)
-    path = folder / _IMAGES
     try:
-        content = json.loads(path.read_bytes())
-        names, local_type = content["images"], str(content["local_type"])
-        noise_rad, noise_px = (
-            math.nan if noise is None else float(noise) for noise in content["noise"]
-        )
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"cannot read: {error}", path=path) from error
-    rows = {name: row for row, name in enumerate(names)}
-    if len(arrays["offsets"]) != len(names) + 1:
-        raise DataError(f"{len(names)} images for {len(arrays['offsets'])} offsets", path=path)
-    return MapIndex(
-        row_of_image=rows,
-        covariances=covariances,
-        local_type=local_type,
-        noise_rad=noise_rad,
-        noise_px=noise_px,
-        **arrays,
-    )
+        names, images, others = json.loads((folder / "index.json").read_bytes())
+        files = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in names}
+    except (OSError, ValueError) as error:
+        raise DataError(f"cannot read a map's index: {error}", path=folder) from error
+    # plain views: the compiled loops know no other kind of array
+    arrays: dict[str, Any] = {name: np.asarray(array) for name, array in files.items()}
+    rows = {name: row for row, name in enumerate(images)}
+    return MapIndex(row_of_image=rows, **arrays, **others)
 
 
 @contextmanager
@@ -184,15 +160,3 @@ def write_array(path: Path, array: NDArray[Any]) -> None:
     """Write an array as numpy does, atomically; the same array gives the same bytes."""
     with atomic_write(path) as file:
         np.lib.format.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
-
-
-def _open_array(path: Path, columns: int, dtype: type[Any]) -> NDArray[Any]:
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise DataError(f"cannot read: {error}", path=path) from error
-    expected = (-1, columns) if columns else (-1,)
-    if array.dtype != dtype or (-1, *array.shape[1:]) != expected:
-        raise DataError(f"{array.dtype} {array.shape} is no part of an index", path=path)
-    # a plain view: the compiled loops know no other kind of array
-    return np.asarray(array)

@@ -41,7 +41,7 @@ from megloc_kapture.mvs.views import (
 )
 from megloc_kapture.plugins import StereoView
 from megloc_kapture.stages.local_features import read_image_of
-from megloc_kapture.stages.rigs import depth_records, read_depth
+from megloc_kapture.stages.scene import depth_records, read_depth
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import RigidTransform
 

@@ -28,6 +28,7 @@ from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.matching.verification import agree_by_chance
+from megloc_kapture.stages.map_points import matched_pairs, matches_of
 from megloc_kapture.stages.matches import MATCHING_OPTIONS, MatchMapping, Verification
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.stage import (
@@ -40,7 +41,6 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.triangulation import verified_matches
 from megloc_kapture.values import Options, RigidTransform
 
 _UNTURNED = RigidTransform.identity()
@@ -127,7 +127,8 @@ class FindPoses(PipelineStage):
             photographs.append(Photograph(image, sensor, data.camera_of(image), px))
         counts = read_match_counts(work.path(PHOTOGRAPH_MATCHES), local_type)
         putative = {(pair.image, pair.other): pair.matches for pair in counts}
-        matches = verified_matches(mapping.matches(local_type), images, putative.keys())
+        reader = mapping.matches(local_type)
+        matches = matches_of(reader, images, matched_pairs(reader, images, putative.keys()))
         for (i, j), rows in list(matches.items()):
             first, second = photographs[i], photographs[j]
             if agree_by_chance(

@@ -28,7 +28,7 @@ from megloc_kapture.features.xfeat import XFeat, descriptors_at, load_xfeat, net
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px
 from megloc_kapture.geometry.poses import rotation_angles_deg
 from megloc_kapture.io.weights import find_weights, read_weights
-from megloc_kapture.matching.superglue import network_input
+from megloc_kapture.matching.networks import network_input
 from megloc_kapture.matching.verification import TwoViewOptions, relative_pose
 from megloc_kapture.nets.runtime import load_strictly
 from megloc_kapture.nets.superglue import (

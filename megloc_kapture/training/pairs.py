@@ -29,7 +29,7 @@ from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, writ
 from megloc_kapture.mapping.pairs import PairsByPosesOptions, pairs_by_poses
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.preprocessing.frames import resized, scaled_camera
-from megloc_kapture.stages.rigs import depth_records
+from megloc_kapture.stages.scene import depth_records
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.training.labels import (
     LabelOptions,

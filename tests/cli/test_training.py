@@ -25,7 +25,7 @@ from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import read_status
 from megloc_kapture.refinement import field_training
-from megloc_kapture.stages.rigs import depth_records
+from megloc_kapture.stages.scene import depth_records
 
 SMALL = ("steps=2", "layers=2", "pairs_per_step=1", "max_keypoints=40", "pairs.max_size_px=200")
 

@@ -22,7 +22,7 @@ from megloc_kapture.datasets.megadepth import (
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.images import read_depth_map, write_image
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.stages.rigs import depth_records
+from megloc_kapture.stages.scene import depth_records
 
 h5py = pytest.importorskip("h5py")
 

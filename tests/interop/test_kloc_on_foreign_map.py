@@ -9,7 +9,8 @@ from kloc import kloc, merged, needs_kapture_localization, pose_errors
 
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.io.kapture.vectors import KaptureVectors
-from megloc_kapture.retrieval.search import rank_by_similarity
+from megloc_kapture.retrieval.fusion import FusionOptions
+from megloc_kapture.retrieval.search import FusedSearch
 from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
 from megloc_kapture.stages.image_pairs import pair_queries
 
@@ -55,7 +56,8 @@ def test_ap_gem_gives_the_pairs_and_scores_of_kapture_localization(
     images, queries = sorted(mapping.read().poses()), query.read().image_names()
     vectors = KaptureVectors(query.global_features(TYPE), queries).read(0, len(queries))
     database = KaptureVectors(mapping.global_features(TYPE), images)
-    indices, scores = rank_by_similarity(vectors, database, top_k)
+    search = FusedSearch(top_k, FusionOptions())
+    ((indices, scores),) = search.lists([vectors], [database])
     assert [images[k] for k in indices.ravel()] == [p.map for p in theirs]
     expected = pytest.approx([p.score for p in theirs], rel=0, abs=1e-6)
     assert scores.ravel().tolist() == expected

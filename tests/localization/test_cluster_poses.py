@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import (
-    ClusterLocalization,
     ClusterOptions,
     cluster_by_centers,
     cluster_by_shared_points,
@@ -26,7 +25,13 @@ from megloc_kapture.localization.cluster_poses import (
     poses_of_cameras,
     transform_covariance,
 )
-from megloc_kapture.localization.map_index import ImageMatches, MapIndex, QueryView, TypedMatches
+from megloc_kapture.localization.map_index import (
+    ImageMatches,
+    MapIndex,
+    PoseProblem,
+    QueryView,
+    TypedMatches,
+)
 from megloc_kapture.plugins import PoseHypothesis
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
@@ -86,7 +91,7 @@ def by_inliers(hypotheses: Sequence[PoseHypothesis]) -> NDArray[np.float64]:
 
 def localize(
     *views: QueryView, clusters: Sequence[Sequence[str]] = PLACES, **more: object
-) -> ClusterLocalization:
+) -> tuple[Pose | Failure, PoseProblem | None]:
     settings: dict[str, object] = {"rank": by_inliers, "max_clusters": 10} | more
     return localize_in_clusters(views, clusters, AbsolutePoseOptions(), **settings)  # type: ignore[arg-type]
 
@@ -95,8 +100,7 @@ SHARES = {"wrong/1": 60, "right/1": 80, "right/2": 90, "wrong/2": 20}
 
 
 def test_each_cluster_has_its_pose_and_the_best_is_kept() -> None:
-    found = localize(view(SHARES))
-    result = found.result
+    result, problem = localize(view(SHARES))
     assert isinstance(result, Pose)
     assert np.linalg.norm(result.cam_from_world.center() - TRUTH.center()) < 1e-5
     assert result.candidates == PLACES[0] and result.cluster == 0
@@ -106,11 +110,11 @@ def test_each_cluster_has_its_pose_and_the_best_is_kept() -> None:
     assert wrong.cam_from_world is not None
     # the same view of the other place, 50 m away
     np.testing.assert_allclose(wrong.cam_from_world.center() - TRUTH.center(), FAR, atol=1e-3)
-    assert found.matches_of_views == (90,)
+    assert problem is not None and len(problem.points) == 90
     steps = {"correspondences", "estimation", "ranking", "refinement"}
     assert result.covariance is not None and set(result.seconds) == steps
     # only the clusters with the most matches are tried
-    result = localize(view(SHARES), clusters=PLACES[::-1], max_clusters=1).result
+    result, _ = localize(view(SHARES), clusters=PLACES[::-1], max_clusters=1)
     assert [cluster.images for cluster in result.clusters] == [PLACES[0]]
 
 
@@ -124,12 +128,12 @@ def test_the_ranker_has_the_last_word() -> None:
         assert shown.errors_px[shown.inliers].max() < 0.1
         return np.array([0.0, 1.0])
 
-    result = localize(view(SHARES), rank=rank).result
+    result, _ = localize(view(SHARES), rank=rank)
     assert asked == [PLACES[0], PLACES[1]]
     assert isinstance(result, Pose) and result.cluster == 1
     np.testing.assert_allclose(result.cam_from_world.center() - TRUTH.center(), FAR, atol=1e-5)
     # of equals the first
-    result = localize(view(SHARES), rank=lambda hypotheses: np.ones(len(hypotheses))).result
+    result, _ = localize(view(SHARES), rank=lambda hypotheses: np.ones(len(hypotheses)))
     assert isinstance(result, Pose) and result.cluster == 0
 
 
@@ -137,15 +141,15 @@ def test_clusters_of_one_place_are_one() -> None:
     """Two images of the right place that share no match with the query, split by a clustering."""
     query = view({"right/2": range(50, 100), "wrong/1": 70, "right/1": 50})
     split = [("right/2",), ("wrong/1",), ("right/1",)]
-    result = localize(query, clusters=split).result
+    result, _ = localize(query, clusters=split)
     assert isinstance(result, Pose) and result.num_inliers == 100
     assert [cluster.images for cluster in result.clusters] == [("right/2", "right/1"), ("wrong/1",)]
-    apart = localize(query, clusters=split, frames=["a", "a", "b"]).result
+    apart, _ = localize(query, clusters=split, frames=["a", "a", "b"])
     assert isinstance(apart, Pose) and len(apart.clusters) == 3
 
 
 def test_a_failure_is_that_of_the_cluster_that_came_nearest() -> None:
-    result = localize(view({"wrong/1": 5, "right/1": 9})).result
+    result, _ = localize(view({"wrong/1": 5, "right/1": 9}))
     assert isinstance(result, Failure)
     assert result.reason == "9 2D-3D matches, at least 12 are needed, the best of 2 clusters"
     assert result.candidates == ("right/1",) and result.num_matches == 9
@@ -156,12 +160,12 @@ def test_without_points_there_is_nothing_to_localize_in() -> None:
     empty = np.zeros(0, np.int64)
     bare = MapIndex.build(np.zeros((0, 3)), (), empty, empty, empty)
     typed = TypedMatches(bare, np.zeros((1, 2), np.float32), matches({"right/1": [0]}))
-    result = localize(QueryView("q", CAMERA, (typed,))).result
+    result, _ = localize(QueryView("q", CAMERA, (typed,)))
     assert result == Failure("no match is with a point of the map")
     # of several keypoints types all matches make one pose
     few = view({"right/1": 8}).matches
-    assert isinstance(localize(QueryView("q", CAMERA, few)).result, Failure)
-    result = localize(QueryView("q", CAMERA, few * 2)).result
+    assert isinstance(localize(QueryView("q", CAMERA, few))[0], Failure)
+    result, _ = localize(QueryView("q", CAMERA, few * 2))
     assert isinstance(result, Pose) and result.num_matches == 16
 
 
@@ -173,10 +177,10 @@ SIDE = RigidTransform.from_matrix(
 @pytest.mark.parametrize("of_side", [{}, {"wrong/1": 20}, {"right/2": 30}])
 def test_a_rig_is_localized_at_once_and_survives_a_dead_camera(of_side: dict[str, int]) -> None:
     views = view({"right/1": 90}), view(of_side, SIDE, name="side")
-    found = localize(*views)
-    assert isinstance(found.result, Pose)
-    assert np.linalg.norm(found.result.cam_from_world.center() - TRUTH.center()) < 1e-4
-    front, side = poses_of_cameras(views, found)
+    rig, problem = localize(*views)
+    assert isinstance(rig, Pose) and problem is not None
+    assert np.linalg.norm(rig.cam_from_world.center() - TRUTH.center()) < 1e-4
+    front, side = poses_of_cameras(views, rig, problem)
     assert isinstance(front, Pose) and front.covariance is not None
     assert front.num_matches == front.num_inliers == 90
     if "right/2" in of_side:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,8 @@ from hypothesis import strategies as st
 from megloc_kapture.localization.map_index import (
     Correspondences,
     MapIndex,
-    ObservedMatches,
-    observed_matches,
+    TypedMatches,
+    resolve_conflicts,
 )
 
 observations = st.lists(
@@ -95,14 +96,13 @@ def test_an_observation_of_an_image_that_has_no_name() -> None:
         build([(1, 0, 0)], ("a",))
 
 
-def observed(matches: list[tuple[int, int, float, int]]) -> ObservedMatches:
+def resolve(matches: list[tuple[int, int, float, int]]) -> Correspondences:
     keypoints, points, similarities, images = zip(*matches, strict=True) if matches else [()] * 4
-    return ObservedMatches(
+    return resolve_conflicts(
         np.array(keypoints, dtype=np.int64),
         np.array(points, dtype=np.int64),
         np.array(similarities, dtype=np.float64),
         np.array(images, dtype=np.int64),
-        4,
     )
 
 
@@ -134,9 +134,9 @@ def test_equal_to_a_greedy_loop_whatever_the_order(
     matches: list[tuple[int, int, float, int]], random: Any
 ) -> None:
     expected = greedy(matches)
-    assert triples(observed(matches).resolve()) == expected
+    assert triples(resolve(matches)) == expected
     random.shuffle(matches)
-    assert triples(observed(matches).resolve()) == expected
+    assert triples(resolve(matches)) == expected
 
 
 @pytest.mark.parametrize("num_points", [500, 3000, 100_000])
@@ -148,17 +148,9 @@ def test_equal_on_as_many_matches_as_a_query_has(num_points: int) -> None:
     keypoints[4000:], points[4000:] = keypoints[again], points[again]
     scores = np.round(rng.normal(size=8000), 1)  # with ties, and of both signs
     images = rng.integers(0, 20, 8000)
-    mine = ObservedMatches(keypoints, points, scores, images, 20).resolve()
+    mine = resolve_conflicts(keypoints, points, scores, images)
     columns = (column.tolist() for column in (keypoints, points, scores, images))
     assert triples(mine) == greedy(list(zip(*columns, strict=True)))
-
-
-@given(rows, st.lists(st.booleans(), min_size=4, max_size=4))
-def test_images_that_are_left_out_have_no_say(
-    matches: list[tuple[int, int, float, int]], kept: list[bool]
-) -> None:
-    found = observed(matches).resolve(np.array(kept))
-    assert triples(found) == greedy([match for match in matches if kept[match[3]]])
 
 
 MAP = MapIndex.build(
@@ -171,22 +163,22 @@ MAP = MapIndex.build(
 
 
 def test_matches_with_map_keypoints_that_observe_a_point() -> None:
-    found = observed_matches(
-        MAP,
-        [
-            ("a", np.array([[10, 5], [11, 6], [12, 7]]), np.array([0.9, 0.8, 0.7])),
-            ("c", np.array([[14, 5]]), np.array([0.5])),  # not in the map
-            ("a", np.zeros((0, 2), np.int64), np.zeros(0, np.float32)),
-            ("b", np.array([[13, 5], [10, 9]], np.uint32), np.array([0.5, 0.4], np.float32)),
-        ],
-    )
-    assert found.keypoint_ids.tolist() == [10, 12, 13]
-    assert found.point_ids.tolist() == [0, 1, 2]  # the first of the two of keypoint 7
-    assert found.similarities.tolist() == [0.9, 0.7, 0.5]
-    assert found.image_rows.tolist() == [0, 0, 3]
-    assert found.num_images == 4
-    rows = np.array([False, True, True, True])
-    assert triples(found.resolve(rows)) == [(13, 2, 1)]
-    for none in ([], [("a", np.zeros((0, 2), np.int64), np.zeros(0))]):
-        empty = observed_matches(MAP, none)
-        assert empty.num_images == len(none) and triples(empty.resolve()) == []
+    given = [
+        ("a", np.array([[10, 5], [11, 6], [12, 7]]), np.array([0.9, 0.8, 0.7])),
+        ("c", np.array([[14, 5]]), np.array([0.5])),  # not in the map
+        ("e", np.zeros((0, 2), np.int64), np.zeros(0, np.float32)),
+        ("b", np.array([[13, 5], [10, 9]], np.uint32), np.array([0.5, 0.4], np.float32)),
+    ]
+    typed = TypedMatches(MAP, np.zeros((15, 2), np.float32), given)
+    keypoint_ids, point_ids, similarities, image_rows = typed.observed
+    assert keypoint_ids.tolist() == [10, 12, 13]
+    assert point_ids.tolist() == [0, 1, 2]  # the first of the two of keypoint 7
+    assert similarities.tolist() == [0.9, 0.7, 0.5]
+    assert image_rows.tolist() == [0, 0, 3]
+    assert triples(typed.correspondences()) == [(10, 0, 1), (12, 1, 1), (13, 2, 1)]
+    # images that are left out have no say
+    assert triples(typed.correspondences(["c", "e", "b"])) == [(13, 2, 1)]
+    assert triples(typed.correspondences([])) == []
+    none = [("a", np.zeros((0, 2), np.int64), np.zeros(0))]
+    for few in ([], none):
+        assert triples(replace(typed, matches=few).correspondences(["a"])) == []

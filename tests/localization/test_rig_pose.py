@@ -92,7 +92,7 @@ def test_any_of_a_rigs_cameras_may_have_the_matches(used: list[int]) -> None:
     truth, views = rig(80, noise_px=1.0, wrong=True)
     some = [view if k in used else without_matches(view) for k, view in enumerate(views)]
     problem = PoseProblem.of(some)
-    estimate = estimate_pose(problem)
+    estimate = estimate_pose(problem, AbsolutePoseOptions())
     assert isinstance(estimate, PoseEstimate)
     assert movement(estimate.rig_from_world, truth)[0] < 0.05
     assert estimate.num_inliers == estimate.inliers.sum() <= estimate.usable.sum()
@@ -152,7 +152,7 @@ def test_the_same_bits_from_many_threads_at_once() -> None:
     problems.append(PoseProblem.of(problems[0].views[:1]))
 
     def estimated(problem: PoseProblem) -> RigidTransform:
-        estimate = estimate_pose(problem)
+        estimate = estimate_pose(problem, AbsolutePoseOptions())
         assert isinstance(estimate, PoseEstimate)
         return estimate.rig_from_world
 

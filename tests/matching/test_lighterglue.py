@@ -20,7 +20,7 @@ from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.weights import find_weights, read_weights
-from megloc_kapture.matching.lightglue import LighterGlue, LighterGlueOptions, normalised_points
+from megloc_kapture.matching.networks import LighterGlue, LighterGlueOptions, normalised_points
 from megloc_kapture.matching.verification import essential_matrix
 from megloc_kapture.nets.lightglue import load_lighterglue
 from megloc_kapture.values import ImageFeatures

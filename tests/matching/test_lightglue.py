@@ -12,7 +12,7 @@ from kornia.feature import LightGlue as KorniaLightGlue
 from transformers import LightGlueConfig, LightGlueForKeypointMatching, SuperPointConfig
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.matching.lightglue import LightGlue, LightGlueOptions
+from megloc_kapture.matching.networks import LightGlue, LightGlueOptions
 from megloc_kapture.values import ImageFeatures
 
 SIZES = [256, 128]  # SuperPoint's descriptors, ALIKED's

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, MeglocError
-from megloc_kapture.matching.superglue import SuperGlue, SuperGlueOptions
+from megloc_kapture.matching.networks import SuperGlue, SuperGlueOptions
 from megloc_kapture.nets.superglue import (
     ImageKeypoints,
     SuperGlueNet,

@@ -12,7 +12,7 @@ import pytest
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.geometry.cameras import project, shift_principal_point
 from megloc_kapture.io.kapture import FeatureWriter, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.localization.map_index import observed_matches
+from megloc_kapture.localization.map_index import TypedMatches
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import options_of_preset
@@ -87,7 +87,7 @@ def residuals_px(opened: KaptureMap, queries: KaptureFolder, truth: Path) -> lis
             theirs = Features.of(opened.camera(image), *described)
             of_pair = match_all(matcher, ours, [theirs], ["theirs"])[0]
             matches.append((image, *verified(ours, theirs, of_pair, verify)[:2]))
-        pairs = observed_matches(stored.index, matches).resolve()
+        pairs = TypedMatches(stored.index, keypoints, matches).correspondences()
         seen = project(query.camera, poses[query.name], stored.index.xyz[pairs.point_ids])
         distances = np.linalg.norm(seen - keypoints[pairs.keypoint_ids], axis=1)
         found.append(float(np.median(distances)))

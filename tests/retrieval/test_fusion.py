@@ -25,8 +25,7 @@ from megloc_kapture.retrieval.fusion import (
     fuse_rankings,
     greedy_coverage,
 )
-from megloc_kapture.retrieval.search import FusedSearch, rank_by_similarity
-from megloc_kapture.retrieval.vectors import ConcatenatedBlocks
+from megloc_kapture.retrieval.search import ConcatenatedBlocks, FusedSearch
 
 needs_kapture_localization = pytest.mark.skipif(
     importlib.util.find_spec("kapture_localization") is None,
@@ -150,8 +149,8 @@ def test_round_robin_is_kapture_localization_s(top_k: int) -> None:
     expected: dict[str, list[str]] = {}
     for query, image, _ in fusion.round_robin_from_similarity_dicts(ranked, top_k):
         expected.setdefault(query, []).append(image)
-    fused = fuse(matrices, FusionOptions(method="round_robin"))
-    order = np.argsort(-fused, axis=1, kind="stable")[:, :top_k]
+    lists = [np.argsort(-matrix, axis=1, kind="stable") for matrix in matrices]
+    order, _ = fuse_rankings(lists, top_k, FusionOptions(method="round_robin"))
     assert {q: images[row].tolist() for q, row in zip(queries, order, strict=True)} == expected
 
 
@@ -191,13 +190,14 @@ def test_features_have_no_order_and_every_value_is_finite(
 
 
 def test_ranks_as_scores() -> None:
-    a, b = np.array([[0.9, 0.5, 0.1]]), np.array([[0.2, 0.8, 0.2]])  # b ties: database order
-    turns = fuse([a, b], FusionOptions(method="round_robin"))
-    assert np.argsort(-turns, kind="stable").tolist() == [[0, 1, 2]]
-    reciprocal = fuse([a, b], FusionOptions(method="reciprocal_rank"))
+    lists = [ids(0, 1, 2)[None], ids(1, 0, 2)[None]]
+    turns, _ = fuse_rankings(lists, 3, FusionOptions(method="round_robin"))
+    assert turns.tolist() == [[0, 1, 2]]
+    _, reciprocal = fuse_rankings(lists, 3, FusionOptions(method="reciprocal_rank"))
     expected = [1 / 61 + 1 / 62, 1 / 62 + 1 / 61, 1 / 63 + 1 / 63]
-    np.testing.assert_allclose(reciprocal, np.array([expected]) / 2)
-    borda = fuse([a, b], FusionOptions(method="borda"), [3, 1])
+    np.testing.assert_allclose(reciprocal, np.array([expected]) / 2, rtol=1e-6)
+    order, borda = fuse_rankings(lists, 3, FusionOptions(method="borda"), [3, 1])
+    assert order.tolist() == [[0, 1, 2]]
     np.testing.assert_allclose(borda, [[2.75, 2.25, 1]])
 
 
@@ -253,7 +253,8 @@ def test_blocks_of_several_features_rank_as_the_mean_does() -> None:
     queries, database = [unit(1, 20, 16), unit(2, 20, 8)], [unit(3, 300, 16), unit(4, 300, 8)]
     blocks = ConcatenatedBlocks(database, [2, 1])
     assert len(blocks) == 300 and blocks.dimension == 24
-    early = rank_by_similarity(concatenate(queries, [2, 1]), blocks, 10)
+    alone = FusedSearch(10, FusionOptions())
+    (early,) = alone.lists([concatenate(queries, [2, 1])], [blocks])
     search = FusedSearch(10, FusionOptions(method="mean"), [2, 1])
     late = search.ranking([search.lists(queries, database)])
     np.testing.assert_array_equal(early[0], late[0])

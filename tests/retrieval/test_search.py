@@ -19,7 +19,6 @@ from megloc_kapture.retrieval.search import (
     Found,
     FusedSearch,
     QuantizedRows,
-    rank_by_similarity,
     short_lists,
 )
 from megloc_kapture.stages.candidates import Candidates, QueryPairsOptions, Retrieval
@@ -27,55 +26,49 @@ from megloc_kapture.values import RigidTransform
 
 
 def rank_fused(
-    queries: Any, database: Any, top_k: int, *, fusion: FusionOptions, weights: Any = None,
-    permitted: Any = None,
-) -> Found:  # fmt: skip
+    queries: Any, database: Any, top_k: int, *, fusion: FusionOptions, weights: Any = None
+) -> Found:
     search = FusedSearch(top_k, fusion, weights)
-    return search.ranking([search.lists(queries, database, permitted)])
+    return search.ranking([search.lists(queries, database)])
+
+
+def rank_by_similarity(queries: Any, database: Any, top_k: int) -> Found:
+    return rank_fused([queries], [database], top_k, fusion=FusionOptions())
 
 
 def full_sort(
-    queries: NDArray[np.float64],
-    database: NDArray[np.float64],
-    top_k: int,
-    permitted: NDArray[np.bool_] | None = None,
+    queries: NDArray[np.float64], database: NDArray[np.float64], top_k: int
 ) -> tuple[list[list[int]], list[list[float]]]:
     indices, scores = [], []
-    for row, query in enumerate(queries):
+    for query in queries:
         products = [float(np.dot(query, other)) for other in database]
-        allowed = [k for k in range(len(database)) if permitted is None or bool(permitted[row, k])]
-        best = sorted(allowed, key=lambda k: (-products[k], k))[:top_k]
-        width = min(top_k, len(database))
-        indices.append(best + [-1] * (width - len(best)))
-        scores.append([products[k] for k in best] + [-np.inf] * (width - len(best)))
+        best = sorted(range(len(database)), key=lambda k: (-products[k], k))[:top_k]
+        indices.append(best)
+        scores.append([products[k] for k in best])
     return indices, scores
 
 
 @st.composite
-def problems(draw: st.DrawFn) -> tuple[NDArray[np.float64], NDArray[np.float64], int, int, bool]:
+def problems(draw: st.DrawFn) -> tuple[NDArray[np.float64], NDArray[np.float64], int, int]:
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     # small integers: exact products, and ties all over
     size = draw(st.integers(1, 3))
     queries = rng.integers(-2, 3, (draw(st.integers(1, 12)), size)).astype(np.float64)
     database = rng.integers(-2, 3, (draw(st.integers(1, 40)), size)).astype(np.float64)
     top_k, block = draw(st.integers(1, 45)), draw(st.integers(1, 60))
-    return queries, database, top_k, block, draw(st.booleans())
+    return queries, database, top_k, block
 
 
 @given(problems())
 @settings(deadline=None)
 def test_equal_to_a_full_stable_sort_whatever_the_blocks(
-    problem: tuple[NDArray[np.float64], NDArray[np.float64], int, int, bool],
+    problem: tuple[NDArray[np.float64], NDArray[np.float64], int, int],
 ) -> None:
-    queries, database, top_k, block, masked = problem
-    permitted = None
-    if masked:
-        rng = np.random.default_rng(top_k)
-        permitted = rng.uniform(size=(len(queries), len(database))) < 0.4
+    queries, database, top_k, block = problem
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(search, "_BLOCK_ELEMENTS", block)
-        indices, scores = rank_by_similarity(queries, database, top_k, permitted=permitted)
-    expected_indices, expected_scores = full_sort(queries, database, top_k, permitted)
+        indices, scores = rank_by_similarity(queries, database, top_k)
+    expected_indices, expected_scores = full_sort(queries, database, top_k)
     np.testing.assert_array_equal(indices, expected_indices)
     np.testing.assert_array_equal(scores, np.array(expected_scores, dtype=np.float32))
     assert indices.dtype == np.int64 and scores.dtype == np.float32
@@ -90,13 +83,6 @@ def test_real_vectors_agree_with_the_full_sort() -> None:
     best = np.take_along_axis(products, order, axis=1)
     np.testing.assert_allclose(scores, best, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(np.take_along_axis(products, indices, axis=1), best, atol=1e-4)
-    # one feature is not fused
-    for found, same in zip(
-        rank_fused([queries], [database], 10, fusion=FusionOptions()),
-        (indices, scores),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(found, same)
 
 
 @pytest.mark.parametrize(("queries", "rows"), [(2, 0), (0, 3)])
@@ -139,17 +125,18 @@ def test_a_source_is_read_once_in_blocks_and_gives_what_the_array_gives() -> Non
         np.testing.assert_array_equal(ours, expected)
 
 
-def test_permission_may_come_block_by_block() -> None:
-    rng = np.random.default_rng(3)
-    queries, database = rng.normal(size=(5, 4)), rng.normal(size=(40, 4))
-    permitted = rng.uniform(size=(5, 40)) < 0.3
-    expected = rank_by_similarity(queries, database, 20, permitted=permitted)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(search, "_MOST_ROWS", 16)
-        for given_so in (permitted, lambda start, stop: permitted[:, start:stop]):
-            found = rank_by_similarity(queries, database, 20, permitted=given_so)
-            np.testing.assert_array_equal(found[0], expected[0])
-            np.testing.assert_allclose(found[1], expected[1], rtol=1e-6)
+def by_ranks(matrices: Any, options: FusionOptions, weights: list[float]) -> NDArray[np.float64]:
+    """Scores (M,) of one query by the ranks of all images."""
+    fused = np.full(matrices[0].shape[1], -np.inf if options.method == "round_robin" else 0.0)
+    for feature, ((row,), weight) in enumerate(zip(matrices, weights, strict=True)):
+        ranks, share = np.argsort(np.argsort(-row, kind="stable")), weight / sum(weights)
+        if options.method == "round_robin":
+            fused = np.maximum(fused, -(ranks * len(matrices) + feature))
+        elif options.method == "reciprocal_rank":
+            fused += share / (options.rank_constant + 1 + ranks)
+        else:
+            fused += share * (len(row) - ranks)
+    return fused
 
 
 METHODS = [
@@ -159,35 +146,25 @@ METHODS = [
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("masked", [False, True])
-def test_fused_ranking_is_that_of_the_whole_matrices(method: str, masked: bool) -> None:
+def test_fused_ranking_is_that_of_the_whole_matrices(method: str) -> None:
     rng = np.random.default_rng(4)
     queries = [rng.normal(size=(7, d)) / 4 for d in (5, 9, 3)]
     database = [rng.normal(size=(60, d)) / 4 for d in (5, 9, 3)]
-    permitted = rng.uniform(size=(7, 60)) < 0.5 if masked else None
     options = FusionOptions.model_validate({"method": method})
     weights = [1.0, 2.0, 0.5]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(search, "_BLOCK_ELEMENTS", 48)
         patch.setattr(search, "_MOST_ROWS", 13)
-        indices, scores = rank_fused(
-            queries, database, 10, fusion=options, weights=weights, permitted=permitted
-        )
+        indices, scores = rank_fused(queries, database, 10, fusion=options, weights=weights)
     assert indices.shape == scores.shape == (7, 10)
     for row in range(7):
-        # ranks count among what is permitted
-        allowed = np.arange(60) if permitted is None else np.flatnonzero(permitted[row])
-        matrices = [q[row : row + 1] @ m[allowed].T for q, m in zip(queries, database, strict=True)]
-        fused = fuse(matrices, options, weights)[0]
-        expected = allowed[np.argsort(-fused, kind="stable")[:10]]
+        matrices = [q[row : row + 1] @ m.T for q, m in zip(queries, database, strict=True)]
+        fused = by_ranks(matrices, options, weights) if options.fuses_ranks() else None
+        fused = fuse(matrices, options, weights)[0] if fused is None else fused
+        expected = np.argsort(-fused, kind="stable")[:10]
         if method in ("power", "harmonic_mean", "villena_roman", "borda", "reciprocal_rank"):
             # of equal scores, which these have, rounding may turn the order
-            place = {int(image): k for k, image in enumerate(allowed)}
-            np.testing.assert_allclose(
-                [fused[place[i]] for i in indices[row].tolist()],
-                np.sort(fused)[::-1][:10],
-                atol=1e-6,
-            )
+            np.testing.assert_allclose(fused[indices[row]], np.sort(fused)[::-1][:10], atol=1e-6)
         else:
             assert indices[row].tolist() == expected.tolist()
 

@@ -36,9 +36,9 @@ from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
 from megloc_kapture.stages.global_features import extract_vlad
 from megloc_kapture.stages.image_pairs import MappingPairsOptions, pair_map_images, pair_queries
 from megloc_kapture.stages.local_features import extract_local_features
+from megloc_kapture.stages.map_points import triangulate_map
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
-from megloc_kapture.stages.triangulation import triangulate_map
 from megloc_kapture.stages.work import HERE
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 

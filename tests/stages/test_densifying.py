@@ -29,11 +29,11 @@ from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.geometry.cameras import project, scaled_camera
 from megloc_kapture.io.kapture import KaptureFolder, read_point_covariances, write_sensors
 from megloc_kapture.io.tables import read_depth_rows
-from megloc_kapture.localization.map_index import observed_matches
+from megloc_kapture.localization.map_index import TypedMatches
 from megloc_kapture.mapping.uncertainty import point_deviations
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.densifying import DensifyOptions, densify_map, fitted_to_poses
-from megloc_kapture.stages.rigs import depth_records, read_depth
+from megloc_kapture.stages.scene import depth_records, read_depth
 from megloc_kapture.stages.shared_index import index_map
 from megloc_kapture.stages.stereo_depth import DEPTH_FILE, fuse_depth, read_beside, side_file
 from megloc_kapture.stages.work import Work
@@ -161,7 +161,7 @@ def test_a_lifted_point_does_not_displace_a_triangulated_one(densified: KaptureF
     # both say the same query keypoint, the lifted one with the better score
     said = ((image, triangulated, 0.5), (other, lifted, 0.9))
     matches = [(name, np.array([[7, row]]), np.array([score])) for name, row, score in said]
-    found = observed_matches(index, matches).resolve()
+    found = TypedMatches(index, np.zeros((8, 2), np.float32), matches).correspondences()
     assert found.keypoint_ids.tolist() == [7]
     assert not index.seen_once[found.point_ids[0]]
 

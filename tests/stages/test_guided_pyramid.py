@@ -31,10 +31,10 @@ from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOption
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.stages.guided_pyramid import COLUMNS, PyramidMethod, retry_query, table_path
 from megloc_kapture.stages.local_features import extract_local_features
+from megloc_kapture.stages.map_points import triangulate_map
 from megloc_kapture.stages.matches import Features, match_pairs
 from megloc_kapture.stages.pyramid_mapping import pyramid_mapping, pyramid_queries
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
-from megloc_kapture.stages.triangulation import triangulate_map
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, ImageFeatures, LocalFeatures, Pose, RigidTransform
 

@@ -201,7 +201,7 @@ def test_nothing_is_lost_where_nothing_is_asked_for(wall: KaptureFolder, tmp_pat
     assert report.points_after == 0 and found.observations() == {}
     write_sensors(tmp_path / "empty", wall.read())
     with pytest.raises(DataError, match="no map to refine"):
-        refine_map(KaptureFolder(tmp_path / "empty"), tmp_path / "out")
+        refine_map(KaptureFolder(tmp_path / "empty"), tmp_path / "out", OFF)
 
 
 def test_covariances_are_those_of_the_new_map(wall: KaptureFolder, tmp_path: Path) -> None:

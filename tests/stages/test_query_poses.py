@@ -31,9 +31,9 @@ from megloc_kapture.stages.query_poses import (
     LocalizationOptions,
     in_turn,
     localize_from_matches,
-    localize_views,
+    localize_unit,
 )
-from megloc_kapture.stages.ranking_scene import KaptureScene
+from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
@@ -165,7 +165,7 @@ def test_every_cluster_gives_a_pose_whichever_retrieval_ranks_first(first: str) 
         for name, count in zip(names, (80, 90, 60, 50), strict=True)
     ]
     seen = project(camera, truth, place).astype(np.float32)
-    found = localize_views(
+    (found,) = localize_unit(
         [QueryView("q", camera, (TypedMatches(index, seen, matches),))],
         sorted(names, key=lambda name: not name.startswith(first)),
         [""] * 4,
@@ -175,7 +175,7 @@ def test_every_cluster_gives_a_pose_whichever_retrieval_ranks_first(first: str) 
         },
         ranker=load_plugin(POSE_RANKERS, "inliers"),
         scene=cast(RankingScene, None),  # that ranker asks for no picture
-    ).result
+    )
     assert isinstance(found, Pose)
     assert len(found.clusters) == 2
     np.testing.assert_allclose(found.cam_from_world.center(), truth.center(), atol=1e-5)
@@ -192,7 +192,7 @@ def test_places_whose_poses_agree_are_one_but_in_two_frames(
     halves = zip("ab", np.split(rows, 2), strict=True)
     matches = [(name, np.stack([own] * 2, axis=1), np.full(50, 0.9)) for name, own in halves]
     seen = project(camera, truth, points).astype(np.float32)
-    found = localize_views(
+    (found,) = localize_unit(
         [QueryView("q", camera, (TypedMatches(index, seen, matches),))],
         ["a", "b"],
         frames,
@@ -200,6 +200,6 @@ def test_places_whose_poses_agree_are_one_but_in_two_frames(
         centers={"a": np.zeros(3), "b": np.full(3, 9.0)},
         ranker=load_plugin(POSE_RANKERS, "inliers"),
         scene=cast(RankingScene, None),
-    ).result
+    )
     assert isinstance(found, Pose)
     assert (len(found.clusters), found.num_matches) == (clusters, 100 // clusters)

@@ -88,28 +88,14 @@ def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-10])
 
 
-def put(array: Any) -> Callable[[Path], None]:
-    return lambda path: np.save(path, array, allow_pickle=True)
-
-
-@pytest.mark.parametrize(
-    ("file", "damage"),
-    [
-        ("point_ids.npy", Path.unlink),
-        ("point_ids.npy", cut),
-        ("xyz.npy", put(np.zeros((40, 2)))),
-        ("keypoint_ids.npy", put(np.zeros(200))),
-        ("offsets.npy", put(np.array([object()] * 4))),
-        ("images.json", lambda path: path.write_text('["a"]')),
-    ],
-    ids=["missing", "cut", "shape", "type", "objects", "names"],
-)
-def test_a_damaged_file_is_named(
+@pytest.mark.parametrize("damage", [Path.unlink, cut])
+@pytest.mark.parametrize("file", ["point_ids.npy", "index.json"])
+def test_a_damaged_index_is_named(
     damage: Callable[[Path], object], file: str, tmp_path: Path
 ) -> None:
     write_index(make_index(), tmp_path)
     damage(tmp_path / file)
-    with pytest.raises(DataError, match=file):
+    with pytest.raises(DataError, match=f"{tmp_path}.*cannot read a map's index"):
         open_index(tmp_path)
 
 

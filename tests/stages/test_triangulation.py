@@ -25,9 +25,9 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import KnownPoseOptions
-from megloc_kapture.stages import triangulation
+from megloc_kapture.stages import map_points
+from megloc_kapture.stages.map_points import triangulate_map
 from megloc_kapture.stages.matches import match_pairs
-from megloc_kapture.stages.triangulation import triangulate_map
 from megloc_kapture.stages.work import Work
 
 
@@ -179,7 +179,7 @@ def test_parts_that_no_match_connects_give_the_map_of_the_whole(
     options = TriangulationOptions()
     found = {}
     for name, at_once, executor in (("whole", 10, None), ("a", 5, None), ("b", 5, two_processes)):
-        monkeypatch.setattr(triangulation, "_IMAGES_AT_ONCE", at_once)
+        monkeypatch.setattr(map_points, "_IMAGES_AT_ONCE", at_once)
         counts = triangulate_map(
             twice, twice, "rootsift", tmp_path / name, options, work=Work(executor)
         )

@@ -20,7 +20,7 @@ from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.features.superpoint import SuperPoint, SuperPointOptions
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.matching.superglue import SuperGlue, SuperGlueOptions
+from megloc_kapture.matching.networks import SuperGlue, SuperGlueOptions
 from megloc_kapture.nets.superglue import SuperGlueNet
 from megloc_kapture.stages.work import Work
 from megloc_kapture.training.pairs import PairOptions, PosedPairs, TrainingPair

@@ -331,8 +331,8 @@ class QueryPictures:
         if len(rows) < 2 or mapping is None or queries is None:
             return ()
         # only a report with such pictures waits for what warps them
-        from megloc_kapture.stages.perceptual_ranking import aligned_view
-        from megloc_kapture.stages.ranking_scene import KaptureScene
+        from megloc_kapture.localization.ranking import aligned_view
+        from megloc_kapture.stages.scene import KaptureScene
 
         found: list[Picture] = []
         with contextlib.suppress(DataError):

@@ -349,7 +349,7 @@ def depth_blocks(context: ResultContext) -> tuple[Block, ...]:
 
 def _with_depth(folder: KaptureFolder, row: DepthRow, unit: str) -> Pictures:
     """The panels of an image; raises DataError where it or its depth cannot be read."""
-    from megloc_kapture.stages.rigs import depth_records, read_depth
+    from megloc_kapture.stages.scene import depth_records, read_depth
     from megloc_kapture.stages.stereo_depth import read_beside
 
     record = depth_records(folder.read()).get(row.image)

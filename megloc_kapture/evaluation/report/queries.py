@@ -19,7 +19,7 @@ from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
 from megloc_kapture.evaluation.without_truth import ResultWithoutTruth
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.kapture import FeatureReader, MatchesReader
-from megloc_kapture.localization.map_index import MapIndex, observed_matches
+from megloc_kapture.localization.map_index import MapIndex, TypedMatches
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.values import RigidTransform
 
@@ -292,8 +292,9 @@ class StoredInliers:
                 read = [(pair[1], *matches.read(*pair)) for pair in pairs if pair in matches]
                 if not read or query.image not in keypoints:
                     continue
-                one = observed_matches(index, read).resolve()
-                pixels = np.asarray(keypoints.read(query.image)[:, :2], np.float64)
+                stored = keypoints.read(query.image)
+                one = TypedMatches(index, stored, read).correspondences()
+                pixels = np.asarray(stored[:, :2], np.float64)
                 if len(pixels) <= one.keypoint_ids.max(initial=-1):
                     continue
                 px, xyz = pixels[one.keypoint_ids], index.xyz[one.point_ids]

@@ -189,7 +189,7 @@ def _looks(
     if context.mapping is None or context.queries is None:
         return
     # only a report with such pictures waits for what warps them
-    from megloc_kapture.stages.ranking_scene import KaptureScene
+    from megloc_kapture.stages.scene import KaptureScene
 
     refined = [i for i, rows in refinements.items() if any(row.accepted for row in rows)]
     refined.sort(key=lambda name: (-sum(row.moved_m for row in refinements[name]), name))
@@ -231,7 +231,7 @@ def _tiled(
 
     ``poses`` has what each is called: before, after.
     """
-    from megloc_kapture.stages.perceptual_ranking import (
+    from megloc_kapture.localization.ranking import (
         AlignedViewOptions,
         aligned_view,
         query_at_size,

@@ -29,7 +29,7 @@ _UNIT = 4e-7  # a squared length that far from one is one, but for rounding
 class KaptureVectors:
     """Global features of images as blocks of unit rows; zero rows stay zero.
 
-    A source of blocks as ``megloc_kapture.retrieval.vectors.VectorBlocks`` says it: nothing is kept
+    A source of blocks as ``megloc_kapture.retrieval.search.VectorBlocks`` says it: nothing is kept
     between reads, so any number of images will do.
     """
 

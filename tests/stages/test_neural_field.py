@@ -32,7 +32,7 @@ from megloc_kapture.refinement.field_training import FieldTrainingOptions  # noq
 from megloc_kapture.refinement.neural_field import FieldRendering  # noqa: E402
 from megloc_kapture.refinement.references import RenderingQuery, RenderingReference  # noqa: E402
 from megloc_kapture.refinement.rendering import judge_by_rendering  # noqa: E402
-from megloc_kapture.stages import field_refinement, neural_field  # noqa: E402
+from megloc_kapture.stages import neural_field  # noqa: E402
 
 IDENTITY = RigidTransform.identity()
 LARGER = Camera("PINHOLE", 320, 240, (220.0, 220.0, 160.0, 120.0))
@@ -125,7 +125,7 @@ def test_light_is_fitted_on_one_half_and_the_pose_judged_by_the_other(
         return judge_by_rendering(*arguments, **more)
 
     monkeypatch.setattr(neural_field, "open_field", lambda *_: Spied())
-    monkeypatch.setattr(field_refinement, "judge_by_rendering", spied)
+    monkeypatch.setattr(neural_field, "judge_by_rendering", spied)
     truth = room.poses(1, 4)[0]
     start = perturbed(truth, 0.1, 2.0, np.random.default_rng(0))
     seen = room.render(truth, camera=LARGER)

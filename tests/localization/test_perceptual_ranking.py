@@ -11,14 +11,15 @@ import pytest
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import bearing_rays, project
-from megloc_kapture.localization.ranking import DistinctiveInliers, InlierCount
-from megloc_kapture.plugins import DepthView, HypothesisView, PoseHypothesis, PoseRanker
-from megloc_kapture.stages.perceptual_ranking import (
+from megloc_kapture.localization.ranking import (
     AlignedViewOptions,
+    DistinctiveInliers,
+    InlierCount,
     PerceptualRanker,
     aligned_view,
     query_at_size,
 )
+from megloc_kapture.plugins import DepthView, HypothesisView, PoseHypothesis, PoseRanker
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Camera("SIMPLE_PINHOLE", 160, 120, (120.0, 80.0, 60.0))

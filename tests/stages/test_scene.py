@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.io.kapture import KaptureData, Sensor
-from megloc_kapture.stages.rigs import poses_through_rig, query_units
+from megloc_kapture.stages.scene import poses_through_rig, query_units
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
 CAMERA = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 100, 80, (90.0, 50.0, 40.0)))

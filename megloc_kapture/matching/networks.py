@@ -1,0 +1,242 @@
+"""Matchers that are networks.
+
+SuperGlue (Sarlin et al., CVPR 2020), for keypoints that carry a score; LightGlue (Lindenberger et
+al., ICCV 2023), and LighterGlue, its small form for XFeat.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from torch.nn.utils.rnn import pad_sequence
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.weights import WeightsFile
+from megloc_kapture.nets import lightglue
+from megloc_kapture.nets.lightglue import KeypointBatch, load_lighterglue, load_lightglue
+from megloc_kapture.nets.runtime import Checkpointed, NetworkOptions, inference
+from megloc_kapture.nets.superglue import (
+    ImageKeypoints,
+    mutual_matches,
+    normalise_keypoints,
+    superglue,
+)
+from megloc_kapture.values import ImageFeatures
+
+Matches = tuple[NDArray[np.int64], NDArray[np.float32]]
+PairOptions = TypeVar("PairOptions", bound=NetworkOptions)
+
+
+class PairNetwork(Checkpointed[PairOptions], ABC):
+    """A network that matches one image with each of several, in one batch."""
+
+    def match(self, a: ImageFeatures, b: ImageFeatures) -> Matches:
+        """Match two images: int64 (K, 2), rows sorted by a, each once; scores float32 (K,).
+
+        Raises as :meth:`match_many`.
+        """
+        return self.match_many(a, [b])[0]
+
+    @abstractmethod
+    def match_many(self, a: ImageFeatures, others: Sequence[ImageFeatures]) -> list[Matches]:
+        """Match one image with each of several, in one batch; see :meth:`match`."""
+
+
+def _matched(
+    num_others: int, rows: Sequence[int], found: Iterable[tuple[torch.Tensor, torch.Tensor]]
+) -> list[Matches]:
+    """The matches of those of the others that a network has seen, and none of the rest."""
+    matches: list[Matches] = [
+        (np.zeros((0, 2), np.int64), np.zeros(0, np.float32)) for _ in range(num_others)
+    ]
+    for row, (pairs, scores) in zip(rows, found, strict=True):
+        matches[row] = pairs.cpu().numpy(), scores.cpu().numpy()
+    return matches
+
+
+class SuperGlueOptions(NetworkOptions):
+    """Options of SuperGlue; threshold and iterations are the authors' own."""
+
+    weights: str = Field(
+        default="superglue_outdoor",
+        description="name or file: superglue_outdoor, superglue_indoor or one of the same layout",
+    )
+    match_threshold: float = Field(default=0.2, ge=0, lt=1, description="scores kept are larger")
+    sinkhorn_iterations: int = Field(default=100, gt=0)
+
+
+class SuperGlue(PairNetwork[SuperGlueOptions]):
+    """The matcher plugin ``superglue``.
+
+    Takes keypoints whose third column is the detector's score, and descriptors of the size that
+    the weights were trained with: 256, SuperPoint's, for the official ones.
+    """
+
+    Options = SuperGlueOptions
+
+    def match_many(self, a: ImageFeatures, others: Sequence[ImageFeatures]) -> list[Matches]:
+        """As of the base, scores in (0, 1].
+
+        Raises DataError for keypoints without scores in (0, 1], or descriptors of another size.
+        """
+        options = self.options
+        net, device = self.network(superglue)
+        with inference(device, options.half_precision):
+            side, *sides = (
+                network_input(image, net.descriptor_size, self._weights.name, device)
+                for image in (a, *others)
+            )
+            rows = [k for k, b in enumerate(sides) if len(side.scores) and len(b.scores)]
+            pairs = [(side, sides[k]) for k in rows]
+            assignments = net(pairs, options.sinkhorn_iterations) if pairs else ()
+            found = [mutual_matches(one, options.match_threshold) for one in assignments]
+            return _matched(len(others), rows, found)
+
+
+def network_input(
+    image: ImageFeatures, descriptor_size: int, where: str, device: torch.device
+) -> ImageKeypoints:
+    """Keypoints of an image as the network takes them; ``where`` names the weights in messages.
+
+    Raises DataError for keypoints without scores in (0, 1], or descriptors of another size.
+    """
+    table = np.asarray(image.keypoints_px, dtype=np.float32)
+    descriptors = np.asarray(image.descriptors, dtype=np.float32)
+    if table.ndim != 2 or table.shape[1] < 3:
+        raise DataError(
+            f"SuperGlue takes keypoints of x, y, score; these have the shape {table.shape}"
+        )
+    scores = table[:, 2]
+    if not ((scores > 0) & (scores <= 1)).all():
+        worst = scores[~((scores > 0) & (scores <= 1))][0]
+        raise DataError(
+            "SuperGlue takes the detector's score as third column of the keypoints, above 0 "
+            f"and up to 1; this one has {worst:g}"
+        )
+    if len(table) and descriptors.shape != (len(table), descriptor_size):
+        raise DataError(
+            f"{where} takes descriptors of {descriptor_size} dimensions, one "
+            f"for each of {len(table)} keypoints; these have the shape {descriptors.shape}"
+        )
+    xy = torch.from_numpy(table[:, :2] - np.float32(0.5)).to(device)  # its first pixel is (0, 0)
+    return ImageKeypoints(
+        normalise_keypoints(xy, image.width, image.height),
+        torch.from_numpy(scores.copy()).to(device),
+        torch.from_numpy(np.array(descriptors, order="C")).to(device),
+    )
+
+
+class LightGlueKindOptions(NetworkOptions):
+    """Options that LightGlue and LighterGlue share."""
+
+    weights: str
+    threshold: float = Field(default=0.1, ge=0, lt=1, description="probability of a match")
+
+
+KindOptions = TypeVar("KindOptions", bound=LightGlueKindOptions)
+
+
+class _LightGlueKind(PairNetwork[KindOptions]):
+    """A matcher that is a network of LightGlue's kind.
+
+    Raises
+    ------
+    OptionError : kornia is not installed.
+    MissingWeightsError : the checkpoint is not there.
+    """
+
+    _load: Any  # of a checkpoint's tensors and the file's name
+
+    def __init__(self, options: KindOptions | None = None) -> None:
+        lightglue.require_kornia()
+        super().__init__(options)
+
+    def match_many(self, a: ImageFeatures, others: Sequence[ImageFeatures]) -> list[Matches]:
+        """As of the base; scores are the matches' probabilities.
+
+        Pairs are padded to the keypoints of the largest; what is padding is masked out of attention
+        and assignment, so that scores are as one by one but for rounding. Raises DataError where
+        the checkpoint or the descriptors do not fit, OptionError where the device is not there.
+        """
+        network, device = self.network(self._load)
+        for image in (a, *others):
+            _check(image, network.descriptor_size, self._weights)
+        rows = [at for at, b in enumerate(others) if len(a.keypoints_px) and len(b.keypoints_px)]
+        if not rows:
+            return _matched(len(others), (), ())
+        with inference(device, self.options.half_precision):
+            assignment = network(
+                _batch([a] * len(rows), device), _batch([others[row] for row in rows], device)
+            )
+            found = lightglue.mutual_matches(assignment, self.options.threshold)
+            return _matched(len(others), rows, found)
+
+
+def _check(image: ImageFeatures, expected: int, file: WeightsFile) -> None:
+    if len(image.descriptors) and image.descriptors.shape[1] != expected:
+        raise DataError(
+            f"these weights match descriptors of {expected} values, the features' have "
+            f"{image.descriptors.shape[1]}",
+            path=file.path,
+        )
+
+
+def normalised_points(image: ImageFeatures) -> NDArray[np.float32]:
+    """Keypoints (N, 2) float32 as the networks know them: the image's longer side is -1 to 1.
+
+    They were trained with the first pixel's centre at (0, 0) and the middle at half the size. A
+    keypoint of the first row or column may then be less than -1, by half a pixel at most, and is
+    clamped: no position outside was seen in training.
+    """
+    size = np.array([image.width, image.height], np.float64)
+    xy = image.keypoints_px[:, :2].astype(np.float64) - 0.5
+    return np.clip((xy - size / 2) / (size.max() / 2), -1, 1).astype(np.float32)
+
+
+def _batch(images: Sequence[ImageFeatures], device: torch.device) -> KeypointBatch:
+    points = [torch.from_numpy(normalised_points(image)) for image in images]
+    descriptors = [
+        torch.from_numpy(np.ascontiguousarray(image.descriptors, np.float32)) for image in images
+    ]
+    lengths = torch.tensor([len(rows) for rows in points])
+    present = torch.arange(int(lengths.max()))[None] < lengths[:, None]
+    return KeypointBatch(
+        pad_sequence(points, batch_first=True).to(device),
+        pad_sequence(descriptors, batch_first=True).to(device),
+        None if bool(present.all()) else present[..., None].to(device),
+    )
+
+
+class LightGlueOptions(LightGlueKindOptions):
+    """Options of LightGlue."""
+
+    weights: str = Field(
+        default="superpoint_lightglue",
+        description="superpoint_lightglue, aliked_lightglue, or a file: those of the features",
+    )
+
+
+class LightGlue(_LightGlueKind[LightGlueOptions]):
+    """The matcher ``lightglue``, for SuperPoint's features or ALIKED's; needs kornia."""
+
+    Options = LightGlueOptions
+    _load = staticmethod(load_lightglue)
+
+
+class LighterGlueOptions(LightGlueKindOptions):
+    """Options of LighterGlue."""
+
+    weights: str = Field(default="xfeat-lighterglue", description="name in the registry, or a file")
+
+
+class LighterGlue(_LightGlueKind[LighterGlueOptions]):
+    """The matcher ``lighterglue`` for features of type ``xfeat``; needs kornia."""
+
+    Options = LighterGlueOptions
+    _load = staticmethod(load_lighterglue)

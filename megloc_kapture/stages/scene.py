@@ -1,0 +1,287 @@
+"""What goes with an image of a kapture folder: siblings on its rig, mask, depth and points.
+
+Pose rankers and refiners look at them through :class:`KaptureScene`, which reads only what is asked
+for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property, lru_cache
+from operator import itemgetter
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.images import read_depth_map
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder
+from megloc_kapture.localization.map_index import MapIndex
+from megloc_kapture.plugins import DepthView
+from megloc_kapture.stages.local_features import mask_path, read_image_of, read_mask
+from megloc_kapture.stages.shared_index import index_map
+from megloc_kapture.stages.work import Digest
+from megloc_kapture.values import Camera, Pose, RigidTransform
+
+Unit = tuple[tuple[str, RigidTransform], ...]
+"""Images that get one pose, sorted by name, with the ``cam_from_rig`` of each."""
+
+
+def query_units(data: KaptureData, *, rigs: bool) -> list[Unit]:
+    """The units of a query folder, sorted by their images; every image is in one.
+
+    ``rigs``: whether cameras of one rig and one timestamp are localized together. A camera on
+    several rigs goes with the first by name. Without, every image is by itself.
+    """
+    rigs_of = _rigs_of(data) if rigs else {}
+    units: list[Unit] = []
+    together: dict[tuple[int, str], list[str]] = {}
+    for image in data.image_names():
+        timestamp, sensor = data.record_of(image)
+        if sensor in rigs_of:
+            together.setdefault((timestamp, rigs_of[sensor][0]), []).append(image)
+        else:
+            units.append(((image, RigidTransform.identity()),))
+    for (_, rig), images in together.items():
+        if len(images) == 1:
+            units.append(((images[0], RigidTransform.identity()),))
+        else:
+            members = data.rigs[rig]
+            units.append(tuple((image, members[data.record_of(image)[1]]) for image in images))
+    return sorted(units, key=lambda unit: [image for image, _ in unit])
+
+
+def poses_through_rig(
+    data: KaptureData, localized: Mapping[str, Pose]
+) -> dict[str, tuple[str, RigidTransform]]:
+    """For images that are not localized: the sibling that is, and the pose it gives them.
+
+    Siblings share the timestamp and a rig; of several, the one with the most inliers counts, then
+    the first by name.
+
+    Parameters
+    ----------
+    data : sensors, rigs (``sensor_from_rig``) and records of the images.
+    localized : the images that were localized.
+    """
+    rigs_of = _rigs_of(data)
+    at_time: dict[int, list[tuple[str, str]]] = {}
+    for (timestamp, sensor), image in data.records_camera.items():
+        at_time.setdefault(timestamp, []).append((sensor, image))
+    found = {}
+    for image in sorted(set(data.records_camera.values()) - set(localized)):
+        timestamp, sensor = data.record_of(image)
+        poses = [
+            (-result.num_inliers, other, sensor_from_other @ result.cam_from_world)
+            for other_sensor, other in at_time[timestamp]
+            if (result := localized.get(other)) is not None
+            and (sensor_from_other := _between(data, rigs_of, sensor, other_sensor)) is not None
+        ]
+        if poses:
+            _, other, pose = min(poses, key=itemgetter(0, 1))
+            found[image] = (other, pose)
+    return found
+
+
+@dataclass(frozen=True)
+class DepthRecord:
+    """A depth map that was taken with an image.
+
+    Parameters
+    ----------
+    path : below ``records_data``.
+    camera : of the depth sensor.
+    image_from_depth : from the depth camera's frame to the image's.
+    """
+
+    path: str
+    camera: Camera
+    image_from_depth: RigidTransform
+
+
+def depth_records(data: KaptureData) -> dict[str, DepthRecord]:
+    """Image -> the depth map of its moment, of a depth sensor on one rig with its camera.
+
+    Where several depth sensors share the rig, the one nearest to the camera counts.
+    """
+    rigs_of = _rigs_of(data)
+    at_time: dict[int, list[tuple[str, str]]] = {}
+    for (timestamp, sensor), path in sorted(data.records_depth.items()):
+        at_time.setdefault(timestamp, []).append((sensor, path))
+    found = {}
+    for (timestamp, camera), image in data.records_camera.items():
+        options = [
+            (image_from_depth, sensor, path)
+            for sensor, path in at_time.get(timestamp, ())
+            if (image_from_depth := _between(data, rigs_of, camera, sensor)) is not None
+        ]
+        if options:
+            image_from_depth, sensor, path = min(
+                options, key=lambda option: (np.linalg.norm(option[0].translation), option[1])
+            )
+            found[image] = DepthRecord(path, data.sensors[sensor].camera(), image_from_depth)
+    return found
+
+
+def read_depth(folder: KaptureFolder, record: DepthRecord) -> NDArray[np.float32]:
+    """Depth (H, W) of a record, 0 where nothing is known; raises DataError."""
+    size = {"width": record.camera.width, "height": record.camera.height}
+    return read_depth_map(folder.depth_path(record.path), **size)
+
+
+def _rigs_of(data: KaptureData) -> dict[str, list[str]]:
+    """The rigs that a sensor is on, sorted by name."""
+    rigs_of: dict[str, list[str]] = {}
+    for rig, members in sorted(data.rigs.items()):
+        for sensor in members:
+            rigs_of.setdefault(sensor, []).append(rig)
+    return rigs_of
+
+
+def _between(
+    data: KaptureData, rigs_of: Mapping[str, list[str]], sensor: str, other: str
+) -> RigidTransform | None:
+    """``sensor_from_other`` where one rig carries both."""
+    for rig in rigs_of.get(sensor, ()):
+        if other in data.rigs[rig]:
+            return data.rigs[rig][sensor] @ data.rigs[rig][other].inverse()
+    return None
+
+
+_NO_POINTS = np.zeros(0, np.int64)
+
+
+class _Images:
+    """Pixels, masks, depth and points of the images of one folder; what is looked up stays."""
+
+    def __init__(self, folder: KaptureFolder) -> None:
+        self.folder = folder
+
+    def camera(self, name: str) -> Camera:
+        return self.folder.read().camera_of(name)
+
+    def image(self, name: str) -> NDArray[np.uint8]:
+        return read_image_of(self.folder.image_path(name), self.camera(name))
+
+    def mask(self, name: str) -> NDArray[np.bool_] | None:
+        camera = self.camera(name)
+        return read_mask(mask_path(self.folder, name), (camera.height, camera.width))
+
+    def depth(self, name: str) -> DepthView | None:
+        record = self._depth_records.get(name)
+        if record is None:
+            return None
+        depth_m = read_depth(self.folder, record)
+        return DepthView(record.camera, depth_m, record.image_from_depth)
+
+    def points(self, name: str) -> NDArray[np.float64]:
+        seen = [index.observed(name)[1] for index in self._indices]
+        return self.folder.points3d()[:, :3][np.unique(np.concatenate([_NO_POINTS, *seen]))]
+
+    @cached_property
+    def _depth_records(self) -> dict[str, DepthRecord]:
+        return depth_records(self.folder.read())
+
+    @cached_property
+    def _indices(self) -> list[MapIndex]:
+        return [index_map(self.folder, name) for name in self.folder.observations()]
+
+
+@lru_cache(maxsize=4)
+def _images_of(folder: KaptureFolder) -> _Images:
+    """The same for every query of a run: a folder is opened once per process."""
+    return _Images(folder)
+
+
+class QueryScene(Protocol):
+    """Pixels, mask and depth of query images by their names; see :class:`KaptureScene`."""
+
+    def image(self, name: str) -> NDArray[np.uint8]:
+        """RGB pixels (H, W, 3); raises DataError."""
+        ...
+
+    def mask(self, name: str) -> NDArray[np.bool_] | None:
+        """Mask (H, W), True = use; None without one."""
+        ...
+
+    def depth(self, name: str) -> DepthView | None:
+        """Depth that was taken with the image; None without; raises DataError."""
+        ...
+
+
+def depth_of(folder: KaptureFolder, name: str) -> DepthView | None:
+    """Depth that was taken with an image of a folder; None without; raises DataError."""
+    return _images_of(folder).depth(name)
+
+
+class KaptureScene:
+    """A :class:`~megloc_kapture.plugins.RankingScene` of a map's folder and its queries; raises
+    DataError where a file cannot be read, or a map image has no pose.
+
+    Parameters
+    ----------
+    query : the folder of the queries, or what else knows them; None: nothing does.
+    map_camera : camera of a map image by its name; as stored unless given.
+    """
+
+    def __init__(
+        self,
+        mapping: KaptureFolder,
+        query: KaptureFolder | QueryScene | None = None,
+        *,
+        map_camera: Callable[[str], Camera] | None = None,
+    ) -> None:
+        self._map = _images_of(mapping)
+        known = _images_of(query) if isinstance(query, KaptureFolder) else query
+        self._query: QueryScene | None = known
+        self._map_camera = map_camera or self._map.camera
+
+    def query_image(self, name: str) -> NDArray[np.uint8]:
+        if self._query is None:
+            raise DataError(f"the pixels of query {name} are not known")
+        return self._query.image(name)
+
+    def query_mask(self, name: str) -> NDArray[np.bool_] | None:
+        return None if self._query is None else self._query.mask(name)
+
+    def query_depth(self, name: str) -> DepthView | None:
+        return None if self._query is None else self._query.depth(name)
+
+    def map_image(self, name: str) -> NDArray[np.uint8]:
+        return self._map.image(name)
+
+    def map_mask(self, name: str) -> NDArray[np.bool_] | None:
+        return self._map.mask(name)
+
+    def map_depth(self, name: str) -> DepthView | None:
+        return self._map.depth(name)
+
+    def map_points(self, name: str) -> NDArray[np.float64]:
+        return self._map.points(name)
+
+    def map_camera(self, name: str) -> Camera:
+        return self._map_camera(name)
+
+    def map_pose(self, name: str) -> RigidTransform:
+        pose = self._map.folder.read().cam_from_world(name)
+        if pose is None:
+            raise DataError(f"map image {name} has no pose", path=self._map.folder.root)
+        return pose
+
+
+def image_inputs(folder: KaptureFolder) -> Callable[[str, Digest], list[str | None]]:
+    """What a ranker may look at: an image's file, its mask and its depth."""
+    names, records = set(folder.read().image_names()), depth_records(folder.read())
+
+    @cache
+    def of_image(image: str, digest: Digest) -> list[str | None]:
+        if image not in names:
+            return []
+        files = [folder.image_path(image), mask_path(folder, image)]
+        if image in records:
+            files.append(folder.depth_path(records[image].path))
+        return [digest(file) if file.is_file() else None for file in files]
+
+    return of_image
