@@ -15,7 +15,6 @@ from megloc_kapture.evaluation.report.reports import RECALL_JSON
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.files import hard_link, output_error
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.manifests import read_manifest
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.run import RunChoice
 from megloc_kapture.pipeline.workspace import LOCK, PARTIAL, Workspace
@@ -172,7 +171,7 @@ def outcome(name: str, workspace: Workspace, stages: Sequence[Stage]) -> Outcome
     # JSON knows no infinity: a median over queries without a pose is written as null
     medians = (row["median_position_m"], row["median_angle_deg"])
     position_m, angle_deg = (float("inf" if value is None else value) for value in medians)
-    manifests = [read_manifest(workspace.manifest_path(s.name)) for s in stages]
+    manifests = [workspace.manifest(s.name) for s in stages]
     return Outcome(
         name=name,
         recall={str(Threshold(**at["threshold"])): float(at["recall"]) for at in row["recall"]},

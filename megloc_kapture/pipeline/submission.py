@@ -44,7 +44,7 @@ from megloc_kapture.pipeline.datasets import (
     check_known,
     dataset_names,
 )
-from megloc_kapture.pipeline.manifests import read_manifest
+from megloc_kapture.pipeline.workspace import read_manifest
 from megloc_kapture.stages import rigs
 from megloc_kapture.values import Pose, RigidTransform
 

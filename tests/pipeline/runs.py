@@ -13,11 +13,10 @@ from megloc_kapture.evaluation.metrics import pose_errors
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX, DatasetChoice, choose_dataset, twin_of
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
-from megloc_kapture.pipeline.manifests import Manifest
 from megloc_kapture.pipeline.plan import StageReport, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import Run, find_benchmark
-from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.pipeline.workspace import Manifest, Workspace
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import RigidTransform
