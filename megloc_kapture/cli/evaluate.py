@@ -17,6 +17,7 @@ from megloc_kapture.cli.common import (
     Input,
     Inputs,
     Output,
+    Overwrite,
     existing,
     side_tables_beside,
 )
@@ -50,10 +51,8 @@ class Evaluate(Common):
     map: Path | None = None
     """Kapture folder of the map, for the report; found in the workspace by itself."""
     force: Force = False
-    """Write into a folder that has other things in it."""
 
-    def run(self) -> int:
-        """Run it."""
+    def run(self) -> None:
         # only this command waits for them
         from megloc_kapture.evaluation.evaluate import (
             benchmark_beside,
@@ -88,7 +87,6 @@ class Evaluate(Common):
             with staged_output(self.output, kind=EVALUATION, force=self.force) as out:
                 write_report(out, found)
         console.result(report_text(found))
-        return 0
 
     def _check(self) -> None:
         if not self.input:
@@ -118,11 +116,10 @@ class Submit(Common):
     """The megloc/ folder of the imported dataset; found beside the result by itself."""
     from_rig: bool = False
     """Queries without a pose get one through the rig, from another camera of their moment."""
-    force: Force = False
+    force: Overwrite = False
     """Overwrite the pose file."""
 
-    def run(self) -> int:
-        """Run it."""
+    def run(self) -> None:
         from megloc_kapture.io.dataset_tables import Protocol, read_protocol
         from megloc_kapture.pipeline.submission import (
             check_dataset,
@@ -145,7 +142,6 @@ class Submit(Common):
             from_rig=self.from_rig,
         )
         console.result(f"{summary(counts)}: {self.output}")
-        return 0
 
     def _check_output(self, *, folder: bool) -> None:
         place = self.output

@@ -19,10 +19,9 @@ import tyro
 
 import megloc_kapture
 from megloc_kapture import plugin_loading
-from megloc_kapture.cli.arguments import EXAMPLES, summary
 from megloc_kapture.cli.common import Console
 from megloc_kapture.cli.info import shown
-from megloc_kapture.cli.main import COMMANDS, _parser, command_class
+from megloc_kapture.cli.main import COMMANDS, EXAMPLES, _parser, command_class, summary
 from megloc_kapture.pipeline.presets import PRESETS, options_of, options_of_preset
 from megloc_kapture.stages.options import PipelineOptions
 

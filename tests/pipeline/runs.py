@@ -10,12 +10,20 @@ from typing import Any
 
 from megloc_kapture import Failure, Pose
 from megloc_kapture.evaluation.metrics import pose_errors
-from megloc_kapture.pipeline.datasets import TWIN_PREFIX, DatasetChoice, choose_dataset, twin_of
+from megloc_kapture.pipeline.datasets import (
+    KAPTURE,
+    TWIN_PREFIX,
+    BenchmarkFile,
+    DatasetChoice,
+    choose_dataset,
+    find_benchmark,
+    twin_of,
+)
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.plan import StageReport, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run, find_benchmark
+from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Manifest, Workspace
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.work import Work
@@ -28,12 +36,12 @@ def run_in(
     options: PipelineOptions,
     *,
     workers: int = 1,
-    benchmark: Any = None,
+    benchmark: BenchmarkFile | None = None,
     **how: Any,
 ) -> dict[str, StageReport]:
     """Run the stages in a workspace, of a scene or a dataset; their reports by name."""
     chosen = choose_dataset("kapture", source) if isinstance(source, Path) else source
-    run = Run(chosen, "classic", options, workspace, benchmark)
+    run = Run(chosen, "classic", options, benchmark or BenchmarkFile(dataset=KAPTURE))
     with workspace.lock(), single_threaded(), open_executor("processes", workers) as executor:
         reports = run_plan(plan_evaluation(run), workspace, Work(executor), **how)
     return {report.name: report for report in reports}

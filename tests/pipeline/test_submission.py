@@ -43,7 +43,6 @@ from megloc_kapture.pipeline.submission import (
     workspace_provenance,
     write_submission,
 )
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import Camera, RigidTransform
 from tests.pipeline.runs import manifest
@@ -423,13 +422,12 @@ def test_places(tmp_path: Path) -> None:
     ],
 )
 def test_a_run_calls_its_pose_file_as_the_server_does(name: str, stem: str, tmp_path: Path) -> None:
-    workspace = Workspace(tmp_path / "workspace")
     rules = protocol_of(name.removeprefix("synthetic-") if name != "synthetic" else name)
-    write_protocol(workspace.path("megloc"), rules)
-    run = Run(DatasetChoice(name, None), "classic", PipelineOptions(), workspace)
+    write_protocol(tmp_path / "megloc", rules)
+    run = Run(DatasetChoice(name, None), "classic", PipelineOptions())
     end = "" if rules.pose_file == "mlad" else ".txt"
     expected = tmp_path / "submissions" / f"{stem}_eval_megloc-classic{end}"
-    assert run.submission_below(tmp_path) == expected
+    assert run.submission_below(tmp_path, tmp_path / "megloc") == expected
 
 
 @pytest.mark.parametrize("stem", ["../x", "a/b", ".x", "a b", "a\n"])
