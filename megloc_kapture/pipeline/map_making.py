@@ -58,7 +58,6 @@ from megloc_kapture.io.files import (
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.io.output_folders import replace_directory
 from megloc_kapture.pipeline.executors import single_threaded
-from megloc_kapture.pipeline.photographs import Photographs
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import (
     DEFAULT_PRESET,
@@ -66,6 +65,7 @@ from megloc_kapture.pipeline.presets import (
     check_weights,
     options_of_preset,
 )
+from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.pipeline.workspace import LOCK, Workspace
 from megloc_kapture.stages.densifying import Densify
 from megloc_kapture.stages.global_features import ExtractGlobalFeatures
