@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,12 +20,11 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.document import REPORT_HTML
-from megloc_kapture.evaluation.report.reports import RECALL_JSON
 from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.images import guessed_camera, photo_of, read_photo, turned_upright
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
+from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, recall_rows
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 from megloc_kapture.pipeline.localizer import LOCALIZING, Localizer
@@ -383,13 +381,9 @@ class FinishedRun:
         """Recall by condition (rows) and threshold (columns); empty where no truth is known."""
         import pandas as pd
 
-        path = self.workspace / EVALUATION / RECALL_JSON
-        if not path.is_file():
-            return pd.DataFrame()
-        rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
         table = {
-            row["name"]: {str(Threshold(**at["threshold"])): at["recall"] for at in row["recall"]}
-            for row in rows
+            name: {str(Threshold(**at["threshold"])): at["recall"] for at in row["recall"]}
+            for name, row in recall_rows(self.workspace).items()
         }
         return pd.DataFrame.from_dict(table, orient="index")
 

@@ -199,7 +199,7 @@ class Working(Common):
         """What to work with, by these flags; all workers must see the folder of the output."""
         folder = output if output.is_dir() else output.absolute().parent
         with single_threaded(), self.open_executor(folder) as executor:
-            yield Work(executor, self.console().track)
+            yield Work(executor, self.console().track, self.workers or available_cores())
 
     @contextmanager
     def staged(self, output: Path, kind: str, *, force: bool) -> Iterator[tuple[Path, Work]]:
@@ -210,8 +210,8 @@ class Working(Common):
     @contextmanager
     def working_in(self, workspace: Workspace) -> Iterator[Work]:
         """What to work with in a workspace, which is held meanwhile."""
-        with workspace.lock(), single_threaded(), self.open_executor(workspace.root) as executor:
-            yield Work(executor, self.console().track, self.workers or available_cores())
+        with workspace.lock(), self.working(workspace.root) as work:
+            yield work
 
 
 @dataclass(frozen=True, kw_only=True)

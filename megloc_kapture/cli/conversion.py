@@ -73,8 +73,7 @@ class Import(Common):
     """Put the queries into a folder of this name, where they share names with the map."""
     force: Force = False
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         name = self.dataset.removeprefix(TWIN_PREFIX)
         if name == COLMAP:
             self._import_colmap(console)
@@ -148,8 +147,7 @@ class Synth(Working):
     """An option of the world: key=value; may be repeated."""
     force: Force = False
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         changes = {"seed": self.seed, **assigned(self.set)}
         twin = twin_of(self.dataset.removeprefix(TWIN_PREFIX), **changes)
         with (
@@ -182,8 +180,7 @@ class Export(Common):
     force: Overwrite = False
     """Overwrite, or write into a folder that has other things in it."""
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         number = export(
             self.format,
             self.output,
@@ -228,11 +225,10 @@ class View(Linked, Common):
     force: Overwrite = False
     """Overwrite a file that is no view."""
 
-    def run(self) -> None:
+    def run(self, console: Console) -> None:
         # only this command waits for it
         from megloc_kapture.evaluation.view import write_view
 
-        console = self.console()
         for path in (self.result, self.gt, self.rendered):
             if path is not None and not path.exists():
                 raise DataError("no such file or folder", path=path)

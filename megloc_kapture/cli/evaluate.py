@@ -52,7 +52,7 @@ class Evaluate(Common):
     """Kapture folder of the map, for the report; found in the workspace by itself."""
     force: Force = False
 
-    def run(self) -> None:
+    def run(self, console: Console) -> None:
         # only this command waits for them
         from megloc_kapture.evaluation.evaluate import (
             benchmark_beside,
@@ -63,7 +63,6 @@ class Evaluate(Common):
         from megloc_kapture.evaluation.report.reports import AnyReported, report_text, write_report
         from megloc_kapture.evaluation.statistics import compare, over_seeds
 
-        console = self.console()
         self._check()
         benchmark = benchmark_beside(
             [self.gt, *self.input], side_tables=self.side_tables, dataset=self.dataset
@@ -119,7 +118,7 @@ class Submit(Common):
     force: Overwrite = False
     """Overwrite the pose file."""
 
-    def run(self) -> None:
+    def run(self, console: Console) -> None:
         from megloc_kapture.io.dataset_tables import Protocol, read_protocol
         from megloc_kapture.pipeline.submission import (
             check_dataset,
@@ -127,7 +126,6 @@ class Submit(Common):
             write_submission,
         )
 
-        console = self.console()
         if self.side_tables is not None and not self.side_tables.is_dir():
             raise DataError("no such folder", path=self.side_tables)
         tables = self.side_tables or side_tables_beside(self.input)
@@ -184,7 +182,7 @@ class Check(Common):
     json: bool = False
     """Print everything that was found as JSON."""
 
-    def run(self) -> int:
+    def run(self, console: Console) -> int:
         """Run it; returns 2 where there are problems."""
         from megloc_kapture.evaluation.check.reading import read_reference
         from megloc_kapture.evaluation.check.submission import check_submission
@@ -192,7 +190,6 @@ class Check(Common):
         from megloc_kapture.pipeline.datasets import TWIN_PREFIX, check_known
         from megloc_kapture.pipeline.submission import check_dataset
 
-        console = self.console()
         check_known(self.dataset)
         if not self.file.exists():
             raise DataError("no such file", path=self.file)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +14,6 @@ from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.document import REPORT_HTML
 from megloc_kapture.evaluation.report.reports import (
     AGREEMENT_TEXT,
-    RECALL_JSON,
     RECALL_TEXT,
 )
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
@@ -25,6 +23,7 @@ from megloc_kapture.pipeline.evaluation_plan import (
     ablate,
     outcomes_text,
     plan_evaluation,
+    recall_rows,
     write_outcomes,
 )
 from megloc_kapture.pipeline.plan import all_kept, run_plan
@@ -76,9 +75,8 @@ class Eval(Deciding, Working):
     force: Overwrite = False
     """Use a workspace folder that has other things in it."""
 
-    def run(self) -> int:
+    def run(self, console: Console) -> int:
         """Run it; returns the exit status."""
-        console = self.console()
         run = choose_run(
             self.dataset,
             self.root,
@@ -166,8 +164,7 @@ class Eval(Deciding, Working):
             console.result(text)
         if self.fail_below is None:
             return 0
-        rows = json.loads((evaluation / RECALL_JSON).read_text(encoding="utf-8"))["rows"]
-        recall = next(row for row in rows if row["name"] == "all")["recall"][-1]["recall"]
+        recall = recall_rows(workspace.root)["all"]["recall"][-1]["recall"]
         if recall >= self.fail_below:
             return 0
         console.say(f"recall {recall:.3f} is below {self.fail_below:.3f}")

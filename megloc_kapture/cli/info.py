@@ -58,9 +58,8 @@ class Info(Reading, Common):
     deep: bool = False
     """Read every file, images included."""
 
-    def run(self) -> None:
+    def run(self, console: Console) -> None:
         """Print it."""
-        console = self.console()
         folder = self.kapture(opened_map(self.input, console))
         describe_content(console, folder)
         folder.validate(deep=self.deep)
@@ -189,8 +188,7 @@ class OptionsCommand(Common):
     preset: str = DEFAULT_PRESET
     """Show the values of this preset."""
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         every = list(options_of(options_of_preset(self.preset)))
         found = [one for one in every if _is_below(one.key, self.key)]
         if not found:

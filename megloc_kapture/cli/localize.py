@@ -15,6 +15,7 @@ import tyro
 
 from megloc_kapture.cli.common import (
     Common,
+    Console,
     Deciding,
     Input,
     Output,
@@ -76,8 +77,7 @@ class Localize(Reading, Deciding, Common):
     """Write into a folder that has other things in it, and localize in a map that contradicts
     itself."""
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         self._check_queries()
         workers = available_cores() if self.workers is None else self.workers
         path = opened_map(self.input, console)
@@ -158,11 +158,10 @@ class Serve(Reading, Deciding, Common):
     force: Overwrite = False
     """Localize in a map that contradicts itself."""
 
-    def run(self) -> None:
+    def run(self, console: Console) -> None:
         from megloc_kapture.cli.main import INTERRUPTED, TERMINATED, Terminated
         from megloc_kapture.service.server import bind, serve
 
-        console = self.console()
         if self.workers < 1:
             raise OptionError(f"{self.workers} workers cannot work; give 1 or more")
         threads = self.limits.threads or max(1, available_cores() // self.workers)

@@ -21,9 +21,12 @@ import traceback
 import weakref
 from collections.abc import Iterator, Sequence
 from importlib import import_module
-from typing import Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 from megloc_kapture.errors import MeglocError, missing_extra
+
+if TYPE_CHECKING:
+    from megloc_kapture.cli.common import Console
 
 DONE, DEFECT, USER_ERROR, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
@@ -50,7 +53,11 @@ class Command(Protocol):
 
     debug: bool
 
-    def run(self) -> int | None:
+    def console(self) -> Console:
+        """The console that the flags ask for."""
+        ...
+
+    def run(self, console: Console) -> int | None:
         """Run it; returns the exit status, nothing where all went well."""
         ...
 
@@ -360,7 +367,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 _parser(given), args=given, prog="megloc", config=(tyro.conf.OmitArgPrefixes,)
             )
         debug = command.debug
-        status = command.run() or DONE
+        status = command.run(command.console()) or DONE
         sys.stdout.flush()
     except SystemExit:
         raise

@@ -9,6 +9,7 @@ import tyro
 
 from megloc_kapture.cli.common import (
     Choosing,
+    Console,
     Force,
     Input,
     Linked,
@@ -65,8 +66,7 @@ class MapPhotographs(Choosing, Working):
     """Of videos every so many frames one is taken; 30 unless given."""
     force: Force = False
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         options = options_of_photographs(
             self.preset or DEFAULT_PRESET, self.assignments(), used=MAPPING_OPTIONS
         )
@@ -101,8 +101,7 @@ class RefineMap(Reading, StageCommand):
     """Write the kept and the rejected points as PLY files, coloured by uncertainty."""
     force: Force = False
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         changes: dict[str, object] = {"refinement": {"ply": True}} if self.ply else {}
         options = self.options(changes).refinement
         source = self.kapture(self.input)
@@ -157,8 +156,7 @@ class Densify(Reading, StageCommand):
     """Write all depth as one cloud to this PLY file."""
     force: Force = False
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         chosen: dict[str, object] = {"mode": "points" if self.points else "depth"}
         if self.by is not None:
             chosen["estimator"] = {"name": self.by}
@@ -198,8 +196,7 @@ class RefinePoses(Linked, StageCommand):
     given."""
     force: Force = False
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         changes: dict[str, object] = {"pose_refinement": {"by": list(self.by)}} if self.by else {}
         options = self.options(changes).pose_refinement
         if self.by:  # in this order, with the options that --set gives them

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from megloc_kapture.cli.common import Folders, Force, Input, Output, Overwrite, Reading
+from megloc_kapture.cli.common import Console, Folders, Force, Input, Output, Overwrite, Reading
 from megloc_kapture.cli.stages import FEATURES, StageCommand, only_type, restrictions_beside
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture import KaptureFolder, write_pairs
@@ -43,8 +43,7 @@ class ExtractGlobal(Reading, StageCommand):
     """Local features that VLAD aggregates; needed where there are several types."""
     force: Force = False
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         choices = self.options(self.named("global_features", self.features)).global_features
         folders = [self.kapture(folder) for folder in (self.input, *self.query)]
         extractors = {one.name: one.make() for one in choices if not one.is_vlad}
@@ -88,8 +87,7 @@ class PairsMapping(Reading, StageCommand):
     force: Overwrite = False
     """Overwrite the pairs file."""
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         mapping = self.kapture(self.input)
         chosen = self.options({"mapping_pairs": _changes(self.by, self.topk)})
         options = chosen.mapping_pairs
@@ -145,8 +143,7 @@ class PairsQuery(Reading, StageCommand):
     force: Overwrite = False
     """Overwrite the pairs file, and what is in the folder of matches."""
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         if (self.rerank is None) != (self.matches_dir is None):
             raise OptionError("--rerank N and --matches-dir DIR go together: matches are kept")
         _refuse_existing(self.output, force=self.force)

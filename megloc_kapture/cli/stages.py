@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from megloc_kapture.cli.common import (
     Choosing,
     Computing,
+    Console,
     Folders,
     Force,
     Input,
@@ -34,7 +35,6 @@ from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.files import first_problem
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.io.output_folders import replace_directory
-from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
 from megloc_kapture.pipeline.workspace import Workspace
@@ -136,8 +136,7 @@ class ExtractLocal(Linked, StageCommand):
     """Extractor plugins; those of the preset unless given."""
     force: Force = False
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         if not self.input:
             raise OptionError("no kapture folder given; use -i")
         folders = [self.kapture(path) for path in self.input]
@@ -181,8 +180,7 @@ class Match(Reading, StageCommand):
     """Matcher plugin; the preset's unless given."""
     force: Force = False
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         mapping = self.kapture(self.input)
         local_type = only_type(mapping, "descriptors", self.features)
         changes: dict[str, object] = {"matching": {"name": self.matcher}} if self.matcher else {}
@@ -220,8 +218,7 @@ class Triangulate(Reading, StageCommand):
     """Types of local features, each with its own points; needed where there are several."""
     force: Force = False
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         mapping = self.kapture(self.input)
         local_types = [only_type(mapping, "matches", asked) for asked in self.features or (None,)]
         pairs = None if self.pairs is None else _read_pairs_of(self.pairs, mapping, mapping)
@@ -233,7 +230,7 @@ class Triangulate(Reading, StageCommand):
                 out,
                 self.options().triangulation,
                 pairs=pairs,
-                num_threads=self.workers or available_cores(),
+                num_threads=work.num_threads,
                 work=work,
             )
         for type_name in sorted(set(local_types)) if len(set(local_types)) > 1 else ():
@@ -263,8 +260,7 @@ class OutsideStage(Working):
     set: Texts = ()
     """Change an option of the stage: key=value; may be repeated."""
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         stage = load_plugin(STAGES, self.stage, assigned(self.set))
         if not (self.workspace / "stages").is_dir():
             raise OptionError(f"{self.workspace} is no workspace of megloc eval")
@@ -313,8 +309,7 @@ class Preprocess(Linked, Computing, Working):
     """Change another option: key=value (upscale, multiple_of, blank_pixels); may be repeated."""
     force: Force = False
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         options = self.options()
         source = self.kapture(self.input)
         sequences = [self.kapture(path) for path in existing(self.sequence)]

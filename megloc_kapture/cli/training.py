@@ -11,6 +11,7 @@ import tyro
 
 from megloc_kapture.cli.common import (
     Common,
+    Console,
     Folders,
     Input,
     Inputs,
@@ -60,12 +61,11 @@ class Train(Linked, Common):
     force: Overwrite = False
     """Begin again where files of another training stand."""
 
-    def run(self) -> None:
+    def run(self, console: Console) -> None:
         # only this command waits for torch
         from megloc_kapture.pipeline.presets import options_with
         from megloc_kapture.training.train import TASKS, TrainingData, train
 
-        console = self.console()
         changes = {} if self.features is None else {"features.name": self.features}
         options = options_with(TASKS[self.task], self.set, changes)
         licences = assigned_pairs("--licence", self.licence, "FOLDER=TEXT")
@@ -130,7 +130,7 @@ class TrainField(Linked, Common):
     force: Overwrite = False
     """Write into a folder that has other things in it; begin again."""
 
-    def run(self) -> None:
+    def run(self, console: Console) -> None:
         from pydantic import ValidationError
 
         from megloc_kapture.io.files import first_problem, remove
@@ -138,7 +138,6 @@ class TrainField(Linked, Common):
         from megloc_kapture.refinement.field_training import FieldTrainingOptions
         from megloc_kapture.stages.neural_field import STATE_FILE, train_field_of_map
 
-        console = self.console()
         of_same_name = vars(self).keys() & FieldTrainingOptions.model_fields
         try:
             options = FieldTrainingOptions(
@@ -195,10 +194,9 @@ class Render(Linked, Working):
     force: Overwrite = False
     """Overwrite a file, or write into a folder that has other things in it."""
 
-    def run(self) -> None:
+    def run(self, console: Console) -> None:
         from megloc_kapture.stages.neural_field import render_along, views_between
 
-        console = self.console()
         if sum(each is not None for each in (self.pose, self.along, self.between)) != 1:
             raise OptionError("say what to render: --pose and --camera, --along or --between")
         many = self.along or self.between

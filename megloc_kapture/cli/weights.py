@@ -42,9 +42,8 @@ class LicenceError(MeglocError):
 class List(Common):
     """List all networks: file, size, licence, whether it is there and its sha256 known."""
 
-    def run(self) -> None:
+    def run(self, console: Console) -> None:
         """Print the table."""
-        console = self.console()
         rows: list[tuple[str, ...]] = [
             ("name", "what for", "file", "size", "licence", "state", "sha256")
         ]
@@ -72,8 +71,7 @@ class Fetch(Common):
     force: Overwrite = False
     """Replace a different file that stands in its place."""
 
-    def run(self) -> None:
-        console = self.console()
+    def run(self, console: Console) -> None:
         names = self.names
         if self.preset is not None:
             names = tuple(dict.fromkeys((*names, *_missing(self.preset))))
@@ -127,9 +125,9 @@ class Add(Common):
     force: Overwrite = False
     """Replace a different file that stands in its place."""
 
-    def run(self) -> None:
+    def run(self, console: Console) -> None:
         added = add_weights(self.file, name=self.name, force=self.force, unverified=self.unverified)
-        self.console().result(f"{added.name}: {added.path} ({_trust(added)})")
+        console.result(f"{added.name}: {added.path} ({_trust(added)})")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,9 +141,9 @@ class Convert(Common):
     force: Overwrite = False
     """Replace a file that stands there."""
 
-    def run(self) -> None:
+    def run(self, console: Console) -> None:
         count = convert_weights(self.file, self.output, force=self.force)
-        self.console().result(f"{self.output}: {count} tensors")
+        console.result(f"{self.output}: {count} tensors")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,9 +153,8 @@ class Check(Common):
     names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME...]")] = ()
     """Networks, by their names in the list; all whose files are there unless given."""
 
-    def run(self) -> int:
+    def run(self, console: Console) -> int:
         """Run it; returns 2 where a file is wrong."""
-        console = self.console()
         wrong = sum(_wrong(console, lookup(name)) for name in self.names)
         if not self.names:
             wrong = sum(_wrong(console, w) for w in registry().values() if _state(w) != "missing")
@@ -182,9 +179,13 @@ class WeightsCommand:
         """Whether to show the traceback of an error."""
         return self.action.debug
 
-    def run(self) -> int | None:
+    def console(self) -> Console:
+        """The console that the flags ask for."""
+        return self.action.console()
+
+    def run(self, console: Console) -> int | None:
         """Run what was chosen."""
-        return self.action.run()
+        return self.action.run(console)
 
 
 def summary() -> str:
@@ -289,9 +290,8 @@ _PACKAGES = (
 class Doctor(Common):
     """Check the environment: versions, known-bad combinations, GPU, weights."""
 
-    def run(self) -> None:
+    def run(self, console: Console) -> None:
         """Print what there is; exit status 2 when something is wrong."""
-        console = self.console()
         for package in _PACKAGES:
             console.result(f"{package:24s}{installed_version(package) or 'not installed'}")
         console.result(f"{'GPU':24s}{gpu()}")

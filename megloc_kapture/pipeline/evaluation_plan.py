@@ -349,11 +349,17 @@ def fresh_copy(source: Workspace, slug: str) -> Workspace:
     return Workspace(place, force=True)
 
 
+def recall_rows(workspace: Path) -> dict[str, Any]:
+    """Rows of the recall table by name; none where no truth is known."""
+    path = workspace / EVALUATION / RECALL_JSON
+    if not path.is_file():
+        return {}
+    return {row["name"]: row for row in json.loads(path.read_text(encoding="utf-8"))["rows"]}
+
+
 def outcome(name: str, workspace: Workspace, stages: Sequence[Stage]) -> Outcome:
-    """Read what a run came to; raises DataError where it has no recall."""
-    path = workspace.path(EVALUATION) / RECALL_JSON
-    rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
-    row = next(row for row in rows if row["name"] == "all")
+    """Read what a run with true poses came to."""
+    row = recall_rows(workspace.root)["all"]
     # JSON knows no infinity: a median over queries without a pose is written as null
     medians = (row["median_position_m"], row["median_angle_deg"])
     position_m, angle_deg = (float("inf" if value is None else value) for value in medians)

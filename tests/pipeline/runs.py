@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from megloc_kapture.pipeline.datasets import (
     find_benchmark,
     twin_of,
 )
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
+from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, recall_rows
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.plan import StageReport, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
@@ -69,15 +68,9 @@ def run_twin(
     return run_in(workspace, source, options, workers=2, benchmark=benchmark)
 
 
-def recall_rows(workspace: Workspace) -> dict[str, Any]:
-    """Rows of the recall table by name."""
-    rows = json.loads(workspace.path("evaluation/recall.json").read_text())["rows"]
-    return {row["name"]: row for row in rows}
-
-
 def recall(workspace: Workspace, name: str = "all") -> list[float]:
     """The shares of queries at each threshold."""
-    return [at["recall"] for at in recall_rows(workspace)[name]["recall"]]
+    return [at["recall"] for at in recall_rows(workspace.root)[name]["recall"]]
 
 
 def errors(found: Pose | Failure, truth: RigidTransform | None) -> tuple[float, float]:
