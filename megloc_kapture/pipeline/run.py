@@ -23,7 +23,6 @@ from megloc_kapture.pipeline.datasets import (
     with_model,
 )
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.submission import place_of
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.stage import SUBMISSIONS
 
@@ -91,7 +90,8 @@ class Run:
         stem = self.dataset
         if protocol.pose_file_stem and not stem.startswith(TWIN_PREFIX):
             stem = protocol.pose_file_stem
-        return place_of(folder / SUBMISSIONS, f"{stem}_eval_megloc-{self.preset}", protocol)
+        end = "" if protocol.pose_file == "mlad" else ".txt"
+        return folder / SUBMISSIONS / f"{stem}_eval_megloc-{self.preset}{end}"
 
     def provenance(self) -> dict[str, Any]:
         """What a result is of, as plain JSON values."""

@@ -97,11 +97,6 @@ def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> N
         )
 
 
-def place_of(folder: Path, stem: str, protocol: Protocol) -> Path:
-    """Where a submission goes below ``folder``: a file, or a folder where it is several files."""
-    return folder / (stem if protocol.pose_file == "mlad" else f"{stem}.txt")
-
-
 def write_submission(
     localized: Path,
     place: Path,

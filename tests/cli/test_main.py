@@ -211,7 +211,7 @@ import ctypes, signal, sys, time
 from megloc_kapture.cli import main
 from megloc_kapture.cli.weights import Doctor
 from megloc_kapture.errors import MeglocError
-def run(self):
+def run(self, console):
 {meeting}
 Doctor.run = run
 sys.argv = ["megloc", "doctor"]

@@ -38,7 +38,6 @@ from megloc_kapture.pipeline.datasets import DatasetChoice
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.submission import (
     check_dataset,
-    place_of,
     poses_through_rig,
     workspace_provenance,
     write_submission,
@@ -400,11 +399,6 @@ def test_rules_that_are_nowhere() -> None:
     check_dataset("kapture", Protocol(), tables=None)
     with pytest.raises(OptionError, match="rules of aachen stand in the megloc/ folder"):
         check_dataset("aachen", Protocol(), tables=None)
-
-
-def test_places(tmp_path: Path) -> None:
-    assert place_of(tmp_path, "x_1.1", Protocol()) == tmp_path / "x_1.1.txt"
-    assert place_of(tmp_path, "x_1.1", Protocol(pose_file="mlad")) == tmp_path / "x_1.1"
 
 
 @pytest.mark.parametrize(
