@@ -365,7 +365,7 @@ def changed_file(record: Path, root: Path, *, verify: bool = False) -> str:
 
     Parameters
     ----------
-    verify : hash all of them, see :func:`~megloc_kapture.io.file_states.state_if_unchanged`.
+    verify : hash all of them, see :func:`~megloc_kapture.io.output_folders.state_if_unchanged`.
     """
     files = written_files(record)
     touched = False
