@@ -17,7 +17,7 @@ from mapped_scene import Query, Scene, errors, hypotheses
 from megloc_twins.indoor_rooms import MODULE_M
 from scenes import megloc
 
-from megloc_kapture.pipeline.run import find_benchmark
+from megloc_kapture.pipeline.datasets import find_benchmark
 from megloc_kapture.plugins import PoseHypothesis
 from megloc_kapture.stages.query_poses import LocalizationOptions
 

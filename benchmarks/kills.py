@@ -157,7 +157,7 @@ class Given:
                 "dask" if address else "inline", scheduler=address, shared=workspace
             ) as executor,
         ):
-            run_plan(plan_evaluation(choice.run_in(opened)), opened, Work(executor, track))
+            run_plan(plan_evaluation(choice), opened, Work(executor, track))
 
 
 def run_with_kills(given: Given, folder: Path, number: int, results: int, seed: int) -> int:

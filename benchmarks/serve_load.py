@@ -34,7 +34,7 @@ import numpy as np
 
 from megloc_kapture import KaptureMap, Localizer
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.service.photographs import answer_of
+from megloc_kapture.service.requests import answer_of
 
 # another address of this machine, so that the service takes it for another client
 HOSTILE_ADDRESS = "127.0.0.2"

@@ -26,7 +26,6 @@ from whole_preset_weights import write_random_weights
 
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.run import choose_run
-from megloc_kapture.pipeline.workspace import Workspace
 
 sys.path.append(str(Path(__file__).resolve().parent / "speed"))
 from timing import table  # noqa: E402
@@ -96,7 +95,7 @@ def main() -> int:
         config = place / "config.toml"
         config.write_text(CONFIG.format(preset=options.preset))
         chosen = choose_run("kapture", scene, config=config)
-        stages = [stage.name for stage in plan_evaluation(chosen.run_in(Workspace(workspace)))]
+        stages = [stage.name for stage in plan_evaluation(chosen)]
         command = [MEGLOC, "eval", "kapture", "--root", str(scene), "--config", str(config), "-q"]
         command += ["--workspace", str(workspace), "--executor", "inline", *arguments]
         idle, _ = peak_of([MEGLOC, "options", "localization.pose.seed"], place / "idle.log")

@@ -8,9 +8,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,24 +20,25 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.document import REPORT_HTML
-from megloc_kapture.evaluation.report.reports import RECALL_JSON
 from megloc_kapture.io.colmap_mapping import Mapper
+from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.images import guessed_camera, photo_of, read_photo, turned_upright
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.pipeline.colmap_maps import kapture_of
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, plan_map
+from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, recall_rows
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 from megloc_kapture.pipeline.localizer import LOCALIZING, Localizer
-from megloc_kapture.pipeline.photograph_maps import (
+from megloc_kapture.pipeline.map_making import (
+    kapture_of,
     options_of_photographs,
+    plan_map,
     plan_photographs,
     structure_options,
 )
-from megloc_kapture.pipeline.photographs import Photographs
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import Query
+from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.pipeline.run import choose_run
 from megloc_kapture.pipeline.workspace import Workspace
@@ -237,7 +236,7 @@ def open_map(
     Parameters
     ----------
     path : kapture map, or a COLMAP model or workspace, which is imported into the user's cache
-        when it is new or has changed (:func:`megloc_kapture.pipeline.colmap_maps.kapture_of`).
+        when it is new or has changed (:func:`megloc_kapture.pipeline.map_making.kapture_of`).
     preset, set : how it is localized in; ``{"localization.rank.name": "perceptual"}``.
     features_dirs : folders with features beside the map.
     pixel_origin : where the map's intrinsics put the pixel origin; auto finds it out.
@@ -258,19 +257,19 @@ def open_map(
     return Map(opened, options)
 
 
-@contextmanager
-def _working_in(
-    workspace: Path | str, workers: int, scheduler: str | None
-) -> Iterator[tuple[Workspace, Work]]:
-    """A workspace, held meanwhile, and what to work with."""
-    opened = Workspace(Path(workspace))
+def _run(
+    stages: Sequence[Stage], folder: Path | str, workers: int, scheduler: str | None
+) -> Workspace:
+    """Run stages in a workspace, on processes or a cluster."""
+    workspace = Workspace(Path(folder))
     executor = (
         open_executor("processes", workers)
         if scheduler is None
-        else open_executor("dask", None if workers == 1 else workers, scheduler, opened.root)
+        else open_executor("dask", None if workers == 1 else workers, scheduler, workspace.root)
     )
-    with opened.lock(), single_threaded(), executor as running:
-        yield opened, Work(running, num_threads=workers)
+    with workspace.lock(), single_threaded(), executor as running:
+        run_plan(stages, workspace, Work(running, num_threads=workers))
+    return workspace
 
 
 def build_map(
@@ -298,8 +297,9 @@ def build_map(
     """
     source = KaptureFolder(mapping)
     options = options_of_preset(preset, assignments=set or {})
-    place = Path(workspace or Path("runs") / f"{source.root.resolve().name}-{preset}")
-    return _made(plan_map(source, options), place, options, workers, scheduler)
+    place = workspace or Path("runs") / f"{source.root.resolve().name}-{preset}"
+    made = _run(plan_map(source, options), place, workers, scheduler)
+    return Map(KaptureMap.open(made.path(MAP)), options)
 
 
 def map_photographs(
@@ -314,7 +314,7 @@ def map_photographs(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> Map:
-    """Make a map of photographs without poses; see :mod:`megloc_kapture.pipeline.photograph_maps`.
+    """Make a map of photographs without poses; see :mod:`megloc_kapture.pipeline.map_making`.
 
     Parameters
     ----------
@@ -341,21 +341,10 @@ def map_photographs(
     asked = () if scale is None else (scale,) if scale == "gps" else tuple(map(str, scale))
     structure = structure_options(photographs, mapper, asked, known_cameras=camera is not None)
     title = paths[0].resolve().stem if paths else "photographs"
-    place = Path(workspace or Path("runs") / f"{title}-{preset}")
+    place = workspace or Path("runs") / f"{title}-{preset}"
     stages = plan_photographs(photographs, options, structure)
-    return _made(stages, place, options, workers, scheduler)
-
-
-def _made(
-    stages: Sequence[Stage],
-    place: Path,
-    options: PipelineOptions,
-    workers: int,
-    scheduler: str | None,
-) -> Map:
-    with _working_in(place, workers, scheduler) as (opened, work):
-        run_plan(stages, opened, work)
-    return Map(KaptureMap.open(opened.path(MAP)), options)
+    made = _run(stages, place, workers, scheduler)
+    return Map(KaptureMap.open(made.path(MAP)), options)
 
 
 @dataclass(frozen=True)
@@ -392,13 +381,9 @@ class FinishedRun:
         """Recall by condition (rows) and threshold (columns); empty where no truth is known."""
         import pandas as pd
 
-        path = self.workspace / EVALUATION / RECALL_JSON
-        if not path.is_file():
-            return pd.DataFrame()
-        rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
         table = {
-            row["name"]: {str(Threshold(**at["threshold"])): at["recall"] for at in row["recall"]}
-            for row in rows
+            name: {str(Threshold(**at["threshold"])): at["recall"] for at in row["recall"]}
+            for name, row in recall_rows(self.workspace).items()
         }
         return pd.DataFrame.from_dict(table, orient="index")
 
@@ -428,11 +413,10 @@ def run(
     ------
     MeglocError : the dataset or the options cannot be used.
     """
-    choice = choose_run(
+    chosen = choose_run(
         dataset, None if root is None else Path(root), preset=preset, assignments=set or {}
     )
-    place = workspace or Path("runs") / f"{dataset}-{choice.preset}"
-    with _working_in(place, workers, scheduler) as (opened, work):
-        chosen = choice.run_in(opened)
-        run_plan(plan_evaluation(chosen), opened, work)
-    return FinishedRun(opened.root, chosen.submission_below(opened.root), choice.options)
+    place = workspace or Path("runs") / f"{dataset}-{chosen.preset}"
+    made = _run(plan_evaluation(chosen), place, workers, scheduler)
+    pose_file = chosen.submission_below(made.root, made.path(SIDE_TABLES))
+    return FinishedRun(made.root, pose_file, chosen.options)

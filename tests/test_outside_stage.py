@@ -49,11 +49,11 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
     sys.modules.pop("keypoint_counts", None)
 
 
-def planned(scene: Path, workspace: Workspace, stages: dict[str, Any]) -> list[Stage]:
+def planned(scene: Path, stages: dict[str, Any]) -> list[Stage]:
     options = options_of_preset(
         changes=[{"stages": stages}], assignments=[SMALL, "global_features.options.num_clusters=4"]
     )
-    return plan_evaluation(Run(choose_dataset("kapture", scene), "classic", options, workspace))
+    return plan_evaluation(Run(choose_dataset("kapture", scene), "classic", options))
 
 
 def expected_counts(workspace: Workspace) -> list[str]:
@@ -78,7 +78,7 @@ def test_it_is_part_of_the_plan_with_manifest_and_progress(scene: Path, tmp_path
         told.append((total, label))
         return iter(items)
 
-    stages = planned(scene, workspace, {"count_keypoints": {}})
+    stages = planned(scene, {"count_keypoints": {}})
     names = [stage.name for stage in stages]
     assert names.index("count_keypoints") == names.index("local_features") + 1
     run_plan(stages, workspace, Work(track=track), last="count_keypoints")
@@ -92,7 +92,7 @@ def test_it_is_part_of_the_plan_with_manifest_and_progress(scene: Path, tmp_path
     assert all_kept(run_plan(stages, workspace, last="count_keypoints"))
     # another option, and it alone runs again
     again = run_plan(
-        planned(scene, workspace, {"count_keypoints": {"least": 10_000}}),
+        planned(scene, {"count_keypoints": {"least": 10_000}}),
         workspace,
         last="count_keypoints",
     )
@@ -117,15 +117,15 @@ def test_it_has_a_command_of_its_own(
     assert text.endswith("examples:\n  megloc count-keypoints -w runs/kapture-classic\n")
     command = ("count-keypoints", "-w", str(workspace.root), "--executor", "inline")
     assert megloc(*command) == (2, f"megloc: {workspace.root} is no workspace of megloc eval\n")
-    run_plan(planned(scene, workspace, {}), workspace, last="import")
+    run_plan(planned(scene, {}), workspace, last="import")
     status, text = megloc(*command)
     assert status == 2 and "count_keypoints reads local_features, which no stage" in text
-    run_plan(planned(scene, workspace, {}), workspace, last="local_features")
+    run_plan(planned(scene, {}), workspace, last="local_features")
     status, text = megloc(*command)
     assert status == 0 and "count_keypoints: 7 images" in text
     assert workspace.path("counts.csv").read_text().splitlines() == expected_counts(workspace)
     # the plan finds it done
-    stages = planned(scene, workspace, {"count_keypoints": {}})
+    stages = planned(scene, {"count_keypoints": {}})
     assert all_kept(run_plan(stages, workspace, last="count_keypoints"))
     status, text = megloc(*command, "--set", "least=100000")
     assert status == 0 and "count_keypoints: 0 images" in text
@@ -148,13 +148,12 @@ def test_a_stage_that_cannot_be_loaded_leaves_the_other_commands_alone(
     assert "cannot be loaded: broken" in capsys.readouterr().err
 
 
-def test_what_cannot_be_planned_is_refused(scene: Path, tmp_path: Path) -> None:
-    workspace = Workspace(tmp_path / "workspace")
+def test_what_cannot_be_planned_is_refused(scene: Path) -> None:
     with pytest.raises(PluginError, match="no plugin 'count_points' in megloc_kapture.stages"):
-        planned(scene, workspace, {"count_points": {}})
+        planned(scene, {"count_points": {}})
     with pytest.raises(PluginError, match="'count_keypoints' refuses its options: most"):
-        planned(scene, workspace, {"count_keypoints": {"most": 1}})
+        planned(scene, {"count_keypoints": {"most": 1}})
     kind = sys.modules["keypoint_counts"].CountKeypoints
     kind.reads = ("depth_maps",)
     with pytest.raises(OptionError, match=r"count_keypoints reads depth_maps, which no stage"):
-        planned(scene, workspace, {"count_keypoints": {}})
+        planned(scene, {"count_keypoints": {}})

@@ -36,7 +36,11 @@ if TYPE_CHECKING:
 Input = Annotated[Path, tyro.conf.arg(aliases=["-i"])]
 Inputs = Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["-i"]), tyro.conf.UseAppendAction]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-Force = Annotated[bool, tyro.conf.arg(aliases=["-f"])]
+Force = Annotated[
+    bool,
+    tyro.conf.arg(aliases=["-f"], help="Write into a folder that has other things in it."),
+]
+Overwrite = Annotated[bool, tyro.conf.arg(aliases=["-f"])]
 Folders = Annotated[tuple[Path, ...], tyro.conf.UseAppendAction]
 Texts = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
@@ -123,7 +127,7 @@ def opened_map(path: Path, console: Console) -> Path:
     and said."""
     # commands that open no map do not wait for all stages
     from megloc_kapture.datasets.colmap_map import is_colmap
-    from megloc_kapture.pipeline.colmap_maps import kapture_of
+    from megloc_kapture.pipeline.map_making import kapture_of
 
     if not is_colmap(path):
         return kapture_of(path)
@@ -195,7 +199,7 @@ class Working(Common):
         """What to work with, by these flags; all workers must see the folder of the output."""
         folder = output if output.is_dir() else output.absolute().parent
         with single_threaded(), self.open_executor(folder) as executor:
-            yield Work(executor, self.console().track)
+            yield Work(executor, self.console().track, self.workers or available_cores())
 
     @contextmanager
     def staged(self, output: Path, kind: str, *, force: bool) -> Iterator[tuple[Path, Work]]:
@@ -206,8 +210,8 @@ class Working(Common):
     @contextmanager
     def working_in(self, workspace: Workspace) -> Iterator[Work]:
         """What to work with in a workspace, which is held meanwhile."""
-        with workspace.lock(), single_threaded(), self.open_executor(workspace.root) as executor:
-            yield Work(executor, self.console().track, self.workers or available_cores())
+        with workspace.lock(), self.working(workspace.root) as work:
+            yield work
 
 
 @dataclass(frozen=True, kw_only=True)

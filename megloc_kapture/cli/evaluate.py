@@ -17,6 +17,7 @@ from megloc_kapture.cli.common import (
     Input,
     Inputs,
     Output,
+    Overwrite,
     existing,
     side_tables_beside,
 )
@@ -50,10 +51,8 @@ class Evaluate(Common):
     map: Path | None = None
     """Kapture folder of the map, for the report; found in the workspace by itself."""
     force: Force = False
-    """Write into a folder that has other things in it."""
 
-    def run(self) -> int:
-        """Run it."""
+    def run(self, console: Console) -> None:
         # only this command waits for them
         from megloc_kapture.evaluation.evaluate import (
             benchmark_beside,
@@ -64,7 +63,6 @@ class Evaluate(Common):
         from megloc_kapture.evaluation.report.reports import AnyReported, report_text, write_report
         from megloc_kapture.evaluation.statistics import compare, over_seeds
 
-        console = self.console()
         self._check()
         benchmark = benchmark_beside(
             [self.gt, *self.input], side_tables=self.side_tables, dataset=self.dataset
@@ -88,7 +86,6 @@ class Evaluate(Common):
             with staged_output(self.output, kind=EVALUATION, force=self.force) as out:
                 write_report(out, found)
         console.result(report_text(found))
-        return 0
 
     def _check(self) -> None:
         if not self.input:
@@ -118,11 +115,10 @@ class Submit(Common):
     """The megloc/ folder of the imported dataset; found beside the result by itself."""
     from_rig: bool = False
     """Queries without a pose get one through the rig, from another camera of their moment."""
-    force: Force = False
+    force: Overwrite = False
     """Overwrite the pose file."""
 
-    def run(self) -> int:
-        """Run it."""
+    def run(self, console: Console) -> None:
         from megloc_kapture.io.dataset_tables import Protocol, read_protocol
         from megloc_kapture.pipeline.submission import (
             check_dataset,
@@ -130,7 +126,6 @@ class Submit(Common):
             write_submission,
         )
 
-        console = self.console()
         if self.side_tables is not None and not self.side_tables.is_dir():
             raise DataError("no such folder", path=self.side_tables)
         tables = self.side_tables or side_tables_beside(self.input)
@@ -145,7 +140,6 @@ class Submit(Common):
             from_rig=self.from_rig,
         )
         console.result(f"{summary(counts)}: {self.output}")
-        return 0
 
     def _check_output(self, *, folder: bool) -> None:
         place = self.output
@@ -188,7 +182,7 @@ class Check(Common):
     json: bool = False
     """Print everything that was found as JSON."""
 
-    def run(self) -> int:
+    def run(self, console: Console) -> int:
         """Run it; returns 2 where there are problems."""
         from megloc_kapture.evaluation.check.reading import read_reference
         from megloc_kapture.evaluation.check.submission import check_submission
@@ -196,7 +190,6 @@ class Check(Common):
         from megloc_kapture.pipeline.datasets import TWIN_PREFIX, check_known
         from megloc_kapture.pipeline.submission import check_dataset
 
-        console = self.console()
         check_known(self.dataset)
         if not self.file.exists():
             raise DataError("no such file", path=self.file)

@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from megloc_kapture.cli.common import Console, Deciding, Force, Working
+from megloc_kapture.cli.common import Console, Deciding, Overwrite, Working
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.document import REPORT_HTML
 from megloc_kapture.evaluation.report.reports import (
     AGREEMENT_TEXT,
-    RECALL_JSON,
     RECALL_TEXT,
 )
+from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.tables import STATUS_FILE, read_status
-from megloc_kapture.pipeline.ablation import ablate, outcomes_text, write_outcomes
-from megloc_kapture.pipeline.datasets import DatasetChoice
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.paper_steps import steps_text
+from megloc_kapture.pipeline.datasets import BenchmarkFile, DatasetChoice
+from megloc_kapture.pipeline.evaluation_plan import (
+    ablate,
+    outcomes_text,
+    plan_evaluation,
+    recall_rows,
+    write_outcomes,
+)
 from megloc_kapture.pipeline.plan import all_kept, run_plan
-from megloc_kapture.pipeline.run import BenchmarkFile, choose_run
+from megloc_kapture.pipeline.run import choose_run, steps_text
 from megloc_kapture.pipeline.submission import FOLDER, keep_submission
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.stage import EVALUATION, LOCALIZED
@@ -69,13 +72,12 @@ class Eval(Deciding, Working):
     """Run again without each of the steps in turn, in ablation/, and print what each adds."""
     fail_below: float | None = None
     """Exit with 3 when the share of queries at the last threshold is lower (0 to 1)."""
-    force: Force = False
+    force: Overwrite = False
     """Use a workspace folder that has other things in it."""
 
-    def run(self) -> int:
+    def run(self, console: Console) -> int:
         """Run it; returns the exit status."""
-        console = self.console()
-        choice = choose_run(
+        run = choose_run(
             self.dataset,
             self.root,
             preset=self.preset,
@@ -86,19 +88,18 @@ class Eval(Deciding, Working):
             find_root=not self.explain,
         )
         if self.explain:
-            console.result(steps_text(choice.steps()))
+            console.result(steps_text(run.steps()))
             return 0
         if self.thresholds:
             parsed = [Threshold.parse(text) for text in self.thresholds]
             pairs = tuple((t.position_m, t.angle_deg) for t in parsed)
-            wanted = choice.benchmark.model_copy(update={"thresholds": pairs})
-            choice = replace(choice, benchmark=wanted)
-        self._check_truth(choice.source)
-        place = self.workspace or Path("runs") / f"{self.dataset}-{choice.preset}"
+            benchmark = run.benchmark.model_copy(update={"thresholds": pairs})
+            run = replace(run, benchmark=benchmark)
+        self._check_truth(run.source)
+        place = self.workspace or Path("runs") / f"{self.dataset}-{run.preset}"
         submissions = self.submissions or (None if self.workspace else Path(FOLDER))
         workspace = Workspace(place, force=self.force)
         with self.working_in(workspace) as work:
-            run = choice.run_in(workspace)
             stages = plan_evaluation(run)
             reports = run_plan(
                 stages,
@@ -111,7 +112,7 @@ class Eval(Deciding, Working):
                 say=console.say,
             )
             if self.ablate and not self.dry_run:
-                outcomes = ablate(choice, workspace, stages, work, console.say)
+                outcomes = ablate(run, workspace, stages, work, console.say)
                 path = write_outcomes(workspace, outcomes)
                 console.result(outcomes_text(outcomes))
                 console.result(f"ablation   {shown(path)}")
@@ -120,9 +121,10 @@ class Eval(Deciding, Working):
         if all_kept(reports):
             console.say("nothing to do: every stage is up to date")
         done = {report.name for report in reports}
-        status = self._conclude(console, workspace, choice.benchmark) if "evaluation" in done else 0
+        status = self._conclude(console, workspace, run.benchmark) if "evaluation" in done else 0
         if "submission" in done:
-            self._hand_in(console, run.submission_below(workspace.root), submissions)
+            pose_file = run.submission_below(workspace.root, workspace.path(SIDE_TABLES))
+            self._hand_in(console, pose_file, submissions)
         report = workspace.path(EVALUATION) / REPORT_HTML
         if "evaluation" in done and report.is_file():
             console.result(f"report     {shown(report)}")
@@ -162,8 +164,7 @@ class Eval(Deciding, Working):
             console.result(text)
         if self.fail_below is None:
             return 0
-        rows = json.loads((evaluation / RECALL_JSON).read_text(encoding="utf-8"))["rows"]
-        recall = next(row for row in rows if row["name"] == "all")["recall"][-1]["recall"]
+        recall = recall_rows(workspace.root)["all"]["recall"][-1]["recall"]
         if recall >= self.fail_below:
             return 0
         console.say(f"recall {recall:.3f} is below {self.fail_below:.3f}")

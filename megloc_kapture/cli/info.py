@@ -58,9 +58,8 @@ class Info(Reading, Common):
     deep: bool = False
     """Read every file, images included."""
 
-    def run(self) -> int:
+    def run(self, console: Console) -> None:
         """Print it."""
-        console = self.console()
         folder = self.kapture(opened_map(self.input, console))
         describe_content(console, folder)
         folder.validate(deep=self.deep)
@@ -70,7 +69,6 @@ class Info(Reading, Common):
             self._describe_map(console, folder.root)
         else:
             line(console, "localizing", "not possible: no points3d and observations")
-        return 0
 
     def _describe_map(self, console: Console, root: Path) -> None:
         try:
@@ -190,9 +188,7 @@ class OptionsCommand(Common):
     preset: str = DEFAULT_PRESET
     """Show the values of this preset."""
 
-    def run(self) -> int:
-        """Run it."""
-        console = self.console()
+    def run(self, console: Console) -> None:
         every = list(options_of(options_of_preset(self.preset)))
         found = [one for one in every if _is_below(one.key, self.key)]
         if not found:
@@ -208,7 +204,6 @@ class OptionsCommand(Common):
         for one in found:
             console.result(f"{one.key} = {shown(one.value)}")
             console.result(f"    {one.kind}{f'; {one.meaning}' if one.meaning else ''}")
-        return 0
 
 
 def shown(value: Any) -> str:

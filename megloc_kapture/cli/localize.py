@@ -15,10 +15,11 @@ import tyro
 
 from megloc_kapture.cli.common import (
     Common,
+    Console,
     Deciding,
-    Force,
     Input,
     Output,
+    Overwrite,
     Reading,
     Texts,
     camera_of_text,
@@ -35,11 +36,10 @@ from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 from megloc_kapture.pipeline.local_types import LocalType, local_types_of
 from megloc_kapture.pipeline.localizer import LOCALIZING, Localizer
-from megloc_kapture.pipeline.photographs import Photographs
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
-from megloc_kapture.pipeline.queries import KaptureQueries
+from megloc_kapture.pipeline.query_folders import Photographs, Queries
 from megloc_kapture.pipeline.results import Results
-from megloc_kapture.service.limits import Limits
+from megloc_kapture.service.requests import Limits
 from megloc_kapture.stages.matches import FeatureCache, iterate_candidates
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.stage import LOCALIZED
@@ -73,13 +73,11 @@ class Localize(Reading, Deciding, Common):
     """Where the map's intrinsics put the pixel origin; auto finds it out."""
     workers: int | None = None
     """Number of threads; all cores unless given."""
-    force: Force = False
+    force: Overwrite = False
     """Write into a folder that has other things in it, and localize in a map that contradicts
     itself."""
 
-    def run(self) -> int:
-        """Run it."""
-        console = self.console()
+    def run(self, console: Console) -> None:
         self._check_queries()
         workers = available_cores() if self.workers is None else self.workers
         path = opened_map(self.input, console)
@@ -127,7 +125,6 @@ class Localize(Reading, Deciding, Common):
         )
         if counts["queries"] and not counts["localized"]:
             console.say(f"warning: no query was localized; reasons are in {self.output}/status.csv")
-        return 0
 
     def _check_queries(self) -> None:
         """Raise OptionError unless the queries are given, in one way."""
@@ -158,15 +155,13 @@ class Serve(Reading, Deciding, Common):
     """Keypoints type to localize with; may be repeated; all that have points unless given."""
     pixel_origin: PixelOriginChoice = "auto"
     """Where the map's intrinsics put the pixel origin; auto finds it out."""
-    force: Force = False
+    force: Overwrite = False
     """Localize in a map that contradicts itself."""
 
-    def run(self) -> int:
-        """Run it."""
+    def run(self, console: Console) -> None:
         from megloc_kapture.cli.main import INTERRUPTED, TERMINATED, Terminated
         from megloc_kapture.service.server import bind, serve
 
-        console = self.console()
         if self.workers < 1:
             raise OptionError(f"{self.workers} workers cannot work; give 1 or more")
         threads = self.limits.threads or max(1, available_cores() // self.workers)
@@ -205,7 +200,6 @@ class Serve(Reading, Deciding, Common):
             except (KeyboardInterrupt, Terminated) as end:
                 console.say("stopped")
                 sys.exit(TERMINATED if isinstance(end, Terminated) else INTERRUPTED)
-        return 0
 
 
 def _read_token(path: Path) -> str:
@@ -235,7 +229,7 @@ def _check_consistent(kapture_map: KaptureMap, path: Path, *, force: bool) -> No
 def _idle_for_queries(
     typed: Mapping[str, Any],
     localizer: Localizer,
-    queries: KaptureQueries | Photographs,
+    queries: Queries,
     *,
     pairs: bool,
 ) -> dict[str, str]:

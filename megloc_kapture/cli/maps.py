@@ -9,6 +9,7 @@ import tyro
 
 from megloc_kapture.cli.common import (
     Choosing,
+    Console,
     Force,
     Input,
     Linked,
@@ -25,16 +26,16 @@ from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_consistency
-from megloc_kapture.pipeline.photograph_maps import (
+from megloc_kapture.pipeline.map_making import (
     MAPPING_OPTIONS,
     describe_map,
     options_of_photographs,
     plan_photographs,
     structure_options,
 )
-from megloc_kapture.pipeline.photographs import Photographs
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET
+from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import POSE_REFINERS
@@ -64,11 +65,8 @@ class MapPhotographs(Choosing, Working):
     every: int | None = None
     """Of videos every so many frames one is taken; 30 unless given."""
     force: Force = False
-    """Write into a folder that has other things in it."""
 
-    def run(self) -> int:
-        """Run it."""
-        console = self.console()
+    def run(self, console: Console) -> None:
         options = options_of_photographs(
             self.preset or DEFAULT_PRESET, self.assignments(), used=MAPPING_OPTIONS
         )
@@ -83,7 +81,6 @@ class MapPhotographs(Choosing, Working):
             run_plan(stages, workspace, work, say=console.say)
         for line in describe_map(self.output, photographs):
             console.result(line)
-        return 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,11 +100,8 @@ class RefineMap(Reading, StageCommand):
     ply: bool = False
     """Write the kept and the rejected points as PLY files, coloured by uncertainty."""
     force: Force = False
-    """Write into a folder that has other things in it."""
 
-    def run(self) -> int:
-        """Run it."""
-        console = self.console()
+    def run(self, console: Console) -> None:
         changes: dict[str, object] = {"refinement": {"ply": True}} if self.ply else {}
         options = self.options(changes).refinement
         source = self.kapture(self.input)
@@ -115,7 +109,6 @@ class RefineMap(Reading, StageCommand):
             refine_map(source, out, options, work=work)
         for row in report_lines(self.output):
             console.say(row)
-        return 0
 
 
 def report_lines(root: Path) -> list[str]:
@@ -162,11 +155,8 @@ class Densify(Reading, StageCommand):
     fuse: Path | None = None
     """Write all depth as one cloud to this PLY file."""
     force: Force = False
-    """Write into a folder that has other things in it."""
 
-    def run(self) -> int:
-        """Run it."""
-        console = self.console()
+    def run(self, console: Console) -> None:
         chosen: dict[str, object] = {"mode": "points" if self.points else "depth"}
         if self.by is not None:
             chosen["estimator"] = {"name": self.by}
@@ -185,7 +175,6 @@ class Densify(Reading, StageCommand):
                 agreement = fitted_to_poses(source, options)[0].agreement
                 fused = fuse_depth(KaptureFolder(out), self.fuse, agreement, work=work)
                 console.say(f"{fused} points in {self.fuse}")
-        return 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,11 +195,8 @@ class RefinePoses(Linked, StageCommand):
     """Pose refiner: icp, rendering or field; repeated, one after another; the preset's unless
     given."""
     force: Force = False
-    """Write into a folder that has other things in it."""
 
-    def run(self) -> int:
-        """Run it."""
-        console = self.console()
+    def run(self, console: Console) -> None:
         changes: dict[str, object] = {"pose_refinement": {"by": list(self.by)}} if self.by else {}
         options = self.options(changes).pose_refinement
         if self.by:  # in this order, with the options that --set gives them
@@ -240,4 +226,3 @@ class RefinePoses(Linked, StageCommand):
         if (table := self.output / CONSISTENCY_FILE).is_file():
             for row in read_consistency(table):
                 console.result(consistency_sentence(row))
-        return 0

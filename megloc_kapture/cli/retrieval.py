@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from megloc_kapture.cli.common import Folders, Force, Input, Output, Reading
+from megloc_kapture.cli.common import Console, Folders, Force, Input, Output, Overwrite, Reading
 from megloc_kapture.cli.stages import FEATURES, StageCommand, only_type, restrictions_beside
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture import KaptureFolder, write_pairs
@@ -42,11 +42,8 @@ class ExtractGlobal(Reading, StageCommand):
     local_type: str | None = None
     """Local features that VLAD aggregates; needed where there are several types."""
     force: Force = False
-    """Write into a folder that has other things in it."""
 
-    def run(self) -> int:
-        """Run it."""
-        console = self.console()
+    def run(self, console: Console) -> None:
         choices = self.options(self.named("global_features", self.features)).global_features
         folders = [self.kapture(folder) for folder in (self.input, *self.query)]
         extractors = {one.name: one.make() for one in choices if not one.is_vlad}
@@ -65,7 +62,6 @@ class ExtractGlobal(Reading, StageCommand):
                     type_name = extractor.name
                     counts = extract_global_features(folders, extractor, out, work=work)
                 console.say(f"{type_name}: {counts['images']} images")
-        return 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,12 +84,10 @@ class PairsMapping(Reading, StageCommand):
     """Types of global features; several are fused; needed where there are several."""
     fusion: FusionMethod | None = None
     """How several are fused; as the preset has it unless given."""
-    force: Force = False
+    force: Overwrite = False
     """Overwrite the pairs file."""
 
-    def run(self) -> int:
-        """Run it."""
-        console = self.console()
+    def run(self, console: Console) -> None:
         mapping = self.kapture(self.input)
         chosen = self.options({"mapping_pairs": _changes(self.by, self.topk)})
         options = chosen.mapping_pairs
@@ -115,7 +109,6 @@ class PairsMapping(Reading, StageCommand):
         _refuse_existing(self.output, force=self.force)
         write_pairs(self.output, pairs)
         console.say(f"{len(pairs)} pairs")
-        return 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,12 +140,10 @@ class PairsQuery(Reading, StageCommand):
     """Types of local features to rerank by; all that map and queries have unless given."""
     matches_dir: Path | None = None
     """Features folder that gets the matches of reranking, for the steps after it."""
-    force: Force = False
+    force: Overwrite = False
     """Overwrite the pairs file, and what is in the folder of matches."""
 
-    def run(self) -> int:
-        """Run it."""
-        console = self.console()
+    def run(self, console: Console) -> None:
         if (self.rerank is None) != (self.matches_dir is None):
             raise OptionError("--rerank N and --matches-dir DIR go together: matches are kept")
         _refuse_existing(self.output, force=self.force)
@@ -190,7 +181,6 @@ class PairsQuery(Reading, StageCommand):
         _refuse_existing(self.output, force=self.force)
         write_pairs(self.output, pairs)
         console.say(f"{len(pairs)} pairs")
-        return 0
 
     def _types_of_both(self, mapping: KaptureFolder, query: KaptureFolder) -> list[str]:
         """The local features to rerank by; raises OptionError."""

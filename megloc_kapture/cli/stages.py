@@ -1,20 +1,24 @@
-"""Commands of single stages: features, matches and points, and the stages of other packages.
+"""Commands of single stages: images, features, matches and points, and other packages' stages.
 
 What our own write, any kapture tool can read; a stage of another package runs in a workspace.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, make_dataclass
 from inspect import getdoc
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import tyro
+from pydantic import ValidationError
 
 from megloc_kapture.cli.common import (
     Choosing,
+    Computing,
+    Console,
+    Folders,
     Force,
     Input,
     Inputs,
@@ -23,23 +27,43 @@ from megloc_kapture.cli.common import (
     Reading,
     Texts,
     Working,
+    assigned_pairs,
+    existing,
     side_tables_beside,
 )
 from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.io.files import first_problem
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
-from megloc_kapture.pipeline.executors import available_cores
+from megloc_kapture.io.output_folders import replace_directory
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.plugin_loading import load_plugin, plugin_class
 from megloc_kapture.plugins import MATCHERS, STAGES, chosen_by_name
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.devices import placed
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.map_points import triangulate_map
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.stages.preprocessing import (
+    REPORT_FILE,
+    PreprocessingOptions,
+    PreprocessingReport,
+    preprocess_images,
+    read_report,
+)
 
-FEATURES, MAP = "features", "map"
+PREPROCESSED, FEATURES, MAP = "preprocessed", "features", "map"
+_SOURCES = {
+    "own": "masks of the kapture",
+    "user": "masks brought along",
+    "fixed": "fixed masks",
+    "unchanging": "unchanging regions",
+    "classes": "dynamic classes",
+    "unseen": "outside the original",
+    "all": "together",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,11 +135,8 @@ class ExtractLocal(Linked, StageCommand):
     features: tuple[str, ...] = ()
     """Extractor plugins; those of the preset unless given."""
     force: Force = False
-    """Write into a folder that has other things in it."""
 
-    def run(self) -> int:
-        """Run it."""
-        console = self.console()
+    def run(self, console: Console) -> None:
         if not self.input:
             raise OptionError("no kapture folder given; use -i")
         folders = [self.kapture(path) for path in self.input]
@@ -137,7 +158,6 @@ class ExtractLocal(Linked, StageCommand):
                         f"{counts['images_reduced']} images were reduced meanwhile (max_megapixels)"
                     )
                 console.say(f"{extractor.name}: {'; '.join(told)}")
-        return 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,11 +179,8 @@ class Match(Reading, StageCommand):
     matcher: str | None = None
     """Matcher plugin; the preset's unless given."""
     force: Force = False
-    """Write into a folder that has other things in it."""
 
-    def run(self) -> int:
-        """Run it."""
-        console = self.console()
+    def run(self, console: Console) -> None:
         mapping = self.kapture(self.input)
         local_type = only_type(mapping, "descriptors", self.features)
         changes: dict[str, object] = {"matching": {"name": self.matcher}} if self.matcher else {}
@@ -183,7 +200,6 @@ class Match(Reading, StageCommand):
                 first, mapping, pairs, local_type, matcher, verification, out, work=work
             )
         console.say(f"{counts['matches']} matches in {counts['pairs_with_matches']} pairs")
-        return 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,11 +217,8 @@ class Triangulate(Reading, StageCommand):
     features: tuple[str, ...] = ()
     """Types of local features, each with its own points; needed where there are several."""
     force: Force = False
-    """Write into a folder that has other things in it."""
 
-    def run(self) -> int:
-        """Run it."""
-        console = self.console()
+    def run(self, console: Console) -> None:
         mapping = self.kapture(self.input)
         local_types = [only_type(mapping, "matches", asked) for asked in self.features or (None,)]
         pairs = None if self.pairs is None else _read_pairs_of(self.pairs, mapping, mapping)
@@ -217,14 +230,13 @@ class Triangulate(Reading, StageCommand):
                 out,
                 self.options().triangulation,
                 pairs=pairs,
-                num_threads=self.workers or available_cores(),
+                num_threads=work.num_threads,
                 work=work,
             )
         for type_name in sorted(set(local_types)) if len(set(local_types)) > 1 else ():
             points, seen = counts[f"points_{type_name}"], counts[f"observations_{type_name}"]
             console.say(f"{type_name}: {points} points, {seen} observations")
         console.say(f"{counts['points']} points, {counts['observations']} observations")
-        return 0
 
 
 def _read_pairs_of(path: Path, first: KaptureFolder, second: KaptureFolder) -> list[ImagePair]:
@@ -248,16 +260,13 @@ class OutsideStage(Working):
     set: Texts = ()
     """Change an option of the stage: key=value; may be repeated."""
 
-    def run(self) -> int:
-        """Run it."""
-        console = self.console()
+    def run(self, console: Console) -> None:
         stage = load_plugin(STAGES, self.stage, assigned(self.set))
         if not (self.workspace / "stages").is_dir():
             raise OptionError(f"{self.workspace} is no workspace of megloc eval")
         workspace = Workspace(self.workspace)
         with self.working_in(workspace) as work:
             run_plan([stage], workspace, work, say=console.say)
-        return 0
 
 
 def stage_command(name: str) -> type[Any]:
@@ -266,3 +275,108 @@ def stage_command(name: str) -> type[Any]:
     command.stage = name  # type: ignore[attr-defined]
     command.__doc__ = getdoc(plugin_class(STAGES, name)) or f"Run the stage {name}."
     return command
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preprocess(Linked, Computing, Working):
+    """Resize, undistort and mask the images of a kapture; poses stay, cameras follow."""
+
+    input: Input
+    """Kapture folder; it stays as it is."""
+    output: Output
+    """Kapture folder of the new images."""
+    resize: int | None = None
+    """The larger side of larger images, px; both sides are then cropped to multiples of 8."""
+    undistort: bool = False
+    """Make images that a pinhole camera would have taken."""
+    segmenter: str | None = None
+    """Segmenter plugin whose dynamic classes (people, vehicles) are masked."""
+    dynamic: tuple[str, ...] = ()
+    """Classes to mask; the segmenter's own choice unless given."""
+    bottom_share: Texts = ()
+    """Mask the bottom of a camera's images: CAMERA=0.2, a sensor id or a pattern of image names."""
+    polygon: Texts = ()
+    """Mask a polygon: CAMERA="x,y x,y x,y", corners in shares of width and height."""
+    mask_file: Texts = ()
+    """Mask what is 0 in an image of the camera's size: CAMERA=FILE."""
+    unchanging: bool = False
+    """Mask the region at the bottom that never changes (the car's bonnet), found per camera."""
+    sequence: Folders = ()
+    """Kapture folder whose images of the same cameras help to find it; may be repeated."""
+    user_masks: Path | None = None
+    """Folder of masks IMAGE.png, 0 where the image is ignored."""
+    set: Texts = ()
+    """Change another option: key=value (upscale, multiple_of, blank_pixels); may be repeated."""
+    force: Force = False
+
+    def run(self, console: Console) -> None:
+        options = self.options()
+        source = self.kapture(self.input)
+        sequences = [self.kapture(path) for path in existing(self.sequence)]
+        with self.staged(self.output, PREPROCESSED, force=self.force) as (out, work):
+            preprocess_images(source, out, options, sequences=sequences, work=work)
+            report = read_report(out)
+            # masks and images of an earlier run would be taken for this one's
+            if (self.output / "sensors" / REPORT_FILE).is_file():
+                replace_directory(out / "sensors", self.output / "sensors")
+        for line in () if report is None else report_lines(report):
+            console.say(line)
+
+    def options(self) -> PreprocessingOptions:
+        """The options that the flags make.
+
+        Raises
+        ------
+        OptionError : one has a value that it cannot have.
+        """
+        masks: dict[str, Any] = {
+            "segmenter": None if self.segmenter is None else {"name": self.segmenter},
+            "dynamic": self.dynamic or None,
+            "fixed": tuple(self._fixed_masks()),
+            "unchanging": self.unchanging,
+            "user_masks": self.user_masks,
+        }
+        tree: dict[str, Any] = {
+            "max_size_px": self.resize,
+            "undistort": self.undistort,
+            **assigned(self.set),
+        }
+        changes = tree.pop("masks", {})
+        try:
+            options = PreprocessingOptions.model_validate({**tree, "masks": {**masks, **changes}})
+        except ValidationError as error:
+            raise OptionError(f"option {first_problem(error)}") from error
+        self.check_computes(options)
+        return placed(options, self.device or "auto", self.precision or "full")
+
+    def _fixed_masks(self) -> Iterator[dict[str, Any]]:
+        takes = "CAMERA=VALUE"
+        for camera, value in assigned_pairs("--bottom-share", self.bottom_share, takes):
+            yield {"camera": camera, "bottom_share": value}
+        for camera, value in assigned_pairs("--polygon", self.polygon, takes):
+            yield {"camera": camera, "polygon": [corner.split(",") for corner in value.split()]}
+        for camera, value in assigned_pairs("--mask-file", self.mask_file, takes):
+            yield {"camera": camera, "file": value}
+
+
+def report_lines(report: PreprocessingReport) -> list[str]:
+    """What was done, for people: cameras, then the share of pixels masked by each source."""
+    lines = [f"{report.images} images, {report.images_changed} of them changed"]
+    changes: dict[str, int] = {}
+    for camera in report.cameras.values():
+        before, after = ("{} {}x{}".format(*row[:3]) for row in (camera.original, camera.processed))
+        change = before if camera.original == camera.processed else f"{before} -> {after}"
+        changes[change] = changes.get(change, 0) + 1
+    lines += [
+        f"{'cameras' if number > 1 else 'camera'}: {number} {change}"
+        for change, number in sorted(changes.items())
+    ]
+    lines += [f"remark: {remark}" for remark in report.remarks]
+    if report.images_masked:
+        lines.append(f"masks of {report.images_masked} images; share of all pixels masked:")
+        lines += [
+            f"  {_SOURCES[source]:24s}{100 * report.masked[source]:7.2f} %"
+            for source in _SOURCES
+            if source in report.masked
+        ]
+    return lines

@@ -11,12 +11,13 @@ import tyro
 
 from megloc_kapture.cli.common import (
     Common,
+    Console,
     Folders,
-    Force,
     Input,
     Inputs,
     Linked,
     Output,
+    Overwrite,
     Texts,
     Working,
     assigned_pairs,
@@ -57,16 +58,14 @@ class Train(Linked, Common):
     """Change an option: key.key=value (steps=20000, pairs.max_size_px=800); may be repeated."""
     threads: int = 1
     """Threads that prepare pairs."""
-    force: Force = False
+    force: Overwrite = False
     """Begin again where files of another training stand."""
 
-    def run(self) -> int:
-        """Run it."""
+    def run(self, console: Console) -> None:
         # only this command waits for torch
         from megloc_kapture.pipeline.presets import options_with
         from megloc_kapture.training.train import TASKS, TrainingData, train
 
-        console = self.console()
         changes = {} if self.features is None else {"features.name": self.features}
         options = options_with(TASKS[self.task], self.set, changes)
         licences = assigned_pairs("--licence", self.licence, "FOLDER=TEXT")
@@ -88,7 +87,6 @@ class Train(Linked, Common):
             if value == value:
                 console.result(f"{name.replace('_', ' '):20s}{value:>12.6g}")
         console.result(f"trained: {self.output}")
-        return 0
 
 
 FIELD = "field"
@@ -129,11 +127,10 @@ class TrainField(Linked, Common):
     """Networks compute in bfloat16, which pays on a GPU."""
     compiled: bool = False
     """By torch.compile, which pays on a GPU: minutes at first, and it needs a C compiler."""
-    force: Force = False
+    force: Overwrite = False
     """Write into a folder that has other things in it; begin again."""
 
-    def run(self) -> int:
-        """Run it."""
+    def run(self, console: Console) -> None:
         from pydantic import ValidationError
 
         from megloc_kapture.io.files import first_problem, remove
@@ -141,7 +138,6 @@ class TrainField(Linked, Common):
         from megloc_kapture.refinement.field_training import FieldTrainingOptions
         from megloc_kapture.stages.neural_field import STATE_FILE, train_field_of_map
 
-        console = self.console()
         of_same_name = vars(self).keys() & FieldTrainingOptions.model_fields
         try:
             options = FieldTrainingOptions(
@@ -170,7 +166,6 @@ class TrainField(Linked, Common):
             raise
         mean = f"{sum(psnr_db.values()) / len(psnr_db):.1f} dB" if psnr_db else "none held out"
         console.result(f"{self.output}: PSNR of {len(psnr_db)} held-out images: {mean}")
-        return 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,14 +191,12 @@ class Render(Linked, Working):
     """Of --along and --between: longer side of the renderings, px; larger cameras are reduced."""
     appearance: str | None = None
     """An image that was trained on, in whose light to render; the mean of all unless given."""
-    force: Force = False
+    force: Overwrite = False
     """Overwrite a file, or write into a folder that has other things in it."""
 
-    def run(self) -> int:
-        """Run it."""
+    def run(self, console: Console) -> None:
         from megloc_kapture.stages.neural_field import render_along, views_between
 
-        console = self.console()
         if sum(each is not None for each in (self.pose, self.along, self.between)) != 1:
             raise OptionError("say what to render: --pose and --camera, --along or --between")
         many = self.along or self.between
@@ -212,7 +205,7 @@ class Render(Linked, Working):
             refuse_given("--along and --between", max_side=self.max_side, **others)
             self._render_one()
             console.result(f"rendered: {self.output}")
-            return 0
+            return
         if self.max_side is not None and self.max_side < 1:
             raise OptionError(f"--max-side {self.max_side} is not positive")
         refuse_given("--pose", camera=self.camera, depth=self.depth)
@@ -230,7 +223,6 @@ class Render(Linked, Working):
                 work=work,
             )
         console.result(f"{count} views rendered: {self.output}")
-        return 0
 
     def _render_one(self) -> None:
         import cv2

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from megloc_kapture.cli.common import Common, Console, Force, Output
+from megloc_kapture.cli.common import Common, Console, Output, Overwrite
 from megloc_kapture.errors import MeglocError, OptionError, OutputError, missing_extra
 from megloc_kapture.evaluation.pose_files import installed_version
 from megloc_kapture.io.weights import (
@@ -42,9 +42,8 @@ class LicenceError(MeglocError):
 class List(Common):
     """List all networks: file, size, licence, whether it is there and its sha256 known."""
 
-    def run(self) -> int:
+    def run(self, console: Console) -> None:
         """Print the table."""
-        console = self.console()
         rows: list[tuple[str, ...]] = [
             ("name", "what for", "file", "size", "licence", "state", "sha256")
         ]
@@ -57,7 +56,6 @@ class List(Common):
         for weights in registry().values():
             if weights.unverified:
                 console.result(f"  {weights.name}: {weights.unverified}")
-        return 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,12 +68,10 @@ class Fetch(Common):
     """All that a preset needs and has not."""
     accept_licence: bool = False
     """Agree to a licence that does not plainly allow commercial use."""
-    force: Force = False
+    force: Overwrite = False
     """Replace a different file that stands in its place."""
 
-    def run(self) -> int:
-        """Run it."""
-        console = self.console()
+    def run(self, console: Console) -> None:
         names = self.names
         if self.preset is not None:
             names = tuple(dict.fromkeys((*names, *_missing(self.preset))))
@@ -95,7 +91,6 @@ class Fetch(Common):
             self._fetch(console, weights, file, url)
         if refused:
             raise MissingWeightsError("\n".join(refused))
-        return 0
 
     def _fetch(self, console: Console, weights: Weights, file: PublishedFile, url: str) -> None:
         place = weights_folder() / file.name
@@ -127,14 +122,12 @@ class Add(Common):
     """Network that it is for; told by its sha256 or its name unless given."""
     unverified: bool = False
     """Take a file that is not the published one, such as one you trained."""
-    force: Force = False
+    force: Overwrite = False
     """Replace a different file that stands in its place."""
 
-    def run(self) -> int:
-        """Run it."""
+    def run(self, console: Console) -> None:
         added = add_weights(self.file, name=self.name, force=self.force, unverified=self.unverified)
-        self.console().result(f"{added.name}: {added.path} ({_trust(added)})")
-        return 0
+        console.result(f"{added.name}: {added.path} ({_trust(added)})")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,14 +138,12 @@ class Convert(Common):
     """Checkpoint: .pth, .pt, .npz, .onnx, TensorFlow's .index, or a tar with one."""
     output: Output
     """File to write; must end in .safetensors."""
-    force: Force = False
+    force: Overwrite = False
     """Replace a file that stands there."""
 
-    def run(self) -> int:
-        """Run it."""
+    def run(self, console: Console) -> None:
         count = convert_weights(self.file, self.output, force=self.force)
-        self.console().result(f"{self.output}: {count} tensors")
-        return 0
+        console.result(f"{self.output}: {count} tensors")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,9 +153,8 @@ class Check(Common):
     names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME...]")] = ()
     """Networks, by their names in the list; all whose files are there unless given."""
 
-    def run(self) -> int:
+    def run(self, console: Console) -> int:
         """Run it; returns 2 where a file is wrong."""
-        console = self.console()
         wrong = sum(_wrong(console, lookup(name)) for name in self.names)
         if not self.names:
             wrong = sum(_wrong(console, w) for w in registry().values() if _state(w) != "missing")
@@ -189,9 +179,13 @@ class WeightsCommand:
         """Whether to show the traceback of an error."""
         return self.action.debug
 
-    def run(self) -> int:
+    def console(self) -> Console:
+        """The console that the flags ask for."""
+        return self.action.console()
+
+    def run(self, console: Console) -> int | None:
         """Run what was chosen."""
-        return self.action.run()
+        return self.action.run(console)
 
 
 def summary() -> str:
@@ -296,9 +290,8 @@ _PACKAGES = (
 class Doctor(Common):
     """Check the environment: versions, known-bad combinations, GPU, weights."""
 
-    def run(self) -> int:
+    def run(self, console: Console) -> None:
         """Print what there is; exit status 2 when something is wrong."""
-        console = self.console()
         for package in _PACKAGES:
             console.result(f"{package:24s}{installed_version(package) or 'not installed'}")
         console.result(f"{'GPU':24s}{gpu()}")
@@ -309,7 +302,6 @@ class Doctor(Common):
         if problems:
             raise MeglocError(f"{len(problems)} problems found, see above")
         console.result("no problem found")
-        return 0
 
 
 def gpu() -> str:

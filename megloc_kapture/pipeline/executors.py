@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import wait
 from multiprocessing.util import Finalize, get_temp_dir
@@ -206,11 +206,6 @@ def _handled_by(handler: Any, *signals: signal.Signals) -> Iterator[None]:
             signal.signal(one, former)
 
 
-def deaf_to(*signals: signal.Signals) -> AbstractContextManager[None]:
-    """This process ignores signals in the block: what it ends must not be disturbed."""
-    return _handled_by(signal.SIG_IGN, *signals)
-
-
 @contextmanager
 def starting_processes() -> Iterator[None]:
     """Processes that are started in the block never hear Ctrl-C, and none is left half started.
@@ -319,7 +314,8 @@ def open_executor(
         yield pool
     except BaseException as error:
         if pool is not None:
-            with deaf_to(signal.SIGINT, signal.SIGTERM):
+            # what ends the workers must not be disturbed
+            with _handled_by(signal.SIG_IGN, signal.SIGINT, signal.SIGTERM):
                 pool.kill()
                 pool.shutdown()
         if isinstance(error, BrokenProcessPool):

@@ -34,8 +34,8 @@ from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.kapture.points import write_ply
 from megloc_kapture.io.output_folders import staged_output
-from megloc_kapture.pipeline.colmap_maps import kapture_of
 from megloc_kapture.pipeline.kapture_map import KaptureMap
+from megloc_kapture.pipeline.map_making import kapture_of
 from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
 
 _MAP_COLOUR, _QUERY_COLOUR = (120, 120, 120), (220, 50, 32)

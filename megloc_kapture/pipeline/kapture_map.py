@@ -68,10 +68,6 @@ class MapKeypoints:
         """Descriptors (N, D) of a map image, as stored."""
         return np.asarray(self._descriptors.read(image))
 
-    def descriptor_size(self) -> int:
-        """Number of values of a stored descriptor; raises DataError where there are none."""
-        return self._descriptors.config.dsize
-
     def has_descriptors(self, images: Collection[str]) -> bool:
         """Whether all of these images that have keypoints have descriptors too."""
         if self.name not in self.folder.types("descriptors"):

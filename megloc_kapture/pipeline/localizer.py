@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -23,13 +23,13 @@ from megloc_kapture.pipeline.local_types import local_types_of
 from megloc_kapture.pipeline.map_retrieval import MapRetrieval
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import (
-    KaptureQueries,
     Preprocessor,
     Query,
     QueryImage,
     QueryImages,
     Unit,
 )
+from megloc_kapture.pipeline.query_folders import KaptureQueries
 from megloc_kapture.stages.devices import Precision, unheeded
 from megloc_kapture.stages.image_pairs import counted, rerank
 from megloc_kapture.stages.localized_folder import unreadable_image
@@ -168,10 +168,10 @@ class Localizer:
         """
         opened = folder if isinstance(folder, KaptureFolder) else KaptureFolder(folder)
         queries = KaptureQueries(opened, self.map)
-        rigs = self.options.localization.rigs
-        results = self.localize_units(queries.read_units(rigs=rigs), executor)
-        for names, found in zip(queries.units(rigs=rigs), results, strict=True):
-            yield from zip(names, found, strict=True)
+        units = queries.units(rigs=self.options.localization.rigs)
+        results = self.localize_units(map(queries.read, units), executor)
+        for unit, found in zip(units, results, strict=True):
+            yield from zip((name for name, _ in unit), found, strict=True)
 
     def localize_units(
         self,
@@ -236,20 +236,20 @@ class Localizer:
         with single_threaded():
             images = [self._preprocessor.of(query) for query, _ in unit]
             scene = self._scene(images)
+            results, cameras = self._solve(unit, images, scene)
             found = []
-            for image, result, matched in zip(
-                images, *self._solve(unit, images, scene), strict=True
-            ):
+            for camera, result in zip(cameras, results, strict=True):
+                image = camera.image
                 if isinstance(result, Pose):
-                    camera = result.camera or image.camera
-                    result = self.refiners.refine(image.query.name, camera, result, scene)
+                    intrinsics = result.camera or image.camera
+                    result = self.refiners.refine(image.query.name, intrinsics, result, scene)
                     result = image.in_original(result)
                 found.append(
                     replace(
                         result,
                         name=image.query.name,
-                        remarks=(*result.remarks, *matched.left_out),
-                        seconds={**matched.seconds, **result.seconds},
+                        remarks=(*result.remarks, *camera.left_out),
+                        seconds={**camera.clock.seconds, **result.seconds},
                     )
                 )
             return found
@@ -261,23 +261,24 @@ class Localizer:
         scene: KaptureScene,
         *,
         as_rig: bool = False,
-    ) -> tuple[list[Pose | Failure], list[_Matched]]:
+    ) -> tuple[list[Pose | Failure], list[_Matching]]:
         """What becomes of the matches of all cameras, see :func:`localize_unit`, and these.
 
         What orders candidates by their matches, and guided pyramids, need all matches at first;
         else no more candidates are matched than are taken.
         """
-        asked = [self._asked(image, at) for image, (_, at) in zip(images, unit, strict=True)]
+        cameras = [self._begin(image, at) for image, (_, at) in zip(images, unit, strict=True)]
         whole = self.options.reranking.reranks() or self.options.matches_again()
-        matched = [self._match(one, len(one.ranked) if whole else 0) for one in asked]
 
         def localize(count: int) -> list[Pose | Failure]:
-            if not whole:
-                matched[:] = [self._match(one, count) for one in asked]
-            first = [one.candidates[:count] for one in matched]
-            candidates = interleave(first)
+            views = []
+            for camera in cameras:
+                if not whole:
+                    self._match(camera, count)
+                views.append(camera.view.among(camera.candidates[:count]))
+            candidates = interleave([camera.candidates[:count] for camera in cameras])
             return localize_unit(
-                [one.view.among(own) for one, own in zip(matched, first, strict=True)],
+                views,
                 candidates,
                 [self.map.restrictions.frame(name) for name in candidates],
                 self.options.localization,
@@ -287,9 +288,12 @@ class Localizer:
                 as_rig=as_rig,
             )
 
-        lists = [one.candidates for one in matched] if whole else [one.ranked for one in asked]
+        if whole:
+            for camera in cameras:
+                self._match(camera, len(camera.ranked))
+        lists = [camera.candidates if whole else camera.ranked for camera in cameras]
         longest = max(map(len, lists), default=0)
-        return in_turn(localize, longest, self.options.localization), matched
+        return in_turn(localize, longest, self.options.localization), cameras
 
     def _scene(self, images: Iterable[QueryImage]) -> KaptureScene:
         return KaptureScene(self.map.folder, QueryImages(images), map_camera=self.map.camera)
@@ -298,34 +302,34 @@ class Localizer:
     def _centers(self) -> dict[str, NDArray[np.float64]]:
         return {image: pose.center() for image, pose in self.map.poses.items()}
 
-    def _asked(self, image: QueryImage, cam_from_rig: RigidTransform) -> _Asked:
+    def _begin(self, image: QueryImage, cam_from_rig: RigidTransform) -> _Matching:
         clock = Clock()
         features = [local.of_query(image) for local in self.types]
         clock.lap("extraction")
         ranked = self._candidates(image, features)
         clock.lap("retrieval")
-        return _Asked(image, cam_from_rig, features, ranked, [[] for _ in self.types], clock)
+        return _Matching(image, cam_from_rig, features, ranked, [[] for _ in self.types], clock)
 
-    def _match(self, asked: _Asked, count: int) -> _Matched:
-        """Matches with the best ``count`` candidates; what is matched already stays."""
-        asked.clock.start()
-        features, ranked = asked.features, asked.ranked[:count]
-        for local, own, found in zip(self.types, features, asked.of_types, strict=True):
+    def _match(self, camera: _Matching, count: int) -> None:
+        """Match with the best ``count`` candidates; what is matched already stays."""
+        camera.clock.start()
+        features, ranked = camera.features, camera.ranked[:count]
+        for local, own, found in zip(self.types, features, camera.of_types, strict=True):
             found += local.match(own, ranked[len(found) :])
-        kept = self._kept(asked.of_types)
+        kept = self._kept(camera.of_types)
         typed, left_out = [], []
-        for local, own, found in zip(self.types, features, asked.of_types, strict=True):
+        for local, own, found in zip(self.types, features, camera.of_types, strict=True):
             named: list[ImageMatches] = [
                 (ranked[at], found[at].matches, found[at].scores) for at in kept
             ]
-            keypoints_px, named, remark = local.match_again(own, named, asked.image)
+            keypoints_px, named, remark = local.match_again(own, named, camera.image)
             left_out += [remark] if remark else []
             typed.append(TypedMatches(local.points.index, keypoints_px, named))
-        asked.clock.lap("matching")
-        image = asked.image
-        view = QueryView(image.query.name, image.camera, tuple(typed), asked.cam_from_rig)
-        candidates = [ranked[at] for at in kept]
-        return _Matched(view, candidates, tuple(left_out), dict(asked.clock.seconds))
+        image = camera.image
+        camera.view = QueryView(image.query.name, image.camera, tuple(typed), camera.cam_from_rig)
+        camera.candidates = [ranked[at] for at in kept]
+        camera.left_out = left_out
+        camera.clock.lap("matching")
 
     def _kept(self, of_types: Sequence[Sequence[VerifiedMatches]]) -> list[int]:
         """Positions of the candidates that reranking leaves, best first."""
@@ -389,9 +393,16 @@ class Localizer:
         return self._retrieval.describe(global_types)
 
 
-@dataclass(frozen=True, eq=False)
-class _Asked:
-    """One camera with its features and its candidates, best first; the first of these matched."""
+@dataclass(eq=False)
+class _Matching:
+    """One camera: its features, its candidates, best first, and the first of these matched.
+
+    Attributes
+    ----------
+    of_types : of each keypoints type, the matches with as many of ``ranked`` as were asked for.
+    view, candidates, left_out : what these make, what reranking leaves of them, and the steps that
+        were left out, in words.
+    """
 
     image: QueryImage
     cam_from_rig: RigidTransform
@@ -399,16 +410,9 @@ class _Asked:
     ranked: list[str]
     of_types: list[list[VerifiedMatches]]
     clock: Clock
-
-
-@dataclass(frozen=True, eq=False)
-class _Matched:
-    """The matches of one camera, its candidates, best first, what was left out, and seconds."""
-
-    view: QueryView
-    candidates: list[str]
-    left_out: tuple[str, ...]
-    seconds: Mapping[str, float]
+    view: QueryView = field(init=False)
+    candidates: list[str] = field(init=False)
+    left_out: list[str] = field(init=False)
 
 
 def _query_of(image: Path | str | NDArray[np.uint8], camera: Camera) -> Query:

@@ -15,16 +15,18 @@ from typing import Any, Literal
 from megloc_kapture.errors import OptionError, suggestion
 from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.io.files import clear_temporary, hard_link, write_bytes, write_json_model
-from megloc_kapture.pipeline.manifests import (
+from megloc_kapture.pipeline.workspace import (
+    HASHES,
+    JOURNAL,
     FileHashes,
     Manifest,
+    Workspace,
     changed_file,
     fingerprint,
     read_manifest,
     remember_files,
     written_files,
 )
-from megloc_kapture.pipeline.workspace import HASHES, JOURNAL, Workspace
 from megloc_kapture.stages.stage import CODE_OF, Stage, StageWork, is_below
 from megloc_kapture.stages.work import HERE, Digest, KeptItems, Work
 
@@ -83,7 +85,7 @@ def run_plan(
         raise OptionError(f"--until {last} stands before --from {first}")
     asked = _with_followers(stages, first) if first else {}
     for name in names[:start]:
-        if read_manifest(workspace.manifest_path(name)) is None:
+        if workspace.manifest(name) is None:
             raise OptionError(
                 f"--from {first} needs stage {name}, which has not run; leave --from out"
             )
@@ -98,7 +100,7 @@ def run_plan(
     for number, stage in enumerate(stages[:stop]):
         inputs = {name: outputs[name] for name in _before(stages, stage)}
         inputs |= _there(stages, stage, workspace) | external[stage.name] | stage.code()
-        made = read_manifest(workspace.manifest_path(stage.name))
+        made = workspace.manifest(stage.name)
         due = _Due(stage, stage.settings(), inputs, made)
         files = workspace.files_path(stage.name)
         why = "" if number < start else asked.get(stage.name) or due.why(workspace)

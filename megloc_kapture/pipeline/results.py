@@ -17,8 +17,7 @@ from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.io.tables import CONSISTENCY_FILE, write_consistency
 from megloc_kapture.localization.focal_length import solve_with_shared_camera
 from megloc_kapture.pipeline.localizer import Localizer
-from megloc_kapture.pipeline.photographs import Photographs
-from megloc_kapture.pipeline.queries import KaptureQueries
+from megloc_kapture.pipeline.query_folders import KaptureQueries, Photographs, Queries
 from megloc_kapture.stages.localized_folder import query_status, unreadable_image, write_localized
 from megloc_kapture.stages.stage import LOCALIZED
 from megloc_kapture.stages.work import Track, untracked
@@ -62,7 +61,7 @@ class Results(Mapping[str, Pose | Failure]):
         if workers < 1:
             raise OptionError(f"{workers} workers cannot work; give 1 or more")
         self.localizer = localizer
-        self.queries: KaptureQueries | Photographs
+        self.queries: Queries
         if isinstance(folder, Photographs):
             self.queries = folder
         else:
@@ -73,10 +72,9 @@ class Results(Mapping[str, Pose | Failure]):
         self.queries.check()
         self._check_extractors()
         self._candidates = candidates
-        self._rigs = localizer.options.localization.rigs
-        self._units = self.queries.units(rigs=self._rigs)
+        self._units = self.queries.units(rigs=localizer.options.localization.rigs)
         self._found: dict[str, Pose | Failure | None] = {
-            name: None for unit in self._units for name in unit
+            name: None for unit in self._units for name, _ in unit
         }
         if broken := self.queries.unreadable:
             self._found |= {name: unreadable_image(name, reason) for name, reason in broken.items()}
@@ -185,14 +183,14 @@ class Results(Mapping[str, Pose | Failure]):
     def _localized(self, workers: int, track: Track) -> Iterator[tuple[str, Pose | Failure]]:
         executor, read_on = ThreadPoolExecutor(workers), True
         try:
-            units = self.queries.read_units(rigs=self._rigs)
+            units = map(self.queries.read, self._units)
             results = self.localizer.localize_units(units, executor, candidates=self._candidates)
             tracked = track(results, len(self._units), "localizing")
             if isinstance(self.queries, Photographs):
                 alone = [found for (found,) in tracked]
                 tracked = ([found] for found in self._with_shared_cameras(alone))
-            for names, found in zip(self._units, tracked, strict=True):
-                for name, result in zip(names, found, strict=True):
+            for unit, found in zip(self._units, tracked, strict=True):
+                for (name, _), result in zip(unit, found, strict=True):
                     if isinstance(result, Failure) and name in self.queries.faults:
                         result = replace(result, reason=self.queries.faults[name])
                     yield name, result
@@ -207,7 +205,7 @@ class Results(Mapping[str, Pose | Failure]):
     def _with_shared_cameras(self, results: list[Pose | Failure]) -> list[Pose | Failure]:
         """Results of photographs, each by itself; those of one camera are solved with one."""
         data, of_sensor = self.queries.data(), defaultdict(list)
-        for at, ((name,), result) in enumerate(zip(self._units, results, strict=True)):
+        for at, (((name, _),), result) in enumerate(zip(self._units, results, strict=True)):
             if isinstance(result, Pose):
                 of_sensor[data.record_of(name)[1]].append((at, result))
         for found in of_sensor.values():

@@ -1,171 +1,102 @@
-"""A run of ``megloc eval``: its benchmark file, dataset, preset, options and workspace."""
+"""A run of ``megloc eval``: a dataset and options, and which steps of the paper they are.
+
+Peng et al., MegLoc, arXiv 2111.13063; docs/paper.md has the same steps with their deviations.
+"""
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, ValidationError, field_validator
-
-from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol, read_protocol
-from megloc_kapture.pipeline.datasets import TWIN_PREFIX, DatasetChoice, choose_dataset, with_model
-from megloc_kapture.pipeline.paper_steps import DatasetFacts, LayeredOptions, PaperStep, paper_steps
-from megloc_kapture.pipeline.presets import DEFAULT_PRESET, PRESETS, options_of_preset
-from megloc_kapture.pipeline.submission import place_of
-from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.errors import OptionError
+from megloc_kapture.io.dataset_tables import read_protocol
+from megloc_kapture.pipeline.datasets import (
+    KAPTURE,
+    TWIN_PREFIX,
+    BenchmarkFile,
+    DatasetChoice,
+    choose_dataset,
+    find_benchmark,
+    read_benchmark,
+    with_model,
+)
+from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.stage import SUBMISSIONS
-from megloc_kapture.values import Options
 
-_PACKAGE = Path(__file__).resolve().parent.parent
-# in a wheel the files lie inside the package, in a checkout beside it
-_PLACES = (_PACKAGE / "benchmarks", _PACKAGE.parent / "benchmarks")
-
-
-class PublishedResult(Options):
-    """Figures of another method on the dataset, to be read beside ours.
-
-    Parameters
-    ----------
-    method, source : what was measured, and where it is published.
-    recall : condition -> percent at the dataset's thresholds, as papers print it.
-    """
-
-    method: str
-    source: str
-    recall: dict[str, str]
-
-
-class PresetOptions(Options):
-    """What a dataset wants different of one preset alone, after what it wants of all of them."""
-
-    import_options: dict[str, Any] = Field(default_factory=dict)
-    options: dict[str, Any] = Field(default_factory=dict)
-
-
-class BenchmarkFile(Options):
-    """``benchmarks/<dataset>.toml``: how one dataset is run.
-
-    Parameters
-    ----------
-    import_options : the adapter's.
-    options : changes to every preset.
-    presets : further ones to the preset of a name.
-    options_with_query_depth : further ones, where the queries come with depth maps of their own.
-    thresholds, conditions, pools : instead of the dataset's own (see the side tables' Protocol).
-    published : what others have reached.
-    """
-
-    dataset: str
-    preset: str = DEFAULT_PRESET
-    thresholds: tuple[tuple[float, float | None], ...] | None = None
-    conditions: tuple[str, ...] | None = None
-    pools: dict[str, tuple[str, ...]] | None = None
-    import_options: dict[str, Any] = Field(default_factory=dict)
-    options: dict[str, Any] = Field(default_factory=dict)
-    presets: dict[str, PresetOptions] = Field(default_factory=dict)
-    options_with_query_depth: dict[str, Any] = Field(default_factory=dict)
-    published: tuple[PublishedResult, ...] = ()
-
-    @field_validator("presets")
-    @classmethod
-    def _known_presets(cls, presets: dict[str, PresetOptions]) -> dict[str, PresetOptions]:
-        unknown = sorted(set(presets) - set(PRESETS))
-        if unknown:
-            raise ValueError(f"unknown preset {unknown[0]!r}; known: {', '.join(PRESETS)}")
-        return presets
-
-    def changes(self, preset: str, *, query_depth: bool) -> list[dict[str, Any]]:
-        """Changes to a preset, in order, for data whose queries have depth or not."""
-        own = self.presets.get(preset, PresetOptions()).options
-        return [self.options, own, *([self.options_with_query_depth] if query_depth else [])]
-
-    def import_options_of(self, preset: str) -> dict[str, Any]:
-        """The adapter's options, where this preset is run."""
-        return self.import_options | self.presets.get(preset, PresetOptions()).import_options
-
-    def change(self, protocol: Protocol) -> Protocol:
-        """A dataset's protocol with what this file wants different."""
-        wanted = {"thresholds": self.thresholds, "conditions": self.conditions, "pools": self.pools}
-        return protocol.model_copy(update={k: v for k, v in wanted.items() if v is not None})
-
-
-def find_benchmark(dataset: str) -> BenchmarkFile:
-    """The benchmark file of a dataset that comes with the package; defaults where there is none.
-
-    A rendered twin runs as its dataset does, but nobody has published figures on it.
-
-    Raises
-    ------
-    DataError : the file is broken.
-    """
-    for name in (dataset, dataset.removeprefix(TWIN_PREFIX)):
-        for place in _PLACES:
-            path = place / f"{name}.toml"
-            if path.is_file():
-                found = read_benchmark(path)
-                if name == dataset:
-                    return found
-                return found.model_copy(update={"dataset": dataset, "published": ()})
-    return BenchmarkFile(dataset=dataset)
-
-
-def read_benchmark(path: Path) -> BenchmarkFile:
-    """Read a benchmark file.
-
-    Raises
-    ------
-    DataError : absent, not TOML, or a key or value that is not of it; names the file.
-    """
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-        return BenchmarkFile.model_validate(content)
-    except OSError as error:
-        raise DataError(f"cannot be read: {error.strerror}", path=path) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"not TOML: {error}", path=path) from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise DataError(f"{where}: {first['msg']}", path=path) from error
+RETRIEVAL = frozenset({"netvlad", "delg", "apgem", "openibl"})
 
 
 @dataclass(frozen=True)
-class RunChoice:
-    """A dataset, its benchmark file and the options, chosen together; nothing is written yet."""
+class DatasetFacts:
+    """What a dataset comes with, which decides which steps it permits."""
+
+    map_depth: bool  # depth maps of the map images
+    query_depth: bool
+    model: bool  # points of its own
+
+
+@dataclass(frozen=True)
+class PaperStep:
+    """A step of the paper in a run."""
+
+    name: str
+    on: bool
+    why: str  # who turned it on or off, or what it needs that is not there
+
+
+@dataclass(frozen=True)
+class Run:
+    """What is run: a dataset, with which options; nothing is written yet.
+
+    Attributes
+    ----------
+    preset : its name.
+    options : those of the run, with what the dataset's file and the user change.
+    benchmark : the dataset's file, which changes the protocol too.
+    facts : what the dataset comes with; None: nobody asks for the steps of the paper.
+    """
 
     source: DatasetChoice
-    benchmark: BenchmarkFile
-    layers: LayeredOptions
-    facts: DatasetFacts
+    preset: str
+    options: PipelineOptions
+    benchmark: BenchmarkFile = BenchmarkFile(dataset=KAPTURE)
+    facts: DatasetFacts | None = None
 
     @property
-    def preset(self) -> str:
-        """The preset's name."""
-        return self.layers.preset
-
-    @property
-    def options(self) -> PipelineOptions:
-        """The options of the run."""
-        return self.layers.chosen
+    def dataset(self) -> str:
+        """The dataset's name."""
+        return self.source.name
 
     def steps(self) -> list[PaperStep]:
-        """The steps of the paper, and which of them the run does."""
-        return paper_steps(self.layers, self.facts)
+        """The steps of the paper in its order, and whether the run does them; nothing is loaded."""
+        if self.facts is None:
+            return []
+        changes = self.benchmark.changes(self.preset, query_depth=self.facts.query_depth)
+        of_preset = options_of_preset(self.preset)
+        of_file = options_of_preset(self.preset, changes=changes)
+        layers = (_steps_of(one, self.facts) for one in (self.options, of_file, of_preset))
+        return [_explained(self.preset, *each) for each in zip(*layers, strict=True)]
 
-    def with_options(self, options: PipelineOptions) -> RunChoice:
-        """The same run with other options."""
-        return replace(self, layers=replace(self.layers, chosen=options))
+    def submission_below(self, folder: Path, tables: Path) -> Path:
+        """Where, below ``folder``, the pose file stands; a folder where it is several files.
 
-    def run_in(self, workspace: Workspace) -> Run:
-        """The run, in a workspace."""
-        return Run(
-            self.source, self.preset, self.options, workspace, self.benchmark, tuple(self.steps())
-        )
+        Its name is the server's, ``Aachen_v1_1_eval_METHOD.txt``. That of a rendered twin begins
+        with ``synthetic-``: there is no server for it. ``tables`` : the dataset's side tables.
+        """
+        protocol = read_protocol(tables)
+        stem = self.dataset
+        if protocol.pose_file_stem and not stem.startswith(TWIN_PREFIX):
+            stem = protocol.pose_file_stem
+        end = "" if protocol.pose_file == "mlad" else ".txt"
+        return folder / SUBMISSIONS / f"{stem}_eval_megloc-{self.preset}{end}"
+
+    def provenance(self) -> dict[str, Any]:
+        """What a result is of, as plain JSON values."""
+        options = self.options.model_dump(mode="json")
+        return {"dataset": self.dataset, "preset": self.preset, "options": options}
 
 
 def choose_run(
@@ -178,7 +109,7 @@ def choose_run(
     query_prefix: str = "",
     allow_missing: bool = False,
     find_root: bool = True,
-) -> RunChoice:
+) -> Run:
     """Choose what ``megloc eval`` runs.
 
     Parameters
@@ -211,45 +142,201 @@ def choose_run(
     facts = DatasetFacts(
         source.has_map_depth(), source.has_query_depth(), with_model(source) is not None
     )
-    of_file = benchmark.changes(preset, query_depth=facts.query_depth)
-    layers = LayeredOptions(
-        preset,
-        options_of_preset(preset),
-        options_of_preset(preset, changes=of_file),
-        options_of_preset(preset, changes=of_file, assignments=assignments),
+    changes = benchmark.changes(preset, query_depth=facts.query_depth)
+    options = options_of_preset(preset, changes=changes, assignments=assignments)
+    return Run(source, preset, options, benchmark, facts)
+
+
+def steps_text(steps: Sequence[PaperStep]) -> str:
+    """The steps as lines of text."""
+    width = max(len(step.name) for step in steps)
+    return "\n".join(
+        f"{step.name:{width}s}  {'on' if step.on else 'off':3s}  {step.why}" for step in steps
     )
-    return RunChoice(source, benchmark, layers, facts)
 
 
 @dataclass(frozen=True)
-class Run:
-    """What a run is of; ``benchmark`` changes the protocol, ``steps`` are the paper's."""
+class _Step:
+    """A step, the option that turns it on, and whether options ask for it.
 
-    source: DatasetChoice
-    preset: str
-    options: PipelineOptions
-    workspace: Workspace
-    benchmark: BenchmarkFile | None = None
-    steps: tuple[PaperStep, ...] = ()
+    ``obstacle`` is why the data do not permit it, ``figures`` how it is done.
+    """
 
-    @property
-    def dataset(self) -> str:
-        """The dataset's name."""
-        return self.source.name
+    name: str
+    option: str
+    asked: bool
+    obstacle: str = ""
+    figures: str = ""
 
-    def submission_below(self, folder: Path) -> Path:
-        """Where, below ``folder``, the pose file stands; a folder where it is several files.
 
-        Its name is the server's, ``Aachen_v1_1_eval_METHOD.txt``. That of a rendered twin begins
-        with ``synthetic-``: there is no server for it.
-        """
-        protocol = read_protocol(self.workspace.path(SIDE_TABLES))
-        stem = self.dataset
-        if protocol.pose_file_stem and not stem.startswith(TWIN_PREFIX):
-            stem = protocol.pose_file_stem
-        return place_of(folder / SUBMISSIONS, f"{stem}_eval_megloc-{self.preset}", protocol)
+def _explained(preset: str, chosen: _Step, by_file: _Step, by_preset: _Step) -> PaperStep:
+    """What becomes of a step that the run, the dataset's file and the preset may ask for."""
+    if chosen.asked != by_file.asked:
+        why = f"an option of this run ({chosen.option})"
+    elif by_file.asked != by_preset.asked:
+        why = f"the dataset's file ({chosen.option})"
+    elif chosen.asked:
+        why = f"preset {preset}"
+    else:
+        why = f"neither preset {preset} nor the dataset's file asks for it ({chosen.option})"
+    # what nobody could turn on is said before who did not
+    if chosen.obstacle and (chosen.asked or chosen.asked == by_file.asked):
+        return PaperStep(chosen.name, on=False, why=chosen.obstacle)
+    told = f"{why}; {chosen.figures}" if chosen.asked and chosen.figures else why
+    return PaperStep(chosen.name, chosen.asked, told)
 
-    def provenance(self) -> dict[str, Any]:
-        """What a result is of, as plain JSON values."""
-        options = self.options.model_dump(mode="json")
-        return {"dataset": self.dataset, "preset": self.preset, "options": options}
+
+def _steps_of(options: PipelineOptions, facts: DatasetFacts) -> list[_Step]:
+    """The steps of the paper in its order, as options and data have them."""
+    preprocessing, masks = options.preprocessing, options.preprocessing.masks
+    features = options.local_features
+    matcher_of = {one.name: one.matching or options.matching for one in features}
+    extracted = matcher_of if options.makes_points() else {}
+    superpoint = next((one for one in features if one.name == "superpoint"), None)
+    superglue = ""
+    if superpoint is not None:
+        radius = superpoint.options.get("nms_radius", 4)
+        weights = matcher_of["superpoint"].options.get("weights", "superglue_outdoor")
+        superglue = f"non-maximum suppression within {radius} px, {weights}"
+    trained_anew = any(one.options.get("descriptor_weights") for one in features)
+    refiners = {one.name for one in options.pose_refinement.by}
+    rank = options.localization.rank
+    pairs = options.mapping_pairs.by
+    stereo = options.mvs.mode != "off"
+
+    not_matched = no_uncertainty = ""
+    if options.map == "lift":
+        not_matched = (
+            "the points are lifted from the map's depth: map images are not matched with each other"
+        )
+        no_uncertainty = (
+            "a lifted point is seen by one image, which says nothing of its uncertainty"
+        )
+    elif not options.triangulates():
+        not_matched = "the map is given: its images are not matched"
+    no_model = not_matched
+    if not facts.model and options.triangulates():
+        no_model = "the dataset comes with no model whose points images could see in common"
+    no_map_depth = "" if facts.map_depth else "the map images have no depth"
+    no_depth_to_render = "" if stereo else no_map_depth
+
+    def pairs_by(method: str, name: str, obstacle: str = not_matched) -> _Step:
+        return _Step(f"map pairs by {name}", "mapping_pairs.by", method in pairs, obstacle)
+
+    return [
+        _Step(
+            "larger side of 1600 px, sides multiples of 8",
+            "preprocessing.max_size_px",
+            preprocessing.max_size_px == 1600,
+            figures="" if preprocessing.upscale else "smaller images are not enlarged",
+        ),
+        _Step(
+            "lens distortion removed",
+            "preprocessing.undistort",
+            preprocessing.undistort,
+            figures="cameras without distortion stay as they are",
+        ),
+        _Step(
+            "people and vehicles masked",
+            "preprocessing.masks.segmenter",
+            masks.segmenter is not None,
+            figures="" if masks.segmenter is None else masks.segmenter.name,
+        ),
+        _Step(
+            "the own car masked",
+            "preprocessing.masks.unchanging",
+            masks.unchanging or bool(masks.fixed),
+        ),
+        _Step(
+            "SuperPoint matched by SuperGlue",
+            "local_features",
+            "superpoint" in extracted and extracted["superpoint"].name == "superglue",
+            figures=superglue,
+        ),
+        _Step("ASLFeat", "local_features", "aslfeat" in extracted),
+        _Step(
+            "descriptors and matcher trained anew",
+            "local_features",
+            trained_anew,
+            ""
+            if trained_anew
+            else "the paper's weights are not public; megloc train descriptor makes such",
+        ),
+        _Step(
+            "four global features fused",
+            "global_features",
+            {one.name for one in options.global_features} >= RETRIEVAL,
+        ),
+        pairs_by("poses", "poses"),
+        pairs_by("covisibility", "co-visibility", no_model),
+        pairs_by("retrieval", "retrieval"),
+        pairs_by("sequence", "sequence"),
+        _Step(
+            "points triangulated with known poses",
+            "map",
+            options.triangulates(),
+            "" if options.triangulates() else f"map = {options.map}",
+        ),
+        _Step(
+            "points verified by depth",
+            "refinement.depth.max_sigmas",
+            options.refinement.depth.max_sigmas is not None,
+            no_map_depth,
+        ),
+        _Step(
+            "uncertain points rejected",
+            "refinement.uncertainty",
+            options.refinement.uncertainty.needs_deviations(),
+            no_uncertainty,
+        ),
+        _Step(
+            "depth of map images by multi-view stereo",
+            "mvs.mode",
+            stereo,
+            "the map images have depth" if facts.map_depth else "",
+        ),
+        _Step(
+            "M images retrieved, N kept by local matches",
+            "reranking.by",
+            options.reranking.reranks(),
+            figures=f"M = {options.query_pairs.top_k}, N = {options.reranking.keep}",
+        ),
+        _Step(
+            "guided pyramid matching",
+            "guided_pyramid.mode",
+            options.matches_again(),
+            figures=f"pairs with fewer than {options.guided_pyramid.min_matches} verified matches",
+        ),
+        _Step(
+            "one pose per cluster of candidates",
+            "localization.clusters.by",
+            options.localization.clusters.by != "none",
+            figures=f"by {options.localization.clusters.by}",
+        ),
+        _Step(
+            "clusters ranked by LPIPS of aligned views",
+            "localization.rank",
+            rank.name == "perceptual" and rank.options.get("distance", {}).get("name") == "lpips",
+            "the paper's indoor strategy; the map images have no depth to make views of"
+            if no_depth_to_render
+            else "",
+        ),
+        _Step(
+            "poses refined by ICP",
+            "pose_refinement.by",
+            "icp" in refiners,
+            "" if facts.query_depth else "the queries have no depth",
+        ),
+        _Step(
+            "poses refined by rendering",
+            "pose_refinement.by",
+            "rendering" in refiners,
+            no_depth_to_render,
+        ),
+        _Step(
+            "rendering by a neural field (NeRF-W)",
+            "pose_refinement.by",
+            "field" in refiners,
+            "" if "field" in refiners else "it needs a field of the map (megloc train-field)",
+        ),
+    ]

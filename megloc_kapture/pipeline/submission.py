@@ -45,7 +45,7 @@ from megloc_kapture.pipeline.datasets import (
     check_known,
     dataset_names,
 )
-from megloc_kapture.pipeline.manifests import read_manifest
+from megloc_kapture.pipeline.workspace import read_manifest
 from megloc_kapture.stages import scene
 from megloc_kapture.values import Pose, RigidTransform
 
@@ -96,11 +96,6 @@ def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> N
             f"dataset {dataset} is asked for, and {(tables or Path()) / PROTOCOL_FILE} is of "
             f"dataset {protocol.dataset}"
         )
-
-
-def place_of(folder: Path, stem: str, protocol: Protocol) -> Path:
-    """Where a submission goes below ``folder``: a file, or a folder where it is several files."""
-    return folder / (stem if protocol.pose_file == "mlad" else f"{stem}.txt")
 
 
 def write_submission(

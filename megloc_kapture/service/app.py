@@ -34,15 +34,19 @@ from megloc_kapture.io.images import turned_upright
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.queries import Query as ImageQuery
-from megloc_kapture.service.limits import Busy, Limits, Rates, Turns, client_of
-from megloc_kapture.service.photographs import (
+from megloc_kapture.service.requests import (
     Answer,
+    Busy,
+    Limits,
     Photograph,
+    Rates,
     Refused,
     TooManyPixels,
+    Turns,
     UnknownFormat,
     answer_of,
     camera_of,
+    client_of,
 )
 
 _PATH = re.compile(r"(^|[\s'\"(=])/\w[^\s]*/")

@@ -32,7 +32,7 @@ from megloc_kapture.pipeline.executors import end_with_parent, single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.service.app import Service, make_app
-from megloc_kapture.service.limits import Limits, client_of
+from megloc_kapture.service.requests import Limits, client_of
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.shared_index import open_index, shared_index
 from megloc_kapture.values import Camera

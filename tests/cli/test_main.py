@@ -19,10 +19,9 @@ import tyro
 
 import megloc_kapture
 from megloc_kapture import plugin_loading
-from megloc_kapture.cli.arguments import EXAMPLES, summary
 from megloc_kapture.cli.common import Console
 from megloc_kapture.cli.info import shown
-from megloc_kapture.cli.main import COMMANDS, _parser, command_class
+from megloc_kapture.cli.main import COMMANDS, EXAMPLES, _parser, command_class, summary
 from megloc_kapture.pipeline.presets import PRESETS, options_of, options_of_preset
 from megloc_kapture.stages.options import PipelineOptions
 
@@ -212,7 +211,7 @@ import ctypes, signal, sys, time
 from megloc_kapture.cli import main
 from megloc_kapture.cli.weights import Doctor
 from megloc_kapture.errors import MeglocError
-def run(self):
+def run(self, console):
 {meeting}
 Doctor.run = run
 sys.argv = ["megloc", "doctor"]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from megloc_kapture.cli.preprocess import Preprocess
+from megloc_kapture.cli.stages import Preprocess
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.images import image_size, read_image_rgb, write_image
 from megloc_kapture.io.kapture import KaptureFolder

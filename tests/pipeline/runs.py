@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,14 +9,21 @@ from typing import Any
 
 from megloc_kapture import Failure, Pose
 from megloc_kapture.evaluation.metrics import pose_errors
-from megloc_kapture.pipeline.datasets import TWIN_PREFIX, DatasetChoice, choose_dataset, twin_of
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
+from megloc_kapture.pipeline.datasets import (
+    KAPTURE,
+    TWIN_PREFIX,
+    BenchmarkFile,
+    DatasetChoice,
+    choose_dataset,
+    find_benchmark,
+    twin_of,
+)
+from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, recall_rows
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
-from megloc_kapture.pipeline.manifests import Manifest
 from megloc_kapture.pipeline.plan import StageReport, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run, find_benchmark
-from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.pipeline.run import Run
+from megloc_kapture.pipeline.workspace import Manifest, Workspace
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import RigidTransform
@@ -29,12 +35,12 @@ def run_in(
     options: PipelineOptions,
     *,
     workers: int = 1,
-    benchmark: Any = None,
+    benchmark: BenchmarkFile | None = None,
     **how: Any,
 ) -> dict[str, StageReport]:
     """Run the stages in a workspace, of a scene or a dataset; their reports by name."""
     chosen = choose_dataset("kapture", source) if isinstance(source, Path) else source
-    run = Run(chosen, "classic", options, workspace, benchmark)
+    run = Run(chosen, "classic", options, benchmark or BenchmarkFile(dataset=KAPTURE))
     with workspace.lock(), single_threaded(), open_executor("processes", workers) as executor:
         reports = run_plan(plan_evaluation(run), workspace, Work(executor), **how)
     return {report.name: report for report in reports}
@@ -62,15 +68,9 @@ def run_twin(
     return run_in(workspace, source, options, workers=2, benchmark=benchmark)
 
 
-def recall_rows(workspace: Workspace) -> dict[str, Any]:
-    """Rows of the recall table by name."""
-    rows = json.loads(workspace.path("evaluation/recall.json").read_text())["rows"]
-    return {row["name"]: row for row in rows}
-
-
 def recall(workspace: Workspace, name: str = "all") -> list[float]:
     """The shares of queries at each threshold."""
-    return [at["recall"] for at in recall_rows(workspace)[name]["recall"]]
+    return [at["recall"] for at in recall_rows(workspace.root)[name]["recall"]]
 
 
 def errors(found: Pose | Failure, truth: RigidTransform | None) -> tuple[float, float]:

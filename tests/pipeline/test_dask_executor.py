@@ -20,7 +20,7 @@ from megloc_kapture.errors import DataError, MeglocError, OptionError
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline import dask_executor
 from megloc_kapture.pipeline.executors import open_executor
-from megloc_kapture.pipeline.queries import KaptureQueries
+from megloc_kapture.pipeline.query_folders import KaptureQueries
 from megloc_kapture.stages.work import ordered_map
 from megloc_kapture.values import Pose
 

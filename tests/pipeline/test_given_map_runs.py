@@ -123,4 +123,4 @@ def test_covisibility_is_that_of_the_model_the_dataset_comes_with(tmp_path: Path
     by = {"mapping_pairs": {"by": ["covisibility"]}}
     lifted = options_of_preset(changes=[by], assignments=["map=lift"])
     inloc = choose_dataset("synthetic-inloc", None)
-    plan_evaluation(Run(inloc, "classic", lifted, Workspace(tmp_path / "i")))
+    plan_evaluation(Run(inloc, "classic", lifted))

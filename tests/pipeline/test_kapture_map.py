@@ -16,7 +16,7 @@ from megloc_kapture.localization.map_index import TypedMatches
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.queries import KaptureQueries
+from megloc_kapture.pipeline.query_folders import KaptureQueries
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.matches import Features, match_all, verification_of, verified
 from megloc_kapture.values import Pose

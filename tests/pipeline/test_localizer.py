@@ -22,7 +22,7 @@ from megloc_kapture.features.r2d2 import R2D2, R2D2Options
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.queries import KaptureQueries
+from megloc_kapture.pipeline.query_folders import KaptureQueries
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import LocalFeatures, RigidTransform

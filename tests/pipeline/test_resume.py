@@ -155,7 +155,7 @@ class Runs:
 
         workspace = Workspace(self.root)
         options = options_of_preset(assignments=self.options)
-        run = Run(choose_dataset("kapture", self.scene), "classic", options, workspace)
+        run = Run(choose_dataset("kapture", self.scene), "classic", options)
         with workspace.lock():
             work = Work(executor, track)
             reports = run_plan(plan_evaluation(run), workspace, work, **{"last": self.last, **how})

@@ -38,12 +38,10 @@ from megloc_kapture.pipeline.datasets import DatasetChoice
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.submission import (
     check_dataset,
-    place_of,
     poses_through_rig,
     workspace_provenance,
     write_submission,
 )
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import Camera, RigidTransform
 from tests.pipeline.runs import manifest
@@ -403,11 +401,6 @@ def test_rules_that_are_nowhere() -> None:
         check_dataset("aachen", Protocol(), tables=None)
 
 
-def test_places(tmp_path: Path) -> None:
-    assert place_of(tmp_path, "x_1.1", Protocol()) == tmp_path / "x_1.1.txt"
-    assert place_of(tmp_path, "x_1.1", Protocol(pose_file="mlad")) == tmp_path / "x_1.1"
-
-
 @pytest.mark.parametrize(
     ("name", "stem"),
     [
@@ -423,13 +416,12 @@ def test_places(tmp_path: Path) -> None:
     ],
 )
 def test_a_run_calls_its_pose_file_as_the_server_does(name: str, stem: str, tmp_path: Path) -> None:
-    workspace = Workspace(tmp_path / "workspace")
     rules = protocol_of(name.removeprefix("synthetic-") if name != "synthetic" else name)
-    write_protocol(workspace.path("megloc"), rules)
-    run = Run(DatasetChoice(name, None), "classic", PipelineOptions(), workspace)
+    write_protocol(tmp_path / "megloc", rules)
+    run = Run(DatasetChoice(name, None), "classic", PipelineOptions())
     end = "" if rules.pose_file == "mlad" else ".txt"
     expected = tmp_path / "submissions" / f"{stem}_eval_megloc-classic{end}"
-    assert run.submission_below(tmp_path) == expected
+    assert run.submission_below(tmp_path, tmp_path / "megloc") == expected
 
 
 @pytest.mark.parametrize("stem", ["../x", "a/b", ".x", "a b", "a\n"])

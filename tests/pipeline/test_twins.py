@@ -10,9 +10,10 @@ import pytest
 from megloc_kapture.evaluation.check.reading import read_reference
 from megloc_kapture.evaluation.check.submission import check_submission
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX
+from megloc_kapture.pipeline.evaluation_plan import recall_rows
 from megloc_kapture.pipeline.plan import all_kept
 from megloc_kapture.pipeline.workspace import Workspace
-from tests.pipeline.runs import recall_rows, run_twin
+from tests.pipeline.runs import run_twin
 
 SMALL: dict[str, dict[str, Any]] = {
     "aachen": {
@@ -36,7 +37,7 @@ DARK = {"night", "night-rain", "night-all", "all"}
 def test_a_twin_from_its_layout_to_what_is_handed_in(name: str, tmp_path: Path) -> None:
     workspace = Workspace(tmp_path / "workspace")
     run_twin(workspace, name, SMALL[name])
-    rows = recall_rows(workspace)
+    rows = recall_rows(workspace.root)
     assert rows["all"]["num_queries"] > 0
     day = {key: row for key, row in rows.items() if key not in DARK and "dusk" not in key}
     assert name == "inloc" or day

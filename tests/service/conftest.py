@@ -13,7 +13,7 @@ import megloc_kapture as megloc
 from megloc_kapture import KaptureMap, Localizer
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.service.limits import Limits
+from megloc_kapture.service.requests import Limits
 
 CHANGES = {"local_features.options.max_keypoints": 400}
 OPTIONS = options_of_preset(assignments=CHANGES)

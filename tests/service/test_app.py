@@ -24,7 +24,7 @@ from starlette.testclient import TestClient
 from megloc_kapture import Localizer, Pose
 from megloc_kapture.api import Map
 from megloc_kapture.errors import DataError
-from megloc_kapture.service.limits import Limits
+from megloc_kapture.service.requests import Limits
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS
 
 # of the machine: no answer has one in it

@@ -24,7 +24,7 @@ from megloc_kapture import Localizer
 from megloc_kapture.errors import OptionError
 from megloc_kapture.service import server
 from megloc_kapture.service.app import Service, make_app
-from megloc_kapture.service.limits import Limits
+from megloc_kapture.service.requests import Limits
 from megloc_kapture.service.server import bind, map_overview
 
 LIMITS = Limits(threads=2, upload_limit_s=1.0, time_limit_s=5.0, requests_per_minute=0)

@@ -8,18 +8,18 @@ from pathlib import Path
 import pytest
 
 from megloc_kapture.io.tables import read_status
-from megloc_kapture.pipeline.ablation import (
+from megloc_kapture.pipeline.datasets import choose_dataset, find_benchmark
+from megloc_kapture.pipeline.evaluation_plan import (
     fresh_copy,
     outcome,
     outcomes_text,
+    plan_evaluation,
     variants,
     write_outcomes,
 )
-from megloc_kapture.pipeline.datasets import choose_dataset
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run, find_benchmark
+from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.workspace import Workspace
 from tests.pipeline.runs import run_in
 
@@ -37,7 +37,7 @@ STEPS = {
 
 
 def names(*assignments: str) -> list[str]:
-    return [v.name for v in variants(options_of_preset(assignments=assignments))]
+    return list(variants(options_of_preset(assignments=assignments)))
 
 
 def test_only_steps_that_are_there_are_left_out() -> None:
@@ -50,16 +50,16 @@ def test_only_steps_that_are_there_are_left_out() -> None:
 def test_a_variant_lacks_its_step_and_nothing_else() -> None:
     changes = find_benchmark("aachen").changes("megloc", query_depth=False)
     options = options_of_preset("megloc", changes=changes)
-    assert [variant.name for variant in variants(options)] == list(STEPS)
+    assert list(variants(options)) == list(STEPS)
     whole = options.model_dump()
-    for variant in variants(options):
-        without = variant.options.model_dump()
-        assert {name for name in whole if without[name] != whole[name]} == STEPS[variant.name]
-        assert variant.name not in [v.name for v in variants(variant.options)]
+    for step, changed in variants(options).items():
+        without = changed.model_dump()
+        assert {name for name in whole if without[name] != whole[name]} == STEPS[step]
+        assert step not in variants(changed)
 
 
 @pytest.fixture(scope="module")
-def first(fountain: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def first(fountain: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Workspace]:
     workspace = Workspace(tmp_path_factory.mktemp("ablation") / "workspace")
     options = options_of_preset(
         assignments=[
@@ -69,7 +69,7 @@ def first(fountain: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
         ]
     )
     run_in(workspace, fountain, options)
-    return Run(choose_dataset("kapture", fountain), "classic", options, workspace)
+    return Run(choose_dataset("kapture", fountain), "classic", options), workspace
 
 
 def folder_bytes(root: Path) -> dict[str, bytes]:
@@ -78,31 +78,34 @@ def folder_bytes(root: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-def test_a_variant_runs_only_what_differs_and_leaves_the_first_run_alone(first: Run) -> None:
-    before = folder_bytes(first.workspace.root)
-    variant = next(v for v in variants(first.options) if v.name == "pose ranking")
-    workspace = fresh_copy(first.workspace, variant.slug)
-    assert workspace.root == first.workspace.root / "ablation" / "without_pose_ranking"
-    reports = run_in(workspace, first.source, variant.options)
+def test_a_variant_runs_only_what_differs_and_leaves_the_first_run_alone(
+    first: tuple[Run, Workspace],
+) -> None:
+    run, whole = first
+    before = folder_bytes(whole.root)
+    workspace = fresh_copy(whole, "without_pose_ranking")
+    assert workspace.root == whole.root / "ablation" / "without_pose_ranking"
+    reports = run_in(workspace, run.source, variants(run.options)["pose ranking"])
     again = {name for name, report in reports.items() if report.state == "run"}
     assert again == {"localization", "submission", "evaluation"}
-    after = folder_bytes(first.workspace.root)
+    after = folder_bytes(whole.root)
     kept = {name: content for name, content in after.items() if not name.startswith("ablation/")}
     assert kept == before
     # what did not change is the same file, not another with the same bytes
     place = "map/reconstruction/points3d.txt"
-    assert workspace.path(place).samefile(first.workspace.path(place))
+    assert workspace.path(place).samefile(whole.path(place))
 
 
 @pytest.mark.slow
-def test_refinement_is_turned_on_and_off_in_one_workspace(first: Run) -> None:
-    workspace = fresh_copy(first.workspace, "with_rendering")
-    plain = folder_bytes(first.workspace.path("localized"))
-    refined = first.options.model_validate(
-        {**first.options.model_dump(), "pose_refinement": {"by": ["rendering"]}}
+def test_refinement_is_turned_on_and_off_in_one_workspace(first: tuple[Run, Workspace]) -> None:
+    run, whole = first
+    workspace = fresh_copy(whole, "with_rendering")
+    plain = folder_bytes(whole.path("localized"))
+    refined = run.options.model_validate(
+        {**run.options.model_dump(), "pose_refinement": {"by": ["rendering"]}}
     )
-    for options in (refined, first.options, refined):
-        stages = plan_evaluation(Run(first.source, "classic", options, workspace))
+    for options in (refined, run.options, refined):
+        stages = plan_evaluation(Run(run.source, "classic", options))
         outputs = [output for stage in stages for output in stage.writes]
         assert len(outputs) == len(set(outputs))
         with workspace.lock():
@@ -119,13 +122,13 @@ def test_refinement_is_turned_on_and_off_in_one_workspace(first: Run) -> None:
 
 
 @pytest.mark.slow
-def test_the_table_has_recall_medians_and_seconds(first: Run) -> None:
-    stages = plan_evaluation(first)
-    found = outcome("all steps", first.workspace, stages)
+def test_the_table_has_recall_medians_and_seconds(first: tuple[Run, Workspace]) -> None:
+    run, whole = first
+    found = outcome("all steps", whole, plan_evaluation(run))
     assert list(found.recall) == ["0.05 m, 5 deg", "0.25 m, 2 deg", "0.5 m, 5 deg", "5 m, 10 deg"]
     assert found.recall["5 m, 10 deg"] == 1 and 0 < found.median_position_m < 0.1
     assert found.seconds > 0
-    path = write_outcomes(first.workspace, [found, found])
+    path = write_outcomes(whole, [found, found])
     with open(path, newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["run"] for row in rows] == ["all steps", "all steps"]

@@ -1,21 +1,30 @@
-"""``megloc import`` and ``megloc synth``: datasets as kapture, and rendered ones."""
+"""Commands that bring data in and out: datasets as kapture, rendered ones, exports and views."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
-from megloc_kapture.cli.common import Common, Console, Force, Output, Texts, Working
+from megloc_kapture.cli.common import (
+    Common,
+    Console,
+    Force,
+    Linked,
+    Output,
+    Overwrite,
+    Texts,
+    Working,
+    opened_map,
+)
 from megloc_kapture.datasets.colmap_map import find_colmap
 from megloc_kapture.datasets.kapture_folders import QUERY
 from megloc_kapture.datasets.megadepth import MegaDepthOptions, import_megadepth
-from megloc_kapture.errors import OptionError
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.dataset_tables import METRES, SIDE_TABLES, write_unit
 from megloc_kapture.io.output_folders import staged_output
-from megloc_kapture.pipeline.colmap_maps import import_colmap
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,
     SUMMARY_FILE,
@@ -25,6 +34,8 @@ from megloc_kapture.pipeline.datasets import (
     twin_of,
 )
 from megloc_kapture.pipeline.executors import open_executor
+from megloc_kapture.pipeline.export import ExportFormat, GeoOrigin, export
+from megloc_kapture.pipeline.map_making import import_colmap
 from megloc_kapture.pipeline.presets import assigned, options_with
 from megloc_kapture.stages.localized_folder import set_aside_unreadable
 from megloc_kapture.stages.stage import MAP
@@ -61,16 +72,15 @@ class Import(Common):
     query_prefix: str = ""
     """Put the queries into a folder of this name, where they share names with the map."""
     force: Force = False
-    """Write into a folder that has other things in it."""
 
-    def run(self) -> int:
-        """Run it."""
-        console = self.console()
+    def run(self, console: Console) -> None:
         name = self.dataset.removeprefix(TWIN_PREFIX)
         if name == COLMAP:
-            return self._import_colmap(console)
+            self._import_colmap(console)
+            return
         if name == MEGADEPTH:
-            return self._import_megadepth(console)
+            self._import_megadepth(console)
+            return
         if self.images or self.database:
             raise OptionError(f"--images and --database are of colmap, not of {self.dataset}")
         if self.unit != METRES:
@@ -94,9 +104,8 @@ class Import(Common):
             console.say(f"warning: query {name} cannot be used and will fail: {reason}")
         if text:
             console.result(text.rstrip())
-        return 0
 
-    def _import_colmap(self, console: Console) -> int:
+    def _import_colmap(self, console: Console) -> None:
         self._refuse_unused("a COLMAP model", {"--set": self.set})
         source = find_colmap(self.root, images=self.images, database=self.database)
         with (
@@ -109,16 +118,14 @@ class Import(Common):
         for what, found in (("images", source.images), ("database", source.database)):
             console.say(f"{what}: {found or 'none'}")
         console.counts(counts)
-        return 0
 
-    def _import_megadepth(self, console: Console) -> int:
+    def _import_megadepth(self, console: Console) -> None:
         self._refuse_unused("MegaDepth", {"--images": self.images, "--database": self.database})
         options = options_with(MegaDepthOptions, self.set)
         with staged_output(self.output, kind=MEGADEPTH, force=self.force) as out:
             work = Work(track=console.track)
             counts = import_megadepth(self.root, out, options, work=work)
         console.counts(counts)
-        return 0
 
     def _refuse_unused(self, what: str, flags: dict[str, object]) -> None:
         of_datasets = {"--query-prefix": self.query_prefix, "--allow-missing": self.allow_missing}
@@ -139,11 +146,8 @@ class Synth(Working):
     set: Texts = ()
     """An option of the world: key=value; may be repeated."""
     force: Force = False
-    """Write into a folder that has other things in it."""
 
-    def run(self) -> int:
-        """Run it."""
-        console = self.console()
+    def run(self, console: Console) -> None:
         changes = {"seed": self.seed, **assigned(self.set)}
         twin = twin_of(self.dataset.removeprefix(TWIN_PREFIX), **changes)
         with (
@@ -153,4 +157,104 @@ class Synth(Working):
             counts = twin.write(out, Work(executor, console.track))
         console.counts(counts)
         console.result(f"rendered: {self.output}")
-        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(Common):
+    """Write a map, localized queries or both for COLMAP, nerfstudio, evo and viewers."""
+
+    format: tyro.conf.Positional[ExportFormat]
+    """colmap: a model; nerfstudio: transforms.json; tum, kitti: a trajectory, as evo reads it; ply:
+    points and camera frusta; geojson: camera centres on earth."""
+    input: Annotated[Path | None, tyro.conf.arg(aliases=["-i"])] = None
+    """Kapture map, or a kapture folder of images with poses."""
+    query: Path | None = None
+    """Kapture folder of localized queries; trajectories are of these alone where given."""
+    output: Output
+    """Folder for colmap and nerfstudio, else a file."""
+    sensor: str | None = None
+    """Images of this camera only; several cameras of one moment are no trajectory."""
+    geo_origin: str | None = None
+    """Of geojson: latitude,longitude[,height] of the world's origin, whose axes are East, North
+    and Up there."""
+    force: Overwrite = False
+    """Overwrite, or write into a folder that has other things in it."""
+
+    def run(self, console: Console) -> None:
+        number = export(
+            self.format,
+            self.output,
+            map=self.input,
+            query=self.query,
+            sensor=self.sensor,
+            origin=None if self.geo_origin is None else _origin(self.geo_origin),
+            force=self.force,
+        )
+        console.result(f"{number} images exported: {self.output}")
+
+
+def _origin(text: str) -> GeoOrigin:
+    try:
+        values = [float(part) for part in text.split(",")]
+        if not 2 <= len(values) <= 3:
+            raise ValueError
+    except ValueError:
+        raise OptionError(f"--geo-origin takes latitude,longitude[,height], got {text!r}") from None
+    return GeoOrigin(*values)
+
+
+@dataclass(frozen=True, kw_only=True)
+class View(Linked, Common):
+    """Write a page that shows a map in 3D, and the queries of a result in it; it needs no
+    network."""
+
+    map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
+    """Kapture folder: a map with points, or images with poses; or a COLMAP model."""
+    result: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="RESULT")] = None
+    """Localized kapture folder, or pose file."""
+    gt: Path | None = None
+    """Kapture folder with the true poses: queries are coloured by their error, and joined to it."""
+    rendered: Path | None = None
+    """Kapture folder of `megloc render --along RESULT`: shown beside the queries' photographs."""
+    output: Output = Path("view.html")
+    """File to write."""
+    rerun: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
+    """Write the same, with the images, for Rerun's viewer as well: `rerun FILE.rrd` shows it."""
+    open: bool = False
+    """Show it in the browser."""
+    force: Overwrite = False
+    """Overwrite a file that is no view."""
+
+    def run(self, console: Console) -> None:
+        # only this command waits for it
+        from megloc_kapture.evaluation.view import write_view
+
+        for path in (self.result, self.gt, self.rendered):
+            if path is not None and not path.exists():
+                raise DataError("no such file or folder", path=path)
+        for needs, given in (
+            ("--gt needs a result to compare with it", self.gt),
+            ("--rendered needs the result it is of", self.rendered),
+        ):
+            if given is not None and self.result is None:
+                raise OptionError(f"{needs}: megloc view MAP RESULT")
+        folder = self.kapture(opened_map(self.map, console))
+        left_out = write_view(
+            self.output,
+            folder,
+            self.result,
+            self.gt,
+            force=self.force,
+            rerun=self.rerun,
+            rendered=None if self.rendered is None else self.kapture(self.rendered),
+        )
+        if left_out:
+            console.say(left_out)
+        console.result(f"view: {self.output}")
+        if self.rerun is not None:
+            console.result(f"recording: {self.rerun}")
+        if self.open:
+            import webbrowser
+
+            if not webbrowser.open(self.output.resolve().as_uri()):
+                console.say("no browser could be started; open the file in one")

@@ -1,0 +1,411 @@
+"""Folders of queries: kapture's, with the features they bring, and plain photographs and videos."""
+
+from __future__ import annotations
+
+import tempfile
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+
+from megloc_kapture.datasets.kapture_folders import check_image, check_image_size
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.io.files import (
+    check_relative,
+    hard_link,
+    link_file,
+    link_images,
+    owned_name,
+)
+from megloc_kapture.io.images import (
+    UNREAD_SUFFIXES,
+    VIDEO_SUFFIXES,
+    WRITABLE_SUFFIXES,
+    extract_frames,
+    read_image_rgb,
+    read_photo,
+    turned_upright,
+    write_image,
+)
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, writable_name
+from megloc_kapture.matching.guided_pyramid import equivalent_types
+from megloc_kapture.pipeline.kapture_map import KaptureMap, check_lengths
+from megloc_kapture.pipeline.queries import Query, Unit
+from megloc_kapture.stages import scene
+from megloc_kapture.stages.local_features import mask_path
+from megloc_kapture.stages.scene import depth_of
+from megloc_kapture.values import Camera, LocalFeatures
+
+FRAMES_EVERY = 30
+
+
+class Queries(ABC):
+    """Images to localize, read one by one.
+
+    Attributes
+    ----------
+    names : of the images that can be used, sorted.
+    unreadable : names of the others to the reason, so far as headers say it.
+    faults : why the features that a query brings cannot be used, known when they have been read;
+        such a query has neither features nor candidates.
+    """
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self.unreadable: dict[str, str] = {}
+        self.faults: dict[str, str] = {}
+
+    @abstractmethod
+    def check(self) -> None:
+        """Check all that can be checked without reading features or pixels; raises DataError."""
+
+    def lacking(self, local_type: str) -> str | None:
+        """The first image without features that serve a type; None where all bring them."""
+        return next(iter(self.names), None)
+
+    def types_of_all(self) -> list[str]:
+        """Global-feature types that all queries bring and the map has."""
+        return []
+
+    def units(self, *, rigs: bool) -> list[scene.Unit]:
+        """Names of the images that are localized together, with the ``cam_from_rig`` of each: with
+        ``rigs`` those of one rig and moment, else every image by itself."""
+        units = scene.query_units(self.data(), rigs=rigs)
+        usable = (tuple(one for one in unit if one[0] not in self.unreadable) for unit in units)
+        return [unit for unit in usable if unit]
+
+    def read(self, unit: scene.Unit) -> Unit:
+        """The queries of a unit; pixels are read when they are needed."""
+        return tuple((self.query(name), cam_from_rig) for name, cam_from_rig in unit)
+
+    @abstractmethod
+    def query(self, name: str) -> Query:
+        """The query of a name."""
+
+    @abstractmethod
+    def data(self) -> KaptureData:
+        """Sensors, rigs and records; the cameras as they were before the run."""
+
+    @abstractmethod
+    def write_images(self, output: Path) -> None:
+        """Put the images into a kapture folder, as links where they stay as they are."""
+
+
+class KaptureQueries(Queries):
+    """The images of a kapture folder as queries, with the features it brings; read one by one.
+
+    Its cameras and keypoints are taken to be described as the map describes its own.
+    """
+
+    def __init__(self, folder: KaptureFolder, kapture_map: KaptureMap) -> None:
+        super().__init__()
+        self._folder, self._map = folder, kapture_map
+        self._data = folder.read()
+        self.names = self._data.image_names()
+        self._stored = stored = kapture_map.stored_types()
+        wanted = {other for name in stored for other in equivalent_types(name)}
+        brought = set(folder.types("keypoints")).intersection(folder.types("descriptors"))
+        self._local = {
+            name: (folder.keypoints(name), folder.descriptors(name))
+            for name in sorted(wanted & brought)
+        }
+        # what the map says of keypoints of each type; looked up here, not for every query
+        self._like = {
+            name: kapture_map.keypoints_of(
+                next(other for other in equivalent_types(name) if other in stored)
+            )
+            for name in self._local
+        }
+        self._globals = {
+            name: folder.global_features(name)
+            for name in kapture_map.global_types()
+            if name in folder.types("global_features")
+        }
+
+    def lacking(self, local_type: str) -> str | None:
+        types = [name for name in equivalent_types(local_type) if name in self._local]
+        return next(
+            (name for name in self.names if not any(name in self._local[t][0] for t in types)), None
+        )
+
+    def check(self) -> None:
+        """See :meth:`Queries.check`.
+
+        Raises
+        ------
+        DataError : there are no images, or none that can be used; features are not as wide as the
+            map's, or would be taken for those of a map image.
+        """
+        self._map.folder.check_features_apart(self._folder)
+        if not self.names:
+            raise DataError("there are no query images", path=self._folder.root)
+        self._check_widths()
+        errors = []
+        for name in self.names:
+            if any(name in keypoints for keypoints, _ in self._local.values()):
+                continue
+            try:
+                check_image(self._folder, name)
+            except DataError as error:
+                self.unreadable[name] = error.message
+                errors.append(error)
+        self.names = [name for name in self.names if name not in self.unreadable]
+        if not self.names:
+            raise errors[0]
+
+    def data(self) -> KaptureData:
+        return self._data
+
+    def write_images(self, output: Path) -> None:
+        link_images(self._folder.root, output)
+
+    def _check_widths(self) -> None:
+        pairs = [
+            (vectors, self._map.folder.global_features(name))
+            for name, vectors in self._globals.items()
+        ]
+        for name, (_, descriptors) in self._local.items():
+            described = self._map.folder.types("descriptors")
+            theirs = next((other for other in equivalent_types(name) if other in described), None)
+            if theirs is not None:
+                pairs.append((descriptors, self._map.folder.descriptors(theirs)))
+        for own, other in pairs:
+            if own.config.dsize != other.config.dsize:
+                raise DataError(
+                    f"{own.kind} of type {own.type_name!r} have {own.config.dsize} values, "
+                    f"the map's {other.config.dsize}",
+                    path=self._folder.root,
+                )
+
+    def types_of_all(self) -> list[str]:
+        return [
+            name
+            for name, vectors in self._globals.items()
+            if all(image in vectors for image in self.names)
+        ]
+
+    def __iter__(self) -> Iterator[Query]:
+        return map(self.query, self.names)
+
+    def query(self, name: str) -> Query:
+        candidates: tuple[str, ...] | None = None
+        try:
+            features = self._features(name)
+            of_image = {t: one.read(name) for t, one in self._globals.items() if name in one}
+        except DataError as error:
+            self.faults[name] = str(error)
+            features, of_image, candidates = self._no_features(), {}, ()
+        return Query(
+            camera=self._map.to_colmap(self._data.camera_of(name)),
+            image=self._folder.image_path(name),
+            name=name,
+            features=features,
+            global_features=of_image,
+            prior=self._priors[name] if name in self._map.restrictions.priors else None,
+            candidates=candidates,
+            mask=mask_path(self._folder, name),
+            depth=partial(depth_of, self._folder, name) if self._data.records_depth else None,
+        )
+
+    @cached_property
+    def _priors(self) -> dict[str, tuple[str, ...]]:
+        """What the map's dataset permits; queries of one pool share their tuple."""
+        images = self._map.images
+        found = {}
+        for positions, permitted in self._map.restrictions.pools(self.names, images):
+            prior = tuple(images[position] for position in permitted)
+            found.update(dict.fromkeys((self.names[at] for at in positions), prior))
+        return found
+
+    def _features(self, name: str) -> dict[str, LocalFeatures]:
+        found = {}
+        for needed in self._stored:
+            serving = (one for one in equivalent_types(needed) if one in self._local)
+            local_type = next((one for one in serving if name in self._local[one][0]), None)
+            if local_type is None or local_type in found:
+                continue
+            keypoints, descriptors = self._local[local_type]
+            check_lengths(keypoints, descriptors, name)
+            stored = keypoints.read(name)
+            found[local_type] = LocalFeatures(
+                self._like[local_type].to_colmap(stored),
+                np.zeros(len(stored), np.float32),
+                descriptors.read(name),
+            )
+        return found
+
+    def _no_features(self) -> dict[str, LocalFeatures]:
+        return {
+            local_type: LocalFeatures(
+                np.zeros((0, 2), np.float32),
+                np.zeros(0, np.float32),
+                np.zeros((0, descriptors.config.dsize), descriptors.config.dtype),
+            )
+            for local_type, (_, descriptors) in self._local.items()
+        }
+
+
+@dataclass(frozen=True)
+class _Image:
+    path: Path
+    camera: Camera
+    orientation: int
+    make: str
+    is_frame: bool
+    gps: tuple[float, float, float] | None = None
+
+
+class Photographs(Queries):
+    """Image files, folders of them, and videos, as the queries of a run, or to make a map of.
+
+    Without a camera an image is turned upright by its EXIF orientation, its camera is of the turned
+    image, and its focal length is EXIF's or a guess, estimated with the pose in any case. A given
+    camera is of the pixels as they are stored. Images of one size, make and focal length share a
+    camera.
+
+    Parameters
+    ----------
+    paths : files and folders. An image is named by its path below the folder that was given, a
+        file that was given by its own name, a frame by its video and number:
+        ``walk.mp4/000120.jpg``. Of a folder images and videos are taken, hidden files are not.
+    camera : of all images; EXIF is not looked at then.
+    every : of a video, every n-th frame; 30 unless given.
+
+    Raises
+    ------
+    DataError : a file or folder is not there, there is no image, two have the same name, or kapture
+        cannot hold a name.
+    OptionError : ``every`` is not positive, or there is no video.
+    """
+
+    def __init__(
+        self, paths: Sequence[Path | str], camera: Camera | None = None, *, every: int | None = None
+    ) -> None:
+        super().__init__()
+        if every is not None and every < 1:
+            raise OptionError(f"every {every}th frame cannot be taken; give 1 or more")
+        files = _named_files([Path(path) for path in paths])
+        videos = [name for name in files if Path(name).suffix.lower() in VIDEO_SUFFIXES]
+        if every is not None and not videos:
+            raise OptionError("--every changes nothing: there is no video among the images")
+        self._images: dict[str, _Image] = {}
+        self._frames: tempfile.TemporaryDirectory[str] | None = None
+        for name, path in files.items():
+            try:
+                if name in videos:
+                    self._add_video(name, path, camera, every or FRAMES_EVERY)
+                else:
+                    self._add(name, path, camera)
+            except DataError as error:
+                self.unreadable[name] = error.message
+        self.names = sorted(self._images)
+
+    def check(self) -> None:
+        """Nothing more is known without reading pixels."""
+
+    def query(self, name: str) -> Query:
+        image = self._images[name]
+        return Query(image.camera, image.path, name, orientation=image.orientation)
+
+    def gps(self) -> dict[str, tuple[float, float, float]]:
+        """Latitude, longitude and height of the images whose EXIF has them."""
+        return {name: one.gps for name, one in self._images.items() if one.gps is not None}
+
+    def files(self) -> dict[str, Path]:
+        """The files of the images that can be read; of frames those that were taken out."""
+        return {name: self._images[name].path for name in self.names}
+
+    def data(self) -> KaptureData:
+        data = KaptureData()
+        sensor_ids: dict[tuple[str, Camera], str] = {}
+        for timestamp, name in enumerate(self.names):
+            image = self._images[name]
+            key = image.make, image.camera
+            sensor_id = sensor_ids.setdefault(key, f"camera{len(sensor_ids)}")
+            title = image.make.replace(",", " ")
+            data.sensors[sensor_id] = Sensor.from_camera(image.camera, name=title)
+            data.records_camera[timestamp, sensor_id] = name
+        return data
+
+    def write_images(self, output: Path) -> None:
+        for name, image in self._images.items():
+            place = Path(output) / "sensors" / "records_data" / name
+            place.parent.mkdir(parents=True, exist_ok=True)
+            if image.is_frame:
+                hard_link(image.path, place)
+            elif image.orientation == 1:
+                link_file(image.path, place)
+            else:
+                try:
+                    pixels = read_image_rgb(image.path)
+                except DataError:  # its row in status.csv says so
+                    continue
+                write_image(place, turned_upright(pixels, image.orientation))
+
+    def _add(self, name: str, path: Path, camera: Camera | None, *, is_frame: bool = False) -> None:
+        if camera is None:
+            photo = read_photo(path)
+            self._images[name] = _Image(
+                path, photo.upright_camera, photo.orientation, photo.make, is_frame, photo.gps
+            )
+            return
+        check_image_size(path, camera)
+        self._images[name] = _Image(path, camera, 1, "", is_frame)
+
+    def _add_video(self, name: str, path: Path, camera: Camera | None, every: int) -> None:
+        if self._frames is None:
+            self._frames = tempfile.TemporaryDirectory(prefix=f".{owned_name()}")
+        folder = Path(self._frames.name) / name
+        for frame in extract_frames(path, folder, every):
+            self._add(f"{name}/{frame}", folder / frame, camera, is_frame=True)
+
+
+def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
+    """Name to path of all files that were given, sorted by name."""
+    found: dict[str, Path] = {}
+    for path in paths:
+        if (path / "sensors" / "sensors.txt").is_file():
+            raise DataError("a kapture folder is no folder of plain images: --query", path=path)
+        if path.is_dir():
+            files = {str(file.relative_to(path)): file for file in _images_below(path)}
+            if not files:
+                raise DataError("no image or video in this folder", path=path)
+        elif path.exists():
+            files = {path.name: path}
+        else:
+            raise DataError("no such file or folder", path=path)
+        for name, file in files.items():
+            if name in found:
+                raise DataError(
+                    f"{found[name]} has the same name below the folder that was given; give the "
+                    "folder that holds both",
+                    path=file,
+                )
+            _check_name(name, file)
+            found[name] = file
+    return dict(sorted(found.items()))
+
+
+def _images_below(folder: Path) -> Iterable[Path]:
+    wanted = {*WRITABLE_SUFFIXES, *UNREAD_SUFFIXES, *VIDEO_SUFFIXES}
+    for path in sorted(folder.rglob("*")):
+        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
+        if path.suffix.lower() in wanted and not hidden and not path.is_dir():
+            yield path
+
+
+def _check_name(name: str, path: Path) -> None:
+    """Refuse names that kapture's tables cannot hold; raises DataError."""
+    try:
+        check_relative(name)
+    except DataError as error:
+        raise DataError(f"{error.message}; rename the file", path=path) from error
+    if name != writable_name(name):
+        raise DataError(
+            f"kapture's tables cannot hold the name {name!r} (a comma, a space at an end, or # at "
+            "its beginning); rename the file",
+            path=path,
+        )
