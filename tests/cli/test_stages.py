@@ -261,6 +261,7 @@ def test_a_map_of_two_types_of_features(megloc: Any, scene: Path, tmp_path: Path
     features, mapping, pairs = tmp_path / "features", scene / "mapping", tmp_path / "pairs.txt"
     place = ("-i", mapping, "--features-dir", features)
     few = ("--set", "local_features.rootsift.options.max_keypoints=500")
+    few += ("--set", "local_features.sift.options.first_octave=0")
     both = ("--features", "rootsift", "sift")
     match = ["match", *place, "--pairs", pairs, "-o", features, *INLINE, "--features"]
     commands = [
