@@ -23,7 +23,8 @@ def entry_points(**of: str) -> metadata.EntryPoints:
 
 
 @cache
-def _entry_points_on(_search_path: tuple[str, ...]) -> metadata.EntryPoints:
+def _entry_points_on(_search_path: tuple[str, ...]) -> Any:
+    """All of them; Python 3.11 has another type for that, which selects alike."""
     return metadata.entry_points()
 
 
