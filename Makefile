@@ -49,7 +49,8 @@ eval: $(STAMP)
 		$(if $(WORKSPACE),--workspace '$(WORKSPACE)') --submissions submissions $(ARGS)
 
 # a file's tests share their fixtures, so they stay together
-PYTEST = $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
+# the many processes that they start compile the package once, whatever the user has set
+PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
 test: $(STAMP)
 	@$(PYTEST) -m 'not slow and not fuzz' $(ARGS)

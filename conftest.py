@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import copy
+import hashlib
 import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from corner import write_scene
@@ -49,11 +52,31 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A rendered scene: mapping/, query/ and query_gt/; not to be written into."""
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A rendered scene: mapping/, query/ and query_gt/; not to be written into.
+
+    Whole runs of it by the dozen extract the same features: this process does it once.
+    """
     root = tmp_path_factory.mktemp("scene")
     write_scene(root)
-    return root
+    with pytest.MonkeyPatch.context() as patch:
+        _remember_rootsift(patch)
+        yield root
+
+
+def _remember_rootsift(patch: pytest.MonkeyPatch) -> None:
+    from megloc_kapture.features.rootsift import RootSift
+
+    extract, known = RootSift.extract, {}
+
+    def remembered(self: RootSift, image: Any, mask: Any = None) -> Any:
+        arrays = (array.tobytes() for array in (image, mask) if array is not None)
+        key = (repr(self.options), image.shape, *(hashlib.sha256(each).digest() for each in arrays))
+        if key not in known:
+            known[key] = extract(self, image, mask)
+        return copy.deepcopy(known[key])
+
+    patch.setattr(RootSift, "extract", remembered)
 
 
 @pytest.fixture(scope="session")

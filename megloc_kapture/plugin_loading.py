@@ -6,7 +6,7 @@ import hashlib
 import sys
 from contextlib import suppress
 from functools import cache
-from importlib.metadata import entry_points
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,17 @@ from pydantic import ValidationError
 from megloc_kapture.errors import MeglocError, PluginError, missing_extra, suggestion
 from megloc_kapture.plugins import PROTOCOLS
 from megloc_kapture.values import Options
+
+
+def entry_points(**of: str) -> metadata.EntryPoints:
+    """Those of the packages on the search path; reading them takes 10 ms, and is done once."""
+    return _entry_points_on(tuple(sys.path)).select(**of)
+
+
+@cache
+def _entry_points_on(_search_path: tuple[str, ...]) -> Any:
+    """All of them; Python 3.11 has another type for that, which selects alike."""
+    return metadata.entry_points()
 
 
 def plugin_names(group: str) -> list[str]:
@@ -85,7 +96,7 @@ def plugin_class(group: str, name: str) -> Any:
 @cache
 def option_models(name: str) -> tuple[type[Options], ...]:
     """The models of the options of plugins of that name, of any group; raises PluginError."""
-    named = entry_points().select(name=name)
+    named = entry_points(name=name)
     groups = sorted({one.group for one in named} & PROTOCOLS.keys())
     models = [getattr(plugin_class(group, name), "Options", None) for group in groups]
     return tuple(model for model in models if model is not None)
@@ -108,7 +119,7 @@ def code_of(kind: type) -> str:
         with suppress(OSError):
             digest.update(file.read_bytes())
     value = f"{kind.__module__}:{kind.__qualname__}"
-    registered = [entry.dist for entry in entry_points().select(value=value) if entry.dist]
+    registered = [entry.dist for entry in entry_points(value=value) if entry.dist]
     return f"{registered[0].version if registered else ''} {digest.hexdigest()}".strip()
 
 

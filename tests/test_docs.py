@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import os
 import re
 import shlex
@@ -10,6 +12,7 @@ import subprocess
 import sys
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -45,10 +48,35 @@ def anchors(page: Path) -> set[str]:
     return {heading.replace(" ", "-") for heading in plain}
 
 
+EXAMPLES = [example for page in PAGES for example in blocks(page, "python")]
+
+
+def test_python_examples_name_what_there_is_with_its_arguments() -> None:
+    """What a type checker says of the names that are imported."""
+    assert len(EXAMPLES) >= 2
+    for example in EXAMPLES:
+        found: dict[str, Any] = {}
+        for node in ast.walk(ast.parse(example)):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                exec(ast.unparse(node), found)  # raises where a name is not there
+
+        def named(node: ast.expr, found: dict[str, Any] = found) -> Any:
+            """What an expression stands for, None of what is not imported."""
+            if isinstance(node, ast.Attribute):
+                owner = named(node.value)
+                return None if owner is None else getattr(owner, node.attr)
+            return found.get(node.id) if isinstance(node, ast.Name) else None
+
+        for node in ast.walk(ast.parse(example)):
+            called = named(node.func) if isinstance(node, ast.Call) else None
+            if str(getattr(called, "__module__", "")).startswith("megloc_kapture"):
+                words = {word.arg: None for word in node.keywords if word.arg}
+                inspect.signature(called).bind_partial(*node.args, **words)
+
+
+@pytest.mark.slow
 def test_python_examples_pass_a_strict_type_checker(tmp_path: Path) -> None:
-    examples = [example for page in PAGES for example in blocks(page, "python")]
-    assert len(examples) >= 2
-    for number, example in enumerate(examples):
+    for number, example in enumerate(EXAMPLES):
         (tmp_path / f"example_{number}.py").write_text(example)
     # errors of the package itself are what `make lint` is for
     options = ["--strict", "--config-file=", "--follow-imports=silent", "--cache-dir=cache"]

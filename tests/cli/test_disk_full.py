@@ -39,7 +39,7 @@ def test_eval_stops_cleanly_and_goes_on(
 ) -> None:
     workspace = small_disk("1m") / "workspace"
     arguments = ["--root", scene, "--workspace", workspace, "--quiet", "--executor", "inline"]
-    arguments += ["--set", "local_features.options.max_keypoints=800"]
+    arguments += ["--set", "local_features.options.max_keypoints=800", "--until", "submission"]
     done = megloc("eval", "kapture", *arguments)
     done.refused(r"/workspace/\.partial/local_features/.*: cannot write: No space left on device")
     assert not (workspace / "local_features").exists()

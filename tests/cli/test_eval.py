@@ -6,7 +6,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -101,20 +101,19 @@ def test_the_pose_file_of_each_result_is_among_the_submissions(
     poses = first.read_bytes()
     assert poses == (run / POSES).read_bytes()
     assert Path(f"{POSES}.json").read_bytes() == (run / f"{POSES}.json").read_bytes()
-    done = megloc(*command, *other)
+    until = ("--until", "submission")  # it is said without the evaluation as well
+    done = megloc(*command, *other, *until)
     assert f"{first} is of another result and stays as it is" in done.err
     assert f"pose file  {second}\n" in done.out
     assert first.read_bytes() == poses != second.read_bytes() == (run / POSES).read_bytes()
     # back again, and into a folder of one's own
-    assert f"pose file  {first}\n" in megloc(*command, *same).out
+    assert f"pose file  {first}\n" in megloc(*command, *same, *until).out
     assert len(list(Path("submissions").iterdir())) == 4
     done = megloc(*command, *same, "--workspace", run, "--submissions", "mine")
     assert done.out.splitlines()[-2] == f"pose file  {Path('mine') / first.name}"
     (run / POSES).unlink()
     assert megloc(*command, *same, "--workspace", run).status == 0  # nobody asked for a copy
-    # without the evaluation it is said as well
-    places = ("--workspace", run, "--submissions", "kept", "--until", "submission")
-    done = megloc(*command, *same, *places)
+    done = megloc(*command, *same, *until, "--workspace", run, "--submissions", "kept")
     assert done.out == f"pose file  {Path('kept') / first.name}\n"
     assert not done.err.count("evaluation")
 
@@ -197,26 +196,29 @@ def test_an_option_of_localization_reruns_what_follows_only(
     assert reasons(done.err)["localization"] == ("options changed: localization.pose.max_error_px")
     assert reasons(done.err)["evaluation"] == "localization changed"
     # and back again
-    assert ran(evaluate(scene, workspace).err) == ["localization", "submission", "evaluation"]
+    until = ("--until", "submission")
+    assert ran(evaluate(scene, workspace, *until).err) == ["localization", "submission"]
     # thresholds are one of the import
     done = evaluate(scene, workspace, "--thresholds", "0.001,1", "0.5,5", "--until", "import")
     assert reasons(done.err) == {"import": "options changed: protocol.thresholds"}
 
 
 def test_a_changed_image_reruns_everything_and_a_touched_one_nothing(
-    evaluate: Any, dataset: Path
+    evaluate: Any, dataset: Path, finished: Path
 ) -> None:
     run, image = dataset.parent / "run", dataset / "mapping/sensors/records_data/0005.jpg"
-    evaluate(dataset, run)
+    until = ("--until", "localization")
+    evaluate(dataset, run, *until)
     image.touch()
-    assert "nothing to do" in evaluate(dataset, run).err
+    assert "nothing to do" in evaluate(dataset, run, *until).err
     with open(image, "ab") as file:
         file.write(b"\0")
-    done = evaluate(dataset, run)
-    assert ran(done.err) == list(STAGES)
+    done = evaluate(dataset, run, *until)
+    assert ran(done.err) == list(STAGES[:9])
     assert reasons(done.err)["import"] == "dataset files changed"
     # its pixels are the same
-    assert "100.0 / 100.0 / 100.0 / 100.0" in done.out
+    poses = "localized/sensors/trajectories.txt"
+    assert (run / poses).read_bytes() == (finished / poses).read_bytes()
 
 
 # ------------------------------------------------------------------ parts of a run
@@ -253,8 +255,8 @@ def test_from_takes_what_another_tool_put_there(
     nearest = {pair.query: pair.map for pair in reversed(pairs)}
     rows = [f"{query}, {image}, 1.0\n" for query, image in sorted(nearest.items())]
     (workspace / "pairs" / "query.txt").write_text("".join(rows))
-    done = evaluate(scene, workspace, "--from", "query_matches")
-    assert ran(done.err) == list(STAGES[7:])
+    done = evaluate(scene, workspace, "--from", "query_matches", "--until", "localization")
+    assert ran(done.err) == list(STAGES[7:9])
     assert set(map(states(done.err).get, STAGES[:6])) == {"taken as it is"}
     statuses = read_status(workspace / "localized" / "status.csv")
     assert {q: s.candidates for q, s in statuses.items()} == {
@@ -311,37 +313,41 @@ def test_processes_give_the_same_bytes(
 # ------------------------------------------------------------------ results
 
 
-def blacken(dataset: Path, names: Sequence[str]) -> None:
-    for name in names:
-        place = dataset / "query/sensors/records_data" / name
-        write_image(place, np.zeros((300, 400, 3), np.uint8))
-
-
-def test_low_recall_fails_when_asked_for(evaluate: Any, dataset: Path, finished: Path) -> None:
-    blacken(dataset, ["0004.jpg"])
+def test_queries_that_fail_are_misses_and_low_recall_fails_when_asked_for(
+    evaluate: Any, dataset: Path, finished: Path
+) -> None:
+    images = dataset / "query/sensors/records_data"
+    (images / "0004.jpg").write_bytes((images / "0004.jpg").read_bytes()[:20_000])
+    write_image(images / "0007.jpg", np.zeros((100, 200, 3), np.uint8))
+    (images / "0010.jpg").unlink()
     run = dataset.parent / "run"
-    done = evaluate(dataset, run, "--fail-below", "0.8", status=3)
-    assert "recall 0.750 is below 0.800" in done.err
-    assert evaluate(dataset, run, "--fail-below", "0.75").status == 0
+    done = evaluate(dataset, run, "--fail-below", "0.3", status=3)
+    assert "recall 0.250 is below 0.300" in done.err
+    assert evaluate(dataset, run, "--fail-below", "0.25").status == 0
     statuses = read_status(run / "localized" / "status.csv")
-    assert statuses["0004.jpg"].status == "failed"
-    assert statuses["0004.jpg"].reason == "no map image matches"
-    # it is not in the pose file, and the others do not mind
+    failed = {name: one.reason for name, one in statuses.items() if one.status == "failed"}
+    assert set(statuses) - set(failed) == {"0001.jpg"}
+    assert set(failed) == {"0004.jpg", "0007.jpg", "0010.jpg"}
+    assert all(one.startswith("the image cannot be used: ") for one in failed.values())
+    assert "200x100, its camera says 400x300" in failed["0007.jpg"]
+    # they are not in the pose file, and the other one does not mind
     expected = (finished / POSES).read_text().splitlines(keepends=True)
-    assert (run / POSES).read_text() == "".join(r for r in expected if "0004" not in r)
+    assert (run / POSES).read_text() == "".join(r for r in expected if "0001" in r)
 
 
 def test_no_query_localized_is_no_error(evaluate: Any, dataset: Path) -> None:
-    blacken(dataset, ["0001.jpg", "0004.jpg", "0007.jpg", "0010.jpg"])
+    for image in (dataset / "query/sensors/records_data").iterdir():
+        write_image(image, np.zeros((300, 400, 3), np.uint8))
     run = dataset.parent / "run"
     done = evaluate(dataset, run)
     assert "warning: no query was localized; reasons are in localized/status.csv" in done.err
     assert (run / POSES).read_text() == ""
     assert recall(run) == [0.0] * 4
     # no fallback unless it is asked for, and then it is marked
-    done = evaluate(dataset, run, "--set", "localization.fallback=retrieval")
-    assert ran(done.err) == ["localization", "submission", "evaluation"]
+    fallback = ("--set", "localization.fallback=retrieval", "--until", "submission")
+    assert ran(evaluate(dataset, run, *fallback).err) == ["localization", "submission"]
     statuses = read_status(run / "localized" / "status.csv")
+    assert {s.reason for s in statuses.values()} == {"no map image matches"}
     assert {s.status for s in statuses.values()} == {"failed"}
     assert {s.fallback for s in statuses.values()} == {"retrieval"}
     poses = KaptureFolder(run / "localized").read().poses()
@@ -377,7 +383,7 @@ def test_equal_names_in_map_and_query(
         r"4 images have the same name in map and query, .*0000\.jpg.*--query-prefix"
     )
     assert not run.exists()
-    evaluate(dataset, run, "--query-prefix", "queries")
+    evaluate(dataset, run, "--query-prefix", "queries", "--until", "submission")
     found = dict(row.split(" ", 1) for row in (run / POSES).read_text().splitlines())
     expected = dict(row.split(" ", 1) for row in (finished / POSES).read_text().splitlines())
     # the pairs are another order of the same, and so the draws of the solver
@@ -385,7 +391,7 @@ def test_equal_names_in_map_and_query(
     for new, old in names.items():
         pose = np.array(found[f"queries/{new}"].split(), float)
         np.testing.assert_allclose(pose, np.array(expected[old].split(), float), atol=2e-2)
-    assert recall(run) == [1.0] * 4
+    assert set(KaptureFolder(run / "query_gt").read().poses()) == set(found)
 
 
 def test_verify_finds_what_size_and_time_do_not_show(

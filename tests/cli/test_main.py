@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -21,7 +22,14 @@ import megloc_kapture
 from megloc_kapture import plugin_loading
 from megloc_kapture.cli.common import Console
 from megloc_kapture.cli.info import shown
-from megloc_kapture.cli.main import COMMANDS, EXAMPLES, _parser, command_class, summary
+from megloc_kapture.cli.main import (
+    COMMANDS,
+    EXAMPLES,
+    _parser,
+    command_class,
+    main,
+    summary,
+)
 from megloc_kapture.pipeline.presets import PRESETS, options_of, options_of_preset
 from megloc_kapture.stages.options import PipelineOptions
 
@@ -43,7 +51,10 @@ BAD_ARGUMENTS = {
 
 
 @pytest.mark.parametrize(("arguments", "message"), BAD_ARGUMENTS.values(), ids=BAD_ARGUMENTS)
-def test_argument_errors_are_one_line(megloc: Any, arguments: list[str], message: str) -> None:
+def test_argument_errors_are_one_line(
+    megloc: Any, arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
     line = megloc(*arguments).refused(message)
     assert "megloc" in line and "--help" in line
     assert not set("│╭╰─") & set(line)
@@ -74,8 +85,8 @@ def test_a_drawn_box_becomes_one_line() -> None:
     assert summary("") == "the arguments cannot be used"
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
-def test_argument_errors_are_one_line_in_a_terminal_of_any_width(encoding: str) -> None:
+@pytest.mark.parametrize("encoding", ["ascii", pytest.param("utf-8", marks=pytest.mark.slow)])
+def test_argument_errors_are_one_line_in_a_terminal_of_any_encoding(encoding: str) -> None:
     done = subprocess.run(
         [PROGRAM, "triangulate", "--input", "x"],
         env=os.environ | {"PYTHONIOENCODING": encoding, "COLUMNS": "40"},
@@ -202,30 +213,46 @@ MEETINGS = {
 }
 
 
-@pytest.mark.parametrize(("number", "told"), [("SIGINT", "interrupted"), ("SIGTERM", "terminated")])
-@pytest.mark.parametrize("meeting", MEETINGS.values(), ids=MEETINGS)
-def test_a_signal_ends_a_run_whatever_it_meets(number: str, told: str, meeting: str) -> None:
-    meeting = meeting.replace("NUMBER", f"signal.{number}").replace("\n        ", "\n    ")
-    script = f"""
-import ctypes, signal, sys, time
+# forks a process for each meeting, so that what all need is imported once
+EVERY_MEETING = """
+import ctypes, json, os, signal, sys, time
+import tyro
 from megloc_kapture.cli import main
 from megloc_kapture.cli.weights import Doctor
 from megloc_kapture.errors import MeglocError
-def run(self, console):
-{meeting}
-Doctor.run = run
-sys.argv = ["megloc", "doctor"]
-main.main()
+ends = {}
+for name, body in json.loads(sys.argv[1]).items():
+    reading, writing = os.pipe()
+    if (child := os.fork()) == 0:
+        os.dup2(writing, sys.stderr.fileno())
+        exec("def run(self, console):" + body)
+        Doctor.run = run
+        sys.argv = ["megloc", "doctor"]
+        main.main()
+    os.close(writing)
+    with open(reading) as told:
+        err = told.read()
+    ends[name] = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), err
+print(json.dumps(ends))
 """
+
+
+def test_a_signal_ends_a_run_whatever_it_meets() -> None:
+    numbers = {"SIGINT": (130, "interrupted"), "SIGTERM": (143, "terminated")}
+    bodies, expected = {}, {}
+    for number, (status, told) in numbers.items():
+        for meeting, body in MEETINGS.items():
+            name = f"{number} {meeting}"
+            bodies[name] = body.replace("NUMBER", f"signal.{number}")
+            expected[name] = [status, f"megloc: {told}; run the same command again to go on\n"]
     run = subprocess.run(
-        [sys.executable, "-c", script],
-        capture_output=True,
+        [sys.executable, "-c", EVERY_MEETING, json.dumps(bodies)],
+        stdout=subprocess.PIPE,
         text=True,
         # a shell ignores SIGINT for what it starts in the background, and that is inherited
         preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
     )
-    assert run.stderr == f"megloc: {told}; run the same command again to go on\n"
-    assert run.returncode == {"SIGINT": 130, "SIGTERM": 143}[number]
+    assert json.loads(run.stdout) == expected
 
 
 @pytest.mark.parametrize("example", EXAMPLES)
@@ -270,17 +297,18 @@ def completed(script: str, *words: str) -> list[str]:
     return done.stdout.split()
 
 
-def script_for(shell: str) -> str:
-    command = [PROGRAM, "--tyro-print-completion", shell]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+def script_for(shell: str, capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit):
+        main(["--tyro-print-completion", shell])
+    return capsys.readouterr().out
 
 
-def test_completion_knows_commands_and_their_flags() -> None:
-    script = script_for("bash")
+def test_completion_knows_commands_and_their_flags(capsys: pytest.CaptureFixture[str]) -> None:
+    script = script_for("bash", capsys)
     assert set(COMMANDS) <= set(completed(script, "megloc", ""))
     assert completed(script, "megloc", "loc") == ["localize"]
     assert "--features-dir" in completed(script, "megloc", "match", "--feat")
-    assert script_for("zsh").startswith("#compdef megloc")
+    assert script_for("zsh", capsys).startswith("#compdef megloc")
 
 
 def test_every_option_is_listed_with_a_meaning(megloc: Any) -> None:

@@ -55,7 +55,8 @@ def test_photographs(megloc: Any, finished: Path, scene: Path, tmp_path: Path) -
     first = query.image_path("0004.jpg")
     truth = KaptureFolder(scene / "query_gt").read().poses()["0004.jpg"]
     place = tmp_path / "photos"
-    for orientation in range(1, 9):
+    orientations = (1, 5, 6, 8)
+    for orientation in orientations:
         name = f"my dir/{orientation}.jpg"
         focal = 0 if orientation == 1 else 26
         photograph(first, place / name, orientation=orientation, focal_35mm=focal)
@@ -67,14 +68,14 @@ def test_photographs(megloc: Any, finished: Path, scene: Path, tmp_path: Path) -
     size, film = (400, 298), str(place / "walk.avi")
     writer = cv2.VideoWriter(film, cv2.VideoWriter.fourcc(*"MJPG"), 10, size)
     for name in query.read().image_names():
-        for _ in range(4):
+        for _ in range(8):
             writer.write(cv2.resize(cv2.imread(str(query.image_path(name))), size))
     writer.release()
 
     out = tmp_path / "out"
-    done = megloc("localize", "-i", finished / "map", "--images", place, "--every", "4", "-o", out)
+    done = megloc("localize", "-i", finished / "map", "--images", place, "--every", "16", "-o", out)
     assert done.status == 0
-    assert done.out.startswith("12 of 16 queries localized in "), done
+    assert done.out.startswith("6 of 10 queries localized in "), done
     statuses = read_status(out / "status.csv")
     reasons = {name: row.reason for name, row in statuses.items() if row.status == "failed"}
     assert set(reasons) == {"cut.jpg", "empty.jpg", "phone.HEIC", "grey.png"}
@@ -85,9 +86,9 @@ def test_photographs(megloc: Any, finished: Path, scene: Path, tmp_path: Path) -
     # what is written is kapture with upright images, and the cameras that the poses go with
     theirs = kapture_from_dir(str(out))
     ours = KaptureFolder(out).read()
-    assert len(theirs.records_camera.data_list()) == 14 == len(ours.image_names())
+    assert len(theirs.records_camera.data_list()) == 8 == len(ours.image_names())
     poses = ours.poses()
-    for orientation in range(1, 9):
+    for orientation in orientations:
         name = f"my dir/{orientation}.jpg"
         assert np.linalg.norm(poses[name].center() - truth.center()) < 0.05
         camera = ours.camera_of(name)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
+import shutil
 from collections.abc import Callable
+from contextlib import redirect_stderr
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -12,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 
+from megloc_kapture.cli.main import main
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.io.tables import read_match_counts
 
@@ -34,10 +38,12 @@ class Made:
     map: Path
 
 
-@pytest.fixture
-def made(megloc: Any, scene: Path, tmp_path: Path) -> Made:
-    """Every stage up to the map and the matches of the queries, each by its own command."""
-    made = Made(*(tmp_path / field.name for field in fields(Made)))
+@pytest.fixture(scope="module")
+def made(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """Every stage up to the map and the matches of the queries, each by its own command; not to
+    be written into."""
+    root = tmp_path_factory.mktemp("made")
+    made = Made(*(root / field.name for field in fields(Made)))
     mapping, query = scene / "mapping", scene / "query"
     local = ["--features-dir", made.features]
     both = [*local, "--features-dir", made.vlad]
@@ -52,8 +58,9 @@ def made(megloc: Any, scene: Path, tmp_path: Path) -> Made:
         [*match, made.query_pairs, "--query", query, "-o", made.query_matches],
         [*triangulate, "--pairs", made.mapping_pairs, "-o", made.map],
     ):
-        done = megloc(*command, "--quiet")
-        assert (done.status, done.err) == (0, ""), command[0]
+        with pytest.raises(SystemExit) as end, redirect_stderr(io.StringIO()) as told:
+            main([*map(str, command), "--quiet"])
+        assert (end.value.code, told.getvalue()) == (0, ""), command[0]
     return made
 
 
@@ -191,14 +198,16 @@ def test_a_scheduler_that_nothing_asks_is_refused(
         assert megloc(*given[:-1], given[-1], "-f", "--workers", "0").status == 2
 
 
-def test_output_of_another_kind_is_refused(megloc: Any, made: Made, scene: Path) -> None:
+def test_output_of_another_kind_is_refused(
+    megloc: Any, made: Made, scene: Path, tmp_path: Path
+) -> None:
     # features where a map is
     command = ["extract-local", "-i", scene / "query", "-o", made.map, *OPTIONS, *INLINE]
     megloc(*command, "-q").refused(f"{made.map}: is not empty and not a features of megloc")
     # more features beside ours
-    command[4] = made.vlad
+    command[4] = shutil.copytree(made.vlad, tmp_path / "vlad")
     assert megloc(*command, "-q").status == 0
-    assert KaptureFolder(scene / "query", features_dirs=[made.vlad]).types("keypoints")
+    assert KaptureFolder(scene / "query", features_dirs=[tmp_path / "vlad"]).types("keypoints")
 
 
 def test_what_cannot_be_extracted_is_refused(megloc: Any, scene: Path, tmp_path: Path) -> None:
@@ -252,6 +261,7 @@ def test_a_map_of_two_types_of_features(megloc: Any, scene: Path, tmp_path: Path
     features, mapping, pairs = tmp_path / "features", scene / "mapping", tmp_path / "pairs.txt"
     place = ("-i", mapping, "--features-dir", features)
     few = ("--set", "local_features.rootsift.options.max_keypoints=500")
+    few += ("--set", "local_features.sift.options.first_octave=0")
     both = ("--features", "rootsift", "sift")
     match = ["match", *place, "--pairs", pairs, "-o", features, *INLINE, "--features"]
     commands = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -36,12 +37,17 @@ def distance(files: tuple[Path, Path], **options: object) -> Any:
     return load_plugin(IMAGE_DISTANCES, "lpips", given)
 
 
-def by_network(files: tuple[Path, Path], a: np.ndarray, b: np.ndarray, valid: np.ndarray) -> float:
+@cache
+def network(files: tuple[Path, Path]) -> Lpips:
     net = Lpips("squeeze")
     net.load_state_dict({k: v for f in files for k, v in torch.load(f, weights_only=True).items()})
+    return net
+
+
+def by_network(files: tuple[Path, Path], a: np.ndarray, b: np.ndarray, valid: np.ndarray) -> float:
     tensors = [torch.from_numpy(x.transpose(2, 0, 1)[None] / 255.0).float() for x in (a, b)]
     with torch.inference_mode():
-        return float(net(*tensors, torch.from_numpy(valid)[None, None].float())[0])
+        return float(network(files)(*tensors, torch.from_numpy(valid)[None, None].float())[0])
 
 
 def pictures(count: int = 2, height: int = 80) -> np.ndarray:

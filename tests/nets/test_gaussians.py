@@ -102,7 +102,8 @@ def test_gradients_are_those_of_differences(monkeypatch: pytest.MonkeyPatch) -> 
         return nerf_w_loss(found, seen) + found.depth.sum()
 
     values = [getattr(field, name).detach().clone().requires_grad_() for name in names]
-    assert torch.autograd.gradcheck(loss, values, eps=1e-7, atol=1e-4)
+    # along a random direction of each
+    assert torch.autograd.gradcheck(loss, values, eps=1e-7, atol=1e-4, fast_mode=True)
 
 
 def test_what_is_transient_stands_before_all() -> None:

@@ -204,7 +204,8 @@ def test_without_bias_and_amplitudes() -> None:
 def test_gradients_fit_finite_differences() -> None:
     given = case(batch=1, channels=2, out=2, size=(3, 4), sigma_px=1.0)
     leaves = [values.requires_grad_() for values in given.values()]
-    assert torch.autograd.gradcheck(lambda *given: deform_conv2d(*given), leaves)
+    # along a random direction of each
+    assert torch.autograd.gradcheck(lambda *given: deform_conv2d(*given), leaves, fast_mode=True)
 
 
 def test_strips_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,13 +27,16 @@ from megloc_kapture.values import RigidTransform
 from tests.pipeline.runs import evaluated
 
 FEW = ("local_features.rootsift.options.max_keypoints=300",)
-TWO_TYPES = ('local_features=["rootsift","sift"]', *FEW)
+TWO_TYPES = (
+    *('local_features=["rootsift","sift"]', "local_features.sift.options.first_octave=0"),
+    *FEW,
+)
 
 
 def both(scene: Path, root: Path, *assignments: str) -> tuple[Workspace, Localizer]:
-    """A workspace in which all stages have run, and a localizer in its map, of the same options."""
+    """A workspace with localized queries, and a localizer in its map, of the same options."""
     options = options_of_preset(assignments=assignments)
-    workspace = evaluated(root, scene, options)
+    workspace = evaluated(root, scene, options, last="submission")
     return workspace, Localizer(KaptureMap.open(workspace.path("map")), options=options)
 
 
@@ -162,7 +165,8 @@ def test_the_same_refined_poses(with_depth: Path, tmp_path: Path, by: str) -> No
 @pytest.mark.parametrize("by", ["icp", pytest.param("rendering", marks=pytest.mark.slow)])
 def test_the_command_writes_what_eval_writes(with_depth: Path, tmp_path: Path, by: str) -> None:
     sets = [*FEW, f'pose_refinement.by=["{by}"]', "preprocessing.max_size_px=240"]
-    workspace = evaluated(tmp_path / "w", with_depth, options_of_preset(assignments=sets))
+    options = options_of_preset(assignments=sets)
+    workspace = evaluated(tmp_path / "w", with_depth, options, last="submission")
     flags = [flag for one in sets for flag in ("--set", one)]
     out, inputs = tmp_path / "localized", [str(workspace.path(name)) for name in ("map", "query")]
     with pytest.raises(SystemExit) as end:

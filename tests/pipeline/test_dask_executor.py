@@ -144,7 +144,8 @@ def test_a_scheduler_that_goes_away_is_one_line(tmp_path: Path) -> None:
                 kill_session(found.scheduler.pid)
 
 
-def test_what_cannot_be_used_is_refused(cluster: Cluster) -> None:
+def test_what_cannot_be_used_is_refused(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dask_executor, "_CONNECT_S", 1.0)
     with (
         pytest.raises(OptionError, match="no dask scheduler at tcp://127.0.0.1:1$"),
         open_executor("dask", scheduler="tcp://127.0.0.1:1"),

@@ -123,9 +123,10 @@ TYPES = ("rootsift", "rootsift-pyramid")
 def workspaces(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Workspace]:
     """A run without and one with guided pyramids, by the type that their maps are of."""
     root = tmp_path_factory.mktemp("pyramids")
+    plain, guided = (options_of_preset(assignments=[FEW, *more]) for more in ((), PYRAMID))
     return {
-        name: evaluated(root / name, scene, options_of_preset(assignments=[FEW, *more]))
-        for name, more in zip(TYPES, ((), PYRAMID), strict=True)
+        "rootsift": evaluated(root / "rootsift", scene, plain, last="map"),
+        "rootsift-pyramid": evaluated(root / "pyramid", scene, guided, last="localization"),
     }
 
 

@@ -103,11 +103,10 @@ def test_gaussians_learn_the_room_and_begin_with_its_depth() -> None:
 
 def test_half_precision_learns_nearly_the_same() -> None:
     half = QUICK.model_copy(update={"half_precision": True})
-    exact, near = (train_field(views(5), each)[0].module.state_dict() for each in (QUICK, half))
+    fields = [train_field(views(5), each)[0] for each in (QUICK, half)]
+    exact, near = (field.module.state_dict() for field in fields)
     assert any(not torch.equal(exact[name], near[name]) for name in exact)
-    images = [
-        train_field(views(5), each)[0].render(SMALL, IDENTITY).image for each in (QUICK, half)
-    ]
+    images = [field.render(SMALL, IDENTITY).image for field in fields]
     assert np.abs(np.subtract(*np.float64(images))).mean() < 8
 
 

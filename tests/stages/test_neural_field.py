@@ -87,7 +87,7 @@ def exact(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_from_ten_centimetres_to_millimetres(exact: None) -> None:
     rng = np.random.default_rng(0)
-    for number, truth in enumerate(room.poses(3, 4)):
+    for number, truth in enumerate(room.poses(2, 4)):
         seen = room.render(truth, camera=LARGER, light=number % 2, moving=number)
         found = refined("exact", LARGER, seen.image, perturbed(truth, 0.1, 2.0, rng))
         error_m, error_deg = movement(truth, found.cam_from_world)

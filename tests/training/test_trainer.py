@@ -104,7 +104,8 @@ def interrupted_after(step: int) -> Work:
     return Work(track=track)
 
 
-@pytest.mark.parametrize("task", ["matcher", "descriptor"])
+# of descriptors the matcher is a part
+@pytest.mark.parametrize("task", [pytest.param("matcher", marks=pytest.mark.slow), "descriptor"])
 def test_interrupted_and_resumed_is_uninterrupted(
     task: str,
     files: dict[str, str],
