@@ -45,7 +45,7 @@ from megloc_kapture.pipeline.datasets import (
     check_known,
     dataset_names,
 )
-from megloc_kapture.pipeline.workspace import read_manifest
+from megloc_kapture.pipeline.workspace import Manifest, read_manifest
 from megloc_kapture.stages import scene
 from megloc_kapture.values import Pose, RigidTransform
 
@@ -105,7 +105,6 @@ def write_submission(
     tables: Path | None,
     provenance: Mapping[str, Any],
     from_rig: bool = False,
-    weights: Mapping[str, str] | None = None,
 ) -> dict[str, int]:
     """Write the pose file or files of a localized kapture, and the provenance beside them.
 
@@ -120,7 +119,6 @@ def write_submission(
         ``stages/`` (the dataset's fingerprint), where there are any.
     provenance : entries for the provenance (dataset, preset, options).
     from_rig : queries without a pose of their own get one through the rig.
-    weights : name -> SHA-256 of the network weights that took part.
 
     Returns
     -------
@@ -156,7 +154,7 @@ def write_submission(
     known = set(posed)
     entries = {
         **provenance,
-        "weights": dict(weights or {}),
+        "weights": _weights(localized),
         "confidence": {i: c for i, c in sorted(result.confidences.items()) if i in known},
         "dataset_fingerprint": _dataset_fingerprint(beside),
         "dummies" if rules.pose_file == "mlad" else "missing": missing,
@@ -276,16 +274,49 @@ def workspace_provenance(localized: Path) -> dict[str, Any]:
 
     They are told only where they are those of this very result, and not of an older one.
     """
-    stages = localized.resolve().parent / "stages"
-    made = read_manifest(stages / "localization.json")
-    handed_in = read_manifest(stages / "submission.json")
-    if made is None or localized.resolve().name not in made.outputs:
+    manifests = _manifests(localized)
+    made = _maker(localized, manifests)
+    if made is None:
         return {}
     found: dict[str, Any] = {"localization_fingerprint": made.fingerprint}
-    if handed_in is not None and handed_in.inputs.get("localization") == made.output:
+    handed_in = manifests.get("submission")
+    if handed_in is not None and handed_in.inputs.get(made.stage) == made.output:
         options = handed_in.options
         found |= {key: options[key] for key in ("preset", "options") if key in options}
     return found
+
+
+def _weights(localized: Path) -> dict[str, str]:
+    """File name to SHA-256 of the weights of all networks that took part in a workspace's result.
+
+    They stand in the manifests of the stages that it was made of, which are followed back by what
+    each has read. Nothing where it is in no workspace.
+    """
+    manifests = _manifests(localized)
+    made = _maker(localized, manifests)
+    reached = {} if made is None else {made.stage: made}
+    for manifest in (waiting := list(reached.values())):
+        for stage, output in manifest.inputs.items():
+            before = manifests.get(stage)
+            if before is not None and before.output == output and stage not in reached:
+                reached[stage] = before
+                waiting.append(before)
+    found = {}
+    for manifest in reached.values():
+        found |= manifest.options.get("weights", {})
+    return dict(sorted(found.items()))
+
+
+def _manifests(localized: Path) -> dict[str, Manifest]:
+    """The manifests, by stage, of the workspace that a result is in."""
+    found = map(read_manifest, (localized.resolve().parent / "stages").glob("*.json"))
+    return {manifest.stage: manifest for manifest in found if manifest is not None}
+
+
+def _maker(localized: Path, manifests: Mapping[str, Manifest]) -> Manifest | None:
+    """The manifest of the stage that wrote a result."""
+    name = localized.resolve().name
+    return next((one for one in manifests.values() if name in one.outputs), None)
 
 
 FOLDER = "submissions"

@@ -310,7 +310,7 @@ def test_mlad_files_are_those_of_kaptures_own_exporter(tmp_path: Path, far: bool
 def test_mlad_rows_without_a_pose_are_dummies_by_name(tmp_path: Path) -> None:
     drives = Drives(tmp_path / "workspace", World(official_from_local=FAR))
     place = tmp_path / "out" / "submission"
-    write_submission(drives.result, place, tables=drives.tables, provenance={}, weights={"n": "0a"})
+    write_submission(drives.result, place, tables=drives.tables, provenance={})
     rows = read_mlad_file(place / "a_to_b.txt")
     assert [(row.reference, row.query) for row in rows] == drives.pairs
     last = place / "a_to_b.txt"
@@ -321,7 +321,6 @@ def test_mlad_rows_without_a_pose_are_dummies_by_name(tmp_path: Path) -> None:
         f"a_to_b.txt: {drives.rows[3].reference} {drives.rows[3].query}",
         f"sub/b.txt: {drives.unposed.reference} {drives.unposed.query}",
     ]
-    assert beside["weights"] == {"n": "0a"}
     assert sorted(beside["files"]) == ["a_to_b.txt", "sub/b.txt"]
     # lengths are the official ones
     first = rows[1].query_from_reference
@@ -342,15 +341,15 @@ def test_provenance_says_where_it_comes_from_and_when_nothing(
     dataset.localize(["dawn/rear/10.jpg"], {})
     write_json_model(dataset.root / "stages" / "import.json", manifest("import"))
     place = tmp_path / "poses.txt"
-    _, beside = submit(dataset, place, weights={"superpoint": "ab"})
+    _, beside = submit(dataset, place)
     assert beside["dataset_fingerprint"] == "print of import"
-    assert beside["weights"] == {"superpoint": "ab"}
+    assert beside["weights"] == {}
     assert beside["dataset"] == "robotcar" and beside["preset"] == "classic"
     assert beside["options"] == {"a": 1} and "megloc-kapture" in beside["versions"]
     assert beside["files"] == {"poses.txt": hashlib.sha256(place.read_bytes()).hexdigest()}
     text = place.with_name("poses.txt.json").read_text()
     assert "2024" not in text and "1.5" not in text
-    submit(dataset, tmp_path / "again" / "poses.txt", weights={"superpoint": "ab"})
+    submit(dataset, tmp_path / "again" / "poses.txt")
     assert (tmp_path / "again" / "poses.txt").read_bytes() == place.read_bytes()
     assert (tmp_path / "again" / "poses.txt.json").read_text() == text
 
@@ -369,6 +368,29 @@ def test_options_of_a_workspace_are_told_only_where_they_are_the_results(tmp_pat
         told = workspace_provenance(result)
         own = {"preset": "classic", "options": {"map": "lift"}} if read.startswith("print") else {}
         assert told == {"localization_fingerprint": "print of localization"} | own
+
+
+def test_weights_are_those_of_the_stages_that_a_result_is_made_of(
+    dataset: Dataset, tmp_path: Path
+) -> None:
+    dataset.localize(["dawn/rear/10.jpg"], {})
+    stages = dataset.result.parent / "stages"
+    for one in (
+        manifest("local_features", options={"weights": {"superpoint.pth": "ab"}}),
+        manifest("matches", inputs={"local_features": "print of local_features"}),
+        manifest("global_features", options={"weights": {"netvlad.mat": "cd"}}),
+        # of another run, whose features are not there any more
+        manifest("ranking", options={"weights": {"lpips.pth": "ef"}}),
+        manifest(
+            "pose_refinement",
+            options={"weights": {"field.pth": "01"}},
+            inputs={"matches": "print of matches", "global_features": "an older one"},
+            outputs=(dataset.result.name,),
+        ),
+    ):
+        write_json_model(stages / f"{one.stage}.json", one)
+    _, beside = submit(dataset, tmp_path / "poses.txt")
+    assert beside["weights"] == {"field.pth": "01", "superpoint.pth": "ab"}
 
 
 @pytest.mark.parametrize(
