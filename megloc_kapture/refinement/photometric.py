@@ -141,6 +141,7 @@ class LevelProblem:
         at = Alignment(cam_from_world, np.ones(shape), np.zeros(shape), np.inf)
         rows = few.rows(at)
         seen = ~np.isnan(rows[..., 0])
+        rows[~seen] = np.nan  # what lies there was never written, and might warn
         for _ in range(_NUISANCE_STEPS):
             steps = few.system_of(rows, at.squared_scale).nuisance_step()
             at = at.moved(cam_from_world, *steps)
