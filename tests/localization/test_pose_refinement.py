@@ -77,7 +77,7 @@ def refined(
     count = len(view.points_px)
     usable = np.ones(count, dtype=np.bool_) if usable is None else usable
     estimate = PoseEstimate(start, usable, usable, np.zeros(count))
-    return refine_pose(PoseProblem.of([view]), estimate, options)
+    return refine_pose(PoseProblem.of([view]), estimate, options or AbsolutePoseOptions())
 
 
 def six(matrices: Array) -> Array:
