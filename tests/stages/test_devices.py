@@ -84,6 +84,7 @@ def test_features_of_a_batch(
     options = {"min_size": 96, "max_size": 144} if name == "r2d2" else {}
     given = {"weights": str(path), "device": "cpu", **options}
     extractor = load_plugin(LOCAL_FEATURES, name, given)
+    frames = frames[1:4]  # one of them masked
     alone = [extractor.extract(*frame) for frame in frames]
     assert min(len(found.scores) for found in alone) > 20
     together = extractor.extract_many(*map(list, zip(*frames, strict=True)))
@@ -96,7 +97,7 @@ def test_features_of_a_batch(
         np.testing.assert_allclose(a.descriptors[row[near]], b.descriptors[near], atol=5e-3)
         assert a.num_masked == pytest.approx(b.num_masked, abs=2)
     # on a processor each runs alone: the same bytes, whatever it comes with
-    for a, b in zip(alone, extract_all(extractor, frames, NAMES), strict=True):
+    for a, b in zip(alone, extract_all(extractor, frames, NAMES[1:4]), strict=True):
         assert a.keypoints_px.tobytes() == b.keypoints_px.tobytes()
         assert a.descriptors.tobytes() == b.descriptors.tobytes()
 
