@@ -294,22 +294,24 @@ def _weights(localized: Path) -> dict[str, str]:
     """
     manifests = _manifests(localized)
     made = _maker(localized, manifests)
-    reached = {} if made is None else {made.stage: made}
-    for manifest in (waiting := list(reached.values())):
+    reached: dict[str, Manifest] = {}
+    waiting = [] if made is None else [made]
+    while waiting:
+        manifest = waiting.pop()
+        reached[manifest.stage] = manifest
         for stage, output in manifest.inputs.items():
             before = manifests.get(stage)
             if before is not None and before.output == output and stage not in reached:
-                reached[stage] = before
                 waiting.append(before)
-    found = {}
-    for manifest in reached.values():
-        found |= manifest.options.get("weights", {})
+    weights = [one.options.get("weights") for one in reached.values()]
+    found = {file: sha for part in weights if isinstance(part, dict) for file, sha in part.items()}
     return dict(sorted(found.items()))
 
 
 def _manifests(localized: Path) -> dict[str, Manifest]:
     """The manifests, by stage, of the workspace that a result is in."""
-    found = map(read_manifest, (localized.resolve().parent / "stages").glob("*.json"))
+    paths = sorted((localized.resolve().parent / "stages").glob("*.json"))
+    found = map(read_manifest, paths)
     return {manifest.stage: manifest for manifest in found if manifest is not None}
 
 
