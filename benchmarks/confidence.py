@@ -42,7 +42,7 @@ from megloc_kapture.geometry.cameras import principal_point_px, shift_principal_
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.localization import confidence
-from megloc_kapture.localization.confidence import TERMS
+from megloc_kapture.localization.confidence import MIRROR_ASKED, MIRRORED, TERMS
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import assigned
 from megloc_kapture.preprocessing.frames import scaled_camera
@@ -144,6 +144,8 @@ def collect(
     changes: Sequence[str] = (),
 ) -> pd.DataFrame:
     """Localize every query of one map, and keep every pose."""
+    # of every pose: what the others' calibration makes of it is not known yet
+    confidence.MIRROR_ASKED = 0.0, 2.0
     with TemporaryDirectory() as folder:
         place = Path(folder) / "map"
         built = megloc.build_map(scene / "mapping", preset, set=assigned(changes), workspace=place)
@@ -211,9 +213,12 @@ def fitted(table: pd.DataFrame, terms: Sequence[str], origin: str) -> confidence
 def confidences(table: pd.DataFrame, model: confidence.Calibration) -> NDArray[np.float64]:
     """Confidences of the rows; NaN without a pose."""
     found = np.full(len(table), np.nan)
+    lowest, beyond_doubt = MIRROR_ASKED
     for at, row in enumerate(table.to_dict("records")):
         if row["localized"]:
             found[at] = model.probability(row)
+            if lowest <= found[at] < beyond_doubt and row.get(MIRRORED, 1.0) < 1.0:
+                found[at] *= row[MIRRORED]
     return found
 
 

@@ -30,7 +30,7 @@ from megloc_kapture.localization.absolute_pose import (
     refine_pose,
     transform_covariance,
 )
-from megloc_kapture.localization.confidence import match_sources, with_confidence
+from megloc_kapture.localization.confidence import MatchSources, match_sources, with_confidence
 from megloc_kapture.localization.focal_length import (
     estimate_with_intrinsics,
     focal_remark,
@@ -38,6 +38,7 @@ from megloc_kapture.localization.focal_length import (
     refine_with_intrinsics,
 )
 from megloc_kapture.localization.map_index import Correspondences, MapIndex, PoseProblem, QueryView
+from megloc_kapture.localization.mirrored import mirror_matches
 from megloc_kapture.localization.ranking import poses_agree
 from megloc_kapture.localization.structure import displacements_rad
 from megloc_kapture.plugins import HypothesisView, PoseHypothesis, RankingScene
@@ -242,11 +243,13 @@ def localize_in_clusters(
             sources = match_sources(views, found, ranked[best].images, centers or {})
             if scene is not None:
                 seen = partial(displacements_rad, problem, views, found, scene)
-                sources = replace(sources, displacements_rad=seen)
+                reflected = partial(_mirror_matches, views, ranked[best].images, sources, scene)
+                sources = replace(sources, displacements_rad=seen, mirror_matches=reflected)
             result = with_confidence(problem, result, sources, options.max_error_px, min_confidence)
             if isinstance(result, Pose) and result.camera is None:
                 remark = focal_remark(problem, result)
-                result = replace(result, remarks=(remark,) if remark else ())
+                remarks = (*result.remarks, remark) if remark else result.remarks
+                result = replace(result, remarks=remarks)
             clock.lap("confidence")
     result = replace(result, candidates=ranked[best].images, clusters=ranked, seconds=clock.seconds)
     if isinstance(result, Failure):
@@ -258,6 +261,28 @@ def localize_in_clusters(
         inlier_points_world=problem.points[result.inliers] + problem.offset,
     )
     return pose, problem
+
+
+def _mirror_matches(
+    views: Sequence[QueryView],
+    cluster: Sequence[str],
+    sources: MatchSources,
+    scene: RankingScene,
+    pose: Pose,
+) -> tuple[int, int]:
+    """Matches as they are and reflected, with each view's map images of most inliers first."""
+    assert pose.inliers is not None  # it was estimated here
+    sighted = np.repeat(pose.inliers, sources.support)
+    counts = np.bincount(sources.images[sighted], minlength=len(cluster))
+    by_inliers = [cluster[at] for at in np.argsort(-counts, kind="stable")]
+    matched = [set(view.matched_images()) for view in views]
+    return mirror_matches(
+        [
+            (view.name, [image for image in by_inliers if image in own])
+            for view, own in zip(views, matched, strict=True)
+        ],
+        scene,
+    )
 
 
 @dataclass(frozen=True, eq=False)

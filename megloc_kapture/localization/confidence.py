@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from megloc_kapture.geometry.cameras import focal_px, project
 from megloc_kapture.localization.absolute_pose import center_deviation, match_errors
 from megloc_kapture.localization.map_index import Correspondences, PoseProblem, QueryView
+from megloc_kapture.localization.mirrored import chance_of, is_mirrored
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
 Floats = NDArray[np.float64]
@@ -38,6 +39,9 @@ _MIN_NOISE_PX = 0.3
 # an image of the scene fits worse than the map makes expected by less than that, and fewer inliers
 # than these say nothing about it
 _USUAL_RATIO, _FEW = 2.9, 20
+# of confidences from the one to below the other it is asked whether the image is mirrored, which
+# takes 0.3 s
+MIRROR_ASKED = 0.1, 0.995
 
 TERMS: dict[str, str] = {
     "surprise": "hardly more matches agree than would by chance",
@@ -51,6 +55,9 @@ TERMS: dict[str, str] = {
     "support": "few map images agree with the pose",
 }
 """The terms of the model, and what a low contribution of each says."""
+MIRRORED = "mirrored"
+"""Beside the terms: by what probability chance makes features match better in the mirror so much.
+It multiplies the model's; there only where the image seems to be mirrored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +76,8 @@ class MatchSources:
     local_types : keypoints types of the matches.
     displacements_rad : of a pose the angles by which the scene stands elsewhere in the query than
         the pose says, by the looks of its map images; empty where that cannot be told.
+    mirror_matches : of a pose how many features match the map's images as they are, and how many
+        reflected, see :mod:`megloc_kapture.localization.mirrored`.
     """
 
     support: NDArray[np.int64]
@@ -79,6 +88,7 @@ class MatchSources:
     seen: Sequence[Floats]
     local_types: Collection[str] = ()
     displacements_rad: Callable[[Pose], Floats] | None = None
+    mirror_matches: Callable[[Pose], tuple[int, int]] | None = None
 
 
 def evidence_of(
@@ -129,12 +139,25 @@ def with_confidence(
     model = calibration_for(sources.local_types)
     confidence = model.probability(evidence)
     weakest = min(model.weights, key=lambda name: model.weights[name] * evidence[name])
+    why, remarks = TERMS[weakest], pose.remarks
+    lowest, beyond_doubt = MIRROR_ASKED
+    asked = max(min_confidence, lowest) <= confidence < beyond_doubt
+    if asked and sources.mirror_matches is not None:
+        as_it_is, mirrored = sources.mirror_matches(pose)
+        if is_mirrored(as_it_is, mirrored):
+            chance = chance_of(as_it_is, mirrored)
+            confidence *= chance
+            evidence[MIRRORED] = chance
+            why = (
+                f"the image seems to be mirrored: {as_it_is} features match the map's images as "
+                f"they are, {mirrored} reflected"
+            )
+            remarks = (*remarks, why)
     if confidence >= min_confidence:
-        return replace(pose, confidence=confidence, evidence=evidence)
+        return replace(pose, confidence=confidence, evidence=evidence, remarks=remarks)
     return Failure(
         f"confidence {confidence:.2g} of the pose, at least {min_confidence:g} is needed: "
-        f"{pose.num_inliers} of {pose.num_matches} 2D-3D matches agree, and "
-        f"{TERMS[weakest]}",
+        f"{pose.num_inliers} of {pose.num_matches} 2D-3D matches agree, and {why}",
         num_matches=pose.num_matches,
         num_inliers=pose.num_inliers,
         confidence=confidence,

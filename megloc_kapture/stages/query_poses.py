@@ -340,7 +340,7 @@ class LocalizeQueries(PipelineStage):
     """Estimate the poses of the queries from their matches with the map."""
 
     name = "localization"
-    version = 8
+    version = 9
     uses = ("localization", "guided_pyramid.mode", *LOCAL_TYPES)
     inputs = (
         MAPPING,

@@ -84,7 +84,7 @@ class KeptItems:
     journal : lines are added as items are done.
     sources : folders that may have items, and their journals; the first that has one counts.
     verify : hash all files that are taken over, see
-        :func:`~megloc_kapture.io.file_states.state_if_unchanged`.
+        :func:`~megloc_kapture.io.output_folders.state_if_unchanged`.
     states : of the files of items that are done, by path below the folder.
     """
 
