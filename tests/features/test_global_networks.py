@@ -217,10 +217,10 @@ def seen(plugin: GlobalNetwork[Any], *images: Image) -> torch.Tensor:
 def test_vectors_are_the_networks_of_what_it_sees(name: str, make: Make) -> None:
     plugin = make(name)
     assert isinstance(plugin, GlobalFeatureExtractor)
-    images = [texture(61, 83, seed, sigma_px=6.0) for seed in range(3)]
+    images = [texture(61, 83, seed, sigma_px=6.0) for seed in range(2)]
     many = plugin.describe_many(images)
     size, apart = SIZES[name]
-    assert many.shape == (3, size) and many.dtype == np.float32
+    assert many.shape == (2, size) and many.dtype == np.float32
     np.testing.assert_allclose(np.linalg.norm(many, axis=1), 1, atol=1e-6)
     assert np.abs(many[0] - many[1]).max() > apart
     for image, vector in zip(images, many, strict=True):

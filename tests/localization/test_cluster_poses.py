@@ -196,15 +196,13 @@ def test_a_covariance_moves_with_the_camera() -> None:
     rng = np.random.default_rng(3)
     root = rng.normal(size=(6, 6)) * 1e-3
     covariance = root @ root.T
-    draws = []
-    for xi in rng.multivariate_normal(np.zeros(6), covariance, 20_000):
-        rotation = Rotation.from_rotvec(xi[:3]).as_matrix()
-        step = RigidTransform.from_matrix(rotation, xi[3:])
-        # what the same step is, seen from the camera: C step = step_of_camera C
-        own = SIDE @ step @ SIDE.inverse()
-        vector = Rotation.from_matrix(own.rotation_matrix()).as_rotvec()
-        draws.append(np.concatenate([vector, own.translation]))
-    measured = np.cov(np.array(draws).T)
+    draws = rng.multivariate_normal(np.zeros(6), covariance, 20_000)
+    steps, turn, shift = Rotation.from_rotvec(draws[:, :3]), SIDE.rotation_matrix(), SIDE.translation
+    # what the same step is, seen from the camera: C step = step_of_camera C
+    turned = turn @ steps.as_matrix() @ turn.T
+    vectors = Rotation.from_matrix(turned).as_rotvec()
+    translations = draws[:, 3:] @ turn.T + np.array(shift) - turned @ np.array(shift)
+    measured = np.cov(np.concatenate([vectors, translations], axis=1).T)
     moved = transform_covariance(covariance, SIDE)
     scale = np.sqrt(np.outer(np.diag(moved), np.diag(moved)))
     np.testing.assert_allclose(measured / scale, moved / scale, atol=0.05)

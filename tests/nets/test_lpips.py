@@ -149,16 +149,16 @@ def test_keys_and_shapes_are_the_published_ones(net: Lpips, trunk: Trunk) -> Non
 
 
 def test_it_is_a_distance_of_the_valid_pixels(net: Lpips) -> None:
-    a, b = pictures(3, 64, 80)
+    a, b = pictures(3, 48, 64)
     assert distance(net, a, a) == 0.0 < distance(net, a, b)
     assert distance(net, a, b) == pytest.approx(distance(net, b, a), rel=1e-5)
-    valid = torch.ones(1, 1, 64, 80)
-    valid[..., :32, :] = 0
+    valid = torch.ones(1, 1, 48, 64)
+    valid[..., :24, :] = 0
     changed = b.clone()
-    changed[..., :32, :] = torch.rand(3, 32, 80)
+    changed[..., :24, :] = torch.rand(3, 24, 64)
     assert distance(net, a, changed, valid) == distance(net, a, b, valid)
     assert distance(net, a, changed) != distance(net, a, b)
-    same = torch.cat([b[..., :32, :], a[..., 32:, :]], dim=2)
+    same = torch.cat([b[..., :24, :], a[..., 24:, :]], dim=2)
     assert distance(net, a, same, valid) == 0.0 < distance(net, a, same)
 
 

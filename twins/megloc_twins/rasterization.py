@@ -111,25 +111,37 @@ def visible_surfaces(
     boxes = _bounding_boxes(seen_from.corners(), grid)
     nearest = np.zeros(grid.shape, np.float32)
     surface = np.full(grid.shape, NO_SURFACE, np.int16)
-    forms = planes.astype(np.float32)
-    gx, gy = grid.x.astype(np.float32), grid.y.astype(np.float32)
+    x, y = (np.broadcast_to(of.astype(np.float32), grid.shape) for of in (grid.x, grid.y))
     candidates = np.flatnonzero(facing & (boxes[:, 0] < boxes[:, 1]) & (boxes[:, 2] < boxes[:, 3]))
+    _cover(candidates, boxes, planes.astype(np.float32), x, y, nearest, surface)
+    return Visibility(grid, surface, nearest, planes)
+
+
+@compiled_loop
+def _cover(
+    candidates: NDArray[np.int64],
+    boxes: NDArray[np.int64],
+    forms: Float32,
+    x: Float32,
+    y: Float32,
+    nearest: Float32,
+    surface: NDArray[np.int16],
+) -> None:
+    """Write each candidate where it is nearer than what is there, within its box."""
     for index in candidates:
         left, right, top, bottom = boxes[index]
-        window = np.s_[top:bottom, left:right]
-        if gx.shape[0] == 1:
-            x, y = gx[:, left:right], gy[top:bottom]
-        else:
-            x, y = gx[window], gy[window]
-        inv, u, v = (form[0] * x + (form[1] * y + form[2]) for form in forms[index])
-        seen = inv > nearest[window]
-        seen &= u >= 0
-        seen &= u <= inv
-        seen &= v >= 0
-        seen &= v <= inv
-        np.copyto(nearest[window], inv, where=seen)
-        np.copyto(surface[window], np.int16(index), where=seen)
-    return Visibility(grid, surface, nearest, planes)
+        depth, along_u, along_v = forms[index]
+        for row in range(top, bottom):
+            for column in range(left, right):
+                at_x, at_y = x[row, column], y[row, column]
+                inverse = depth[0] * at_x + (depth[1] * at_y + depth[2])
+                if not inverse > nearest[row, column]:
+                    continue
+                u = along_u[0] * at_x + (along_u[1] * at_y + along_u[2])
+                v = along_v[0] * at_x + (along_v[1] * at_y + along_v[2])
+                if u >= 0 and u <= inverse and v >= 0 and v <= inverse:
+                    nearest[row, column] = inverse
+                    surface[row, column] = index
 
 
 def _planes(origin: Float64, edge_u: Float64, edge_v: Float64) -> tuple[Float64, NDArray[np.bool_]]:
