@@ -197,11 +197,12 @@ def test_a_covariance_moves_with_the_camera() -> None:
     root = rng.normal(size=(6, 6)) * 1e-3
     covariance = root @ root.T
     draws = rng.multivariate_normal(np.zeros(6), covariance, 20_000)
-    steps, turn, shift = Rotation.from_rotvec(draws[:, :3]), SIDE.rotation_matrix(), SIDE.translation
-    # what the same step is, seen from the camera: C step = step_of_camera C
+    steps, turn = Rotation.from_rotvec(draws[:, :3]), SIDE.rotation_matrix()
+    shift = np.array(SIDE.translation)
+    # what the same step is, seen from the camera, where C step = step_of_camera times C
     turned = turn @ steps.as_matrix() @ turn.T
     vectors = Rotation.from_matrix(turned).as_rotvec()
-    translations = draws[:, 3:] @ turn.T + np.array(shift) - turned @ np.array(shift)
+    translations = draws[:, 3:] @ turn.T + shift - turned @ shift
     measured = np.cov(np.concatenate([vectors, translations], axis=1).T)
     moved = transform_covariance(covariance, SIDE)
     scale = np.sqrt(np.outer(np.diag(moved), np.diag(moved)))

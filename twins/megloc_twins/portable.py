@@ -14,6 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from megloc_kapture.compiling import compiled_loop
 from megloc_kapture.values import RigidTransform
 
 _DECIMALS = 9  # a nanometre; errors of the functions that were used are a millionth of it
@@ -80,11 +81,21 @@ def _interpolated(rows: Float32, count: int, cubic: bool) -> Float32:
     weights = {0: 1 - part, 1: part}
     if cubic:
         weights = {tap: _keys(np.abs(part - tap)) for tap in (-1, 0, 1, 2)}
-    shape = (count,) + (1,) * (rows.ndim - 1)
-    total = np.zeros((count, *rows.shape[1:]), np.float32)
-    for tap, weight in weights.items():
-        taken = rows[np.clip(first + tap, 0, len(rows) - 1)]
-        total += taken * weight.astype(np.float32).reshape(shape)
+    taps = np.clip(first + np.array(list(weights))[:, None], 0, len(rows) - 1)
+    shares = np.array(list(weights.values()), np.float32)
+    flat = np.ascontiguousarray(rows, np.float32).reshape(len(rows), -1)
+    return _summed(flat, taps, shares).reshape(count, *rows.shape[1:])
+
+
+@compiled_loop
+def _summed(rows: Float32, taps: NDArray[np.int64], shares: Float32) -> Float32:
+    """Rows of an array (N, M) that are sums of some of its rows, by their shares, (T, K) both."""
+    total = np.zeros((taps.shape[1], rows.shape[1]), np.float32)
+    for row in range(len(total)):
+        for tap in range(len(taps)):
+            share, taken = shares[tap, row], rows[taps[tap, row]]
+            for column in range(rows.shape[1]):
+                total[row, column] += taken[column] * share
     return total
 
 
