@@ -50,7 +50,8 @@ eval: $(STAMP)
 
 # a file's tests share their fixtures, so they stay together
 # the many processes that they start compile the package once, whatever the user has set
-PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
+# every worker's networks have a thread per core: who waits for one leaves the core to the others
+PYTEST = PYTHONDONTWRITEBYTECODE= OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
 test: $(STAMP)
 	@$(PYTEST) -m 'not slow and not fuzz' $(ARGS)
