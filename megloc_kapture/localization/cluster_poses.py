@@ -270,7 +270,7 @@ def _mirror_matches(
     scene: RankingScene,
     pose: Pose,
 ) -> tuple[int, int]:
-    """Matches as they are and reflected, with each view's map images of most inliers first."""
+    """Matches as they are and reflected, with the map images of each view, most inliers first."""
     assert pose.inliers is not None  # it was estimated here
     sighted = np.repeat(pose.inliers, sources.support)
     counts = np.bincount(sources.images[sighted], minlength=len(cluster))

@@ -57,7 +57,7 @@ TERMS: dict[str, str] = {
 """The terms of the model, and what a low contribution of each says."""
 MIRRORED = "mirrored"
 """Beside the terms: by what probability chance makes features match better in the mirror so much.
-It multiplies the model's; there only where the image seems to be mirrored."""
+There only where the image seems to be mirrored, see :meth:`Calibration.probability`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,14 +140,12 @@ def with_confidence(
     confidence = model.probability(evidence)
     weakest = min(model.weights, key=lambda name: model.weights[name] * evidence[name])
     why, remarks = TERMS[weakest], pose.remarks
-    lowest, beyond_doubt = MIRROR_ASKED
-    asked = max(min_confidence, lowest) <= confidence < beyond_doubt
+    asked = confidence >= min_confidence and _is_asked(confidence)
     if asked and sources.mirror_matches is not None:
         as_it_is, mirrored = sources.mirror_matches(pose)
         if is_mirrored(as_it_is, mirrored):
-            chance = chance_of(as_it_is, mirrored)
-            confidence *= chance
-            evidence[MIRRORED] = chance
+            evidence[MIRRORED] = chance_of(as_it_is, mirrored)
+            confidence = model.probability(evidence)
             why = (
                 f"the image seems to be mirrored: {as_it_is} features match the map's images as "
                 f"they are, {mirrored} reflected"
@@ -162,6 +160,11 @@ def with_confidence(
         num_inliers=pose.num_inliers,
         confidence=confidence,
     )
+
+
+def _is_asked(confidence: float) -> bool:
+    lowest, beyond_doubt = MIRROR_ASKED
+    return lowest <= confidence < beyond_doubt
 
 
 def _surprise(problem: PoseProblem, errors_px: Floats, max_error_px: float) -> float:
@@ -294,11 +297,15 @@ class Calibration:
     weights: Mapping[str, float]
 
     def probability(self, evidence: Mapping[str, float]) -> float:
-        """The probability that a pose of this evidence is right, from 0 to 1."""
+        """The probability that a pose of this evidence is right, from 0 to 1.
+
+        That of the terms, and times :data:`MIRRORED` where that was asked and is in the evidence.
+        """
         logit = self.bias + sum(
             weight * evidence[name] for name, weight in sorted(self.weights.items())
         )
-        return 1.0 / (1.0 + math.exp(-min(max(logit, -700.0), 700.0)))
+        of_terms = 1.0 / (1.0 + math.exp(-min(max(logit, -700.0), 700.0)))
+        return of_terms * evidence.get(MIRRORED, 1.0) if _is_asked(of_terms) else of_terms
 
 
 OF_ALL = "all"

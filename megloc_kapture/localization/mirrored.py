@@ -67,7 +67,7 @@ def chance_of(as_it_is: int, mirrored: int) -> float:
     """The probability that so many more match reflected where either way is as likely, 0 to 1."""
     from scipy.special import bdtrc
 
-    return float(bdtrc(mirrored - 1, as_it_is + mirrored, 0.5)) if mirrored else 1.0
+    return float(bdtrc(mirrored - 1, as_it_is + mirrored, 0.5))
 
 
 def _best_matches(query: str, images: Sequence[str], scene: RankingScene) -> tuple[int, int]:
@@ -75,9 +75,10 @@ def _best_matches(query: str, images: Sequence[str], scene: RankingScene) -> tup
     first, others = images[:_OF_EACH], images[_OF_EACH:]
     try:
         own = _descriptors(scene.query_image(query))
+        ways = own, reflected(own)
         for image in (*first, *others[:: max(1, math.ceil(len(others) / _OF_EACH))]):
             other = _descriptors(scene.map_image(image))
-            best = np.maximum(best, [_num_matches(each, other) for each in (own, reflected(own))])
+            best = np.maximum(best, [_num_matches(way, other) for way in ways])
             if _decided(*best.tolist()):
                 break
     except DataError:
