@@ -94,7 +94,8 @@ def _descriptors(pixels: NDArray[np.uint8]) -> Float32:
     share = min(1.0, _LARGER_SIDE_PX / max(pixels.shape[:2]))
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
     if share < 1:
-        grey = cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
+        size = [max(round(side * share), 1) for side in grey.shape[::-1]]
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     # without precise upscaling the first octave is shifted to one side
     sift = cv2.SIFT.create(_MAX_FEATURES, contrastThreshold=0.02, enable_precise_upscale=True)
     found = sift.detectAndCompute(grey, None)[1]

@@ -129,6 +129,7 @@ def test_map_images_are_looked_at_until_it_is_clear() -> None:
     assert asked(scene, ["lost", "same"]) == (0, 0)
     assert asked(scene, []) == (0, 0)
     assert asked(Scene(np.full_like(image, 90), {"a": image})) == (0, 0)
+    assert asked(Scene(image, {"a": np.zeros((1, 2000, 3), np.uint8)})) == (0, 0)
     # the cameras of a rig are mirrored together
     one, both = (mirror_matches([("q", ["same"])] * n, scene) for n in (1, 2))  # type: ignore[arg-type]
     assert both == (2 * one[0], 2 * one[1])
