@@ -14,8 +14,9 @@ reach 90 % within 0.25 m and 2 deg, 95 % within 0.5 m and 5 deg; InLoc's within 
 where that is there, else of the user's folder.
 
 The worlds are small, and images and numbers of keypoints smaller than the preset's, so that two
-cores do it in an hour; ``--whole`` leaves both as they are, for a GPU or a night. Nothing else is
-set. Arguments that are not known here go to ``megloc eval``. Nothing is downloaded.
+cores do it in an hour. ``--size images`` leaves images and keypoints as they are, in worlds of few
+images; ``--size all`` the worlds too, for a GPU or a night. Nothing else is set. Arguments that are
+not known here go to ``megloc eval``. Nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -83,6 +84,16 @@ BARS = (0.90, 0.95)
 DARK = ("night", "night-rain", "night-all", "dusk", "all")
 
 
+SIZES = ("small", "images", "all")
+SIZE_OPTIONS = ("width", "height", "size_px")
+
+
+def world_options(wiring: str, dataset: str, size: str) -> list[str]:
+    """What ``--set`` of ``megloc synth`` is given."""
+    small = SMALL_WORLDS[wiring][dataset] if size != "all" else []
+    return [o for o in small if size == "small" or o.partition("=")[0] not in SIZE_OPTIONS]
+
+
 def options_of(wiring: str, dataset: str) -> list[str]:
     """What ``--set`` is given, sizes apart."""
     if wiring == "random":
@@ -91,15 +102,15 @@ def options_of(wiring: str, dataset: str) -> list[str]:
 
 
 def run_twin(
-    wiring: str, dataset: str, place: Path, megloc: Megloc, whole: bool, arguments: Sequence[str]
+    wiring: str, dataset: str, place: Path, megloc: Megloc, size: str, arguments: Sequence[str]
 ) -> tuple[float, Path]:
     """Render a twin unless it is there, and localize in it; seconds and the workspace."""
     root, workspace = place / "world", place / "workspace"
     if not root.is_dir():
-        world = [] if whole else SMALL_WORLDS[wiring][dataset]
+        world = world_options(wiring, dataset, size)
         changes = [part for each in world for part in ("--set", each)]
         megloc("synth", ["synth", dataset, "-o", str(root), *changes])
-    changed = options_of(wiring, dataset) + ([] if whole else SMALL_NETWORKS[wiring])
+    changed = options_of(wiring, dataset) + (SMALL_NETWORKS[wiring] if size == "small" else [])
     changes = [part for each in changed for part in ("--set", each)]
     places = ["--root", str(root), "--workspace", str(workspace)]
     seconds = megloc(
@@ -126,7 +137,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--wiring", choices=("random", "free"), required=True)
     parser.add_argument("--dataset", action="append", choices=DATASETS)
-    parser.add_argument("--whole", action="store_true", help="nothing smaller than it is")
+    parser.add_argument("--size", choices=SIZES, default="small", help="what is as large as it is")
     parser.add_argument("--workspace", type=Path, help="keep weights, worlds and runs here")
     options, arguments = parser.parse_known_args()
     with tempfile.TemporaryDirectory(prefix="megloc-paper-") as temporary:
@@ -141,7 +152,7 @@ def main() -> None:
             here = place / dataset
             megloc = program(environment, here / "logs")
             seconds, found = run_twin(
-                options.wiring, dataset, here, megloc, options.whole, arguments
+                options.wiring, dataset, here, megloc, options.size, arguments
             )
             evaluation = found / "evaluation"
             rows = json.loads((evaluation / "recall.json").read_text())["rows"]

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from megloc_kapture.cli.main import main
+from tests.cli.foreign import write_foreign
 
 # enough to localize all queries of the small scene
 SMALL = ("--set", "local_features.options.max_keypoints=800")
@@ -81,20 +82,22 @@ def workspace(finished: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def virtual_gallery(shared_data: Path) -> Path:
-    """The foreign map: map/, query/ and query_gt/; not to be written into."""
+    """A real map of another tool: map/, query/ and query_gt/; not to be written into."""
     return shared_data / "foreign_maps" / "virtual_gallery"
 
 
+@pytest.fixture(scope="session")
+def foreign_map(finished: Path, scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small scene as another tool's map: map/, query/, query_gt/; not to be written into."""
+    root = tmp_path_factory.mktemp("foreign")
+    write_foreign(root, finished, scene)
+    return root
+
+
 @pytest.fixture
-def gallery(virtual_gallery: Path, tmp_path: Path) -> Path:
-    """A copy of the foreign map and its queries whose images are links; to be spoilt."""
-    no_images = shutil.ignore_patterns("records_data")
-    for part in ("map", "query", "query_gt"):
-        shutil.copytree(virtual_gallery / part, tmp_path / "gallery" / part, ignore=no_images)
-        images = virtual_gallery / part / "sensors" / "records_data"
-        if images.is_dir():
-            (tmp_path / "gallery" / part / "sensors" / "records_data").symlink_to(images.resolve())
-    return tmp_path / "gallery"
+def foreign(foreign_map: Path, tmp_path: Path) -> Path:
+    """A copy of it whose images are links; to be spoilt."""
+    return copy_of(foreign_map, tmp_path / "foreign")
 
 
 def copy_of(folder: Path, place: Path) -> Path:

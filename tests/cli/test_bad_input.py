@@ -14,16 +14,14 @@ import numpy as np
 import pytest
 
 from megloc_kapture.io.images import write_image
+from tests.cli.foreign import DESCRIPTORS, GLOBAL, KEYPOINTS, rename_type
 
 Contents = Callable[[Path], dict[str, bytes]]
 Spoil = Callable[[Path], Any]
 
 TIMES = "sensors/trajectories.txt"
 RECORDS = "sensors/records_camera.txt"
-FIRST = "training/gallery_light1_loop1/frames/rgb/camera_0/rgb_00223.jpg"
-QUERY = "testing/gallery_light1_occlusion1/frames/rgb/camera_0/rgb_00267.jpg"
-KEYPOINTS, DESCRIPTORS = "reconstruction/keypoints/r2d2_500", "reconstruction/descriptors/r2d2_500"
-GLOBAL = "reconstruction/global_features/AP-GeM-LM18"
+FIRST, QUERY = "0000.jpg", "0001.jpg"
 
 
 def cut(name: str, size: int = -2) -> Spoil:
@@ -62,22 +60,22 @@ def again(number: int) -> Callable[[Path], Any]:
 NO_COLUMN = fields(lambda f: f[:-1])
 NAN = fields(lambda f: [*f[:-1], "nan"])
 UPWARDS = fields(lambda f: [*f[:2], "../../" + f[2]])
-PAST = fields(lambda f: [*f[:-1], "500"])
-NO_POINT = fields(lambda f: ["630", *f[1:]])
+PAST = fields(lambda f: [*f[:-1], "800"])
+NO_POINT = fields(lambda f: ["1000000", *f[1:]])
 
 # of the map: how to spoil it, and what the message has to say
 MAPS: dict[str, tuple[Spoil, str]] = {
     "no sensors.txt": (remove("sensors/sensors.txt"), r"map/sensors/sensors\.txt: "),
-    "keypoints cut": (cut(f"{KEYPOINTS}/{FIRST}.kpt"), r"rgb_00223\.jpg\.kpt: .*truncated"),
+    "keypoints cut": (cut(f"{KEYPOINTS}/{FIRST}.kpt"), r"0000\.jpg\.kpt: .*truncated"),
     "keypoints missing": (
         remove(f"{KEYPOINTS}/{FIRST}.kpt"),
-        r"observations\.txt: points are observed in '.*rgb_00223\.jpg', which has no keypoints",
+        r"observations\.txt: points are observed in '.*0000\.jpg', which has no keypoints",
     ),
-    "descriptors cut": (cut(f"{DESCRIPTORS}/{FIRST}.desc"), r"rgb_00223\.jpg\.desc: .*truncated"),
-    "global cut": (cut(f"{GLOBAL}/{FIRST}.gfeat"), r"rgb_00223\.jpg\.gfeat: .*truncated"),
+    "descriptors cut": (cut(f"{DESCRIPTORS}/{FIRST}.desc"), r"0000\.jpg\.desc: .*truncated"),
+    "global cut": (cut(f"{GLOBAL}/{FIRST}.gfeat"), r"0000\.jpg\.gfeat: .*truncated"),
     "lengths differ": (
-        cut(f"{DESCRIPTORS}/{FIRST}.desc", 128 * 4 * 499),
-        r"rgb_00223\.jpg\.desc: 499 descriptors for 500 keypoints",
+        cut(f"{DESCRIPTORS}/{FIRST}.desc", 128 * 4 * 799),
+        r"0000\.jpg\.desc: 799 descriptors for 800 keypoints",
     ),
     "sensor column": (line("sensors/sensors.txt", 3, NO_COLUMN), r"sensors\.txt:3: "),
     "pose column": (line(TIMES, 4, NO_COLUMN), r"trajectories\.txt:4: .*columns"),
@@ -104,34 +102,34 @@ MAPS: dict[str, tuple[Spoil, str]] = {
     "path upwards": (line(RECORDS, 3, UPWARDS), r"records_camera\.txt:3: .*'\.\.'"),
     "keypoint past the end": (
         line("reconstruction/observations.txt", 9, PAST),
-        r"observations\.txt:9: keypoint id 500, but .* has 500 keypoints",
+        r"observations\.txt:9: keypoint id 800, but .* has 800 keypoints",
     ),
     "point past the end": (
         line("reconstruction/observations.txt", 9, NO_POINT),
-        r"observations\.txt:9: point id 630, but there are 630 points",
+        r"observations\.txt:9: point id 1000000, but there are \d+ points",
     ),
 }
 
 
-def localize(gallery: Path) -> list[str | Path]:
-    places: list[str | Path] = ["-i", gallery / "map", "--query", gallery / "query"]
-    return ["localize", *places, "-o", gallery.parent / "new" / "localized"]
+def localize(foreign: Path) -> list[str | Path]:
+    places: list[str | Path] = ["-i", foreign / "map", "--query", foreign / "query"]
+    return ["localize", *places, "-o", foreign.parent / "new" / "localized"]
 
 
 @pytest.mark.parametrize(("spoil", "message"), MAPS.values(), ids=MAPS)
 def test_localize_refuses_a_bad_map_and_info_finds_the_same_fault(
-    megloc: Any, gallery: Path, contents: Contents, spoil: Spoil, message: str
+    megloc: Any, foreign: Path, contents: Contents, spoil: Spoil, message: str
 ) -> None:
-    spoil(gallery / "map")
-    before = contents(gallery)
-    megloc(*localize(gallery)).refused(message)
-    assert not (gallery.parent / "new").exists()
-    done = megloc("info", gallery / "map")
+    spoil(foreign / "map")
+    before = contents(foreign)
+    megloc(*localize(foreign)).refused(message)
+    assert not (foreign.parent / "new").exists()
+    done = megloc("info", foreign / "map")
     assert done.status == 2
     if "no keypoints" in message:
-        message = r"rgb_00223\.jpg\.desc: image .* has descriptors but no keypoints"
+        message = r"0000\.jpg\.desc: image .* has descriptors but no keypoints"
     assert re.fullmatch(f"megloc: .*{message}.*\n", done.err)
-    assert contents(gallery) == before
+    assert contents(foreign) == before
 
 
 QUERIES: dict[str, tuple[Spoil, str]] = {
@@ -142,59 +140,46 @@ QUERIES: dict[str, tuple[Spoil, str]] = {
     ),
     "other descriptors": (
         line(f"{DESCRIPTORS}/descriptors.txt", 3, lambda text: text.replace("128", "64")),
-        r"rgb_00\d+\.jpg\.desc: .*descriptors for|64 values, the map's 128",
+        r"00\d+\.jpg\.desc: .*descriptors for|64 values, the map's 128",
     ),
     "path upwards": (line(RECORDS, 3, UPWARDS), r"records_camera\.txt:3: .*'\.\.'"),
-    "camera": (line("sensors/sensors.txt", 4, NO_COLUMN), r"sensors\.txt:4: "),
+    "camera": (line("sensors/sensors.txt", 3, NO_COLUMN), r"sensors\.txt:3: "),
 }
 
 
 @pytest.mark.parametrize(("spoil", "message"), QUERIES.values(), ids=QUERIES)
 def test_localize_refuses_bad_queries(
-    megloc: Any, gallery: Path, spoil: Spoil, message: str
+    megloc: Any, foreign: Path, spoil: Spoil, message: str
 ) -> None:
-    spoil(gallery / "query")
-    megloc(*localize(gallery)).refused(message)
-    assert not (gallery.parent / "new").exists()
+    spoil(foreign / "query")
+    megloc(*localize(foreign)).refused(message)
+    assert not (foreign.parent / "new").exists()
 
 
-def of_unknown_type(root: Path) -> None:
-    """The type of the keypoints becomes one that no extractor makes."""
-    for kind in (KEYPOINTS, DESCRIPTORS):
-        folder = root / kind
-        for table in folder.glob("*.txt"):
-            table.write_text(table.read_text().replace("r2d2", "orb"))
-        folder.rename(folder.with_name("orb_500"))
-    seen = root / "reconstruction" / "observations.txt"
-    if seen.is_file():
-        seen.write_text(seen.read_text().replace("r2d2_500", "orb_500"))
-
-
-def test_features_that_nobody_can_extract(megloc: Any, gallery: Path) -> None:
-    for part in ("map", "query"):
-        of_unknown_type(gallery / part)
-    told = megloc("info", gallery / "map").out
-    assert "must be given in kapture: no extractor for orb_500" in told
-    keypoints = gallery / "query" / "reconstruction" / "keypoints" / "orb_500" / f"{QUERY}.kpt"
+def test_features_that_nobody_can_extract(megloc: Any, foreign: Path) -> None:
+    rename_type(foreign)
+    told = megloc("info", foreign / "map").out
+    assert "must be given in kapture: no extractor for orb_800" in told
+    keypoints = foreign / "query" / "reconstruction" / "keypoints" / "orb_800" / f"{QUERY}.kpt"
     keypoints.unlink()
-    message = r"image '.*rgb_00267\.jpg': features of type 'orb_500' are missing and no extractor"
-    megloc(*localize(gallery)).refused(message)
+    message = r"image '.*0001\.jpg': features of type 'orb_800' are missing and no extractor"
+    megloc(*localize(foreign)).refused(message)
     # nor those of the map again
-    shutil.rmtree(gallery / "map" / "reconstruction" / "descriptors")
-    megloc(*localize(gallery)).refused(r"/map: .*'orb_500'", "no extractor")
-    assert not (gallery.parent / "new").exists()
-    told = megloc("info", gallery / "map").out
+    shutil.rmtree(foreign / "map" / "reconstruction" / "descriptors")
+    megloc(*localize(foreign)).refused(r"/map: .*'orb_800'", "no extractor")
+    assert not (foreign.parent / "new").exists()
+    told = megloc("info", foreign / "map").out
     assert re.search("map descriptors .*no extractor .*not possible", told)
 
 
 def test_quaternions_almost_of_unit_length_are_normalised(
-    megloc: Any, gallery: Path, contents: Contents
+    megloc: Any, foreign: Path, contents: Contents
 ) -> None:
-    megloc(*localize(gallery))
-    place = gallery.parent / "new" / "localized"
+    megloc(*localize(foreign))
+    place = foreign.parent / "new" / "localized"
     expected = contents(place / "sensors")["trajectories.txt"]
-    line(TIMES, 3, quaternion_times(1.0009))(gallery / "map")
-    assert megloc(*localize(gallery)).status == 0
+    line(TIMES, 3, quaternion_times(1.0009))(foreign / "map")
+    assert megloc(*localize(foreign)).status == 0
     assert contents(place / "sensors")["trajectories.txt"] == expected
 
 
@@ -205,7 +190,7 @@ SPECIAL: dict[str, tuple[list[str], str]] = {
     "no pairs": (["--pairs", "{}/nowhere"], r"/nowhere: "),
     "strange pairs": (["--pairs", "{}/pairs.txt"], r"nowhere\.jpg, which is no image of the map"),
     "not a map": (["-i", "{}/query"], r"/query: no map to localize in"),
-    "no such type": (["--keypoints-type", "sift"], r"'sift'; there are: r2d2_500"),
+    "no such type": (["--keypoints-type", "sift"], r"'sift'; there are: r2d2_800"),
     "bad value": (["--set", "localization.fallback=guess"], r"option localization\.fallback"),
     "no workers": (["--workers", "0"], r"0 workers"),
 }
@@ -213,24 +198,24 @@ SPECIAL: dict[str, tuple[list[str], str]] = {
 
 @pytest.mark.parametrize(("change", "message"), SPECIAL.values(), ids=SPECIAL)
 def test_arguments_that_cannot_be(
-    megloc: Any, gallery: Path, change: list[str], message: str
+    megloc: Any, foreign: Path, change: list[str], message: str
 ) -> None:
     header = "# query_image, map_image, score\n"
-    (gallery / "pairs.txt").write_text(f"{header}{QUERY}, nowhere.jpg, 1.0\n")
-    megloc(*localize(gallery), *(text.format(gallery) for text in change)).refused(message)
-    assert not (gallery.parent / "new").exists()
+    (foreign / "pairs.txt").write_text(f"{header}{QUERY}, nowhere.jpg, 1.0\n")
+    megloc(*localize(foreign), *(text.format(foreign) for text in change)).refused(message)
+    assert not (foreign.parent / "new").exists()
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
-def test_localize_leaves_what_others_wrote(megloc: Any, gallery: Path, kind: str) -> None:
-    place = gallery.parent / "new" / "localized"
+def test_localize_leaves_what_others_wrote(megloc: Any, foreign: Path, kind: str) -> None:
+    place = foreign.parent / "new" / "localized"
     place.parent.mkdir()
     if kind == "file":
         place.write_text("mine")
     else:
         place.mkdir()
         (place / "thesis.txt").write_text("mine")
-    megloc(*localize(gallery)).refused(str(place))
+    megloc(*localize(foreign)).refused(str(place))
     left = [str(p.relative_to(place.parent)) for p in place.parent.rglob("*")]
     assert left == (["localized"] if kind == "file" else ["localized", "localized/thesis.txt"])
 

@@ -54,20 +54,20 @@ def test_eval_stops_cleanly_and_goes_on(
 
 @pytest.mark.parametrize("pages", [1, 2, 4])
 def test_localize_leaves_nothing(
-    megloc: Any, gallery: Path, small_disk: Callable[..., Path], pages: int
+    megloc: Any, foreign: Path, small_disk: Callable[..., Path], pages: int
 ) -> None:
     disk = small_disk(f"{4 * pages}k")
-    places = ("-i", gallery / "map", "--query", gallery / "query", "-o", disk / "new" / "localized")
+    places = ("-i", foreign / "map", "--query", foreign / "query", "-o", disk / "new" / "localized")
     done = megloc("localize", *places)
     done.refused(f"{disk}/new/localized.*: cannot write: No space left on device")
     assert list(disk.iterdir()) == []
 
 
-def test_localize_leaves_nothing_where_files_may_not_grow(gallery: Path, tmp_path: Path) -> None:
+def test_localize_leaves_nothing_where_files_may_not_grow(foreign: Path, tmp_path: Path) -> None:
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200))
 
-    command = [PROGRAM, "localize", "-i", str(gallery / "map"), "--query", str(gallery / "query")]
+    command = [PROGRAM, "localize", "-i", str(foreign / "map"), "--query", str(foreign / "query")]
     command += ["-o", str(tmp_path / "new" / "localized"), "--quiet"]
     done = subprocess.run(command, preexec_fn=limit, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (2, "")

@@ -15,25 +15,25 @@ def described(out: str) -> dict[str, str]:
     return dict(re.findall(r"^(\w[\w ]*?)  +(.*)$", out, re.MULTILINE))
 
 
-def test_info_says_what_the_foreign_map_allows(megloc: Any, virtual_gallery: Path) -> None:
-    done = megloc("info", virtual_gallery / "map")
+def test_info_says_what_the_foreign_map_allows(megloc: Any, foreign_map: Path) -> None:
+    done = megloc("info", foreign_map / "map")
     assert (done.status, done.err) == (0, "")
     told = described(done.out)
-    assert told["images"] == "12 (12 PINHOLE), 12 with a pose"
-    assert told["points"] == "630"
-    assert told["pixel origin"].startswith("centre: ")
+    assert told["images"] == "7 (7 PINHOLE), 7 with a pose"
+    assert told["points"] == str(len(KaptureFolder(foreign_map / "map").points3d()))
+    assert told["pixel origin"].startswith("corner: ")
     assert told["map descriptors"] == "there"
     # R2D2 has an extractor, whose weights are not there
     assert told["query features"].startswith("must be given in kapture; plugin r2d2 could extract")
     assert "megloc weights fetch r2d2_WASF_N16" in told["query features"]
     # so few that all are matched; vectors without the weights that make a query's
-    assert told["retrieval"] == "all 12 map images, not ranked"
+    assert told["retrieval"] == "all 7 map images, not ranked"
     assert (
-        "where queries bring AP-GeM-LM18: all 12 map images, ranked by global features AP-GeM-LM18"
+        "where queries bring AP-GeM-LM18: all 7 map images, ranked by global features AP-GeM-LM18"
     ) in done.out
     errors = re.search(r"origin: corner ([\d.]+) px, centre ([\d.]+) px", done.out)
     assert errors is not None
-    assert float(errors[2]) < 0.9 * float(errors[1])
+    assert float(errors[1]) <= float(errors[2])
 
 
 def test_info_of_our_own_map_and_of_what_is_none(megloc: Any, finished: Path, scene: Path) -> None:
@@ -75,11 +75,11 @@ def test_info_says_what_ranks_many_images(megloc: Any, finished: Path, tmp_path:
     )
 
 
-def test_info_of_a_map_whose_descriptors_are_missing(megloc: Any, gallery: Path) -> None:
-    shutil.rmtree(gallery / "map" / "reconstruction" / "descriptors")
-    told = described(megloc("info", gallery / "map").out)
+def test_info_of_a_map_whose_descriptors_are_missing(megloc: Any, foreign: Path) -> None:
+    shutil.rmtree(foreign / "map" / "reconstruction" / "descriptors")
+    told = described(megloc("info", foreign / "map").out)
     assert told["map descriptors"] == "missing; will be extracted again by plugin r2d2"
-    assert told["retrieval"] == "all 12 map images, not ranked"
-    (gallery / "map" / "sensors" / "records_data").rename(gallery / "away")
-    told = described(megloc("info", gallery / "map").out)
+    assert told["retrieval"] == "all 7 map images, not ranked"
+    (foreign / "map" / "sensors" / "records_data").rename(foreign / "away")
+    told = described(megloc("info", foreign / "map").out)
     assert told["retrieval"] == "not possible without the map's descriptors"

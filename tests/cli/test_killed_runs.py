@@ -196,8 +196,8 @@ def test_items_that_are_done_when_a_run_is_killed_are_not_done_again(
             run = start(scene, workspace)
             wait_for(run, f"{kind}, stage")
             journal = workspace / ".partial" / kind / ".items"
-            # the run, two helpers of multiprocessing's, a worker: items that an earlier run has done are
-            # there before any worker is
+            # the run, two helpers of multiprocessing's, a worker: what an earlier run has done is
+            # there before any worker
             while num_lines(journal) < count or len(processes_of(run.pid)) < 4:
                 assert run.poll() is None
                 time.sleep(0.002)

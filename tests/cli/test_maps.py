@@ -105,9 +105,9 @@ def rows_of(text: str) -> dict[str, tuple[int, int]]:
 
 
 def test_a_foreign_map_is_refined_and_localized_in(
-    megloc: Any, virtual_gallery: Path, tmp_path: Path, contents: Callable[[Path], Any]
+    megloc: Any, foreign_map: Path, tmp_path: Path, contents: Callable[[Path], Any]
 ) -> None:
-    place = virtual_gallery
+    place = foreign_map
     before = contents(place)
     out = tmp_path / "refined"
     keep = ("--set", "refinement.uncertainty.keep_quantile=0.9")
@@ -134,27 +134,27 @@ def test_a_foreign_map_is_refined_and_localized_in(
     known = int(np.isfinite(covariances).all(axis=1).sum())
     assert f"known of {known} points" in told
     theirs = kapture_from_dir(str(out))
-    assert len(theirs.points3d) == len(left)
+    assert len(theirs.points3d) == len(new.points3d())
     localized = megloc("localize", "-i", out, "--query", place / "query", "-o", tmp_path / "poses")
     assert localized.out.startswith("4 of 4 queries localized in ")
 
 
-def test_what_cannot_be_refined_is_refused(megloc: Any, gallery: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_refined_is_refused(megloc: Any, foreign: Path, tmp_path: Path) -> None:
     out = tmp_path / "refined"
-    query = megloc("refine-map", "-i", gallery / "query", "-o", out)
+    query = megloc("refine-map", "-i", foreign / "query", "-o", out)
     query.refused("no map to refine", "points3d.txt")
     unknown = ("--set", "refinement.uncertainty.max_sigma=1")
-    megloc("refine-map", "-i", gallery / "map", "-o", out, *unknown).refused(
+    megloc("refine-map", "-i", foreign / "map", "-o", out, *unknown).refused(
         "unknown option refinement.uncertainty.max_sigma; did you mean 'max_robust_sigmas'. known "
         "here: .*keep_quantile"
     )
     assert not out.exists()
-    (gallery / "full").mkdir()
-    (gallery / "full" / "file").touch()
-    megloc("refine-map", "-i", gallery / "map", "-o", gallery / "full").refused("is not empty")
-    report = gallery / "map" / "reconstruction" / "refinement.json"
+    (foreign / "full").mkdir()
+    (foreign / "full" / "file").touch()
+    megloc("refine-map", "-i", foreign / "map", "-o", foreign / "full").refused("is not empty")
+    report = foreign / "map" / "reconstruction" / "refinement.json"
     report.write_text('{"points_before": "many"}')
-    done = megloc("info", gallery / "map")
+    done = megloc("info", foreign / "map")
     assert done.status == 2 and "refinement.json" in done.err
 
 

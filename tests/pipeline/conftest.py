@@ -1,4 +1,4 @@
-"""Our own small map of a real scene, shared by the tests of what localizes in it."""
+"""Our own map of the small scene, shared by the tests of what localizes in it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.pipeline.runs import evaluated
 
 @pytest.fixture(scope="session")
 def fountain(shared_data: Path) -> Path:
-    """The scene: mapping/, query/ and query_gt/; not to be written into."""
+    """A real scene: mapping/, query/ and query_gt/; not to be written into."""
     return shared_data / "scenes" / "fountain_p11"
 
 
@@ -24,11 +24,11 @@ def virtual_gallery(shared_data: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def workspace(fountain: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def workspace(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A workspace with our map of the scene, few keypoints per image; not to be written into."""
     few = options_of_preset(assignments=["local_features.options.max_keypoints=800"])
-    root = tmp_path_factory.mktemp("fountain") / "workspace"
-    return evaluated(root, fountain, few, last="map").root
+    root = tmp_path_factory.mktemp("map") / "workspace"
+    return evaluated(root, scene, few, last="map").root
 
 
 @pytest.fixture

@@ -94,6 +94,7 @@ def residuals_px(opened: KaptureMap, queries: KaptureFolder, truth: Path) -> lis
     return found
 
 
+@pytest.mark.slow
 def test_the_origin_of_the_foreign_map_and_what_the_wrong_one_costs(virtual_gallery: Path) -> None:
     """Its principal points are ((w - 1) / 2, (h - 1) / 2), its keypoints fit them as stored."""
     right = KaptureMap.open(virtual_gallery / "map")
@@ -109,15 +110,13 @@ def test_the_origin_of_the_foreign_map_and_what_the_wrong_one_costs(virtual_gall
     assert (off_px[0] < off_px[1]).all(), off_px
 
 
-def test_queries_are_described_as_their_map(
-    workspace: Path, map_copy: Path, fountain: Path
-) -> None:
+def test_queries_are_described_as_their_map(workspace: Path, map_copy: Path, scene: Path) -> None:
     # a map, and queries, that are all described with the origin at the centre
     shift_intrinsics(map_copy, -0.5)
     query = map_copy.parent / "query"
-    shutil.copytree(fountain / "query", query, symlinks=True)
+    shutil.copytree(scene / "query", query, symlinks=True)
     shift_intrinsics(query, -0.5)
-    queries, truth = KaptureFolder(query, features_dirs=[workspace]), fountain / "query_gt"
+    queries, truth = KaptureFolder(query, features_dirs=[workspace]), scene / "query_gt"
     right = KaptureMap.open(map_copy)
     wrong = KaptureMap.open(map_copy, pixel_origin="corner")
     off_px = np.array([residuals_px(opened, queries, truth) for opened in (right, wrong)])
@@ -125,7 +124,7 @@ def test_queries_are_described_as_their_map(
     assert np.median(off_px[0]) < 0.6 * np.median(off_px[1]), off_px
     # and the poses are those of the map before
     before = Localizer(KaptureMap.open(workspace / "map"))
-    original = KaptureFolder(fountain / "query", features_dirs=[workspace])
+    original = KaptureFolder(scene / "query", features_dirs=[workspace])
     expected = dict(before.localize_kapture(original))
     for name, pose in Localizer(right).localize_kapture(queries):
         reference = expected[name]
@@ -133,6 +132,7 @@ def test_queries_are_described_as_their_map(
         assert errors(pose, reference.cam_from_world)[0] < 1e-3
 
 
+@pytest.mark.slow
 def test_opening_writes_nothing_and_reads_through_links(
     virtual_gallery: Path, tmp_path: Path
 ) -> None:

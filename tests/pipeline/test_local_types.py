@@ -55,6 +55,6 @@ def test_a_map_of_another_extractor_or_without_images_is_refused(stripped: Kaptu
 def test_masks_are_used_as_they_were(stripped: KaptureMap) -> None:
     root = stripped.folder.root
     for image in stripped.images:
-        write_image(root / "sensors" / "masks" / f"{image}.png", np.zeros((1024, 1536), np.uint8))
+        write_image(root / "sensors" / "masks" / f"{image}.png", np.zeros((300, 400), np.uint8))
     with pytest.raises(DataError, match=r"finds only 0 of \d+ observed keypoints"):
         again(KaptureMap.open(root), max_keypoints=800)

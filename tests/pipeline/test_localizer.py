@@ -46,20 +46,20 @@ def localizer(opened: KaptureMap) -> Localizer:
 
 
 @pytest.fixture(scope="module")
-def truth(fountain: Path) -> KaptureData:
-    return KaptureFolder(fountain / "query_gt").read()
+def truth(scene: Path) -> KaptureData:
+    return KaptureFolder(scene / "query_gt").read()
 
 
 @pytest.fixture(scope="module")
-def image(fountain: Path) -> Path:
+def image(scene: Path) -> Path:
     """Of the query 0004.jpg."""
-    return fountain / "query" / "sensors" / "records_data" / "0004.jpg"
+    return scene / "query" / "sensors" / "records_data" / "0004.jpg"
 
 
 @pytest.fixture(scope="module")
-def queries(workspace: Path, fountain: Path) -> list[Query]:
+def queries(workspace: Path, scene: Path) -> list[Query]:
     """The four queries with their features."""
-    folder = KaptureFolder(fountain / "query", features_dirs=[workspace])
+    folder = KaptureFolder(scene / "query", features_dirs=[workspace])
     data = folder.read()
     keypoints, descriptors = folder.keypoints("rootsift"), folder.descriptors("rootsift")
     scores = np.zeros(800, np.float32)
@@ -103,7 +103,7 @@ def test_an_image_file_and_an_array_give_the_same(
     assert set(found.candidates) <= set(localizer.map.images)
     assert same(localizer.localize(read_image_rgb(image), camera), found)
     assert same(localizer.localize(str(image), camera), found)
-    black = np.zeros((1024, 1536, 3), np.uint8)
+    black = np.zeros((300, 400, 3), np.uint8)
     pairs = list(localizer.localize_many([(black, camera), (image, camera)]))
     assert not pairs[0] and same(pairs[1], found)
     with pytest.raises(AttributeError, match="no attribute 'Loclizer'"):
@@ -139,12 +139,12 @@ def test_too_few_matches_fail_and_are_counted(localizer: Localizer, queries: lis
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (np.zeros((10, 10, 3), np.uint8), "the image is 10x10, its camera says 1536x1024"),
+        (np.zeros((10, 10, 3), np.uint8), "the image is 10x10, its camera says 400x300"),
         (
-            np.zeros((1024, 1536), np.uint8),
-            r"an image is uint8 \(H, W, 3\), got uint8 \(1024, 1536",
+            np.zeros((300, 400), np.uint8),
+            r"an image is uint8 \(H, W, 3\), got uint8 \(300, 400",
         ),
-        (np.zeros((1024, 1536, 3)), r"an image is uint8 \(H, W, 3\), got float64"),
+        (np.zeros((300, 400, 3)), r"an image is uint8 \(H, W, 3\), got float64"),
         ("nowhere.jpg", "nowhere.jpg: no such image"),
         (Path(__file__), "test_localizer.py: not an image"),
     ],
@@ -159,9 +159,9 @@ def test_what_is_no_image_is_an_error_and_no_failure(
 
 def test_a_mask_keeps_features_away(localizer: Localizer, image: Path, truth: KaptureData) -> None:
     query = Query(truth.camera_of("0004.jpg"), image)
-    mask = np.zeros((1024, 1536), bool)
+    mask = np.zeros((300, 400), bool)
     assert not localizer.localize_query(replace(query, mask=mask))
-    mask[:, 700:] = True
+    mask[:, 180:] = True
     half = localizer.localize_query(replace(query, mask=mask))
     whole = localizer.localize_query(query)
     assert isinstance(half, Pose) and isinstance(whole, Pose)
@@ -189,13 +189,17 @@ def test_retrieval_ranks_where_there_are_more_images_than_candidates(
     opened: KaptureMap, queries: list[Query]
 ) -> None:
     narrow = Localizer(opened, options=few("query_pairs.top_k=2"))
-    # neighbours along the facade, told by our VLAD, for the queries bring no vectors
-    neighbours = {"0001.jpg": {"0000.jpg", "0002.jpg"}, "0004.jpg": {"0003.jpg", "0005.jpg"}}
+    # the walk's nearest, told by our VLAD, for the queries bring no vectors
+    nearest = {
+        "0001.jpg": {"0000.jpg", "0002.jpg", "0003.jpg"},
+        "0007.jpg": {"0006.jpg", "0008.jpg", "0009.jpg"},
+        "0010.jpg": {"0008.jpg", "0009.jpg"},
+    }
     for query in queries:
         found = narrow.localize_query(query)
         ranked = narrow.ranked(query)
         assert len(ranked) == 2 and set(found.candidates) <= set(ranked)
-        assert set(ranked) == neighbours.get(query.name, set(ranked))
+        assert set(ranked) <= nearest.get(query.name, set(ranked))
         # within a prior, the best of those
         kept = replace(query, prior=("0000.jpg", "0002.jpg", "0009.jpg"))
         assert set(narrow.ranked(kept)) < set(kept.prior or ())
@@ -262,9 +266,9 @@ def test_many_are_localized_lazily_and_in_order(
 
 
 def test_a_kapture_folder_as_queries(
-    localizer: Localizer, workspace: Path, fountain: Path, queries: list[Query]
+    localizer: Localizer, workspace: Path, scene: Path, queries: list[Query]
 ) -> None:
-    folder = KaptureFolder(fountain / "query", features_dirs=[workspace])
+    folder = KaptureFolder(scene / "query", features_dirs=[workspace])
     found = dict(localizer.localize_kapture(folder))
     assert list(found) == [query.name for query in queries]
     for query in queries:
@@ -297,7 +301,7 @@ def test_a_rig_is_localized_as_one_and_a_blind_camera_does_no_harm(
     alone = [localizer.localize_query(query) for query, _ in views]
     assert found.num_matches == sum(single.num_matches for single in alone)
     assert set(found.candidates) == set(alone[0].candidates) | set(alone[1].candidates)
-    black = Query(queries[0].camera, np.zeros((1024, 1536, 3), np.uint8), "blind")
+    black = Query(queries[0].camera, np.zeros((300, 400, 3), np.uint8), "blind")
     blind = (black, RigidTransform.identity())
     assert errors(localizer.localize_rig([blind, *views]), rig_from_world)[0] < 0.01
     assert not localizer.localize_rig([blind])
@@ -307,13 +311,14 @@ def test_a_rig_is_localized_as_one_and_a_blind_camera_does_no_harm(
 # ------------------------------------------------------------------ maps of others
 
 
+@pytest.mark.slow
 def test_queries_of_a_network_cannot_be_extracted_without_its_weights(
     virtual_gallery: Path,
 ) -> None:
     localizer = Localizer(KaptureMap.open(virtual_gallery / "map"))
     camera = Camera("SIMPLE_PINHOLE", 1536, 1024, (1000.0, 768.0, 512.0))
     with pytest.raises(DataError, match="the weights r2d2_WASF_N16 are missing.*megloc weights"):
-        localizer.localize(np.zeros((1024, 1536, 3), np.uint8), camera)
+        localizer.localize(np.zeros((300, 400, 3), np.uint8), camera)
 
 
 @pytest.mark.slow
@@ -351,7 +356,7 @@ def test_a_map_in_a_tar(localizer: Localizer, map_copy: Path, queries: list[Quer
 
 
 def test_results_that_nobody_reads_on_wait_for_no_worker(
-    localizer: Localizer, fountain: Path, monkeypatch: pytest.MonkeyPatch
+    localizer: Localizer, scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     released, waiting = threading.Event(), []
 
@@ -360,7 +365,7 @@ def test_results_that_nobody_reads_on_wait_for_no_worker(
         yield from ([Failure("none")] for _ in units)
 
     monkeypatch.setattr(localizer, "localize_units", localize_units)
-    results = Results(localizer, fountain / "query")
+    results = Results(localizer, scene / "query")
     assert results["0001.jpg"].reason == "none"
     del results
     gc.collect()  # in whatever thread it runs

@@ -146,6 +146,7 @@ def test_a_camera_beside_it_sees_none(drive: Drive) -> None:
     assert region.mask(30, 20).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [1, 4])
 def test_a_hand_held_camera_sees_none(shared_data: Path, every: int) -> None:
     folder = shared_data / "scenes" / "redkitchen_rgbd" / "mapping" / "sensors" / "records_data"
@@ -154,6 +155,7 @@ def test_a_hand_held_camera_sees_none(shared_data: Path, every: int) -> None:
     assert not region_of([read_image_rgb(path) for path in paths])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["herzjesu_p25", "fountain_p11"])
 def test_photographs_of_one_facade_have_none(shared_data: Path, scene: str) -> None:
     folder = shared_data / "scenes" / scene

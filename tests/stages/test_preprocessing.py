@@ -209,6 +209,7 @@ def test_how_images_are_stored(small_kapture: Any, tmp_path: Path) -> None:
     np.testing.assert_array_equal(pixels[..., 0], pixels[..., 2])
 
 
+@pytest.mark.slow
 def test_real_photographs_keep_their_geometry(shared_data: Path, tmp_path: Path) -> None:
     """A point at a keypoint's ray is seen at the keypoint carried over: no pose can move."""
     folder = KaptureFolder(shared_data / "scenes" / "fountain_p11" / "query")

@@ -129,6 +129,7 @@ def test_map_points_are_those_that_an_image_observes(world: Any) -> None:
     assert scene.map_points("elsewhere.png").shape == (0, 3)
 
 
+@pytest.mark.slow
 def test_real_photographs_are_localized_within_a_centimetre(
     shared_data: Path, make_map: Any, tmp_path: Path
 ) -> None:

@@ -293,6 +293,7 @@ def observed(folder: KaptureFolder, name: str, offset: int = 0) -> list[Any]:
     return [seen.image_names, *(column.tolist() for column in columns)]
 
 
+@pytest.mark.slow
 def test_virtual_gallery_given_per_rig_and_per_camera(shared_data: Path, tmp_path: Path) -> None:
     gallery = shared_data / "foreign_maps" / "virtual_gallery"
     for name, sensors in (("rig", gallery / "mapping_rig"), ("camera", gallery / "map")):

@@ -177,6 +177,7 @@ def sample(shared_data: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_sample_is_what_kapture_makes_of_it(sample: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     write_official(read(sample), out, allow_missing=True)

@@ -270,6 +270,7 @@ def test_the_second_camera_may_not_lack(tmp_path: Path) -> None:
         read_calibration(tmp_path)
 
 
+@pytest.mark.slow
 def test_the_published_clouds_as_kapture_reads_them(sample: Path) -> None:
     from tools.kapture_import_4seasons import (
         load_4season_depth_from_keyframe_data,
@@ -291,6 +292,7 @@ def test_the_published_clouds_as_kapture_reads_them(sample: Path) -> None:
         np.testing.assert_allclose(np.abs(cam_from_world.quat_wxyz), np.abs(pose.r_raw), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_published_times(sample: Path) -> None:
     folder = next(sample.glob("recording_*"))
     times = read_times(folder / "times.txt")

@@ -161,6 +161,7 @@ def check_against_kapture(models: list[NvmModel], data: kapture.Kapture, folder:
     assert sorted(rows) == observed(data, folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["aachen_cvpr2018_db.nvm", "aachen_two_parts.nvm"])
 def test_the_published_sample_reads_as_kapture_reads_it(
     shared_data: Path, tmp_path: Path, name: str

@@ -289,6 +289,7 @@ def sample(shared_data: Path, tmp_path: Path) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_all_poses_of_the_sample_as_kaptures_importer_has_them(sample: Path) -> None:
     folder = sample / "a_map"
     poses = read_keyframe_poses(
@@ -310,6 +311,7 @@ def test_all_poses_of_the_sample_as_kaptures_importer_has_them(sample: Path) -> 
         assert abs(dot) == pytest.approx(1, abs=1e-14)
 
 
+@pytest.mark.slow
 def test_the_sample_as_kapture(sample: Path, tmp_path: Path) -> None:
     dataset = read(sample)
     with pytest.raises(DataError, match="11480 files are missing"):

@@ -46,6 +46,7 @@ def only_error(report: CheckReport) -> Finding:
     return errors[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["fountain_p11", "herzjesu_p25", "herzjesu_wide", "redkitchen_rgbd"]
 )
@@ -56,6 +57,7 @@ def test_real_scenes_pass(real_scene: Any, pose_lines: Any, check: Check, name: 
     assert {finding.kind for finding in report.findings} <= {"undecided"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", [*CLASSIC, *COMBINED])
 @pytest.mark.parametrize("name", ["fountain_p11", "herzjesu_p25", "herzjesu_wide"])
 def test_mistakes_in_real_scenes(
@@ -66,6 +68,7 @@ def test_mistakes_in_real_scenes(
     assert only_error(check(lines, scene.reference())).kind == mistake
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", CLASSIC)
 def test_mistakes_where_cameras_hardly_turn(
     real_scene: Any, pose_lines: Any, check: Check, mistake: str

@@ -172,9 +172,9 @@ def test_damage_is_told_exactly_where_the_strict_reader_refuses(
 
 
 @pytest.fixture
-def imported(shared_data: Path, tmp_path: Path) -> Path:
+def imported(scene: Path, tmp_path: Path) -> Path:
     for part in ("mapping", "query"):
-        data = KaptureFolder(shared_data / "scenes" / "fountain_p11" / part).read()
+        data = KaptureFolder(scene / part).read()
         data.records_camera = {k: f"{part}/{name}" for k, name in data.records_camera.items()}
         write_sensors(tmp_path / part, data)
     return tmp_path

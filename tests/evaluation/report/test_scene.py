@@ -138,6 +138,7 @@ def test_the_page_has_what_kapture_reads(make_map: Any, camera: Camera, offset: 
     np.testing.assert_allclose(data["up"], [0, 0, 1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_foreign_map_of_rigs(shared_data: Path) -> None:
     root = shared_data / "foreign_maps" / "virtual_gallery" / "map"
     scene = drawn(root)

@@ -231,6 +231,7 @@ def test_features_that_are_not_finite_are_found_without_a_deep_check(root: Path)
         vectors.read(0, 1)
 
 
+@pytest.mark.slow
 def test_real_folders_are_read_and_valid(shared_data: Path) -> None:
     roots = sorted(p.parent for p in shared_data.glob("scenes/*/*/sensors"))
     roots += sorted(p.parent for p in shared_data.glob("foreign_maps/*/*/sensors"))

@@ -250,6 +250,7 @@ def test_kapture_reads_our_pairs(tmp_path: Path) -> None:
     assert read_pairs(tmp_path / "theirs.txt") == pairs
 
 
+@pytest.mark.slow
 def test_kapture_and_we_read_the_same_map_of_other_tools(shared_data: Path) -> None:
     root = shared_data / "foreign_maps/virtual_gallery/map"
     theirs = kapture.io.csv.kapture_from_dir(str(root))

@@ -1,0 +1,63 @@
+"""A map and queries as another tool leaves them: they bring features that are not ours by name."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from megloc_kapture.io.kapture import FeatureWriter, KaptureFolder
+
+KEYPOINTS = "reconstruction/keypoints/r2d2_800"
+DESCRIPTORS = "reconstruction/descriptors/r2d2_800"
+GLOBAL = "reconstruction/global_features/AP-GeM-LM18"
+
+
+def write_foreign(root: Path, finished: Path, scene: Path) -> None:
+    """Write ``map/``, ``query/`` and ``query_gt/`` from a finished run of the scene.
+
+    What is stored as R2D2's and AP-GeM's is RootSIFT's and VLAD's. Images are links.
+    """
+    shutil.copytree(finished / "map", root / "map", symlinks=True)
+    shutil.rmtree(root / "map" / "reconstruction")
+    shutil.copytree(finished / "query" / "sensors", root / "query" / "sensors", symlinks=True)
+    shutil.copytree(scene / "query_gt", root / "query_gt")
+    for part in ("map", "query"):
+        images = root / part / "sensors" / "records_data"
+        source = scene / ("mapping" if part == "map" else part) / "sensors" / "records_data"
+        shutil.rmtree(images) if not images.is_symlink() else images.unlink()
+        images.symlink_to(source.resolve())
+        folder = KaptureFolder(finished / part, features_dirs=[finished])
+        for kind in ("keypoints", "descriptors", "global_features"):
+            _write_features(root / part, folder, kind)
+    ours, theirs = (place / "map" / "reconstruction" for place in (finished, root))
+    shutil.copyfile(ours / "points3d.txt", theirs / "points3d.txt")
+    seen = (ours / "observations.txt").read_text()
+    (theirs / "observations.txt").write_text(seen.replace("rootsift", "r2d2_800"))
+
+
+def _write_features(root: Path, folder: KaptureFolder, kind: str) -> None:
+    if kind == "global_features":
+        reader = folder.global_features("vlad_rootsift")
+        name, config = "AP-GeM-LM18", replace(reader.config, name="dirtorch")
+    else:
+        reader = getattr(folder, kind)("rootsift")
+        owner = "r2d2_800" if kind == "descriptors" else None
+        name, config = "r2d2_800", replace(reader.config, name="r2d2", keypoints_type=owner)
+    with FeatureWriter(root, kind, name, config) as writer:
+        for image in folder.read().image_names():
+            writer.write(image, reader.read(image))
+
+
+def rename_type(root: Path, parts: Sequence[str] = ("map", "query")) -> None:
+    """The type of the keypoints becomes ``orb_800``, which no extractor makes."""
+    for part in parts:
+        for kind in (KEYPOINTS, DESCRIPTORS):
+            folder = root / part / kind
+            for table in folder.glob("*.txt"):
+                table.write_text(table.read_text().replace("r2d2", "orb"))
+            folder.rename(folder.with_name("orb_800"))
+        seen = root / part / "reconstruction" / "observations.txt"
+        if seen.is_file():
+            seen.write_text(seen.read_text().replace("r2d2_800", "orb_800"))
