@@ -19,7 +19,12 @@ from megloc_kapture.values import Options
 
 def entry_points(**of: str) -> metadata.EntryPoints:
     """Those of the packages on the search path; reading them takes 10 ms, and is done once."""
-    return _entry_points_on(tuple(sys.path)).select(**of)
+    return _selected(tuple(sys.path), *sorted(of.items()))
+
+
+@cache
+def _selected(search_path: tuple[str, ...], *of: tuple[str, str]) -> Any:
+    return _entry_points_on(search_path).select(**dict(of))
 
 
 @cache

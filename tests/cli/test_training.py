@@ -87,6 +87,7 @@ def test_what_it_refuses(megloc: Any, inputs: Path, tmp_path: Path) -> None:
 
 
 QUICK = ("--steps", "6", "--max-side", "40", "--device", "cpu")
+HERE = ("--max-side", "80", "--executor", "inline")
 CAMERA_TEXT = "SIMPLE_PINHOLE,48,36,40,24,18"
 
 
@@ -160,7 +161,7 @@ def test_gaussians_begin_where_depth_says(megloc: Any, mapping: Path, tmp_path: 
     assert megloc("train-field", "-i", mapping, "-o", again, *options).status == 0
     assert same_field(again, out)
     rendered = tmp_path / "rendered"
-    assert megloc("render", out, "--along", mapping, "-o", rendered, "--max-side", "40").status == 0
+    assert megloc("render", out, "--along", mapping, "-o", rendered, *HERE).status == 0
     maps, truth = (KaptureFolder(each) for each in (rendered, mapping))
     for name in ("0000", "0003"):
         found = np.fromfile(maps.root / f"sensors/records_data/{name}.depth", np.float32)
@@ -195,7 +196,7 @@ def test_views_along_a_result(megloc: Any, mapping: Path, field: Path, tmp_path:
     path = one / "sensors" / "trajectories.txt"
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(lines[:3]))  # the header, and one pose
-    done = megloc("render", field, "--along", one, "-o", tmp_path / "rendered", "--max-side", "80")
+    done = megloc("render", field, "--along", one, "-o", tmp_path / "rendered", *HERE)
     assert done.out.startswith("1 views rendered")
     written = KaptureFolder(tmp_path / "rendered")
     written.validate(deep=True)
@@ -231,7 +232,7 @@ def test_the_view_shows_them_beside_the_photographs(
     megloc: Any, finished: Path, field: Path, tmp_path: Path, data_of: Any
 ) -> None:
     found, rendered, page = finished / "localized", tmp_path / "rendered", tmp_path / "view.html"
-    assert megloc("render", field, "--along", found, "-o", rendered, "--max-side", "80").status == 0
+    assert megloc("render", field, "--along", found, "-o", rendered, *HERE).status == 0
     view = ("view", finished / "map", found, "-o", page)
     assert megloc(*view, "--rendered", rendered).status == 0
     poses, photographs = KaptureFolder(found).read().poses(), KaptureFolder(finished / "query")
@@ -281,7 +282,7 @@ def test_views_that_no_camera_took_join_the_map(
     megloc: Any, mapping: Path, field: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "between"
-    done = megloc("render", field, "--between", mapping, "-o", out, "--max-side", "64")
+    done = megloc("render", field, "--between", mapping, "-o", out, *HERE)
     assert done.status == 0, done
     written, real = KaptureFolder(out), KaptureFolder(mapping).read().poses()
     written.validate(deep=True)

@@ -133,6 +133,7 @@ def test_a_worker_that_was_killed_costs_no_result(tmp_path: Path) -> None:
         assert list(ordered_map(_die_once, places, executor)) == ["done"] * 3
 
 
+@pytest.mark.slow  # distributed tries for ten seconds to reach it again
 def test_a_scheduler_that_goes_away_is_one_line(tmp_path: Path) -> None:
     with (
         running(tmp_path, 1) as found,

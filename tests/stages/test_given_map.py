@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +77,12 @@ def triples(folder: KaptureFolder, local_type: str = TYPE) -> set[tuple[int, str
 
 def place(folder: KaptureFolder, image: str, keypoint: int) -> tuple[float, ...]:
     """Where a keypoint is."""
-    return tuple(folder.keypoints(TYPE).read(image)[keypoint].tolist())
+    return tuple(_stored(folder, image)[keypoint].tolist())
+
+
+@lru_cache(maxsize=20)
+def _stored(folder: KaptureFolder, image: str) -> Any:
+    return folder.keypoints(TYPE).read(image)
 
 
 def test_a_map_with_descriptors_is_taken_as_it_is(world, tmp_path: Path, folder_bytes: Any) -> None:
