@@ -53,12 +53,12 @@ eval: $(STAMP)
 # every worker's networks have a thread per core: who waits for one leaves the core to the others
 PYTEST = PYTHONDONTWRITEBYTECODE= OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
-# some disks take milliseconds to remove a folder, and the tests make thousands: in memory, where
-# there is room
+# as many workers as cores, so each needs one thread. Some disks take milliseconds to remove a
+# folder, and the tests make thousands: in memory, where there is room
 IN_MEMORY = $(shell df -Pk /dev/shm 2>/dev/null | awk 'NR == 2 && $$4 > 4e6 { print "PYTEST_DEBUG_TEMPROOT=/dev/shm" }')
 
 test: $(STAMP)
-	@$(IN_MEMORY) $(PYTEST) -m 'not slow and not fuzz' $(ARGS)
+	@OMP_NUM_THREADS=1 $(IN_MEMORY) $(PYTEST) -m 'not slow and not fuzz' $(ARGS)
 
 test-slow: $(STAMP)
 	@$(PYTEST) -m 'slow or fuzz' --no-loadscope-reorder --hypothesis-profile thorough \

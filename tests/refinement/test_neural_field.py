@@ -71,7 +71,7 @@ def depth_error(field: NeuralField, tests: list[FieldView]) -> float:
 
 def test_a_small_field_learns_the_room_and_the_same_bytes_twice() -> None:
     seen: list[tuple[int, list[float]]] = []
-    options = FieldTrainingOptions(steps=80, rays_per_step=256, device="cpu")
+    options = FieldTrainingOptions(steps=60, rays_per_step=256, device="cpu")
 
     def progress(step: int, seconds: float, psnr_db: list[float]) -> None:
         seen.append((step, psnr_db))
@@ -80,7 +80,7 @@ def test_a_small_field_learns_the_room_and_the_same_bytes_twice() -> None:
     assert set(psnr) == {"007.png"} and len(field.images) == 7
     # an image of one colour has 14 dB
     assert min(psnr.values()) > 16 and depth_error(field, views(4)) < 0.2
-    assert [step for step, _ in seen] == list(range(16, 80, 16))
+    assert [step for step, _ in seen] == list(range(12, 60, 12))
     assert all(len(values) == 1 for _, values in seen)
     brief = QUICK.model_copy(update={"steps": 3})
     one, other = (train_field(views(5), brief)[0].module.state_dict() for _ in range(2))
