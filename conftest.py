@@ -60,23 +60,24 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     root = tmp_path_factory.mktemp("scene")
     write_scene(root)
     with pytest.MonkeyPatch.context() as patch:
-        _remember_rootsift(patch)
+        from megloc_kapture.features.rootsift import ColmapSift, RootSift
+
+        for kind in (RootSift, ColmapSift):
+            patch.setattr(kind, "extract", _remembered(kind.extract))
         yield root
 
 
-def _remember_rootsift(patch: pytest.MonkeyPatch) -> None:
-    from megloc_kapture.features.rootsift import RootSift
+def _remembered(extract: Any) -> Any:
+    known: dict[Any, Any] = {}
 
-    extract, known = RootSift.extract, {}
-
-    def remembered(self: RootSift, image: Any, mask: Any = None) -> Any:
+    def remembered(self: Any, image: Any, mask: Any = None) -> Any:
         arrays = (array.tobytes() for array in (image, mask) if array is not None)
         key = (repr(self.options), image.shape, *(hashlib.sha256(each).digest() for each in arrays))
         if key not in known:
             known[key] = extract(self, image, mask)
         return copy.deepcopy(known[key])
 
-    patch.setattr(RootSift, "extract", remembered)
+    return remembered
 
 
 @pytest.fixture(scope="session")

@@ -213,6 +213,7 @@ def test_views_along_a_result(megloc: Any, mapping: Path, field: Path, tmp_path:
     megloc("render", field, "--along", one, "-o", tmp_path / "x").refused("rendered into one file")
 
 
+@pytest.mark.slow
 def test_processes_render_the_same_views(
     megloc: Any, mapping: Path, field: Path, tmp_path: Path
 ) -> None:

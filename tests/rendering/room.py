@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.values import Camera, RigidTransform
@@ -43,9 +42,8 @@ def _texture(seed: int) -> NDArray[np.float64]:
     rng = np.random.default_rng(seed)
     image = np.zeros((_TEXTURE_PX, _TEXTURE_PX, 3))
     for sigma, strength in ((3.0, 1.0), (8.0, 1.2), (24.0, 1.5)):
-        noise = np.tile(rng.normal(size=(_TEXTURE_PX, _TEXTURE_PX, 3)), (3, 3, 1))
-        layer = cv2.GaussianBlur(noise, (0, 0), sigma)[_TEXTURE_PX:-_TEXTURE_PX]
-        layer = layer[:, _TEXTURE_PX:-_TEXTURE_PX]
+        noise = rng.normal(size=(_TEXTURE_PX, _TEXTURE_PX, 3))
+        layer = gaussian_filter(noise, (sigma, sigma, 0), mode="wrap")
         image += strength * layer / layer.std()
     return np.clip(0.5 + 0.1 * image, 0.02, 0.98)
 
