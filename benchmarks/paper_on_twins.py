@@ -82,8 +82,6 @@ FREE_OUTDOORS = ["preprocessing.masks.segmenter=null"]
 # recall at the two finest thresholds of a dataset; conditions that are dark by design have no bar
 BARS = (0.90, 0.95)
 DARK = ("night", "night-rain", "night-all", "dusk", "all")
-
-
 SIZES = ("small", "images", "all")
 SIZE_OPTIONS = ("width", "height", "size_px")
 

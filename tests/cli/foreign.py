@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+
+import pytest
 
 from megloc_kapture.io.kapture import FeatureWriter, KaptureFolder
 
 KEYPOINTS = "reconstruction/keypoints/r2d2_800"
 DESCRIPTORS = "reconstruction/descriptors/r2d2_800"
 GLOBAL = "reconstruction/global_features/AP-GeM-LM18"
+# the fixtures: rendered, and real
+FOREIGN_MAPS = ["foreign_map", pytest.param("virtual_gallery", marks=pytest.mark.slow)]
 
 
 def write_foreign(root: Path, finished: Path, scene: Path) -> None:
@@ -19,15 +22,13 @@ def write_foreign(root: Path, finished: Path, scene: Path) -> None:
 
     What is stored as R2D2's and AP-GeM's is RootSIFT's and VLAD's. Images are links.
     """
-    shutil.copytree(finished / "map", root / "map", symlinks=True)
-    shutil.rmtree(root / "map" / "reconstruction")
-    shutil.copytree(finished / "query" / "sensors", root / "query" / "sensors", symlinks=True)
     shutil.copytree(scene / "query_gt", root / "query_gt")
-    for part in ("map", "query"):
-        images = root / part / "sensors" / "records_data"
-        source = scene / ("mapping" if part == "map" else part) / "sensors" / "records_data"
-        shutil.rmtree(images) if not images.is_symlink() else images.unlink()
-        images.symlink_to(source.resolve())
+    no_images = shutil.ignore_patterns("records_data")
+    for part, of_scene in (("map", "mapping"), ("query", "query")):
+        sensors = root / part / "sensors"
+        shutil.copytree(finished / part / "sensors", sensors, ignore=no_images)
+        images = scene / of_scene / "sensors" / "records_data"
+        (sensors / "records_data").symlink_to(images.resolve())
         folder = KaptureFolder(finished / part, features_dirs=[finished])
         for kind in ("keypoints", "descriptors", "global_features"):
             _write_features(root / part, folder, kind)
@@ -50,9 +51,9 @@ def _write_features(root: Path, folder: KaptureFolder, kind: str) -> None:
             writer.write(image, reader.read(image))
 
 
-def rename_type(root: Path, parts: Sequence[str] = ("map", "query")) -> None:
+def rename_type(root: Path) -> None:
     """The type of the keypoints becomes ``orb_800``, which no extractor makes."""
-    for part in parts:
+    for part in ("map", "query"):
         for kind in (KEYPOINTS, DESCRIPTORS):
             folder = root / part / kind
             for table in folder.glob("*.txt"):

@@ -57,11 +57,18 @@ def again(number: int) -> Callable[[Path], Any]:
     return line(TIMES, number, lambda text: text + text)
 
 
+def point_past(root: Path) -> None:
+    """The first point that is not there is observed."""
+    rows = (root / "reconstruction/points3d.txt").read_text().splitlines()
+    number = sum(not row.startswith("#") for row in rows)
+    change = fields(lambda f: [str(number), *f[1:]])
+    line("reconstruction/observations.txt", 9, change)(root)
+
+
 NO_COLUMN = fields(lambda f: f[:-1])
 NAN = fields(lambda f: [*f[:-1], "nan"])
 UPWARDS = fields(lambda f: [*f[:2], "../../" + f[2]])
 PAST = fields(lambda f: [*f[:-1], "800"])
-NO_POINT = fields(lambda f: ["1000000", *f[1:]])
 
 # of the map: how to spoil it, and what the message has to say
 MAPS: dict[str, tuple[Spoil, str]] = {
@@ -105,8 +112,8 @@ MAPS: dict[str, tuple[Spoil, str]] = {
         r"observations\.txt:9: keypoint id 800, but .* has 800 keypoints",
     ),
     "point past the end": (
-        line("reconstruction/observations.txt", 9, NO_POINT),
-        r"observations\.txt:9: point id 1000000, but there are \d+ points",
+        point_past,
+        r"observations\.txt:9: point id (\d+), but there are \1 points",
     ),
 }
 

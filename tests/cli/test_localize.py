@@ -21,7 +21,7 @@ from megloc_kapture.io.kapture import (
     write_pairs,
 )
 from megloc_kapture.io.tables import read_status
-from tests.cli.foreign import DESCRIPTORS, KEYPOINTS, rename_type
+from tests.cli.foreign import DESCRIPTORS, FOREIGN_MAPS, KEYPOINTS, rename_type
 
 
 def medians(result: Path, truth: Path) -> tuple[float, float, float]:
@@ -88,26 +88,31 @@ def test_a_real_foreign_map(megloc: Any, virtual_gallery: Path, tmp_path: Path) 
     assert all(s.status == "localized" and s.num_inliers > 50 for s in statuses.values())
 
 
+@pytest.mark.parametrize("given", FOREIGN_MAPS)
 @pytest.mark.parametrize("preset", ["modern", "megloc"])
 def test_the_foreign_map_needs_no_weights_of_ours(
-    megloc: Any, foreign: Path, tmp_path: Path, preset: str
+    megloc: Any, request: pytest.FixtureRequest, tmp_path: Path, preset: str, given: str
 ) -> None:
     """It brings its own R2D2 and AP-GeM, and so do its queries."""
-    for path, size in [(KEYPOINTS, 8), (DESCRIPTORS, 512)]:  # too few for 100 matches
-        for file in (foreign / "query" / path).glob("*.jpg.*"):
-            file.write_bytes(file.read_bytes()[: 110 * size])
+    foreign = request.getfixturevalue(given)
+    if given == "foreign_map":  # leave its queries too few keypoints for 100 matches
+        foreign = shutil.copytree(foreign, tmp_path / "foreign", symlinks=True)
+        for path, size in [(KEYPOINTS, 8), (DESCRIPTORS, 512)]:
+            for file in (foreign / "query" / path).glob("*.jpg.*"):
+                file.write_bytes(file.read_bytes()[: 110 * size])
+    (local_type,) = KaptureFolder(foreign / "map").types("keypoints")
     result = tmp_path / "localized"
     command = [*queries_of(foreign, result), "--preset", preset]
     done = megloc(*command)
     assert done.out.startswith("4 of 4 queries localized in ")
-    assert "localizing with r2d2_800" in done.err
+    assert f"localizing with {local_type}" in done.err
     _, median_m, median_deg = medians(result, foreign / "query_gt")
-    assert median_m < 0.01 and median_deg < 0.05
+    assert median_m <= 0.010 and median_deg <= (0.16 if given == "virtual_gallery" else 0.05)
     # what could not be done is said: pairs with few matches would be extracted again
     remarks = {status.remarks for status in read_status(result / "status.csv").values()}
     if preset == "megloc":
         assert remarks == {
-            "guided pyramid matching: the weights that extract r2d2_800 are missing "
+            f"guided pyramid matching: the weights that extract {local_type} are missing "
             "(megloc weights list)"
         }
         assert "left out of 4 queries: guided pyramid matching" in done.err
@@ -115,16 +120,20 @@ def test_the_foreign_map_needs_no_weights_of_ours(
         assert remarks == {""}
     # who asks for it by name is refused instead
     refused = megloc(*command, "-f", "--set", "guided_pyramid.mode=all")
-    refused.refused("--set guided_pyramid changes nothing: the weights that extract r2d2_800")
+    refused.refused(f"--set guided_pyramid changes nothing: the weights that extract {local_type}")
 
 
-def test_proxy_folders_of_kapture_localization(megloc: Any, foreign: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("given", FOREIGN_MAPS)
+def test_proxy_folders_of_kapture_localization(
+    megloc: Any, request: pytest.FixtureRequest, tmp_path: Path, given: str
+) -> None:
     """Its normal intermediate: a kapture folder whose parts are links."""
     symlink = pytest.importorskip("kapture_localization.utils.symlink")
-    local, vectors = ["r2d2_800"], ["AP-GeM-LM18"]
+    foreign = request.getfixturevalue(given)
+    local, vectors = KaptureFolder(foreign / "map").types("keypoints"), ["AP-GeM-LM18"]
     for part in ("map", "query"):
         data = foreign / part / "reconstruction"
-        parts = ("keypoints/r2d2_800", "descriptors/r2d2_800", "global_features/AP-GeM-LM18")
+        parts = (f"keypoints/{local[0]}", f"descriptors/{local[0]}", "global_features/AP-GeM-LM18")
         folders = [str(tmp_path / part), str(foreign / part)]
         linked = [[str(data / name)] for name in parts]
         symlink.create_kapture_proxy(*folders, *linked, None, local, local, vectors, force=True)
@@ -134,7 +143,7 @@ def test_proxy_folders_of_kapture_localization(megloc: Any, foreign: Path, tmp_p
     command = queries_of(tmp_path, tmp_path / "localized")
     # links lead only where the user lets them
     megloc(*command).refused("lies behind a link that leaves .*--allow-links-below")
-    elsewhere = ("--allow-links-below", tmp_path / "query")
+    elsewhere = ("--allow-links-below", tmp_path)
     megloc(*command, *elsewhere).refused("lies behind a link that leaves")
     allowed = ("--allow-links-below", foreign)
     done = megloc(*command, *allowed)

@@ -19,6 +19,7 @@ from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.io.tables import read_status
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.service.server import map_overview
+from tests.cli.foreign import FOREIGN_MAPS
 
 FEW = ("--set", "local_features.options.max_keypoints=700", "--executor", "inline")
 
@@ -104,10 +105,15 @@ def rows_of(text: str) -> dict[str, tuple[int, int]]:
     return {name: (int(points), int(seen)) for name, points, seen in found}
 
 
+@pytest.mark.parametrize("given", FOREIGN_MAPS)
 def test_a_foreign_map_is_refined_and_localized_in(
-    megloc: Any, foreign_map: Path, tmp_path: Path, contents: Callable[[Path], Any]
+    megloc: Any,
+    request: pytest.FixtureRequest,
+    tmp_path: Path,
+    contents: Callable[[Path], Any],
+    given: str,
 ) -> None:
-    place = foreign_map
+    place = request.getfixturevalue(given)
     before = contents(place)
     out = tmp_path / "refined"
     keep = ("--set", "refinement.uncertainty.keep_quantile=0.9")
