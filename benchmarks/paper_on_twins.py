@@ -39,14 +39,14 @@ SMALL_WORLDS = {
     # networks that see nothing need little to look at; each kind of query is there
     "random": {
         "aachen": [
-            *("num_places=1", "stations_per_place=4", "sequence_images=2", "day_queries=2"),
+            *("num_places=1", "stations_per_place=3", "sequence_images=2", "day_queries=1"),
             *("night_queries=1", "additional_night_queries=1", "width=320", "height=240"),
         ],
         "robotcar": [
-            *("num_locations=1", "stops_per_location=4", "moments_per_condition=2", "size_px=256"),
+            *("num_locations=1", "stops_per_location=3", "moments_per_condition=2", "size_px=256"),
         ],
         "4seasons": [
-            *("num_places=1", "map_keyframes=6", "winter_keyframes=2", "dusk_keyframes=1"),
+            *("num_places=1", "map_keyframes=4", "winter_keyframes=1", "dusk_keyframes=1"),
             *("width=400", "height=200"),
         ],
         "inloc": ["modules=1", "queries=2"],

@@ -6,6 +6,7 @@ import contextlib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
@@ -71,7 +72,7 @@ class ResultContext:
     ----------
     queries : images and cameras of the queries, their keypoints, their matches with the map.
     mapping : images, cameras and poses of the map.
-    frames : map image or query -> its coordinate frame, where a dataset has several.
+    side_tables : the tables of the dataset.
     clusters : query -> the clusters of candidates it was tried in.
     refinements : query -> what each step of refining its pose came to.
     consistency : what the map's own images said of it, before poses were refined.
@@ -84,7 +85,7 @@ class ResultContext:
 
     queries: KaptureFolder | None = None
     mapping: KaptureFolder | None = None
-    frames: Mapping[str, str] = field(default_factory=dict)
+    side_tables: Path | None = None
     clusters: Mapping[str, Sequence[ClusterRow]] = field(default_factory=dict)
     refinements: Mapping[str, Sequence[RefinementRow]] = field(default_factory=dict)
     consistency: Sequence[ConsistencyRow] = ()
@@ -93,6 +94,13 @@ class ResultContext:
     localized: Mapping[str, Pose] = field(default_factory=dict)
     cameras: Mapping[str, Camera] = field(default_factory=dict)
     unit: str = METRES
+
+    @cached_property
+    def frames(self) -> dict[str, str]:
+        """Map image or query -> its coordinate frame, where a dataset has several. DataError: the
+        tables are broken."""
+        groups = {} if self.side_tables is None else read_groups(self.side_tables)
+        return {image: group.frame for image, group in groups.items() if group.frame}
 
     def map_poses(self) -> dict[str, RigidTransform]:
         """``cam_from_world`` of the map's images; empty without a map. DataError: it is broken."""
@@ -133,7 +141,7 @@ def context_of(result: Path | str, *, mapping: Path | str | None = None) -> Resu
 
     Raises
     ------
-    DataError : broken side tables, or a broken table of clusters, of refinement or of consistency.
+    DataError : a broken table of clusters, of refinement or of consistency.
     """
     workspace, found = workspace_of(result), Path(result)
     features, candidates, maps = [], [found], []
@@ -149,14 +157,13 @@ def context_of(result: Path | str, *, mapping: Path | str | None = None) -> Resu
     map_path = next((path for path in maps if (path / _SENSORS).is_file()), None)
     if mapping is not None:
         map_path = Path(mapping)
-    groups = {} if workspace is None else read_groups(workspace / SIDE_TABLES)
     refinements: dict[str, list[RefinementRow]] = {}
     for row in _if_there(read_refinement, found / REFINEMENT_FILE) or ():
         refinements.setdefault(row.image, []).append(row)
     return ResultContext(
         queries=None if queries is None else KaptureFolder(queries, features_dirs=features),
         mapping=None if map_path is None else KaptureFolder(map_path, features_dirs=features),
-        frames={image: group.frame for image, group in groups.items() if group.frame},
+        side_tables=None if workspace is None else workspace / SIDE_TABLES,
         clusters=_if_there(read_clusters, found / CLUSTERS_FILE) or {},
         refinements=refinements,
         consistency=_if_there(read_consistency, found / CONSISTENCY_FILE) or (),

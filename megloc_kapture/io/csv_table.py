@@ -230,16 +230,20 @@ class Table(Generic[RowT]):
         Raises DataError: absent or broken table, a value that is not of its kind, a key given
         twice; names file, line and column.
         """
-        known: set[tuple[tuple[str, ...], ...]] = set()
+        known = self._no_keys()
         rows = []
+        readers = [(name, column.read) for name, column in self._columns.items()]
         for line, cells in read_csv_table(path, tuple(self._columns), optional=self._later):
-            with named(path, line):
-                values = {name: self._value(name, text) for name, text in cells.items()}
-                try:
-                    rows.append(self._row(**values))
-                except ValidationError as error:
-                    raise DataError(first_problem(error)) from error
+            try:
+                values = {name: read(cells[name]) for name, read in readers if name in cells}
+                rows.append(self._row(**values))
                 self._check_keys(cells, known)
+            except ValidationError as error:
+                raise DataError(first_problem(error), path=path, line=line) from error
+            except (DataError, ValueError) as error:
+                with named(path, line):
+                    self._check_cells(cells)
+                    raise
         return rows
 
     def read_if_there(self, path: Path) -> list[RowT]:
@@ -254,7 +258,7 @@ class Table(Generic[RowT]):
         DataError : a key given twice, or a name that cannot stand in the table.
         OutputError : the file cannot be written.
         """
-        known: set[tuple[tuple[str, ...], ...]] = set()
+        known = self._no_keys()
         lines = []
         for row in rows:
             cells = {
@@ -264,17 +268,22 @@ class Table(Generic[RowT]):
             lines.append(tuple(cells.values()))
         write_csv_table(path, tuple(self._columns), lines)
 
-    def _check_keys(
-        self, cells: Mapping[str, str], known: set[tuple[tuple[str, ...], ...]]
-    ) -> None:
-        for key in self._keys:
-            value = tuple(cells[name] for name in key)
-            if (key, value) in known:
-                raise DataError(f"{', '.join(key)} {', '.join(map(repr, value))} is given twice")
-            known.add((key, value))
+    def _no_keys(self) -> list[tuple[tuple[str, ...], set[tuple[str, ...]]]]:
+        return [(key, set()) for key in self._keys]
 
-    def _value(self, name: str, text: str) -> Any:
-        try:
-            return self._columns[name].read(text)
-        except ValueError as error:
-            raise DataError(f"{name} {text!r} is not {self._columns[name].expected}") from error
+    def _check_keys(
+        self, cells: Mapping[str, str], known: list[tuple[tuple[str, ...], set[tuple[str, ...]]]]
+    ) -> None:
+        for key, seen in known:
+            value = tuple([cells[name] for name in key])
+            if value in seen:
+                raise DataError(f"{', '.join(key)} {', '.join(map(repr, value))} is given twice")
+            seen.add(value)
+
+    def _check_cells(self, cells: Mapping[str, str]) -> None:
+        for name, text in cells.items():
+            try:
+                self._columns[name].read(text)
+            except ValueError as error:
+                expected = self._columns[name].expected
+                raise DataError(f"{name} {text!r} is not {expected}") from error

@@ -304,10 +304,10 @@ def table_path(folder: Path | str, name: str) -> Path:
 
 def read_groups(folder: Path | str) -> dict[str, ImageGroup]:
     """Read ``groups.csv``: image -> group, sorted by image."""
-    rows = sorted(_GROUPS.read_if_there(table_path(folder, GROUPS_FILE)))
+    names = tuple(ImageGroup.model_fields)
     return {
-        row.image: ImageGroup(**{name: getattr(row, name) for name in ImageGroup.model_fields})
-        for row in rows
+        row.image: ImageGroup(**{name: getattr(row, name) for name in names})
+        for row in sorted(_GROUPS.read_if_there(table_path(folder, GROUPS_FILE)))
     }
 
 

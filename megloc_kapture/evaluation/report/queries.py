@@ -82,9 +82,10 @@ def shown_queries(result: Evaluation | ResultWithoutTruth) -> list[ShownQuery]:
     evaluation = result if isinstance(result, Evaluation) else None
     poses = result.estimated if isinstance(result, Evaluation) else result.poses
     shown = []
+    attributes = [own.name for own in fields(QueryResult)]
     for query in result.queries:
         name = query.image
-        known = {own.name: getattr(query, own.name) for own in fields(query)}
+        known = {attribute: getattr(query, attribute) for attribute in attributes}
         if evaluation is not None:
             known["image"] = evaluation.image(name)
         if name not in poses:

@@ -27,6 +27,7 @@ from megloc_kapture.evaluation.report.queries import (
 from megloc_kapture.evaluation.report.scene import Scene, corner_rays, render_view, scene_of
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation, evaluate_poses
+from megloc_kapture.io.dataset_tables import ImageGroup, write_groups
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.io.kapture.points import write_points3d
@@ -261,8 +262,9 @@ def test_coordinate_frames_are_kept_apart(world: Any, make_map: Any) -> None:
         replace(q, candidates=("m/2.jpg",) * (k % 2))
         for k, q in enumerate(shown_queries(evaluation))
     ]
-    frames = dict.fromkeys(names[:2], "DUC1") | dict.fromkeys(names[2:], "DUC2")
-    scene = drawn(root, shown, frames=frames)
+    floors = {name: ImageGroup(frame=f"DUC{1 + k // 2}") for k, name in enumerate(names)}
+    write_groups(root / "tables", floors)
+    scene = drawn(root, shown, side_tables=root / "tables")
     assert scene.frames == ("DUC1", "DUC2")
     assert scene.point_frames.tolist() == [0, 1, 1]
     assert scene.camera_frames.tolist() == [0, 0, 1, 1]
