@@ -50,22 +50,25 @@ eval: $(STAMP)
 
 # a file's tests share their fixtures, so they stay together
 # the many processes that they start compile the package once, whatever the user has set
-# every worker's networks have a thread per core: who waits for one leaves the core to the others
-PYTEST = PYTHONDONTWRITEBYTECODE= OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
+# as many workers as cores, so each needs one thread
+PYTEST = PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
-# as many workers as cores, so each needs one thread. Some disks take milliseconds to remove a
-# folder, and the tests make thousands: in memory, where there is room
+# whole runs wait for a quarter of their time, for processes and for the disk: one more worker
+SLOW_WORKERS = $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1)
+
+# some disks take milliseconds to remove a folder, and the quick tests make thousands: in memory,
+# where there is room
 IN_MEMORY = $(shell df -Pk /dev/shm 2>/dev/null | awk 'NR == 2 && $$4 > 4e6 { print "PYTEST_DEBUG_TEMPROOT=/dev/shm" }')
 
 test: $(STAMP)
-	@OMP_NUM_THREADS=1 $(IN_MEMORY) $(PYTEST) -m 'not slow and not fuzz' $(ARGS)
+	@$(IN_MEMORY) $(PYTEST) -m 'not slow and not fuzz' $(ARGS)
 
 test-slow: $(STAMP)
-	@$(PYTEST) -m 'slow or fuzz' --no-loadscope-reorder --hypothesis-profile thorough \
+	@$(PYTEST) -n $(SLOW_WORKERS) -m 'slow or fuzz' --no-loadscope-reorder --hypothesis-profile thorough \
 		$(if $(BUDGET_S),--time-budget-s '$(BUDGET_S)') $(ARGS)
 
 test-all: $(STAMP)
-	@$(PYTEST) --hypothesis-profile thorough $(ARGS)
+	@$(PYTEST) -n $(SLOW_WORKERS) --hypothesis-profile thorough $(ARGS)
 
 lint: $(STAMP)
 	@$(BIN)/ruff check .
