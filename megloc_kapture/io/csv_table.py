@@ -240,7 +240,7 @@ class Table(Generic[RowT]):
                 self._check_keys(cells, known)
             except ValidationError as error:
                 raise DataError(first_problem(error), path=path, line=line) from error
-            except (DataError, ValueError) as error:
+            except (DataError, ValueError):
                 with named(path, line):
                     self._check_cells(cells)
                     raise
