@@ -68,7 +68,7 @@ test-slow: $(STAMP)
 		$(if $(BUDGET_S),--time-budget-s '$(BUDGET_S)') $(ARGS)
 
 test-all: $(STAMP)
-	@$(PYTEST) -n $(SLOW_WORKERS) --no-loadscope-reorder --hypothesis-profile thorough $(ARGS)
+	@$(PYTEST) -n $(SLOW_WORKERS) --hypothesis-profile thorough $(ARGS)
 
 lint: $(STAMP)
 	@$(BIN)/ruff check .

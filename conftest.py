@@ -31,16 +31,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests first: with minutes to go at the end, one core would do nothing."""
-    slow = {
-        item.path
-        for item in items
-        if any(item.get_closest_marker(name) for name in ("slow", "fuzz"))
-    }
-    items.sort(key=lambda item: item.path not in slow)
-
-
 _BEGIN_S = time.monotonic()
 
 
