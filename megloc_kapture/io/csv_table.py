@@ -230,19 +230,18 @@ class Table(Generic[RowT]):
         Raises DataError: absent or broken table, a value that is not of its kind, a key given
         twice; names file, line and column.
         """
-        known = self._no_keys()
+        known: set[tuple[tuple[str, ...], ...]] = set()
         rows = []
-        readers = [(name, column.read) for name, column in self._columns.items()]
         for line, cells in read_csv_table(path, tuple(self._columns), optional=self._later):
+            # no context is entered for each of a benchmark's tens of thousands of rows
             try:
-                values = {name: read(cells[name]) for name, read in readers if name in cells}
+                values = {name: self._value(name, text) for name, text in cells.items()}
                 rows.append(self._row(**values))
                 self._check_keys(cells, known)
             except ValidationError as error:
                 raise DataError(first_problem(error), path=path, line=line) from error
-            except (DataError, ValueError):
+            except DataError:
                 with named(path, line):
-                    self._check_cells(cells)
                     raise
         return rows
 
@@ -258,7 +257,7 @@ class Table(Generic[RowT]):
         DataError : a key given twice, or a name that cannot stand in the table.
         OutputError : the file cannot be written.
         """
-        known = self._no_keys()
+        known: set[tuple[tuple[str, ...], ...]] = set()
         lines = []
         for row in rows:
             cells = {
@@ -268,22 +267,17 @@ class Table(Generic[RowT]):
             lines.append(tuple(cells.values()))
         write_csv_table(path, tuple(self._columns), lines)
 
-    def _no_keys(self) -> list[tuple[tuple[str, ...], set[tuple[str, ...]]]]:
-        return [(key, set()) for key in self._keys]
-
     def _check_keys(
-        self, cells: Mapping[str, str], known: list[tuple[tuple[str, ...], set[tuple[str, ...]]]]
+        self, cells: Mapping[str, str], known: set[tuple[tuple[str, ...], ...]]
     ) -> None:
-        for key, seen in known:
-            value = tuple([cells[name] for name in key])
-            if value in seen:
+        for key in self._keys:
+            value = tuple(cells[name] for name in key)
+            if (key, value) in known:
                 raise DataError(f"{', '.join(key)} {', '.join(map(repr, value))} is given twice")
-            seen.add(value)
+            known.add((key, value))
 
-    def _check_cells(self, cells: Mapping[str, str]) -> None:
-        for name, text in cells.items():
-            try:
-                self._columns[name].read(text)
-            except ValueError as error:
-                expected = self._columns[name].expected
-                raise DataError(f"{name} {text!r} is not {expected}") from error
+    def _value(self, name: str, text: str) -> Any:
+        try:
+            return self._columns[name].read(text)
+        except ValueError as error:
+            raise DataError(f"{name} {text!r} is not {self._columns[name].expected}") from error
