@@ -50,8 +50,9 @@ eval: $(STAMP)
 
 # a file's tests share their fixtures, so they stay together
 # the many processes that they start compile the package once, whatever the user has set
-# as many workers as cores, so each needs one thread
-PYTEST = PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
+# as many workers as cores, so each needs one thread; the few tests that ask for more leave the core
+# to the others while they wait
+PYTEST = PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m pytest --maxprocesses 4 --dist loadfile
 
 # whole runs wait for a quarter of their time, for processes and for the disk: one more worker
 SLOW_WORKERS = $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1)
@@ -61,7 +62,7 @@ SLOW_WORKERS = $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1)
 IN_MEMORY = $(shell df -Pk /dev/shm 2>/dev/null | awk 'NR == 2 && $$4 > 4e6 { print "PYTEST_DEBUG_TEMPROOT=/dev/shm" }')
 
 test: $(STAMP)
-	@$(IN_MEMORY) $(PYTEST) -m 'not slow and not fuzz' $(ARGS)
+	@$(IN_MEMORY) $(PYTEST) -n logical -m 'not slow and not fuzz' $(ARGS)
 
 test-slow: $(STAMP)
 	@$(PYTEST) -n $(SLOW_WORKERS) -m 'slow or fuzz' --no-loadscope-reorder --hypothesis-profile thorough \
