@@ -55,7 +55,7 @@ _ONNX_OTHERS = {
 class KeypointBatch:
     """Keypoints of one side of several pairs."""
 
-    # points, descriptors: float32 (B, N, 2), normalised to [-1, 1], and (B, N, D)
+    # points, descriptors: (B, N, 2), normalised to [-1, 1], and (B, N, D), of the weights' type
     points: torch.Tensor
     descriptors: torch.Tensor
     # bool (B, N, 1), False where a row is padding; None: all are there
@@ -84,7 +84,7 @@ class LightGlueNetwork(nn.Module):
         self.descriptor_size = descriptor_size
 
     def forward(self, a: KeypointBatch, b: KeypointBatch) -> torch.Tensor:
-        """Logarithm of the probability that two keypoints match, float32 (B, M, N).
+        """Logarithm of the probability that two keypoints match (B, M, N), of the points' type.
 
         Sections 3.1 to 3.3 of the paper; minus infinity where there is padding. Under autocast the
         layers run in half precision, positions and the assignment do not.
@@ -97,7 +97,8 @@ class LightGlueNetwork(nn.Module):
         for layer in self.parts.transformers:
             x, y = layer(x, y, where_x, where_y, *of_heads)
         with torch.autocast(x.device.type, enabled=False):
-            return _assignment(self.parts.log_assignment[-1], x.float(), y.float(), masks)
+            x, y = x.to(a.points.dtype), y.to(a.points.dtype)
+            return _assignment(self.parts.log_assignment[-1], x, y, masks)
 
 
 def load_lightglue(

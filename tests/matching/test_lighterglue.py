@@ -152,7 +152,8 @@ def test_many_are_the_same_as_one_by_one(weights: str, features: dict[str, Image
     for (matches, scores), other in zip(one.match_many(a, others), others, strict=True):
         expected, expected_scores = one.match(a, other)
         np.testing.assert_array_equal(matches, expected)
-        np.testing.assert_allclose(scores, expected_scores, atol=1e-5)
+        # float32: what is rounded differs by processor; in double, see LightGlue's tests
+        np.testing.assert_allclose(scores, expected_scores, atol=1e-4)
     assert one.match_many(a, []) == []
 
 

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import torch
 from kornia.feature import LightGlue as KorniaLightGlue
+from torch.nn.utils.rnn import pad_sequence
 from transformers import LightGlueConfig, LightGlueForKeypointMatching, SuperPointConfig
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.matching.networks import LightGlue, LightGlueOptions
+from megloc_kapture.matching.networks import LightGlue, LightGlueOptions, normalised_points
+from megloc_kapture.nets.lightglue import KeypointBatch, load_lightglue
 from megloc_kapture.values import ImageFeatures
 
 SIZES = [256, 128]  # SuperPoint's descriptors, ALIKED's
@@ -179,6 +181,35 @@ def test_matches_are_kornias(checkpoint: Path, size: int) -> None:
     assert len(matches) > 50
     np.testing.assert_array_equal(matches, found["matches"][0].numpy())
     np.testing.assert_allclose(scores, found["scores"][0].numpy(), atol=1e-4)
+
+
+def batch_of(*images: ImageFeatures) -> KeypointBatch:
+    """In double precision."""
+    points = [torch.from_numpy(normalised_points(image)).double() for image in images]
+    descriptors = [torch.from_numpy(image.descriptors).double() for image in images]
+    lengths = torch.tensor([len(rows) for rows in points])
+    present = torch.arange(int(lengths.max())) < lengths[:, None]
+    return KeypointBatch(
+        pad_sequence(points, batch_first=True),
+        pad_sequence(descriptors, batch_first=True),
+        present[:, :, None],
+    )
+
+
+def test_padding_changes_nothing(size: int) -> None:
+    network = load_lightglue(official(random_network(size)), "it.pth").double()
+    left = [random_image(number, size, seed=number) for number in (60, 25)]
+    right = [noisy(image, seed=1) for image in left]
+    with torch.inference_mode():
+        together = network(batch_of(*left), batch_of(*right))
+        for row, (a, b) in enumerate(zip(left, right, strict=True)):
+            (alone,) = network(batch_of(a), batch_of(b))
+            rows, columns = alone.shape
+            torch.testing.assert_close(
+                together[row, :rows, :columns], alone, rtol=1e-12, atol=1e-12
+            )
+            assert (together[row, rows:] == -torch.inf).all()
+            assert (together[row, :, columns:] == -torch.inf).all()
 
 
 def test_a_file_may_lack_what_is_not_used(checkpoint: Path, size: int, tmp_path: Path) -> None:
