@@ -30,6 +30,9 @@ from megloc_kapture.values import Options, RigidTransform
 # squared distance between two poses over the covariance of one that chance exceeds once in a
 # thousand times: the chi-squared distribution of six degrees of freedom
 CHI2_OF_CHANCE = 22.46
+# displacement in pixels of the level that says nothing, however small a covariance is: of a rendering
+# without any noise it is of the size of rounding
+_LEAST_PX = 1e-3
 Float64 = NDArray[np.float64]
 _CHANGE = 0.5  # of the residuals by a difference at most, in their deviations
 # of the normal equations, that the objective's own curvature must have
@@ -145,7 +148,7 @@ def accept_or_keep(
         return PoseRefinement(start, reason, measures)
     if uncertainty is None:
         return PoseRefinement(start, "the images do not determine the pose", measures)
-    if not measures["squared_distance"] > CHI2_OF_CHANCE:
+    if measures["moved_px"] < _LEAST_PX or not measures["squared_distance"] > CHI2_OF_CHANCE:
         return PoseRefinement(start, "it is as near as the images can tell", measures)
     return PoseRefinement(pose, "", measures, uncertainty)
 

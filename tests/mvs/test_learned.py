@@ -39,25 +39,18 @@ def test_depth_is_the_authors() -> None:
         parts = k @ turned @ np.linalg.inv(k), k @ moved
         projections.append((torch.from_numpy(parts[0]), torch.from_numpy(parts[1])))
 
-    def estimated(brightness: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        seen = [brightness * image for image in images]
-        with torch.inference_mode():
-            found = network(seen, projections, script["LIMITS"], seed=0)
-        return found[0].numpy(), found[1].numpy()
-
-    depth, confidence = estimated()
+    with torch.inference_mode():
+        found = network(images, projections, script["LIMITS"], seed=0)
     near, far = np.quantile(outputs["depth"], [0.1, 0.9])
     low, high = np.quantile(outputs["confidence"], [0.1, 0.9])
     assert far > 1.5 * near and high > low + 0.1
-    # hypotheses that differ in their last bits are scored a thousand times as far apart
-    assert np.abs(depth - outputs["depth"]).max() < 0.02
-    assert np.median(np.abs(depth - outputs["depth"])) < 2e-4
-    # a confidence is that of the likeliest hypotheses: where others are as likely, last bits
-    # choose, which differ between processors; brightness that changes as little tells where
-    moved = [1 + sign * change for change in (1e-6, 3e-6, 1e-5) for sign in (1, -1)]
-    own = np.max([np.abs(estimated(each)[1] - confidence) for each in moved], axis=0)
-    assert np.count_nonzero(own > 0.005) < 0.01 * own.size
-    assert np.abs(confidence - outputs["confidence"])[own <= 0.005].max() < 0.01
+    # where hypotheses are as likely as each other, in some pixels of a thousand, last bits choose,
+    # which differ between processors
+    for name, values in zip(("depth", "confidence"), found, strict=True):
+        error = np.abs(values.numpy() - outputs[name])
+        assert np.median(error) < 2e-4
+        assert np.mean(error > 0.005) < 0.01
+        assert np.mean(error > 0.05) < 0.001
 
 
 def test_what_lies_behind_a_source_is_nothing() -> None:
