@@ -30,8 +30,8 @@ from megloc_kapture.values import Options, RigidTransform
 # squared distance between two poses over the covariance of one that chance exceeds once in a
 # thousand times: the chi-squared distribution of six degrees of freedom
 CHI2_OF_CHANCE = 22.46
-# displacement in pixels of the level that says nothing, however small a covariance is: of a rendering
-# without any noise it is of the size of rounding
+# displacement in pixels of the level that says nothing, however small the covariance is: without
+# any noise that is of the size of rounding
 _LEAST_PX = 1e-3
 Float64 = NDArray[np.float64]
 _CHANGE = 0.5  # of the residuals by a difference at most, in their deviations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -62,3 +63,16 @@ def test_aachen_in_both_forms_gives_the_same_pose_file(
     assert done.status == 0, done.out
     recall = json.loads((runs[1] / "evaluation/recall.json").read_text())
     assert [row["name"] for row in recall["rows"]] == ["day", "night", "all"]
+    # what a server might find right is told of, and handed in where that is asked for
+    again = (
+        *("eval", "aachen", "--root", downloaded, "--workspace", runs[1], "--until", "submission"),
+        *("--set", "local_features.options.max_keypoints=1500", "--executor", "inline"),
+        *("--set", "global_features.options.num_clusters=16"),
+    )
+    doubted = megloc(*again, "--set", "localization.min_confidence=1")
+    kept = len((runs[1] / NAME).read_text().splitlines())
+    told = re.search(r"(\d+) queries that the pose file lacks had a pose of too", doubted.err)
+    assert told is not None and kept + int(told[1]) >= len(rows) > kept, doubted.err
+    trusted = megloc(*again, "--set", "localization.min_confidence=0")
+    assert len((runs[1] / NAME).read_text().splitlines()) >= len(rows)
+    assert "too little confidence" not in trusted.err
