@@ -44,6 +44,8 @@ _CONNECT_S = 10.0
 _ALLOWED_FAILURES = 10
 _ITEMS_PER_WORKER = 4
 _WATCH_S = 0.5
+# a client that has given its scheduler up has none, or a closed pool, or one that it cannot close
+_WITHOUT_SCHEDULER = (CommClosedError, OSError, TimeoutError, AttributeError, RuntimeError)
 # what dask does by the clock, 50 times a second in each process unless told otherwise: 8 % of a
 # core for two workers that wait, 1 % so
 _QUIET = {
@@ -97,8 +99,7 @@ def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator
             raise MeglocError("the workers have no megloc_kapture: install it there") from error
         finally:
             plugin.token.unlink(missing_ok=True)
-            # a client that has given its scheduler up has no scheduler, or a closed pool
-            with suppress(CommClosedError, OSError, TimeoutError, AttributeError, RuntimeError):
+            with suppress(*_WITHOUT_SCHEDULER):
                 client.unregister_worker_plugin("megloc")
 
 
@@ -119,7 +120,7 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
                 client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
             except (OSError, ValueError, TypeError) as error:
                 raise OptionError(f"there is no dask scheduler at {scheduler}") from error
-            with client:
+            with _closing(client):
                 yield client
             return
         clear_leftovers(Path(tempfile.gettempdir()))
@@ -138,9 +139,19 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
                     stack.enter_context(cluster)
                 # results need not pass through the scheduler
                 client = Client(cluster, set_as_default=False, direct_to_workers=True)
-                yield stack.enter_context(client)
+                yield stack.enter_context(_closing(client))
         finally:
             shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _closing(client: Client) -> Iterator[Client]:
+    """Close it behind; what fails in that says nothing of the work, and hides no error of it."""
+    try:
+        yield client
+    finally:
+        with suppress(*_WITHOUT_SCHEDULER):
+            client.close()
 
 
 class _ClusterExecutor(Executor):

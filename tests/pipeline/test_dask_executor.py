@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from distributed import Client
 from threadpoolctl import threadpool_info
 
 import megloc_kapture as megloc
@@ -94,6 +95,25 @@ def test_what_an_item_raises_arrives_as_it_is(cluster: Cluster) -> None:
     ):
         list(ordered_map(_broken, [Path("a/b.txt")], executor))
     assert error.value.path == Path("a/b.txt")
+
+
+def test_what_fails_in_closing_hides_no_error(
+    cluster: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    close = Client.close
+
+    def failing(client: Client) -> None:
+        was_open = client.status != "closed"
+        close(client)
+        if was_open:
+            raise RuntimeError("Cannot change state of expiring Timeout")  # as dask's own, at times
+
+    monkeypatch.setattr(Client, "close", failing)
+    with (
+        pytest.raises(DataError, match="expected so, got thus"),
+        open_executor("dask", scheduler=cluster.address) as executor,
+    ):
+        list(ordered_map(_broken, [Path("a/b.txt")], executor))
 
 
 @pytest.mark.parametrize(
