@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import torch
 from kornia.feature import LightGlue as KorniaLightGlue
-from torch.nn.utils.rnn import pad_sequence
 from transformers import LightGlueConfig, LightGlueForKeypointMatching, SuperPointConfig
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.matching.networks import LightGlue, LightGlueOptions, normalised_points
+from megloc_kapture.matching.networks import LightGlue, LightGlueOptions, _batch
 from megloc_kapture.nets.lightglue import KeypointBatch, load_lightglue
 from megloc_kapture.values import ImageFeatures
 
@@ -183,17 +182,10 @@ def test_matches_are_kornias(checkpoint: Path, size: int) -> None:
     np.testing.assert_allclose(scores, found["scores"][0].numpy(), atol=1e-4)
 
 
-def batch_of(*images: ImageFeatures) -> KeypointBatch:
-    """In double precision."""
-    points = [torch.from_numpy(normalised_points(image)).double() for image in images]
-    descriptors = [torch.from_numpy(image.descriptors).double() for image in images]
-    lengths = torch.tensor([len(rows) for rows in points])
-    present = torch.arange(int(lengths.max())) < lengths[:, None]
-    return KeypointBatch(
-        pad_sequence(points, batch_first=True),
-        pad_sequence(descriptors, batch_first=True),
-        present[:, :, None],
-    )
+def in_double(*images: ImageFeatures) -> KeypointBatch:
+    """A batch of the matcher's own, in double precision: what padding adds is not lost."""
+    batch = _batch(images, torch.device("cpu"))
+    return replace(batch, points=batch.points.double(), descriptors=batch.descriptors.double())
 
 
 def test_padding_changes_nothing(size: int) -> None:
@@ -201,9 +193,9 @@ def test_padding_changes_nothing(size: int) -> None:
     left = [random_image(number, size, seed=number) for number in (60, 25)]
     right = [noisy(image, seed=1) for image in left]
     with torch.inference_mode():
-        together = network(batch_of(*left), batch_of(*right))
+        together = network(in_double(*left), in_double(*right))
         for row, (a, b) in enumerate(zip(left, right, strict=True)):
-            (alone,) = network(batch_of(a), batch_of(b))
+            (alone,) = network(in_double(a), in_double(b))
             rows, columns = alone.shape
             torch.testing.assert_close(
                 together[row, :rows, :columns], alone, rtol=1e-12, atol=1e-12
