@@ -18,7 +18,7 @@ from megloc_kapture.evaluation.report.reports import (
 )
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.tables import STATUS_FILE, read_status
-from megloc_kapture.pipeline.datasets import KAPTURE, SYNTHETIC, BenchmarkFile, DatasetChoice
+from megloc_kapture.pipeline.datasets import BenchmarkFile, DatasetChoice
 from megloc_kapture.pipeline.evaluation_plan import (
     ablate,
     outcomes_text,
@@ -120,13 +120,18 @@ class Eval(Deciding, Working):
             return 0
         if all_kept(reports):
             console.say("nothing to do: every stage is up to date")
-        done = {report.name for report in reports}
+        done = {report.name: report for report in reports}
         status = self._conclude(console, workspace, run.benchmark) if "evaluation" in done else 0
         if "submission" in done:
             pose_file = run.submission_below(workspace.root, workspace.path(SIDE_TABLES))
             self._hand_in(console, pose_file, submissions)
-            if self.dataset not in (KAPTURE, SYNTHETIC):
-                _tell_doubtful(console, workspace.path(LOCALIZED))
+            doubtful = done["submission"].counts.get("doubtful", 0)
+            if doubtful and run.source.adapter is not None:  # a challenge, which has a server
+                console.say(
+                    f"{doubtful:g} queries that the pose file lacks had a pose of too little "
+                    "confidence; a server counts a missing pose as a wrong one: --set "
+                    "localization.min_confidence=0 hands in every pose"
+                )
         report = workspace.path(EVALUATION) / REPORT_HTML
         if "evaluation" in done and report.is_file():
             console.result(f"report     {shown(report)}")
@@ -171,18 +176,6 @@ class Eval(Deciding, Working):
             return 0
         console.say(f"recall {recall:.3f} is below {self.fail_below:.3f}")
         return BELOW_RECALL
-
-
-def _tell_doubtful(console: Console, localized: Path) -> None:
-    """Say how many poses were kept out of the pose file that a server might find right."""
-    failed = [s for s in read_status(localized / STATUS_FILE).values() if s.status == "failed"]
-    doubtful = sum(s.confidence is not None and s.fallback == "none" for s in failed)
-    if doubtful:
-        console.say(
-            f"{doubtful} queries that the pose file lacks had a pose of too little confidence; a "
-            "server counts a missing pose as a wrong one: --set localization.min_confidence=0 "
-            "hands in every pose"
-        )
 
 
 def published_results(benchmark: BenchmarkFile) -> list[str]:

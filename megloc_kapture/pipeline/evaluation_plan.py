@@ -198,7 +198,7 @@ class Submit(_RunStage):
     """Write the pose file, with its provenance beside it."""
 
     name = "submission"
-    version = 3
+    version = 4
     reads = (SIDE_TABLES, LOCALIZED)
     writes = (SUBMISSIONS,)
 

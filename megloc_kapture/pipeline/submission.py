@@ -53,17 +53,21 @@ from megloc_kapture.values import Pose, RigidTransform
 _DUMMY = RigidTransform.identity()
 
 
-_Content = tuple[Mapping[str, str], Sequence[str], Sequence[str]]
+_Content = tuple[Mapping[str, str], Sequence[str], Sequence[tuple[str, str]]]
 
 
 @dataclass(frozen=True)
 class _Result:
-    """The queries, and their poses in the workspace's frame; which are guesses or of the rig."""
+    """The queries, and their poses in the workspace's frame; which are guesses or of the rig.
+
+    ``doubtful`` are queries whose own pose was not trusted.
+    """
 
     data: KaptureData
     poses: Mapping[str, RigidTransform]
     guesses: Collection[str]
     from_rig: Collection[str]
+    doubtful: set[str]
     confidences: Mapping[str, float]
 
 
@@ -123,8 +127,9 @@ def write_submission(
     Returns
     -------
     Counts: ``queries``, ``scored`` (images, or rows of MLAD, that the challenge counts),
-    ``poses`` written for them, ``missing``, and of the poses ``fallbacks`` (guesses) and
-    ``from_rig``; ``dummies`` are rows that hold no pose.
+    ``poses`` written for them, ``missing``, queries of these that are ``doubtful`` (a pose of too
+    little confidence), and of the poses ``fallbacks`` (guesses) and ``from_rig``; ``dummies`` are
+    rows that hold no pose.
 
     Raises
     ------
@@ -147,6 +152,7 @@ def write_submission(
         "scored": len(posed) + len(missing),
         "poses": len(posed),
         "missing": len(missing),
+        "doubtful": len(result.doubtful.intersection(image for _, image in missing)),
         "fallbacks": sum(image in result.guesses for image in posed),
         "from_rig": sum(image in result.from_rig for image in posed),
         "dummies": len(missing) if rules.pose_file == "mlad" else 0,
@@ -157,7 +163,7 @@ def write_submission(
         "weights": _weights(localized),
         "confidence": {i: c for i, c in sorted(result.confidences.items()) if i in known},
         "dataset_fingerprint": _dataset_fingerprint(beside),
-        "dummies" if rules.pose_file == "mlad" else "missing": missing,
+        "dummies" if rules.pose_file == "mlad" else "missing": [row for row, _ in missing],
     }
     files = None if rules.pose_file == "ltvl" else list(texts)
     write_provenance(place, entries, counts=counts, files=files)
@@ -211,13 +217,17 @@ def _read_result(localized: Path, beside: Path | None, *, from_rig: bool) -> _Re
         derived = poses_through_rig(data, poses, statuses)
     guesses = {image for image, s in statuses.items() if s.fallback == "retrieval"}
     by_stage = {image for image, s in statuses.items() if s.fallback == "rig"}
+    doubtful = {
+        image for image, s in statuses.items() if s.status == "failed" and s.confidence is not None
+    }
     confidences = {
         image: s.confidence
         for image, s in statuses.items()
         if s.confidence is not None and s.status == "localized"
     }
     from_rigs = by_stage | derived.keys()
-    return _Result(data, poses | derived, guesses - derived.keys(), from_rigs, confidences)
+    guesses -= derived.keys()
+    return _Result(data, poses | derived, guesses, from_rigs, doubtful, confidences)
 
 
 def _ltvl(
@@ -234,11 +244,11 @@ def _ltvl(
     posed = [image for image in images if image in result.poses]
     official = {image: world.pose_in_official(result.poses[image]) for image in posed}
     text = format_pose_file(official, names=names or rules.pose_file_names)
-    return {"": text}, posed, [image for image in images if image not in result.poses]
+    return {"": text}, posed, [(image, image) for image in images if image not in result.poses]
 
 
 def _mlad(result: _Result, tables: Path) -> _Content:
-    """Texts by file name, the images of their rows that have a pose, and the other rows."""
+    """Texts by file name, images of the rows that have a pose, and the other rows with theirs."""
     pairs = read_relocalization(tables)
     if not pairs:
         raise DataError(
@@ -253,7 +263,7 @@ def _mlad(result: _Result, tables: Path) -> _Content:
     for pair in pairs:
         query, reference = result.poses.get(pair.query), references.get(pair.reference)
         if query is None or reference is None:
-            missing.append(f"{pair.file}: {pair.reference} {pair.query}")
+            missing.append((f"{pair.file}: {pair.reference} {pair.query}", pair.query))
             pose = _DUMMY
         else:
             posed.append(pair.query)

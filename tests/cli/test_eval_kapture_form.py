@@ -34,11 +34,14 @@ def test_aachen_in_both_forms_gives_the_same_pose_file(
     downloaded = aachen_with_kapture(official, tmp_path / "downloaded")
     shutil.copytree(official / "ground_truth", downloaded / "ground_truth")
     monkeypatch.chdir(tmp_path)
+    options = (
+        *("--set", "local_features.options.max_keypoints=1500", "--executor", "inline"),
+        *("--set", "global_features.options.num_clusters=16"),
+    )
     for root in (official, downloaded):
         done = megloc(
             *("eval", "aachen", "--root", root, "--workspace", tmp_path / f"{root.name}-run"),
-            *("--set", "local_features.options.max_keypoints=1500", "--executor", "inline"),
-            *("--set", "global_features.options.num_clusters=16", "--submissions", "submissions"),
+            *(*options, "--submissions", "submissions"),
         )
         assert done.status == 0, done.err
         assert f"pose file  {NAME}\n" in done.out
@@ -66,8 +69,7 @@ def test_aachen_in_both_forms_gives_the_same_pose_file(
     # what a server might find right is told of, and handed in where that is asked for
     again = (
         *("eval", "aachen", "--root", downloaded, "--workspace", runs[1], "--until", "submission"),
-        *("--set", "local_features.options.max_keypoints=1500", "--executor", "inline"),
-        *("--set", "global_features.options.num_clusters=16"),
+        *options,
     )
     doubted = megloc(*again, "--set", "localization.min_confidence=1")
     kept = len((runs[1] / NAME).read_text().splitlines())

@@ -116,7 +116,7 @@ def dataset(tmp_path: Path) -> Dataset:
 
 
 FAILED = {"status": "failed", "reason": "no map image matches"}
-NONE = {"fallbacks": 0, "from_rig": 0, "dummies": 0}
+NONE = {"fallbacks": 0, "from_rig": 0, "dummies": 0, "doubtful": 0}
 
 
 def submit(dataset: Dataset, place: Path, **options: Any) -> tuple[dict[str, int], dict[str, Any]]:
@@ -137,6 +137,24 @@ def test_scored_images_by_the_rule(dataset: Dataset, tmp_path: Path) -> None:
     assert counts == NONE | {"queries": 12, "scored": 4, "poses": 2, "missing": 2}
     assert beside["counts"] == counts
     assert beside["missing"] == ["dawn/rear/20.jpg", "night/rear/30.jpg"]
+
+
+def test_doubtful_are_those_that_the_file_lacks(dataset: Dataset, tmp_path: Path) -> None:
+    doubted = {**FAILED, "confidence": 0.3}
+    guessed = {**doubted, "fallback": "retrieval"}
+    dataset.localize(["dawn/rear/10.jpg", "dawn/rear/20.jpg"], {})
+    # of those without a pose the first is not scored, and the last had none at all
+    statuses = {
+        "dawn/rear/20.jpg": guessed,
+        "dawn/left/10.jpg": doubted,
+        "night/rear/30.jpg": doubted,
+        "night/rear/40.jpg": FAILED,
+    }
+    rows = [QueryStatus(image=image, **status) for image, status in statuses.items()]
+    write_status(dataset.result / "status.csv", rows)
+    counts, _ = submit(dataset, tmp_path / "poses.txt")
+    assert (counts["poses"], counts["missing"], counts["fallbacks"]) == (2, 2, 1)
+    assert counts["doubtful"] == 1
 
 
 def test_the_list_names_and_orders(dataset: Dataset, tmp_path: Path) -> None:
