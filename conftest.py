@@ -14,6 +14,12 @@ import pytest
 from corner import write_scene
 from hypothesis import settings
 
+from megloc_kapture.io.colmap import load_pycolmap
+
+# its import takes over the signals of a crash, and what it tells of one pytest captures; before
+# pytest takes them, a crash is told with the lines of Python that led to it
+load_pycolmap()
+
 REPOSITORY = Path(__file__).resolve().parent
 
 # no test depends on how fast the machine is. The quick tier draws the same few examples every time,

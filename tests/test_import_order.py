@@ -7,6 +7,9 @@ importing pycolmap through it, must always be safe, whichever version is install
 
 from __future__ import annotations
 
+import os
+import re
+import signal
 import subprocess
 import sys
 
@@ -68,3 +71,19 @@ def test_package_imports_zlib_before_anything_else(module: str) -> None:
     done = run_python(FIRST_IMPORTS.format(module=module))
     assert done.returncode == 0, done.stderr
     assert done.stdout.split()[:2] == ["megloc_kapture", "zlib"]
+
+
+if "MEGLOC_TEST_CRASHES" in os.environ:
+
+    def test_crash() -> None:
+        import pycolmap  # noqa: F401
+
+        os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def test_a_test_that_crashes_says_where() -> None:
+    """pycolmap's import takes over the signals that pytest would tell of."""
+    command = [sys.executable, "-m", "pytest", "-q", f"{__file__}::test_crash"]
+    environment = {**os.environ, "MEGLOC_TEST_CRASHES": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert re.search(r"Segmentation fault(.|\n)*test_import_order.* in test_crash", done.stderr)

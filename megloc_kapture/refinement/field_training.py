@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.nets.gaussians import DEFAULT_COUNT, Gaussians
 from megloc_kapture.nets.radiance import NerfW, Rays, nerf_w_loss
@@ -171,7 +173,8 @@ class FieldTrainer:
                 group["lr"] = rate * _DECAY**done * min(1.0, (step + 1) / 50)
             seeds = np.random.SeedSequence([options.seed, step])
             generator.manual_seed(int(seeds.generate_state(1, np.uint64)[0]))
-            self._learn(generator)
+            with _compiling() if options.compiled else nullcontext():
+                self._learn(generator)
             self._step = step + 1
             if self._step == options.steps:
                 break
@@ -198,6 +201,26 @@ class FieldTrainer:
         self._optimizer.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)
         self._optimizer.step()
+
+
+@contextmanager
+def _compiling() -> Iterator[None]:
+    """torch.compile compiles within; OptionError where it cannot, for want of a compiler.
+
+    torch keeps graphs on disk by their content alone, tiled for the vectors of the processor at
+    hand: one kept where AVX2 was used, by an older machine on the same disk or by
+    ATEN_CPU_CAPABILITY, writes past its arrays where AVX-512 is. So processors are told apart.
+    """
+    from torch._dynamo.exc import TorchDynamoException
+
+    config: Any = torch.compiler.config
+    instructions = torch.backends.cpu.get_cpu_capability()
+    try:
+        with config.patch(cache_key_tag=f"{config.cache_key_tag} {instructions}"):
+            yield
+    except TorchDynamoException as error:
+        reason = str(error).strip().partition("\n")[0]
+        raise OptionError(f"compiled: torch.compile fails here: {reason}") from error
 
 
 def _groups(module: FieldModule) -> list[dict[str, object]]:

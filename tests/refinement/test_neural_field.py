@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import re
+import subprocess
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -112,12 +116,45 @@ def test_half_precision_learns_nearly_the_same() -> None:
 
 
 @pytest.mark.slow
-def test_compiled_learns_the_same() -> None:
+def test_compiled_learns_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
     brief = QUICK.model_copy(update={"steps": 2})
     compiled = brief.model_copy(update={"compiled": True})
     one, other = (train_field(views(5), each)[0].module.state_dict() for each in (brief, compiled))
     for name in one:
         torch.testing.assert_close(one[name], other[name], atol=5e-3, rtol=0)
+
+
+_COMPILE = """
+import torch
+from torch._dynamo.utils import counters
+from megloc_kapture.refinement.field_training import _compiling
+
+with _compiling():
+    torch.compile(lambda values: (2 * values).sin())(torch.ones(64))
+print(counters["inductor"]["fxgraph_cache_hit"])
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    torch.backends.cpu.get_cpu_capability() not in ("AVX2", "AVX512"), reason="needs AVX2"
+)
+def test_what_is_compiled_is_kept_for_such_processors_alone(tmp_path: Path) -> None:
+    def hits(instructions: str) -> int:
+        chosen = {"TORCHINDUCTOR_CACHE_DIR": str(tmp_path), "ATEN_CPU_CAPABILITY": instructions}
+        command = [sys.executable, "-c", _COMPILE]
+        return int(subprocess.check_output(command, env={**os.environ, **chosen}))
+
+    assert [hits(each) for each in ("avx2", "default", "avx2")] == [0, 0, 1]
+
+
+@pytest.mark.slow
+def test_no_compiler_is_one_line(tmp_path: Path) -> None:
+    environment = {**os.environ, "TORCHINDUCTOR_CACHE_DIR": str(tmp_path), "CXX": "/nowhere/g++"}
+    command = [sys.executable, "-c", _COMPILE]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert re.search("OptionError: compiled: .*No working C.. compiler.*$", done.stderr)
 
 
 def test_interrupted_and_resumed_is_uninterrupted(monkeypatch: pytest.MonkeyPatch) -> None:
