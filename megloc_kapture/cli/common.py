@@ -202,9 +202,14 @@ class Working(Common):
             yield Work(executor, self.console().track, self.workers or available_cores())
 
     @contextmanager
-    def staged(self, output: Path, kind: str, *, force: bool) -> Iterator[tuple[Path, Work]]:
+    def staged(
+        self, output: Path, kind: str, *, force: bool, adds: bool = False
+    ) -> Iterator[tuple[Path, Work]]:
         """A folder to write into, which ends as the output, and what to work with."""
-        with staged_output(output, kind=kind, force=force) as out, self.working(out) as work:
+        with (
+            staged_output(output, kind=kind, force=force, adds=adds) as out,
+            self.working(out) as work,
+        ):
             yield out, work
 
     @contextmanager

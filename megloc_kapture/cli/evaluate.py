@@ -116,7 +116,7 @@ class Submit(Common):
     from_rig: bool = False
     """Queries without a pose get one through the rig, from another camera of their moment."""
     force: Overwrite = False
-    """Overwrite the pose file."""
+    """Overwrite the pose file, and the JSON beside it."""
 
     def run(self, console: Console) -> None:
         from megloc_kapture.io.dataset_tables import Protocol, read_protocol
@@ -142,12 +142,16 @@ class Submit(Common):
         console.result(f"{summary(counts)}: {self.output}")
 
     def _check_output(self, *, folder: bool) -> None:
+        from megloc_kapture.evaluation.pose_files import provenance_path
+
         place = self.output
         if place.is_dir() != folder and place.exists():
             kind = "folder, one file per relocalization file" if folder else "file"
             raise OptionError(f"{place} exists and is not what is to be written, a {kind}")
-        if place.exists() and not self.force and (not folder or any(place.iterdir())):
-            raise OptionError(f"{place} exists; -f overwrites it")
+        there = place.exists() and (not folder or any(place.iterdir()))
+        for path, exists in ((place, there), (beside := provenance_path(place), beside.exists())):
+            if exists and not self.force:
+                raise OptionError(f"{path} exists; -f overwrites it")
 
 
 def summary(counts: Mapping[str, int]) -> str:

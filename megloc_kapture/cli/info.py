@@ -19,6 +19,7 @@ from megloc_kapture.errors import MeglocError, OptionError
 from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.dataset_tables import METRES
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.mapping.uncertainty import point_deviations
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, PixelOriginChoice
@@ -95,7 +96,9 @@ class Info(Reading, Common):
 def describe_content(console: Console, folder: KaptureFolder) -> None:
     """Print counts of what a kapture folder has."""
     data = folder.read()
-    models = Counter(data.camera_of(image).model for image in data.image_names())
+    # also of cameras that are not calibrated yet
+    devices = (data.sensors[device] for _, device in data.records_camera)
+    models = Counter("".join(sensor.params[:1]) or UNKNOWN_CAMERA for sensor in devices)
     cameras = ", ".join(f"{count} {model}" for model, count in sorted(models.items()))
     line(console, "kapture", str(folder.root))
     line(console, "sensors", f"{len(data.sensors)}, rigs {len(data.rigs)}")

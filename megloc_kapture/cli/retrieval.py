@@ -47,7 +47,7 @@ class ExtractGlobal(Reading, StageCommand):
         choices = self.options(self.named("global_features", self.features)).global_features
         folders = [self.kapture(folder) for folder in (self.input, *self.query)]
         extractors = {one.name: one.make() for one in choices if not one.is_vlad}
-        with self.staged(self.output, FEATURES, force=self.force) as (out, work):
+        with self.staged(self.output, FEATURES, force=self.force, adds=True) as (out, work):
             for choice in choices:
                 if choice.is_vlad:
                     options = choice.vlad_options()
@@ -171,7 +171,10 @@ class PairsQuery(Reading, StageCommand):
         if self.rerank is not None and self.matches_dir is not None:
             local_types = self._types_of_both(mapping, query)
             verification = options.verify_queries()
-            with self.staged(self.matches_dir, FEATURES, force=self.force) as (out, work):
+            with self.staged(self.matches_dir, FEATURES, force=self.force, adds=True) as (
+                out,
+                work,
+            ):
                 for name in local_types:
                     matcher = options.make_matcher(name)
                     match_pairs(query, mapping, pairs, name, matcher, verification, out, work=work)

@@ -34,7 +34,6 @@ from megloc_kapture.cli.common import (
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.files import first_problem
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
-from megloc_kapture.io.output_folders import replace_directory
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
 from megloc_kapture.pipeline.workspace import Workspace
@@ -47,7 +46,6 @@ from megloc_kapture.stages.map_points import triangulate_map
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.preprocessing import (
-    REPORT_FILE,
     PreprocessingOptions,
     PreprocessingReport,
     preprocess_images,
@@ -142,7 +140,7 @@ class ExtractLocal(Linked, StageCommand):
         folders = [self.kapture(path) for path in self.input]
         options = self.options(self.named("local_features", self.features))
         extractors = options.make_extractors()
-        with self.staged(self.output, FEATURES, force=self.force) as (out, work):
+        with self.staged(self.output, FEATURES, force=self.force, adds=True) as (out, work):
             for extractor in extractors:
                 counts = extract_local_features(
                     folders, extractor, out, mask_margin_px=options.mask_margin_px, work=work
@@ -195,7 +193,7 @@ class Match(Reading, StageCommand):
             first, verification = self.kapture(self.query), options.verify_queries()
             mapping.check_features_apart(first)
         pairs = _read_pairs_of(self.pairs, first, mapping)
-        with self.staged(self.output, FEATURES, force=self.force) as (out, work):
+        with self.staged(self.output, FEATURES, force=self.force, adds=True) as (out, work):
             counts = match_pairs(
                 first, mapping, pairs, local_type, matcher, verification, out, work=work
             )
@@ -316,9 +314,6 @@ class Preprocess(Linked, Computing, Working):
         with self.staged(self.output, PREPROCESSED, force=self.force) as (out, work):
             preprocess_images(source, out, options, sequences=sequences, work=work)
             report = read_report(out)
-            # masks and images of an earlier run would be taken for this one's
-            if (self.output / "sensors" / REPORT_FILE).is_file():
-                replace_directory(out / "sensors", self.output / "sensors")
         for line in () if report is None else report_lines(report):
             console.say(line)
 

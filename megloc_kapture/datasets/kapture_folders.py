@@ -8,7 +8,8 @@ same. Images keep their official names, and the queries have no poses.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import logging
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -36,6 +37,8 @@ from megloc_kapture.io.files import check_relative, link_images
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
+
+_log = logging.getLogger(__name__)
 
 MAPPING, QUERY, QUERY_GT = "mapping", "query", "query_gt"
 _SENSORS = "sensors/sensors.txt"
@@ -102,6 +105,12 @@ def files_of(folder: KaptureFolder, *, images: bool = True) -> Iterator[Path]:
             yield mask
 
 
+def tell_of_truth_without_query(folder: Path, images: Sequence[str]) -> None:
+    """Warn of true poses of images that are no query: the names may be wrong."""
+    said = "%s: true poses of %d images that are no query are left out, the first is %s"
+    _log.warning(said, folder, len(images), images[0])
+
+
 def import_kapture_folders(
     root: Path,
     output: Path,
@@ -148,7 +157,10 @@ def import_kapture_folders(
     truth = 0
     if is_kapture(root / QUERY_GT):
         truth_data = KaptureFolder(root / QUERY_GT).read()
-        truth = len(truth_data.poses())
+        strange = sorted(truth_data.poses().keys() - set(query_data.image_names()))
+        truth = len(truth_data.poses()) - len(strange)
+        if strange:
+            tell_of_truth_without_query(root / QUERY_GT, strange)
         write_sensors(output / QUERY_GT, _renamed(truth_data, rename, is_truth=True))
         if nowhere := [rename(name) for name in read_nowhere(root / QUERY_GT)]:
             write_nowhere(output / QUERY_GT, nowhere)

@@ -15,7 +15,7 @@ from megloc_kapture.datasets.kapture_folders import (
     MAPPING,
     QUERY,
     QUERY_GT,
-    is_kapture,
+    tell_of_truth_without_query,
 )
 from megloc_kapture.datasets.reference_map import ReferenceModel, write_reference_map
 from megloc_kapture.errors import DataError
@@ -218,9 +218,11 @@ def read_ground_truth(
     DataError : the folder is broken.
     """
     folder = root / GROUND_TRUTH
-    if not is_kapture(folder / QUERY):
+    if not (folder / QUERY).exists():
         return None, {}
     true_poses = KaptureFolder(folder / QUERY).read().poses()
+    if strange := sorted(true_poses.keys() - set(query.image_names())):
+        tell_of_truth_without_query(folder / QUERY, strange)
     poses = {
         record: world.pose_in_local(true_poses[image])
         for record, image in query.records_camera.items()

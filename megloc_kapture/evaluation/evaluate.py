@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+import logging
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.metrics import Threshold
@@ -22,9 +25,11 @@ from megloc_kapture.evaluation.results import (
 )
 from megloc_kapture.evaluation.scoring import Evaluation, evaluate_pairs, evaluate_poses
 from megloc_kapture.evaluation.without_truth import WithoutTruth, evaluate_without_truth
-from megloc_kapture.io.dataset_tables import METRES, read_nowhere, unit_of
+from megloc_kapture.io.dataset_tables import METRES, World, read_nowhere, unit_of
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import Failure, Pose, RigidTransform
+
+_log = logging.getLogger(__name__)
 
 Localized = Path | str | Mapping[str, Pose | Failure] | Mapping[str, RigidTransform]
 
@@ -108,7 +113,10 @@ def evaluate_results(
     ------
     DataError : something is missing or broken, or there is nothing to count.
     """
-    true_poses = truth if isinstance(truth, Mapping) else KaptureFolder(Path(truth)).read().poses()
+    if isinstance(truth, Mapping):
+        true_poses: Poses = result_in_memory(truth).poses
+    else:
+        true_poses = KaptureFolder(Path(truth)).read().poses()
     nowhere = () if isinstance(truth, Mapping) else read_nowhere(truth)
     contexts = [_context(source, mapping) for source in results]
     _check_metres(contexts)
@@ -121,7 +129,10 @@ def evaluate_results(
         )
     limits = thresholds or benchmark.thresholds()
     evaluations = []
-    for found in _read(results, benchmark, contexts, labels, true_poses, references):
+    read = _read(results, benchmark, contexts, labels, true_poses, references)
+    if not isinstance(truth, Mapping) and side_tables_near(truth) is None:
+        true_poses = _in_local_frame(true_poses, read, benchmark.world, truth)
+    for found in read:
         if relative:
             evaluation = evaluate_pairs(
                 found.poses_of_pairs(benchmark.pairs),
@@ -216,6 +227,28 @@ def _read(
             )
         found.append(replace(result, context=context))
     return found
+
+
+def _in_local_frame(
+    true_poses: Poses, results: Sequence[Result], world: World, truth: Path | str
+) -> Poses:
+    """True poses as they came, or, where they fit the results a thousand times as well from the
+    official frame, as a dataset's owner has them, brought to the results' local one."""
+    pairs = [
+        (true_poses[i], pose) for r in results for i, pose in r.poses.items() if i in true_poses
+    ]
+    if world == World() or not pairs:
+        return true_poses
+
+    def median_m(poses: Iterable[RigidTransform]) -> float:
+        centres = ((a.center(), b.center()) for a, (_, b) in zip(poses, pairs, strict=True))
+        return float(np.median([np.linalg.norm(a - b) for a, b in centres]))
+
+    as_they_are = median_m(true for true, _ in pairs)
+    if 1000 * median_m(world.pose_in_local(true) for true, _ in pairs) >= as_they_are:
+        return true_poses
+    _log.warning("%s is in the dataset's official frame, and is brought to that of the map", truth)
+    return {image: world.pose_in_local(pose) for image, pose in true_poses.items()}
 
 
 def _context(source: Localized, mapping: Path | str | None) -> ResultContext:

@@ -16,6 +16,7 @@ Beside a pose file stands where it comes from: versions, options, counts; no dat
 from __future__ import annotations
 
 import hashlib
+import logging
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -39,6 +40,8 @@ from megloc_kapture.io.files import (
 )
 from megloc_kapture.io.kapture.format import FLOAT_PATTERN
 from megloc_kapture.values import RigidTransform
+
+_log = logging.getLogger(__name__)
 
 COLUMNS = "name qw qx qy qz tx ty tz"
 
@@ -151,8 +154,9 @@ def poses_by_image(
     """Give the poses of a pose file the names that ``images`` bear in kapture.
 
     A name of the challenge's list becomes its image. Of the others, one that is an image stays;
-    one that is the last part of exactly one image's path becomes that image; any other stays as it
-    is, unknown, for the evaluation to report.
+    one that ends exactly one image's path becomes that image, where none fits also with another
+    ending (``.jpg`` for ``.png``, as servers take it); any other stays as it is, unknown, for the
+    evaluation to report.
 
     Parameters
     ----------
@@ -163,21 +167,39 @@ def poses_by_image(
     DataError : a name fits several images, or two names fit one.
     """
     known = set(images)
-    by_basename: dict[str, list[str]] = {}
-    for image in sorted(known):
-        by_basename.setdefault(image.rsplit("/", 1)[-1], []).append(image)
     listed = {name: image for image, name in (names or {}).items()}
+    by_end: dict[str, list[str]] = {}
+    for image in sorted(known):
+        for end in _ends(image):
+            by_end.setdefault(end, []).append(image)
+    by_stem: dict[str, set[str]] = {}
+    for name, image in (*listed.items(), *((end, i) for end, all_ in by_end.items() for i in all_)):
+        by_stem.setdefault(_stem(name), set()).add(image)
     renamed: dict[str, RigidTransform] = {}
     for name, pose in poses.items():
-        fitting = [name] if name in known else by_basename.get(name, [name])
+        fitting = [name] if name in known else by_end.get(name, [])
         if name in listed:
             fitting = [listed[name]]
+        if not fitting:
+            alike = by_stem.get(_stem(name), {name})
+            fitting = list(alike) if len(alike) == 1 else [name]
         if len(fitting) > 1:
             raise DataError(f"{name!r} may be {fitting[0]!r} or {fitting[1]!r}; use full names")
         if fitting[0] in renamed:
             raise DataError(f"the pose file names image {fitting[0]!r} in two ways")
         renamed[fitting[0]] = pose
     return renamed
+
+
+def _ends(image: str) -> list[str]:
+    """The paths that end an image's path: of ``a/b/c.jpg`` that, ``b/c.jpg`` and ``c.jpg``."""
+    parts = image.split("/")
+    return ["/".join(parts[start:]) for start in range(len(parts))]
+
+
+def _stem(name: str) -> str:
+    stem, _, ending = name.rpartition(".")
+    return stem if ending.lower() in ("jpg", "jpeg", "png") else name
 
 
 def parse_number(text: str) -> float:
@@ -197,7 +219,8 @@ def checked_pose(
 ) -> RigidTransform:
     """The pose with a unit quaternion; one that is unit to rounding keeps its very digits.
     DataError: not finite, or a quaternion off unit length by 1e-3 or more; names ``whose``."""
-    if not all(math.isfinite(v) for v in (*quat_wxyz, *translation)):
+    # beyond, squares overflow
+    if not all(abs(v) < 1e100 for v in (*quat_wxyz, *translation)):
         raise DataError(f"{whose}: the pose is not finite")
     norm = math.sqrt(sum(q * q for q in quat_wxyz))
     if not abs(norm - 1.0) < MAX_QUATERNION_NORM_ERROR:
@@ -392,12 +415,30 @@ def write_provenance(
     return path
 
 
+class _Beside(BaseModel):
+    files: dict[str, str] = {}
+    confidence: Any = None
+
+
 class _Scores(BaseModel):
     confidence: dict[str, Annotated[float, Field(ge=0, le=1)]] = {}
 
 
 def read_confidences(target: Path | str) -> dict[str, float]:
-    """Image -> confidence of its pose, as the provenance beside a pose file has it under
-    ``confidence``; empty where there is none. DataError: it is broken, or has something else."""
-    path = provenance_path(target)
-    return read_json_model(path, _Scores).confidence if path.is_file() else {}
+    """Image -> confidence of its pose, as the JSON beside a pose file has it under ``confidence``.
+
+    Empty where there is none, where the JSON is about something else, and, with a warning, where
+    it tells the SHA-256 of another pose file. DataError: a confidence is no probability.
+    """
+    target, path = Path(target), provenance_path(target)
+    try:
+        beside = read_json_model(path, _Beside) if path.is_file() else _Beside()
+    except DataError:
+        return {}
+    if beside.confidence is None:
+        return {}
+    known = beside.files.get(target.name)
+    if known is not None and known != hashlib.sha256(read_content(target)).hexdigest():
+        _log.warning("%s is of another pose file; its confidences are left out", path)
+        return {}
+    return read_json_model(path, _Scores).confidence

@@ -15,6 +15,7 @@ from pydantic import BaseModel, Field
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.pose_files import (
+    checked_pose,
     poses_by_image,
     read_confidences,
     read_mlad_file,
@@ -290,12 +291,15 @@ def read_result(
 def result_in_memory(
     estimated: Mapping[str, Pose | Failure] | Mapping[str, RigidTransform], *, label: str = ""
 ) -> Result:
-    """A result of poses by image: what localizing gave, or ``cam_from_world`` alone."""
+    """A result of poses by image: what localizing gave, or ``cam_from_world`` alone.
+
+    DataError: one of the latter is not finite, or has a quaternion off unit length by 1e-3 or more.
+    """
     poses: dict[str, RigidTransform] = {}
     statuses: dict[str, QueryStatus] = {}
     for image, found in estimated.items():
         if isinstance(found, RigidTransform):
-            poses[image] = found
+            poses[image] = checked_pose(found.quat_wxyz, found.translation, repr(image))
             continue
         statuses[image] = query_status(image, found)
         if isinstance(found, Pose):
@@ -329,6 +333,9 @@ def _in_frame_of(world: World, poses: dict[str, RigidTransform], result: Path) -
 def _read_mlad(
     path: Path, pairs: Sequence[RelocalizationPair], references: Poses, world: World
 ) -> dict[RelocalizationPair, RigidTransform]:
+    if not references:
+        reason = "its poses are relative to the map's images: give the map with --map"
+        raise DataError(reason, path=path)
     files = {pair.file for pair in pairs}
     found_files = {path.name if path.name in files else min(files): path}
     if path.is_dir():
@@ -360,7 +367,9 @@ def _read_mlad(
                 problem = f"reference {pair.reference!r} has no pose in the map"
             else:
                 pose = _in_local_units(row.query_from_reference, world.official_from_local.scale)
-                found[pair] = pose @ references[pair.reference]
+                # a dummy is no pose: the file must have every row
+                if row.query_from_reference != RigidTransform.identity():
+                    found[pair] = pose @ references[pair.reference]
                 continue
             raise DataError(problem, path=pose_file)
     return found

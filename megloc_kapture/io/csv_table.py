@@ -86,7 +86,7 @@ def write_csv_table(
     takes.
     """
     longest = csv.field_size_limit()
-    lines = [",".join(columns)]
+    lines = [",".join(map(_quoted, columns))]
     for row in rows:
         for column, field in zip(columns, row, strict=True):
             if len(field) > longest:

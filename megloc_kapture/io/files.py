@@ -170,7 +170,8 @@ def check_no_escape(roots: Roots, path: Path) -> Path:
             return path
     raise DataError(
         f"is or lies behind a link that leaves {roots[0]}, to {real}; images may be links to "
-        "anywhere, anything else only to below a folder that --allow-links-below names",
+        "anywhere, anything else only to below a folder that --allow-links-below names, of "
+        "commands that have it",
         path=path,
     )
 

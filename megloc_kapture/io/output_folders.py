@@ -1,8 +1,10 @@
 """Folders that a command writes: whose they are, and output that comes only when all went well.
 
 A folder is ours when it is new, empty, or carries our mark; nothing that a user owns is written
-over unasked. What replaces a folder does so in one step. The state of a written file is remembered,
-so that one changed, cut or gone is noticed.
+over unasked. The mark names the kind of the folder, in its first line, and what we have written
+into it, so that nothing of an earlier run is taken for the last one's. What replaces a folder does
+so in one step. The state of a written file is remembered, so that one changed, cut or gone is
+noticed.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import hashlib
 import os
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from stat import S_ISLNK, S_ISREG
@@ -75,13 +77,13 @@ def claim_folder(folder: Path, *, kind: str, force: bool = False) -> Claim:
     """
     folder = Path(folder)
     mark = folder / MARKER
-    content = f"{kind}\n".encode()
     try:
         made = tuple(path for path in (folder, *folder.parents) if not path.exists())
         if not made and not folder.is_dir():
             raise OutputError(f"{folder}: is a file, a folder is needed")
         old_mark = mark.read_bytes() if mark.is_file() else None
-        if not made and old_mark != content and not force and any(folder.iterdir()):
+        ours = old_mark is not None and _kind(old_mark) == kind
+        if not made and not ours and not force and any(folder.iterdir()):
             raise OutputError(
                 f"{folder}: is not empty and not a {kind} of megloc; give an empty folder, "
                 "or -f to write into it all the same"
@@ -91,8 +93,8 @@ def claim_folder(folder: Path, *, kind: str, force: bool = False) -> Claim:
     claim = Claim(folder, made, old_mark)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if old_mark != content:
-            write_bytes(mark, content)
+        if not ours:
+            write_bytes(mark, _mark_of(kind))
     except OSError as error:
         claim.undo()
         raise output_error(folder, error) from error
@@ -102,15 +104,32 @@ def claim_folder(folder: Path, *, kind: str, force: bool = False) -> Claim:
     return claim
 
 
+def _kind(mark: bytes) -> str:
+    return mark.partition(b"\n")[0].decode(errors="replace")
+
+
+def _mark_of(kind: str, names: Iterable[str] = ()) -> bytes:
+    # no tool's file has a line break in its name, and a name cut in two would be another's
+    lines = (kind, *sorted(name for name in names if "\n" not in name))
+    return b"".join(os.fsencode(line) + b"\n" for line in lines)
+
+
 @contextlib.contextmanager
-def staged_output(folder: Path, *, kind: str, force: bool = False) -> Iterator[Path]:
+def staged_output(
+    folder: Path, *, kind: str, force: bool = False, adds: bool = False
+) -> Iterator[Path]:
     """A folder to write a command's output to; it gets to ``folder`` only when the block ends well.
 
-    Files that are written anew replace old ones, one by one; others stay. When the
+    Files that are written anew replace old ones, one by one. Those of an earlier run with the same
+    kind that are not written anew go, what else stands in the folder stays. When the
     block raises, ``folder`` is as it was, and gone if it was not there. What killed runs have left
     in it is cleared.
 
-    Raises OutputError: see :func:`claim_folder`.
+    Parameters
+    ----------
+    adds : runs add to each other; what earlier ones have written stays.
+
+    Raises OutputError: see :func:`claim_folder`; or something of the user's is in the way.
     """
     folder = Path(folder)
     claim = claim_folder(folder, kind=kind, force=force)
@@ -121,7 +140,16 @@ def staged_output(folder: Path, *, kind: str, force: bool = False) -> Iterator[P
             staging.mkdir()
             yield staging
             clear_temporary(staging)
+            new = _names_below(staging)
+            before = set() if adds else _listed(claim.old_mark, kind)
+            stale = {name for name in before - new if not _through_link(folder, name)}
+            _check_ways(folder, new, stale)
+            if not adds:
+                write_bytes(folder / MARKER, _mark_of(kind, before | new))
+            _remove_files(folder, stale)
             _merge(staging, folder)
+            if before - new:
+                write_bytes(folder / MARKER, _mark_of(kind, new))
         finally:
             shutil.rmtree(staging, ignore_errors=True)
     except OSError as error:
@@ -133,6 +161,62 @@ def staged_output(folder: Path, *, kind: str, force: bool = False) -> Iterator[P
     except BaseException:
         claim.undo()
         raise
+
+
+def _names_below(folder: Path) -> set[str]:
+    """Files and links below a folder, as paths from it."""
+    found = set()
+    for place, folders, files in os.walk(folder):
+        links = [name for name in folders if os.path.islink(os.path.join(place, name))]
+        found |= {os.path.relpath(os.path.join(place, name), folder) for name in files + links}
+    return found
+
+
+def _listed(mark: bytes | None, kind: str) -> set[str]:
+    """What a mark says was written; names that leave the folder are not ours."""
+    if mark is None or _kind(mark) != kind:
+        return set()
+    names = {os.fsdecode(line) for line in mark.split(b"\n")[1:] if line}
+    return {
+        name
+        for name in names
+        if not os.path.isabs(name)
+        and os.path.normpath(name) == name
+        and ".." not in Path(name).parts
+    } - {MARKER, "."}
+
+
+def _through_link(folder: Path, name: str) -> bool:
+    return any((folder / one).is_symlink() for one in list(Path(name).parents)[:-1])
+
+
+def _check_ways(folder: Path, new: set[str], stale: set[str]) -> None:
+    """Raises OutputError where a folder stands in a file's way or the reverse, and stays."""
+    for name in sorted(new):
+        path = folder / name
+        if not path.is_dir() or path.is_symlink():
+            continue
+        if any(os.path.join(name, one) not in stale for one in _names_below(path)):
+            raise OutputError(f"{path}: a folder stands where a file is to be written")
+    for name in sorted(_parents(new) - stale):
+        path = folder / name
+        if path.is_file() and not path.is_symlink():
+            raise OutputError(f"{path}: a file stands where a folder is to be written")
+
+
+def _parents(names: set[str]) -> set[str]:
+    return {str(one) for name in names for one in list(Path(name).parents)[:-1]}
+
+
+def _remove_files(folder: Path, names: set[str]) -> None:
+    """Remove files and links below a folder, and the folders that this leaves empty."""
+    for name in names:
+        path = folder / name
+        if path.is_symlink() or not path.is_dir():
+            path.unlink(missing_ok=True)
+    for name in sorted(_parents(names), key=len, reverse=True):
+        with contextlib.suppress(OSError):
+            (folder / name).rmdir()
 
 
 def _lies_in(name: str | bytes | int, folder: Path) -> bool:

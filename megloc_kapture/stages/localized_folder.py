@@ -6,6 +6,7 @@ one broken photograph must not end the run of all others, and counts as a miss.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
 from functools import partial
@@ -180,7 +181,8 @@ def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, 
     if not reasons:
         return {}
     if len(reasons) == len(names):
-        raise DataError(reasons[names[0]], path=folder.image_path(names[0]))
+        # the image where it lies, not a link to it that may be gone in a moment
+        raise DataError(reasons[names[0]], path=Path(os.path.realpath(folder.image_path(names[0]))))
     records = {key: name for key, name in data.records_camera.items() if name not in reasons}
     write_sensors(query, replace(data, records_camera=records))
     write_unreadable(tables, reasons)

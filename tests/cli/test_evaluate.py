@@ -251,6 +251,9 @@ def test_what_submit_refuses(megloc: Any, imported: Path, tmp_path: Path) -> Non
     megloc("submit", "aachen", "-i", result, "-o", place, "--from-rig").refused("rigs.txt")
     megloc("submit", "aachen", "-i", result, "-o", tmp_path).refused("is not what is to be written")
     assert not place.exists()
+    (tmp_path / "poses.txt.json").write_text("mine")
+    megloc("submit", "aachen", "-i", result, "-o", place).refused("poses.txt.json exists; -f")
+    assert (tmp_path / "poses.txt.json").read_text() == "mine" and not place.exists()
 
 
 def test_mlad_goes_to_a_folder(megloc: Any, imported: Path, tmp_path: Path) -> None:
@@ -273,6 +276,8 @@ def test_mlad_goes_to_a_folder(megloc: Any, imported: Path, tmp_path: Path) -> N
     assert done.out == f"3 poses of 4 queries, 1 missing, dummies in their place: {place}\n"
     assert {path.name for path in tmp_path.glob("submission*")} == {place.name, "submission.json"}
     assert [path.name for path in place.iterdir()] == ["a_to_b.txt"]
+    tables = ("--side-tables", imported / "megloc")
+    megloc("evaluate", "-i", place, *tables).refused("relative to the map's", "--map")
     megloc(*command).refused("exists; -f")
     assert megloc(*command, "-f").status == 0
     (tmp_path / "file").write_text("")

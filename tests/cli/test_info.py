@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,14 @@ def test_info_of_our_own_map_and_of_what_is_none(megloc: Any, finished: Path, sc
     told = described(megloc("info", scene / "query").out)
     assert told["images"] == "4 (4 PINHOLE), 0 with a pose"
     assert told["localizing"] == "not possible: no points3d and observations"
+
+
+def test_cameras_that_are_not_calibrated(megloc: Any, scene: Path, tmp_path: Path) -> None:
+    data = KaptureFolder(scene / "query").read()
+    for name, sensor in data.sensors.items():
+        data.sensors[name] = replace(sensor, params=("UNKNOWN_CAMERA", *sensor.params[1:3]))
+    write_sensors(tmp_path, data)
+    assert re.search(r"images +4 \(4 UNKNOWN_CAMERA\)", megloc("info", tmp_path).out)
 
 
 def test_info_says_what_ranks_many_images(megloc: Any, finished: Path, tmp_path: Path) -> None:

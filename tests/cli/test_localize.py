@@ -60,6 +60,19 @@ def test_a_map_of_another_tool_stays_as_it_is(megloc: Any, foreign: Path, scene:
     assert "no extractor for orb_800" in megloc("info", foreign / "map").out
 
 
+def test_a_second_result_in_the_same_folder_has_no_pose_of_the_first(
+    megloc: Any, foreign: Path, scene: Path
+) -> None:
+    result = foreign.parent / "localized"
+    command = queries_of(foreign, result)
+    assert megloc(*command).out.startswith("4 of 4 queries")
+    (result / "notes.txt").write_text("mine")
+    assert megloc(*command, "--min-confidence", "1").out.startswith("0 of 4 queries")
+    assert evaluate(result, scene / "query_gt").row().num_localized == 0
+    assert not KaptureFolder(result).read().poses()
+    assert (result / "notes.txt").read_text() == "mine"
+
+
 @pytest.mark.slow
 def test_a_real_foreign_map(megloc: Any, virtual_gallery: Path, tmp_path: Path) -> None:
     before = state(virtual_gallery)

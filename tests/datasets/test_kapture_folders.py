@@ -48,7 +48,7 @@ def root(tmp_path: Path) -> Path:
     return place
 
 
-def test_what_is_imported(root: Path, tmp_path: Path) -> None:
+def test_what_is_imported(root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     out = tmp_path / "out"
     counts = {"map_images": 2, "map_images_with_pose": 2, "queries": 2, "queries_with_truth": 2}
     assert import_kapture_folders(root, out) == counts
@@ -63,6 +63,9 @@ def test_what_is_imported(root: Path, tmp_path: Path) -> None:
     assert query.image_path("b/q.png").is_file()
     assert tables.read_protocol(out / "megloc") == tables.Protocol()
     assert sorted(path.name for path in (out / "megloc").iterdir()) == ["protocol.json"]
+    write_part(root, "query_gt", ["b/q.png", "s.png"], poses=True, images=False)
+    assert import_kapture_folders(root, tmp_path / "c") == counts | {"queries_with_truth": 1}
+    assert "query_gt: true poses of 1 images that are no query" in caplog.text
     (root / "query_gt/sensors/sensors.txt").unlink()
     assert import_kapture_folders(root, tmp_path / "b") == counts | {"queries_with_truth": 0}
     assert not (tmp_path / "b" / "query_gt").exists()

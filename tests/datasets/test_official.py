@@ -127,7 +127,9 @@ def test_counts_say_how_they_differ_from_what_is_published() -> None:
     assert str(Count("cameras", 7)).endswith("  7")
 
 
-def test_ground_truth_beside_a_dataset_comes_in_the_local_frame(tmp_path: Path) -> None:
+def test_ground_truth_beside_a_dataset_comes_in_the_local_frame(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     moved = tables.SimilarityTransform(quat_wxyz=(0.5, 0.5, 0.5, 0.5), translation=(4e6, 1e6, -2e6))
     world = tables.World(official_from_local=moved)
     assert read_ground_truth(tmp_path, records("q/1.jpg"), world) == (None, {})
@@ -140,3 +142,7 @@ def test_ground_truth_beside_a_dataset_comes_in_the_local_frame(tmp_path: Path) 
     back = world.pose_in_official(found.poses()["q/1.jpg"])
     np.testing.assert_allclose(back.center(), POSE.center(), atol=1e-6)
     np.testing.assert_allclose(back.quat_wxyz, POSE.quat_wxyz, atol=1e-12)
+    assert "true poses of 1 images that are no query are left out, the first is q/2" in caplog.text
+    (truth / "query" / "sensors" / "sensors.txt").unlink()
+    with pytest.raises(DataError, match="sensors.txt: cannot read: the file is missing"):
+        read_ground_truth(tmp_path, records("q/1.jpg"), world)

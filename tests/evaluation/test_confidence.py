@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.confidence import calibration_error, reliability, risk_by_score
 from megloc_kapture.evaluation.evaluate import evaluate
+from megloc_kapture.evaluation.pose_files import write_pose_file, write_provenance
 from megloc_kapture.evaluation.report.reports import report_text, write_report
 from megloc_kapture.evaluation.scoring import evaluate_poses
 from megloc_kapture.io.dataset_tables import read_nowhere, write_nowhere
@@ -123,6 +124,22 @@ def test_in_memory_and_on_a_page(tmp_path: Path) -> None:
     assert "Does it know when it does not know?" in (tmp_path / "report.html").read_text()
     data = json.loads((tmp_path / "recall.json").read_text())
     assert data["confidence"]["num_poses"] == 1
+
+
+def test_json_of_something_else_beside_a_pose_file(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    truth = {"a": at(0.0), "b": at(0.0)}
+    poses, beside = tmp_path / "poses.txt", tmp_path / "poses.txt.json"
+    write_pose_file(poses, truth)
+    for content in ("[1, 2]", "{", '{"files": 3}', '{"other": {"a": 7}}'):
+        beside.write_text(content)
+        assert evaluate(poses, truth).confidence is None
+    write_provenance(poses, {"confidence": {"a": 0.9, "b": 0.8}}, counts={})
+    assert evaluate(poses, truth).confidence is not None and not caplog.records
+    write_pose_file(poses, {"a": at(9.0), "b": at(9.0)})
+    assert evaluate(poses, truth).confidence is None
+    assert "poses.txt.json is of another pose file" in caplog.text
 
 
 def test_confidences_beside_a_pose_file(tmp_path: Path) -> None:

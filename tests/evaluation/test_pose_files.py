@@ -265,6 +265,24 @@ def test_short_names_find_their_images() -> None:
         poses_by_image({"rear/1.png": HERE, "dawn/rear/1.jpg": HERE}, listed, listed)
 
 
+def test_names_that_end_a_path_or_have_another_ending() -> None:
+    images = [
+        "v2/dawn/rear/1.jpg",
+        "v2/dusk/rear/2.jpg",
+        "v2/dusk/left/2.jpg",
+        "a/3.jpg",
+        "a/3.png",
+    ]
+    named = ("rear/1.jpg", "left/2.png", "rear/2.JPG", "3.jpg", "4.jpg")
+    found = poses_by_image(dict.fromkeys(named, HERE), images)
+    assert list(found) == [images[0], images[2], images[1], "a/3.jpg", "4.jpg"]
+    # neither of two that differ in their ending, nor what is no ending of an image
+    strange = ["a/3.jpeg", "v2/dawn/rear/1.5"]
+    assert list(poses_by_image(dict.fromkeys(strange, HERE), images)) == strange
+    listed = {"v2/dawn/rear/1.jpg": "rear/1.png"}
+    assert list(poses_by_image({"rear/1.jpeg": HERE}, images, listed)) == images[:1]
+
+
 def test_relative_poses_are_query_from_reference() -> None:
     rng = np.random.default_rng(0)
     turns = Rotation.random(2, random_state=0)

@@ -137,6 +137,36 @@ def test_workspaces_that_were_recentred_in_other_ways_are_brought_together(
     assert evaluate(tmp_path / "far.txt", truth).errors.position_m.min() > 1e6
 
 
+def test_truth_in_the_official_frame_is_brought_to_the_maps(
+    world: Any, tmp_path: Path, kaptures: Callable[..., Path], caplog: pytest.LogCaptureFixture
+) -> None:
+    """As a dataset's owner has it, outside of any import."""
+    similarity = SimilarityTransform(
+        quat_wxyz=(0.8, 0.0, 0.6, 0.0), translation=(4.1e6, 8.6e5, 4.7e6), scale=2.0
+    )
+    own = World(official_from_local=similarity)
+    run, names = tmp_path / "run", list(world.truth)
+    write_world(run / "megloc", own)
+    write_protocol(run / "megloc", Protocol())
+    local = kaptures(run / "query_gt", names, world.truth)
+    official = {name: own.pose_in_official(pose) for name, pose in world.truth.items()}
+    found = kaptures(run / "localized", names, world.estimated)
+    expected = evaluate(found, local).errors.position_m
+    assert not caplog.records
+    errors = evaluate(found, kaptures(tmp_path / "owner", names, official)).errors.position_m
+    np.testing.assert_allclose(errors, expected, rtol=0, atol=1e-6)
+    assert "owner is in the dataset's official frame" in caplog.text
+
+
+@pytest.mark.parametrize("pose", [(float("nan"), 0.0, 0.0), (1e300, 0.0, 0.0)])
+def test_poses_in_memory_are_finite(world: Any, pose: tuple[float, float, float]) -> None:
+    (name, *_) = world.truth
+    broken = {**world.truth, name: RigidTransform((1.0, 0.0, 0.0, 0.0), pose)}
+    for given in ((broken, world.truth), (world.truth, broken)):
+        with pytest.raises(DataError, match=f"{name}': the pose is not finite"):
+            evaluate(*given)
+
+
 def test_the_challenges_names_are_read_back(
     world: Any, truth: Path, result: Path, tmp_path: Path
 ) -> None:

@@ -257,6 +257,12 @@ def test_pose_files_give_the_figures_of_the_folder(
     )
     assert half.row("b").num_missing == 0
     assert half.row("c").num_missing == 3
+    # a dummy, which the file must have in a missing pose's place, is none
+    first, *others = (files / "reloc_b.txt").read_text().splitlines()
+    rows = [" ".join([*first.split()[:2], "0 0 0 0 0 0 1"]), *others]
+    (files / "reloc_b.txt").write_text("".join(f"{row}\n" for row in rows))
+    with_dummy, _ = evaluate_results([files, results[0]], workspace / "query_gt", rules)
+    assert with_dummy.row("b").num_missing == 1
 
 
 def test_both_errors_are_told_everywhere(challenge: tuple[Path, Path], tmp_path: Path) -> None:

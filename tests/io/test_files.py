@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import re
@@ -9,7 +10,9 @@ import shutil
 import subprocess
 import sys
 import tarfile
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import example, given
@@ -65,7 +68,9 @@ def test_an_impossible_place_is_an_output_error_that_names_it(tmp_path: Path) ->
 
 FULL_DISK = """
 import resource, sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 import numpy as np
 from megloc_kapture.errors import OutputError
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, write_points3d
@@ -310,15 +315,89 @@ def test_a_claim_is_undone(tmp_path: Path, foreign: Path) -> None:
     assert tree(tmp_path / "d") == {"e": None, "e/file": b"kept"}
 
 
-def test_new_files_replace_old_ones_and_others_stay(tmp_path: Path) -> None:
+@contextlib.contextmanager
+def writing(place: Path, *names: str, **how: Any) -> Iterator[None]:
+    with staged_output(place, kind="map", **how) as out:
+        for name in names:
+            (out / name).parent.mkdir(parents=True, exist_ok=True)
+            (out / name).write_text(name)
+        yield
+
+
+def names_in(place: Path) -> set[str]:
+    return {name for name, content in tree(place).items() if content is not None} - {MARKER}
+
+
+@pytest.mark.parametrize("adds", [False, True])
+def test_what_an_earlier_run_wrote_goes_and_what_others_wrote_stays(
+    tmp_path: Path, adds: bool
+) -> None:
     place = tmp_path / "out"
-    for content, name in ((b"1", "a"), (b"2", "b"), (b"3", "a")):
-        before = tree(place / "sub")
+    with writing(place, "sub/a", "sub/deep/b", "old/c", adds=adds):
+        assert not (place / "sub").exists()  # until the end
+    (place / "old" / "notes.txt").write_text("mine")
+    with writing(place, "sub/a", "d", adds=adds):
+        pass
+    earlier = {"sub/deep/b", "old/c"} if adds else set()
+    assert names_in(place) == {"sub/a", "d", "old/notes.txt"} | earlier
+    assert (place / "sub" / "deep").exists() == adds
+    with writing(place, "e", adds=adds), pytest.raises(OutputError, match="not a dataset"):
+        claim_folder(place, kind="dataset")
+    # of another kind, by force: nothing of it was written by such a run
+    with staged_output(place, kind="dataset", force=True) as out:
+        (out / "f").touch()
+    assert names_in(place) >= {"e", "f", "old/notes.txt"}
+
+
+def test_what_a_mark_says_of_files_elsewhere_is_not_believed(tmp_path: Path) -> None:
+    place, other = tmp_path / "out", tmp_path / "other"
+    other.mkdir()
+    (other / "mine").touch()
+    (tmp_path / "mine").touch()
+    with writing(place, "a"):
+        pass
+    (place / "link").symlink_to(other)
+    names = ("../mine", str(other / "mine"), "link/mine", "b/../../mine", ".", "", MARKER)
+    (place / MARKER).write_text("\n".join(("map", "a", *names, "")))
+    with writing(place, "b"):
+        pass
+    assert (other / "mine").exists() and (tmp_path / "mine").exists()
+    assert names_in(place) == {"b"} and (place / "link").is_symlink()
+
+
+@pytest.mark.parametrize(
+    ("mine", "written", "words"),
+    [
+        ("a/mine", ("0", "a"), "out/a: a folder stands where a file"),
+        ("a", ("0", "a/b"), "out/a: a file stands where a folder"),
+    ],
+)
+def test_what_is_in_the_way_is_refused_before_anything_changes(
+    tmp_path: Path, mine: str, written: tuple[str, ...], words: str
+) -> None:
+    place = tmp_path / "out"
+    with writing(place, "0", "1"):
+        pass
+    (place / mine).parent.mkdir(exist_ok=True)
+    (place / mine).write_text("mine")
+    before = tree(place)
+    with pytest.raises(OutputError, match=words), writing(place, *written):
+        pass
+    assert tree(place) == before
+
+
+def test_a_folder_of_ours_may_become_a_file_or_link_and_back(tmp_path: Path) -> None:
+    place = tmp_path / "out"
+    for _ in range(2):
+        with writing(place, "a/b/c", "d"):
+            pass
+        assert names_in(place) == {"a/b/c", "d"}
+        with writing(place, "a"):
+            pass
+        assert names_in(place) == {"a"}
         with staged_output(place, kind="map") as out:
-            (out / "sub").mkdir()
-            (out / "sub" / name).write_bytes(content)
-            assert tree(place / "sub") == before  # until the end
-    assert tree(place) == {MARKER: b"map\n", "sub": None, "sub/a": b"3", "sub/b": b"2"}
+            (out / "a").symlink_to(tmp_path)
+        assert (place / "a").is_symlink()
 
 
 def test_a_link_is_replaced_and_not_followed(tmp_path: Path, foreign: Path) -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
+import pandas as pd
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -52,6 +53,8 @@ def test_any_text_reads_back(tmp_path_factory: pytest.TempPathFactory, rows: lis
     write_csv_table(path, COLUMNS, rows)
     read = [(row["image"], row["reason"]) for _, row in read_csv_table(path, COLUMNS)]
     assert read == rows
+    write_csv_table(path, ["image", 'of "a, b"'], [("a.jpg", "1")])
+    assert pd.read_csv(path).columns.tolist() == ["image", 'of "a, b"']
     write_csv_table(path, COLUMNS, [("a b.jpg", "few, far"), ("c.jpg", "")])
     assert path.read_bytes() == b'image,reason\na b.jpg,"few, far"\nc.jpg,\n'
 

@@ -24,6 +24,7 @@ from megloc_kapture.datasets.formats.text_lines import (
     shown,
 )
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.files import read_text
 from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -155,6 +156,11 @@ def read_gnss_poses(path: Path) -> dict[int, GnssPose]:
     A row has 8 to 11 fields, ``timestamp tx ty tz qx qy qz qw [scale [fusion_quality [v3]]]``; the
     published header announces 11, the published rows have 10. DataError names file and line.
     """
+    lines = read_lines(path, comments=True)
+    longest = max((len(line.comma_fields) for line in lines), default=0)
+    # one that ends within a number would be read with another one
+    if longest and len(lines[-1].comma_fields) < longest and not read_text(path).endswith("\n"):
+        raise lines[-1].error("has fewer fields and is not ended: the file may be cut short")
 
     def parse(line: Line) -> GnssPose:
         fields = line.comma_fields
@@ -385,14 +391,17 @@ def parse_relocalization_name(name: str) -> tuple[str | None, str] | None:
 
 
 def read_relocalization(path: Path) -> list[RelocalizationRow]:
-    """Read the pairs of a relocalization file, in its order; DataError names file and line."""
-    rows = []
+    """Read the pairs of a relocalization file, in its order, each once, as a pose file has it.
+
+    DataError names file and line.
+    """
+    rows: dict[tuple[int, int], RelocalizationRow] = {}
     for line in read_lines(path, comments=True):
         fields = line.comma_fields
         line.expect(fields, (2, 9), "reference query [tx ty tz qx qy qz qw]")
         reference, query = (_timestamp(line, field) for field in fields[:2])
         pose = _transform(line, fields[2:]) if len(fields) == 9 else None
-        rows.append(RelocalizationRow(reference, query, pose))
+        rows.setdefault((reference, query), RelocalizationRow(reference, query, pose))
     if not rows:
         raise DataError("no pair in the file", path=path)
-    return rows
+    return list(rows.values())

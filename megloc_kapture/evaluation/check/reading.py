@@ -24,8 +24,9 @@ from megloc_kapture.io.dataset_tables import (
     PoseFileFormat,
     read_priors,
 )
-from megloc_kapture.io.files import read_text
+from megloc_kapture.io.files import read_content, read_text
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture.format import BYTE_ORDER_MARK
 
 # error: the server would refuse the file, or its figures would be wrong as a whole; warning: single
 # poses cannot be right, or queries are lost; note: good to know
@@ -184,6 +185,9 @@ def read_rows(path: Path, kind: PoseFileFormat) -> Rows:
     """Read what can be read of a pose file; DataError: nothing can, or it is no text in UTF-8."""
     _, columns, at = _FORMATS[kind]
     poses, named, findings = _scan(read_text(path).split("\n"), kind)
+    if read_content(path).startswith(BYTE_ORDER_MARK):
+        message = "a byte order mark stands before the first name: a server may not find that query"
+        findings.append(Finding("warning", "byte-order-mark", message, line=1))
     keys = tuple(poses)
     numbers = np.array(list(poses.values()), dtype=np.float64).reshape(-1, 7)
     norms, off = _norms(numbers[:, at : at + 4])

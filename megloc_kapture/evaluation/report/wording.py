@@ -145,7 +145,7 @@ def notes(evaluation: Evaluation) -> list[str]:
         if evaluation.truth_known_by:
             said.append(evaluation.truth_known_by.rstrip("."))
         if not evaluation.estimated and row.num_missing == row.num_queries:
-            said.append("no estimated image is in the ground truth: do the names agree?")
+            said.append("no estimated image is in the ground truth; the names may not agree")
     if evaluation.not_scored:
         number = len(evaluation.not_scored)
         told = counted(number, "image with a true pose is", "images with a true pose are")

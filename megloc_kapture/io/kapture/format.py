@@ -8,10 +8,12 @@ Every complaint names file and line. Timestamps and ids are integers of any leng
 from __future__ import annotations
 
 import contextlib
+import logging
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 from megloc_kapture.errors import DataError
@@ -20,6 +22,7 @@ from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransfor
 
 CAMERA_SENSOR_TYPES = ("camera", "depth")
 UNKNOWN_CAMERA = "UNKNOWN_CAMERA"
+_log = logging.getLogger(__name__)
 
 FORMAT_VERSION = "1.1"
 FORMAT_LINE = f"# kapture format: {FORMAT_VERSION}"
@@ -206,6 +209,11 @@ def _shortest(value: float) -> str:
 # --------------------------------------------------------------------------------------- text
 
 
+@cache  # every stage reads the same tables
+def _tell_of_unended(path: Path, line: int) -> None:
+    _log.warning("%s:%d: the last line is not ended; the file may be cut short", path, line)
+
+
 @contextlib.contextmanager
 def read_rows(path: Path, *, version_required: bool = False) -> Iterator[Iterator[Row]]:
     """Rows of a kapture CSV file as ``(line number, stripped fields)``; comments left out.
@@ -218,6 +226,8 @@ def read_rows(path: Path, *, version_required: bool = False) -> Iterator[Iterato
     """
     lines = read_text(path).split("\n")
     check_version(path, lines[0], required=version_required)
+    if lines[-1].strip():
+        _tell_of_unended(path, len(lines))
     number = 0
 
     def rows() -> Iterator[Row]:

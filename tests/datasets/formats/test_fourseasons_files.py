@@ -86,6 +86,15 @@ def test_pinhole(write: Callable[[str], Path], old: str, new: str) -> None:
     assert camera == Camera("PINHOLE", 800, 400, (501.5, 502.5, 421.8, 167.7))
 
 
+def test_gnss_poses_that_are_cut_short(write: Callable[[str], Path]) -> None:
+    text = f"{ROW}\n{ROW.replace(str(TIME), str(LATER))}"
+    assert read_gnss_poses(write(text))[LATER].scale == 0.9624
+    cut = text.removesuffix("624,2")
+    with pytest.raises(DataError, match=":2: has fewer fields and is not ended"):
+        read_gnss_poses(write(cut))
+    assert read_gnss_poses(write(cut + "\n"))[LATER].scale == 0.9
+
+
 @pytest.mark.parametrize(
     ("text", "scale", "quality"),
     [

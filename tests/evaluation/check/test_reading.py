@@ -52,6 +52,14 @@ def test_good_files(tmp_path: Path) -> None:
     assert nothing.translations.shape == (0, 3)
 
 
+def test_a_byte_order_mark_is_told(tmp_path: Path) -> None:
+    for name in (b"", b"\xef\xbb\xbf"):
+        (tmp_path / "poses.txt").write_bytes(name + b"a.jpg 1 0 0 0 0 0 0\n")
+        rows = read_rows(tmp_path / "poses.txt", "ltvl")
+        assert rows.keys == ("a.jpg",)
+        assert [one.kind for one in rows.findings] == ["byte-order-mark"] * bool(name)
+
+
 def test_files_that_are_cut_or_no_text(tmp_path: Path) -> None:
     rows = rows_of(tmp_path, GOOD + "b.jpg 1 0 0 0 1.5 -0.2 3.1")
     assert [(f.severity, f.kind, f.line) for f in rows.findings] == [("warning", "cut", 2)]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture.format import KaptureData, Sensor
+from megloc_kapture.io.kapture.format import KaptureData, Sensor, read_rows
 from megloc_kapture.io.kapture.sensors import read_kapture_data, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -156,6 +156,17 @@ def test_almost_unit_quaternions_are_normalised(tmp_path: Path) -> None:
     poses = read_kapture_data(make(tmp_path, trajectories=VERSION + rows)).trajectories
     assert poses[0, "cam"].quat_wxyz == (1, 0, 0, 0)
     assert abs(np.linalg.norm(poses[1, "cam"].quat_wxyz) - 1) < 1e-15
+
+
+def test_a_table_that_may_be_cut_short_is_told_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "rows.txt"
+    for end, told in (("\n", 0), ("", 1), ("", 1)):
+        path.write_text(f"# kapture format: 1.1\n0, cam, 7842{end}")
+        with read_rows(path) as rows:
+            assert list(rows) == [(2, ["0", "cam", "7842"])]
+        assert caplog.text.count("rows.txt:2: the last line is not ended") == told
 
 
 def test_missing_and_unreadable_files_are_named(tmp_path: Path) -> None:
