@@ -231,6 +231,13 @@ class Linked:
         """A kapture folder; raises DataError where a folder that links may lead to is not there."""
         return KaptureFolder(root, allow_links_below=existing(self.allow_links_below))
 
+    def kapture_map(self, root: Path) -> KaptureFolder:
+        """The kapture folder of a map, which a workspace may stand for; raises as the other."""
+        # commands that open no workspace do not wait for its imports
+        from megloc_kapture.pipeline.workspace import map_of_workspace
+
+        return self.kapture(map_of_workspace(root))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Reading(Linked):

@@ -104,7 +104,7 @@ class RefineMap(Reading, StageCommand):
     def run(self, console: Console) -> None:
         changes: dict[str, object] = {"refinement": {"ply": True}} if self.ply else {}
         options = self.options(changes).refinement
-        source = self.kapture(self.input)
+        source = self.kapture_map(self.input)
         with self.staged(self.output, MAP, force=self.force) as (out, work):
             refine_map(source, out, options, work=work)
         for row in report_lines(self.output):
@@ -161,7 +161,7 @@ class Densify(Reading, StageCommand):
         if self.by is not None:
             chosen["estimator"] = {"name": self.by}
         options = self.options({"mvs": chosen}).mvs
-        source = self.kapture(self.input)
+        source = self.kapture_map(self.input)
         with self.staged(self.output, MAP, force=self.force) as (out, work):
             counts = densify_map(
                 source, out, options, restrictions=restrictions_beside(self.input), work=work
@@ -206,7 +206,7 @@ class RefinePoses(Linked, StageCommand):
             raise OptionError(f"no pose refiner is chosen; --by takes: {names}")
         with self.staged(self.output, LOCALIZED, force=self.force) as (out, work):
             counts = refine_poses(
-                self.kapture(self.input),
+                self.kapture_map(self.input),
                 self.kapture(self.query),
                 self.kapture(self.poses),
                 out,

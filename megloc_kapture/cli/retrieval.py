@@ -45,7 +45,7 @@ class ExtractGlobal(Reading, StageCommand):
 
     def run(self, console: Console) -> None:
         choices = self.options(self.named("global_features", self.features)).global_features
-        folders = [self.kapture(folder) for folder in (self.input, *self.query)]
+        folders = [self.kapture_map(self.input), *map(self.kapture, self.query)]
         extractors = {one.name: one.make() for one in choices if not one.is_vlad}
         with self.staged(self.output, FEATURES, force=self.force, adds=True) as (out, work):
             for choice in choices:
@@ -88,7 +88,7 @@ class PairsMapping(Reading, StageCommand):
     """Overwrite the pairs file."""
 
     def run(self, console: Console) -> None:
-        mapping = self.kapture(self.input)
+        mapping = self.kapture_map(self.input)
         chosen = self.options({"mapping_pairs": _changes(self.by, self.topk)})
         options = chosen.mapping_pairs
         covisible = self.covisibility_map
@@ -103,7 +103,7 @@ class PairsMapping(Reading, StageCommand):
                 options,
                 retrieval=retrieval,
                 restrictions=restrictions_beside(self.input),
-                covisible=None if covisible is None else self.kapture(covisible),
+                covisible=None if covisible is None else self.kapture_map(covisible),
                 work=work,
             )
         _refuse_existing(self.output, force=self.force)
@@ -147,7 +147,7 @@ class PairsQuery(Reading, StageCommand):
         if (self.rerank is None) != (self.matches_dir is None):
             raise OptionError("--rerank N and --matches-dir DIR go together: matches are kept")
         _refuse_existing(self.output, force=self.force)
-        mapping = self.kapture(self.input)
+        mapping = self.kapture_map(self.input)
         query = self.kapture(self.query)
         mapping.check_features_apart(query)
         by = "exhaustive" if self.exhaustive else "retrieval"

@@ -137,7 +137,7 @@ class ExtractLocal(Linked, StageCommand):
     def run(self, console: Console) -> None:
         if not self.input:
             raise OptionError("no kapture folder given; use -i")
-        folders = [self.kapture(path) for path in self.input]
+        folders = [self.kapture_map(path) for path in self.input]
         options = self.options(self.named("local_features", self.features))
         extractors = options.make_extractors()
         with self.staged(self.output, FEATURES, force=self.force, adds=True) as (out, work):
@@ -179,7 +179,7 @@ class Match(Reading, StageCommand):
     force: Force = False
 
     def run(self, console: Console) -> None:
-        mapping = self.kapture(self.input)
+        mapping = self.kapture_map(self.input)
         local_type = only_type(mapping, "descriptors", self.features)
         changes: dict[str, object] = {"matching": {"name": self.matcher}} if self.matcher else {}
         between = "mapping_verification" if self.query is None else "query_verification"
@@ -217,7 +217,7 @@ class Triangulate(Reading, StageCommand):
     force: Force = False
 
     def run(self, console: Console) -> None:
-        mapping = self.kapture(self.input)
+        mapping = self.kapture_map(self.input)
         local_types = [only_type(mapping, "matches", asked) for asked in self.features or (None,)]
         pairs = None if self.pairs is None else _read_pairs_of(self.pairs, mapping, mapping)
         with self.staged(self.output, MAP, force=self.force) as (out, work):
@@ -309,7 +309,7 @@ class Preprocess(Linked, Computing, Working):
 
     def run(self, console: Console) -> None:
         options = self.options()
-        source = self.kapture(self.input)
+        source = self.kapture_map(self.input)
         sequences = [self.kapture(path) for path in existing(self.sequence)]
         with self.staged(self.output, PREPROCESSED, force=self.force) as (out, work):
             preprocess_images(source, out, options, sequences=sequences, work=work)

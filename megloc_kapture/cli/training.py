@@ -70,7 +70,7 @@ class Train(Linked, Common):
         options = options_with(TASKS[self.task], self.set, changes)
         licences = assigned_pairs("--licence", self.licence, "FOLDER=TEXT")
         data = TrainingData(
-            [self.kapture(path) for path in self.input],
+            [self.kapture_map(path) for path in self.input],
             self.photographs,
             [self.kapture(path) for path in self.held_out],
             {Path(folder): licence for folder, licence in licences},
@@ -153,7 +153,7 @@ class TrainField(Linked, Common):
                 + (f", held-out images {held_out} dB" if held_out else "")
             )
 
-        mapping, state = self.kapture(self.input), self.output / STATE_FILE
+        mapping, state = self.kapture_map(self.input), self.output / STATE_FILE
         claim = claim_folder(self.output, kind=FIELD, force=self.force)
         try:
             if self.force:
@@ -209,7 +209,7 @@ class Render(Linked, Working):
         if self.max_side is not None and self.max_side < 1:
             raise OptionError(f"--max-side {self.max_side} is not positive")
         refuse_given("--pose", camera=self.camera, depth=self.depth)
-        data = self.kapture(many).read()
+        data = self.kapture_map(many).read()
         if not data.poses():
             raise DataError("no image here has a pose", path=many)
         with self.staged(self.output, RENDERED, force=self.force) as (out, work):

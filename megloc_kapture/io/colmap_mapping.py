@@ -11,9 +11,11 @@ Stereo has a workspace, which is written, run where there is CUDA, and read:
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -43,6 +45,9 @@ _FOLDERS = {"depth": "depth_maps", "normal": "normal_maps"}
 MIN_IMAGES = 3
 # fewer are what RANSAC finds in anything; as many inliers COLMAP asks of an image it adds
 _MIN_POINTS = 30
+# a photograph of another zoom, or of a part of an image: with a camera of its own the focal length
+# is off the others' median by more than this, and its points' errors are at most this share
+_OTHER_ZOOM, _SMALLER_ERROR = 0.08, 0.95
 # matches that move less than this in the median are of one image twice
 _SAME_PX = 0.5
 
@@ -133,12 +138,14 @@ class Photograph:
     ----------
     sensor : images of one sensor have one camera, which is estimated for all of them.
     keypoints_px : (N, 2), the first pixel's centre is (0.5, 0.5).
+    doubtful : nothing but its size tells that it is of that sensor.
     """
 
     name: str
     sensor: str
     camera: Camera
     keypoints_px: NDArray[np.float32]
+    doubtful: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,12 +154,15 @@ class Model:
 
     Attributes
     ----------
-    cameras : of the sensors, refined.
+    cameras : of the sensors, refined. Photographs that turned out to have another camera than
+        their sensor's are of one that bears the name of the first of them.
+    sensors : of each image.
     poses : ``cam_from_world`` by image.
     error_px : mean reprojection error of its points.
     """
 
     cameras: dict[str, Camera]
+    sensors: dict[str, str]
     poses: dict[str, RigidTransform]
     num_points: int
     error_px: float
@@ -170,6 +180,9 @@ def reconstruct(
     """Find poses and cameras; models that do not hang together are several, the largest first.
 
     Images hang together that share 30 points, or are linked by images that do.
+
+    Photographs that share a sensor without anything to tell so get other cameras where their focal
+    lengths differ, one for those that agree, and everything is found anew.
 
     In one thread, so that the same photographs and seed give the same model.
 
@@ -218,6 +231,15 @@ def reconstruct(
         run = pycolmap.incremental_mapping if mapper == "incremental" else pycolmap.global_mapping
         made = _options(mapper, cameras, seed, known_cameras)
         found = run(str(database), folder, str(Path(folder) / "result"), made) if seen else {}
+    doubtful = {p.name for p in photographs if p.doubtful} if not known_cameras else set()
+    others: dict[str, str] = {}
+    for _, each in sorted(found.items()):
+        others |= _other_cameras(each, doubtful)
+    if others:
+        again = [
+            replace(p, sensor=others.get(p.name, p.sensor), doubtful=False) for p in photographs
+        ]
+        return reconstruct(again, matches, mapper, seed=seed, scratch=scratch)
     models = [
         model
         for _, found_one in sorted(found.items())
@@ -255,6 +277,73 @@ def _options(mapper: Mapper, cameras: Sequence[Any], seed: int, known_cameras: b
     return options
 
 
+def _other_cameras(reconstruction: Any, doubtful: Collection[str]) -> dict[str, str]:
+    """Of the doubtful images those whose camera is not the one that they share with others.
+
+    Each with the first of those whose focal lengths agree.
+
+    A wrong camera hides in poses and points, and an image's own estimate from these says nothing;
+    adjusted with a camera for each image, the focal lengths part.
+    """
+    pycolmap = load_pycolmap()
+    images = [reconstruction.images[number] for number in sorted(reconstruction.reg_image_ids())]
+    sharing = Counter(image.camera_id for image in images if image.name in doubtful)
+    if max(sharing.values(), default=0) < 2:
+        return {}
+    apart = pycolmap.Reconstruction()
+    for image in images:
+        camera = pycolmap.Camera(reconstruction.cameras[image.camera_id].todict())
+        camera.camera_id = image.image_id
+        apart.add_camera_with_trivial_rig(camera)
+        keypoints = np.array([point.xy for point in image.points2D], dtype=np.float64)
+        entry = pycolmap.Image(
+            image_id=image.image_id,
+            name=image.name,
+            camera_id=image.image_id,
+            keypoints=keypoints.reshape(-1, 2),
+        )
+        apart.add_image_with_trivial_frame(entry, image.cam_from_world())
+    for _, point in sorted(reconstruction.points3D.items()):
+        apart.add_point3D(point.xyz, pycolmap.Track(point.track.elements), point.color)
+    before = _errors_px(apart)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.solver_options.num_threads = 1
+    options.ceres.min_num_residuals_for_cpu_multi_threading = NEVER
+    with quiet_stderr():
+        pycolmap.bundle_adjustment(apart, options)
+    after = _errors_px(apart)
+    found: dict[str, str] = {}
+    for camera_id in sorted(camera_id for camera_id, number in sharing.items() if number > 1):
+        own = [image for image in images if image.camera_id == camera_id]
+        focal = np.array([apart.cameras[image.image_id].mean_focal_length() for image in own])
+        zooms = np.log(focal / np.median(focal)).tolist()
+        others = sorted(
+            (zoom, image.name)
+            for zoom, image in zip(zooms, own, strict=True)
+            if abs(zoom) > _OTHER_ZOOM
+            and image.name in doubtful
+            and after[image.image_id] < _SMALLER_ERROR * before[image.image_id]
+        )
+        group: list[str] = []
+        for (zoom, name), (next_zoom, _) in pairwise([*others, (math.inf, "")]):
+            group.append(name)
+            if next_zoom - zoom > _OTHER_ZOOM:
+                found |= dict.fromkeys(group, min(group))
+                group = []
+    return found
+
+
+def _errors_px(reconstruction: Any) -> dict[int, float]:
+    """Mean error of the points of each image, by its number."""
+    reconstruction.update_point_3d_errors()
+    errors: dict[int, list[float]] = {number: [] for number in reconstruction.reg_image_ids()}
+    for _, point in sorted(reconstruction.points3D.items()):
+        for element in point.track.elements:
+            errors[element.image_id].append(point.error)
+    return {number: float(np.mean(one)) if one else 0.0 for number, one in errors.items()}
+
+
 def connected_models(reconstruction: Any, sensors: Sequence[str]) -> list[Model]:
     """Split what a mapper made into the parts that hang together, each with at least one point.
 
@@ -289,16 +378,17 @@ def connected_models(reconstruction: Any, sensors: Sequence[str]) -> list[Model]
         kept = np.flatnonzero(seen @ inside.astype(np.int64) >= 2)
         if not len(kept):
             continue
-        cameras, poses = {}, {}
+        cameras, poses, of_image = {}, {}, {}
         for image in (images[row] for row in np.flatnonzero(inside)):
             camera = reconstruction.cameras[image.camera_id]
-            cameras[sensors[image.camera_id - 1]] = Camera.from_colmap(camera)
+            of_image[image.name] = sensors[image.camera_id - 1]
+            cameras[of_image[image.name]] = Camera.from_colmap(camera)
             found = image.cam_from_world()
             poses[image.name] = RigidTransform.from_matrix(
                 found.rotation.matrix(), np.asarray(found.translation)
             )
         error_px = float(np.mean([points[row].error for row in kept]))
-        models.append(Model(cameras, poses, len(kept), error_px))
+        models.append(Model(cameras, of_image, poses, len(kept), error_px))
     return models
 
 

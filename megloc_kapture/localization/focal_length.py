@@ -9,7 +9,9 @@ still agree. What gives it away is perspective. With a pose at hand the focal le
 - one whose focal length is not certain (``Camera.focal_deviation``) gets the most probable one, and
   principal point and radial distortion, where its model has one, with what was known before as a
   prior. The first estimate is by P4Pf where P3P with the given focal length has fewer inliers. The
-  covariance of the pose has the uncertainty of the intrinsics in it.
+  covariance of the pose has the uncertainty of the intrinsics in it. What was known is doubted
+  where the matches contradict it: of a photograph that was cropped, whose principal point is far
+  off the middle, and of one whose EXIF tells of another lens.
 
 Of a flat scene seen straight on matches say nothing: then what was known before stays.
 """
@@ -61,6 +63,14 @@ _MAX_DEVIATIONS = 3.0
 # standard deviations of what nobody tells of a camera: the principal point's as a share of the
 # larger side, and the radial distortion's
 _PRINCIPAL_POINT_DEVIATION, _DISTORTION_DEVIATION = 0.01, 0.1
+# what is believed where the matches contradict it, instead of EXIF's 0.1 and the above
+_DOUBTED_FOCAL, _DOUBTED_PRINCIPAL_POINT = 0.7, 0.3
+# a focal length that was calibrated, or estimated of several images, is not doubted
+_MIN_DOUBTED = 0.1
+# what contradicts: that large a shift of the principal point, a share of the larger side, or
+# _MAX_DEVIATIONS of the focal length; both by as many of their own uncertainty
+_MIN_CROP = 0.04
+_DOUBT_ROUNDS = 3
 # an estimate this many standard deviations off is of another zoom
 _MAX_SIGMAS = 3.0
 # errors of a map, and a lens that is none of the model, are alike in photographs: their number
@@ -74,17 +84,23 @@ class _Fit:
 
     Attributes
     ----------
-    change : float64 (1, 3 or 4,): logarithm of the focal length's factor, of which ``deviation``
-        is; the principal point's shift, as a share of the focal length; the radial distortion's.
+    change : float64 (1, 3 or 4,): logarithm of the focal length's factor; the principal point's
+        shift, as a share of the focal length; the radial distortion's.
+    deviations : of the change, float64, of its shape.
     pose_covariance : float64 (6, 6), what the uncertainty of the camera adds to that of the pose.
     depth : median of the inliers', unit of the map.
     """
 
     change: Floats
-    deviation: float
+    deviations: Floats
     rig_from_world: RigidTransform
     pose_covariance: Floats
     depth: float
+
+    @property
+    def deviation(self) -> float:
+        """Of the focal length, as a share of it."""
+        return float(self.deviations[0])
 
 
 def is_uncertain(problem: PoseProblem) -> bool:
@@ -111,10 +127,17 @@ def focal_remark(problem: PoseProblem, pose: Pose) -> str | None:
 def estimate_remark(camera: Camera, given: Camera) -> str:
     """Name the focal length that was estimated of an uncertain camera."""
     found_px, given_px = focal_px(camera), focal_px(given)
-    return (
+    told = (
         f"focal length estimated: {found_px:.0f} +- {camera.focal_deviation * found_px:.0f} px "
         f"({given_px:.0f} px +- {100 * given.focal_deviation:.0f} % was assumed)"
     )
+    x, y = _shift(camera, given)
+    if max(abs(x), abs(y)) > _MIN_CROP:
+        told += (
+            f"; the photograph was cropped: its principal point is {abs(100 * x):.0f} % and "
+            f"{abs(100 * y):.0f} % of the larger side off the middle"
+        )
+    return told
 
 
 def estimate_with_intrinsics(
@@ -126,21 +149,71 @@ def estimate_with_intrinsics(
     free = focal_from_matches(
         problem.points_px, problem.points, given, options.max_error_px, options.seed
     )
-    if free is not None and (
-        abs(math.log(free / focal_px(given))) < _MAX_DEVIATIONS * given.focal_deviation
-    ):
+    doubting = None
+    if free is not None:
         other = _with_camera(problem, scale_focal(given, free / focal_px(given)))
-        of_other = estimate_pose(other, options)
-        if isinstance(of_other, PoseEstimate) and of_other.num_inliers > found.num_inliers:
-            problem, found = other, of_other
+        if not _is_doubted(other.views[0].camera, given):
+            of_other = estimate_pose(other, options)
+            if isinstance(of_other, PoseEstimate) and of_other.num_inliers > found.num_inliers:
+                problem, found = other, of_other
+        elif given.focal_deviation >= _MIN_DOUBTED:
+            of_other = estimate_pose(other, options)
+            if isinstance(of_other, PoseEstimate) and of_other.num_inliers > found.num_inliers:
+                doubting = other, of_other
     if isinstance(found, PoseEstimate):
         fit = _fit(problem, found.rig_from_world, found.inliers, given)
         if fit is not None:
             better = _with_camera(problem, _changed(problem.views[0].camera, fit.change))
             of_better = estimate_pose(better, options)
             if isinstance(of_better, PoseEstimate) and of_better.num_inliers >= found.num_inliers:
-                return better, of_better
+                problem, found = better, of_better
+        doubting = doubting or (problem, found)
+    if doubting is not None and given.focal_deviation >= _MIN_DOUBTED:
+        other, of_doubts = _doubted(*doubting, given, options)
+        if of_doubts is not None and of_doubts.num_inliers >= found.num_inliers:
+            return other, of_doubts
     return problem, found
+
+
+def _doubted(
+    problem: PoseProblem, found: PoseEstimate, given: Camera, options: AbsolutePoseOptions
+) -> tuple[PoseProblem, PoseEstimate | None]:
+    """The estimate that believes little of what is known of the camera; None where the matches do
+    not contradict that beyond doubt."""
+    for _ in range(_DOUBT_ROUNDS):
+        if found.num_inliers < _MIN_INLIERS:
+            return problem, None
+        fit = _fit(problem, found.rig_from_world, found.inliers, given, doubting=True)
+        if fit is None:
+            return problem, None
+        camera = _changed(problem.views[0].camera, fit.change)
+        if not _is_doubted(camera, given, _MAX_DEVIATIONS * fit.deviations):
+            return problem, None
+        problem = _with_camera(problem, camera)
+        estimate = estimate_pose(problem, options)
+        if not isinstance(estimate, PoseEstimate):
+            return problem, None
+        found = estimate
+    return problem, found
+
+
+def _is_doubted(camera: Camera, given: Camera, beyond: Floats | None = None) -> bool:
+    """Whether a camera contradicts the given one, ``beyond`` what its uncertainty explains."""
+    bounds = np.zeros(3) if beyond is None else beyond[:3]
+    zoom = abs(math.log(focal_px(camera) / focal_px(given)))
+    shift = np.abs(_shift(camera, given))
+    to_share = focal_px(camera) / max(camera.width, camera.height)
+    return bool(
+        zoom > max(_MAX_DEVIATIONS * given.focal_deviation, bounds[0])
+        or (shift > np.maximum(_MIN_CROP, to_share * bounds[1:3])).any()
+    )
+
+
+def _shift(camera: Camera, given: Camera) -> tuple[float, float]:
+    """How far the principal point is from the given one, as shares of the larger side."""
+    larger = max(camera.width, camera.height)
+    x, y = np.subtract(principal_point_px(camera), principal_point_px(given)) / larger
+    return float(x), float(y)
 
 
 def refine_with_intrinsics(
@@ -187,7 +260,7 @@ def _changed(camera: Camera, change: Floats) -> Camera:
     return with_distortion(camera, radial_distortion(camera) + float(change[3]))
 
 
-def _prior_of(camera: Camera, given: Camera) -> tuple[Floats, Floats]:
+def _prior_of(camera: Camera, given: Camera, *, doubting: bool) -> tuple[Floats, Floats]:
     """The change that makes a camera the given one, and its standard deviations."""
     focal = focal_px(camera)
     shift = np.subtract(principal_point_px(given), principal_point_px(camera)) / focal
@@ -195,6 +268,9 @@ def _prior_of(camera: Camera, given: Camera) -> tuple[Floats, Floats]:
     # rest is known as well then
     known = given.focal_deviation
     share = min(_PRINCIPAL_POINT_DEVIATION, known)
+    # a camera that contradicts the given one does so because the matches did
+    if doubting or (known >= _MIN_DOUBTED and _is_doubted(camera, given)):
+        known, share = max(_DOUBTED_FOCAL, known), _DOUBTED_PRINCIPAL_POINT
     deviation = share * max(camera.width, camera.height) / focal
     change = [math.log(focal_px(given) / focal), *shift]
     deviations = [known, deviation, deviation]
@@ -209,11 +285,13 @@ def _fit(
     rig_from_world: RigidTransform,
     inliers: NDArray[np.bool_],
     given: Camera | None = None,
+    *,
+    doubting: bool = False,
 ) -> _Fit | None:
     """The camera that fits the inliers best; None where nothing determines it.
 
     Without ``given``, the camera as it is known before, with its deviation, nothing is known of the
-    focal length, and the rest is as it is.
+    focal length, and the rest is as it is. ``doubting``: little of it is believed.
     """
     (view,) = problem.views
     rays = normalized_from_px(view.camera, problem.points_px[inliers])
@@ -223,7 +301,7 @@ def _fit(
     if given is None:
         expected, prior_weight, min_inliers = np.zeros(1), np.zeros(1), _MIN_INLIERS
     else:
-        expected, deviations = _prior_of(view.camera, given)
+        expected, deviations = _prior_of(view.camera, given, doubting=doubting)
         prior_weight, min_inliers = (_CORRELATED / deviations) ** 2, 4
     change = np.zeros(len(expected))
     own = np.arange(6, 6 + len(change))
@@ -283,7 +361,7 @@ def _fit(
     of_camera, between = covariance[6:, 6:], covariance[:6, 6:]
     return _Fit(
         change=change,
-        deviation=math.sqrt(of_camera[0, 0]),
+        deviations=np.sqrt(np.diagonal(of_camera)),
         rig_from_world=view.cam_from_rig.inverse() @ moved,
         pose_covariance=between @ np.linalg.solve(of_camera, between.T),
         depth=float(np.median(z)),
@@ -308,8 +386,8 @@ def shared_camera(cameras: Sequence[Camera]) -> Camera:
 def solve_with_shared_camera(poses: Sequence[Pose], options: AbsolutePoseOptions) -> list[Pose]:
     """Poses of photographs of one camera, solved again with what all of them tell of it.
 
-    A photograph whose own estimate contradicts the others', as one at another zoom, keeps it; and
-    so does one whose pose was refined by other means.
+    A photograph whose own estimate contradicts the others', as one at another zoom or one that was
+    cropped, keeps it; and so does one whose pose was refined by other means.
 
     The poses come with the camera that was estimated of each, and their inliers.
     """
@@ -322,6 +400,7 @@ def solve_with_shared_camera(poses: Sequence[Pose], options: AbsolutePoseOptions
         for camera in usable
         if abs(math.log(focal_px(camera) / focal_px(shared)))
         <= _MAX_SIGMAS * math.hypot(camera.focal_deviation, shared.focal_deviation)
+        and max(map(abs, _shift(camera, shared))) <= _MIN_CROP
     ]
     if len(near) < 2:
         return list(poses)

@@ -66,7 +66,7 @@ from megloc_kapture.pipeline.presets import (
     options_of_preset,
 )
 from megloc_kapture.pipeline.query_folders import Photographs
-from megloc_kapture.pipeline.workspace import LOCK, Workspace
+from megloc_kapture.pipeline.workspace import Workspace, map_of_workspace
 from megloc_kapture.stages.densifying import Densify
 from megloc_kapture.stages.global_features import ExtractGlobalFeatures
 from megloc_kapture.stages.image_pairs import PairMapping
@@ -201,7 +201,7 @@ class ImportPhotographs(Stage):
             write_unreadable(tables, unreadable)
         number = len(self._photographs.names) - len(broken)
         if number < MIN_IMAGES:
-            raise _too_few(number)
+            raise _too_few(number, unreadable)
         cameras = len(KaptureFolder(work.out / MAPPING).read().sensors)
         return {"photographs": number, "cameras": cameras, "unreadable": len(unreadable)}
 
@@ -289,7 +289,7 @@ def plan_photographs(
     options.retrieval()
     options.check()
     if len(photographs.names) < MIN_IMAGES:
-        raise _too_few(len(photographs.names))
+        raise _too_few(len(photographs.names), photographs.unreadable)
     stages: list[Stage] = [ImportPhotographs(photographs)]
     stages += wanted_stages(_WITHOUT_POSES, options)
     stages.append(FindPoses(options, structure))
@@ -322,8 +322,12 @@ def describe_map(workspace: Path, photographs: Photographs) -> list[str]:
     return lines
 
 
-def _too_few(number: int) -> DataError:
-    return DataError(f"{number} photographs are too few for a map; give {MIN_IMAGES} or more")
+def _too_few(number: int, unreadable: Mapping[str, str]) -> DataError:
+    told = f"{number} photographs are too few for a map; give {MIN_IMAGES} or more"
+    if unreadable:
+        name, reason = min(unreadable.items())
+        told += f" ({len(unreadable)} more cannot be used, the first is {name}: {reason})"
+    return DataError(told)
 
 
 _STAMP = "colmap.json"
@@ -392,9 +396,7 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
     DataError : it is a COLMAP model that cannot be imported.
     OutputError : the cache cannot be written.
     """
-    path = Path(path)
-    if (path / LOCK).is_file() and (path / MAP).is_dir():
-        return path / MAP
+    path = map_of_workspace(Path(path))
     if not is_colmap(path):
         return path
     source = find_colmap(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
@@ -31,6 +32,7 @@ from megloc_kapture.io.images import (
     write_image,
 )
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, writable_name
+from megloc_kapture.io.output_folders import MARKER
 from megloc_kapture.matching.guided_pyramid import equivalent_types
 from megloc_kapture.pipeline.kapture_map import KaptureMap, check_lengths
 from megloc_kapture.pipeline.queries import Query, Unit
@@ -270,7 +272,8 @@ class Photographs(Queries):
     ----------
     paths : files and folders. An image is named by its path below the folder that was given, a
         file that was given by its own name, a frame by its video and number:
-        ``walk.mp4/000120.jpg``. Of a folder images and videos are taken, hidden files are not.
+        ``walk.mp4/000120.jpg``. Of a folder images and videos are taken, also behind links; hidden
+        files are not, nor kapture folders and what else we have written below it.
     camera : of all images; EXIF is not looked at then.
     every : of a video, every n-th frame; 30 unless given.
 
@@ -323,9 +326,10 @@ class Photographs(Queries):
         sensor_ids: dict[tuple[str, Camera], str] = {}
         for timestamp, name in enumerate(self.names):
             image = self._images[name]
-            key = image.make, image.camera
-            sensor_id = sensor_ids.setdefault(key, f"camera{len(sensor_ids)}")
-            title = image.make.replace(",", " ")
+            # the frames of a video have one camera, and photographs without EXIF may have
+            made_by = name.rpartition("/")[0] if image.is_frame else image.make
+            sensor_id = sensor_ids.setdefault((made_by, image.camera), f"camera{len(sensor_ids)}")
+            title = made_by.replace(",", " ")
             data.sensors[sensor_id] = Sensor.from_camera(image.camera, name=title)
             data.records_camera[timestamp, sensor_id] = name
         return data
@@ -391,10 +395,19 @@ def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
 
 def _images_below(folder: Path) -> Iterable[Path]:
     wanted = {*WRITABLE_SUFFIXES, *UNREAD_SUFFIXES, *VIDEO_SUFFIXES}
-    for path in sorted(folder.rglob("*")):
-        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
-        if path.suffix.lower() in wanted and not hidden and not path.is_dir():
-            yield path
+    found, seen = list[Path](), set[str]()
+    for place, folders, files in os.walk(folder, followlinks=True):
+        here, real = Path(place), os.path.realpath(place)
+        written = (here / MARKER).is_file() or (here / "sensors" / "sensors.txt").is_file()
+        if real in seen or (written and here != folder):  # a loop of links, or a map of these
+            folders.clear()
+            continue
+        seen.add(real)
+        # what is linked to counts where it is, if it is below
+        shown = (name for name in folders if not name.startswith("."))
+        folders[:] = sorted(shown, key=lambda name: ((here / name).is_symlink(), name))
+        found += [here / name for name in files if not name.startswith(".")]
+    return sorted(path for path in found if path.suffix.lower() in wanted)
 
 
 def _check_name(name: str, path: Path) -> None:

@@ -44,8 +44,15 @@ from megloc_kapture.values import Options
 
 PARTIAL = ".partial"
 LOCK = ".lock"
+_MAP = "map"
 HASHES = "stages/.hashes.json"
 JOURNAL = ".items"  # of a stage's items that are done, in the folder that it writes into
+
+
+def map_of_workspace(path: Path) -> Path:
+    """The kapture folder of a workspace's map; any other path as it is."""
+    there = (path / LOCK).is_file() and (path / _MAP).is_dir()
+    return path / _MAP if there else path
 
 
 class Workspace:

@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, MatchesWriter, read_pairs
 from megloc_kapture.io.tables import PairCount, write_match_counts
@@ -229,14 +229,15 @@ def match_all(
 ) -> list[_PairMatches]:
     """Matches of one image with each of several, as many at once as there is memory for.
 
-    Raises DeviceMemoryError: there is no memory for one pair.
+    Raises DeviceMemoryError: there is no memory for one pair; PluginError: the matcher returns no
+    matches.
     """
     many: Any = matcher
 
     def match(batch: Sequence[ImageFeatures]) -> Sequence[_PairMatches]:
         return many.match_many(a, batch) if len(batch) > 1 else [matcher.match(a, batch[0])]
 
-    return in_batches(
+    found = in_batches(
         matcher,
         "match_many",
         match,
@@ -244,6 +245,24 @@ def match_all(
         size=lambda b: len(b.keypoints_px) * (len(a.keypoints_px) + 1),
         name=names.__getitem__,
     )
+    for (matches, scores), other, name in zip(found, others, names, strict=True):
+        bounds = len(a.keypoints_px), len(other.keypoints_px)
+        if fault := _fault(matches, scores, bounds):
+            raise PluginError(f"matcher {type(matcher).__name__} on {name}: {fault}")
+    return found
+
+
+def _fault(matches: Any, scores: Any, bounds: tuple[int, int]) -> str | None:
+    """What is wrong with what a matcher returned; None: nothing."""
+    if not (isinstance(matches, np.ndarray) and isinstance(scores, np.ndarray)):
+        return "it returns no two arrays"
+    if matches.ndim != 2 or matches.shape[1] != 2 or matches.dtype.kind not in "iu":
+        return f"matches are whole numbers (K, 2), not {matches.dtype} {matches.shape}"
+    if scores.shape != matches.shape[:1]:
+        return f"scores of {len(matches)} matches have the shape {scores.shape}"
+    if len(matches) and ((matches < 0) | (matches >= bounds)).any():
+        return f"a match is of no row of the {bounds[0]} and {bounds[1]} keypoints"
+    return None
 
 
 def verified(a: Features, b: Features, pair: _PairMatches, verify: Verify) -> VerifiedMatches:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -45,6 +46,8 @@ from megloc_kapture.values import Options, RigidTransform
 
 _UNTURNED = RigidTransform.identity()
 
+_log = logging.getLogger(__name__)
+
 
 class StructureOptions(Options):
     """How photographs get poses, and what tells the scale of their world.
@@ -78,7 +81,7 @@ class FindPoses(PipelineStage):
     """Find poses and cameras of matched photographs; of several models the largest is the map's."""
 
     name = "poses"
-    version = 2
+    version = 3
     uses = (*LOCAL_TYPES, "query_verification")
     inputs = (Layout.mapping, SIDE_TABLES, LOCAL_FEATURES, PHOTOGRAPH_MATCHES)
     outputs = (POSED, f"{SIDE_TABLES}/{WORLD_FILE}", f"{SIDE_TABLES}/{UNREGISTERED_FILE}")
@@ -95,6 +98,9 @@ class FindPoses(PipelineStage):
         data, structure = mapping.read(), self._structure
         models = self._models(work, mapping, data)
         world, model, counts = _scaled(models[0], structure)
+        if own := sorted(i for i, sensor in model.sensors.items() if sensor not in data.sensors):
+            said = "%d photographs have the size of others and another camera (a zoom, a crop): %s"
+            _log.warning(said, len(own), ", ".join(own))
         tables = work.out / SIDE_TABLES
         reasons = read_unreadable(work.path(SIDE_TABLES))
         absent = set(data.image_names()) - model.poses.keys()
@@ -113,6 +119,7 @@ class FindPoses(PipelineStage):
             "photographs": len(data.image_names()) + len(read_unreadable(work.path(SIDE_TABLES))),
             "with_a_pose": len(model.poses),
             "models": len(models),
+            "cameras": len(model.cameras),
             "points": model.num_points,
             "mean_reprojection_error_px": round(model.error_px, 4),
             **counts,
@@ -124,7 +131,8 @@ class FindPoses(PipelineStage):
         photographs = []
         for image in images:
             sensor, px = data.record_of(image)[1], keypoints.read(image)[:, :2]
-            photographs.append(Photograph(image, sensor, data.camera_of(image), px))
+            untold = data.sensors[sensor].name == ""
+            photographs.append(Photograph(image, sensor, data.camera_of(image), px, untold))
         counts = read_match_counts(work.path(PHOTOGRAPH_MATCHES), local_type)
         putative = {(pair.image, pair.other): pair.matches for pair in counts}
         reader = mapping.matches(local_type)
@@ -155,11 +163,14 @@ class FindPoses(PipelineStage):
 
 def write_posed(output: Path, data: KaptureData, model: Model) -> None:
     """Write sensors, records and poses of the images of a model, without the others."""
-    records = {key: name for key, name in data.records_camera.items() if name in model.poses}
-    sensors = {
-        sensor: Sensor.from_camera(camera, name=data.sensors[sensor].name)
-        for sensor, camera in model.cameras.items()
-    }
+    records, sensors = {}, {}
+    for (timestamp, device), name in data.records_camera.items():
+        if name in model.poses:
+            sensor = model.sensors[name]
+            # one that turned out to have another camera
+            own = sensor if sensor in data.sensors else f"{device}_{data.record_of(sensor)[0]}"
+            records[timestamp, own] = name
+            sensors[own] = Sensor.from_camera(model.cameras[sensor], name=data.sensors[device].name)
     poses = {key: model.poses[name] for key, name in records.items()}
     write_sensors(
         output, replace(data, sensors=sensors, records_camera=records, trajectories=poses)

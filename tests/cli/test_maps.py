@@ -47,6 +47,15 @@ def test_what_is_done_is_kept(megloc: Any, unposed: Path) -> None:
     assert done.err.count("up to date") == 9
 
 
+def test_a_workspace_stands_for_its_map(megloc: Any, unposed: Path, tmp_path: Path) -> None:
+    for name, place in (("workspace", unposed / "map"), ("map", unposed / "map" / "map")):
+        done = megloc("refine-map", "-i", place, "-o", tmp_path / name)
+        assert done.status == 0, done.err
+    for part in ("points3d.txt", "observations.txt"):
+        one, other = (tmp_path / n / "reconstruction" / part for n in ("workspace", "map"))
+        assert one.read_bytes() == other.read_bytes()
+
+
 def test_every_command_says_units(megloc: Any, unposed: Path, scene: Path, tmp_path: Path) -> None:
     workspace, localized = unposed / "map", tmp_path / "localized"
     assert "unit              none: units of its own" in megloc("info", workspace).out

@@ -30,9 +30,9 @@ from megloc_kapture.cli.main import main
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.geometry.poses import earth_from_enu, geodetic
 from megloc_kapture.io.dataset_tables import read_unreadable, read_world
-from megloc_kapture.io.images import write_image
+from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.pipeline.map_making import options_of_photographs
-from megloc_kapture.values import Pose, RigidTransform
+from megloc_kapture.values import Camera, Pose, RigidTransform
 from tests.rendering import corner
 
 
@@ -277,6 +277,26 @@ def test_gps_tells_scale_and_axes(room: Path, tmp_path: Path) -> None:
     megloc.export("geojson", tmp_path / "a.geojson", map=tmp_path / "map")
 
 
+def test_photographs_of_one_size_may_have_other_cameras(
+    room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Three are zoomed, and no EXIF says so."""
+    photos = put(tmp_path / "photos", (room / "photos").iterdir())
+    zoomed = ("0004.jpg", "0006.jpg", "0008.jpg")
+    for name in zoomed:
+        image = read_image_rgb(photos / name)
+        height, width = image.shape[:2]
+        part = image[height * 3 // 20 : height * 17 // 20, width * 3 // 20 : width * 17 // 20]
+        write_image(photos / name, cv2.resize(part, (width, height), interpolation=cv2.INTER_CUBIC))
+    made = megloc.map_photographs(photos, workspace=tmp_path / "map", **FEW)
+    found, _, _ = errors(made.kapture_map.poses, true_poses(room / "mapping", room / "query_gt"))
+    assert len(found) == 11 and np.median(found) < 0.01 and found.max() < 0.03
+    for name in (image.name for image in photos.iterdir()):
+        focal = 301 / 0.7 if name in zoomed else 301
+        assert made.kapture_map.camera(name).params[0] == pytest.approx(focal, rel=0.06)
+    assert f"another camera (a zoom, a crop): {', '.join(zoomed)}" in caplog.text
+
+
 def test_two_scenes_are_two_models(
     room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -314,6 +334,11 @@ def test_what_makes_no_map_is_refused_with_the_reason(room: Path, tmp_path: Path
         with pytest.raises(DataError, match=words):
             megloc.map_photographs(tmp_path / name, workspace=tmp_path / f"of_{name}", **FEW)
     assert not (tmp_path / "of_few").exists()
+    wrong = Camera.pinhole(100, 512, 690.0)
+    with pytest.raises(
+        DataError, match=r"0 photo.* \(2 more .* 0000.jpg: .*its camera says 100x512"
+    ):
+        megloc.map_photographs(tmp_path / "few", workspace=tmp_path / "wrong", camera=wrong)
 
 
 @pytest.mark.parametrize(

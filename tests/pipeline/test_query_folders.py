@@ -14,6 +14,7 @@ from megloc_kapture import KaptureMap, Localizer
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.images import image_size, read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.output_folders import claim_folder
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.query_folders import KaptureQueries, Photographs
 from megloc_kapture.pipeline.results import Results
@@ -40,6 +41,23 @@ def test_names_are_paths_below_what_was_given(tmp_path: Path) -> None:
     assert photos.names == ["a dir/c.PNG", "b.jpg", "e.jpg"]
     assert list(photos.unreadable) == ["raw.NEF"]
     assert ".nef cannot be read" in photos.unreadable["raw.NEF"].lower()
+
+
+def test_links_are_followed_and_what_we_have_written_is_left_out(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    write(photos / "1.jpg")
+    write(photos / "real" / "2.jpg")
+    write(tmp_path / "elsewhere" / "3.jpg")
+    (photos / "a link").symlink_to(tmp_path / "elsewhere")
+    (photos / "again").symlink_to(photos / "real")
+    (photos / "real" / "loop").symlink_to(photos)
+    # a map of them, made below them
+    claim_folder(photos / "map", kind="workspace")
+    write(photos / "map" / "mapping" / "sensors" / "records_data" / "1.jpg")
+    (photos / "kapture" / "sensors").mkdir(parents=True)
+    (photos / "kapture" / "sensors" / "sensors.txt").touch()
+    write(photos / "kapture" / "sensors" / "records_data" / "1.jpg")
+    assert Photographs([photos]).names == ["1.jpg", "a link/3.jpg", "real/2.jpg"]
 
 
 def test_images_of_one_size_and_focal_length_share_a_camera(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder
 from megloc_kapture.io.tables import read_match_counts
@@ -21,10 +21,11 @@ from megloc_kapture.stages.matches import (
     Features,
     NoVerification,
     iterate_candidates,
+    match_all,
     match_pairs,
 )
 from megloc_kapture.stages.work import Work
-from megloc_kapture.values import Camera
+from megloc_kapture.values import Camera, ImageFeatures
 
 CAMERA = Camera("PINHOLE", 400, 300, (300.0, 302.0, 200.0, 150.0))
 
@@ -145,6 +146,29 @@ def test_verified_matches_agree_with_the_true_poses(
         gap = np.abs(normal @ baseline) / np.linalg.norm(normal, axis=1) / 6.0
         assert np.median(gap) < 1e-3
         assert (gap < 0.02).mean() > 0.98  # 0.02 is 6 px
+
+
+@pytest.mark.parametrize(
+    ("returned", "words"),
+    [
+        (([[0, 0]], [1.0]), "no two arrays"),
+        ((np.zeros((1, 2)), np.ones(1)), r"whole numbers \(K, 2\), not float64"),
+        ((np.zeros(4, int), np.ones(4)), r"whole numbers \(K, 2\)"),
+        ((np.zeros((2, 2), int), np.ones(3)), "scores of 2 matches"),
+        ((np.array([[0, 5]]), np.ones(1)), "no row of the 3 and 5 keypoints"),
+        ((np.array([[-1, 0]]), np.ones(1)), "no row"),
+    ],
+)
+def test_what_a_matcher_returns_is_checked(returned: Any, words: str) -> None:
+    class Mistaken:
+        def match(self, a: Any, b: Any) -> Any:
+            return returned
+
+    def image(count: int) -> ImageFeatures:
+        return ImageFeatures(np.zeros((count, 2), np.float32), np.zeros((count, 4)), 64, 48)
+
+    with pytest.raises(PluginError, match=f"matcher Mistaken on pair a, b: .*{words}"):
+        match_all(Mistaken(), image(3), [image(5)], ["pair a, b"])
 
 
 def test_what_has_no_features_is_named(world: Any, tmp_path: Path) -> None:
