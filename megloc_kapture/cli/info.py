@@ -40,6 +40,7 @@ from megloc_kapture.plugins import (
 )
 from megloc_kapture.stages.global_features import VLAD
 from megloc_kapture.stages.matches import FeatureCache
+from megloc_kapture.stages.scene import depth_records
 from megloc_kapture.values import Options
 
 _COLUMN = 18
@@ -105,7 +106,11 @@ def describe_content(console: Console, folder: KaptureFolder) -> None:
     images = len(data.image_names())
     line(console, "images", f"{images} ({cameras}), {len(data.poses())} with a pose")
     if data.records_depth:
-        line(console, "depth maps", str(len(data.records_depth)))
+        joined = len(depth_records(data))
+        told = f"{len(data.records_depth)}, of {joined} images"
+        # of an image is what a rig joins to its camera
+        told += "" if joined else ": no rig joins their sensor to a camera, and they are not used"
+        line(console, "depth maps", told)
     for kind in ("keypoints", "descriptors", "global_features"):
         for name in folder.types(kind):
             reader = getattr(folder, kind)(name)

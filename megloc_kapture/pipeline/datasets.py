@@ -7,6 +7,7 @@ rendered, the latter in the layout of X. A benchmark file says how a dataset is 
 
 from __future__ import annotations
 
+import logging
 import os
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -34,6 +35,8 @@ from megloc_kapture.pipeline.presets import DEFAULT_PRESET, PRESETS
 from megloc_kapture.plugin_loading import load_plugin, plugin_names
 from megloc_kapture.plugins import DATASETS, RENDERED_DATASETS, DatasetAdapter, RenderedDataset
 from megloc_kapture.values import Options
+
+_log = logging.getLogger(__name__)
 
 KAPTURE, SYNTHETIC = "kapture", "synthetic"
 DATA_VARIABLE = "MEGLOC_DATA"
@@ -78,13 +81,14 @@ class DatasetChoice:
         return (self.root / QUERY_GT / "sensors" / "sensors.txt").is_file()
 
     def has_query_depth(self) -> bool:
-        """Whether the queries come with depth maps; those of official datasets have none.
+        """Whether the queries come with depth maps, of a sensor that a rig joins to their camera;
+        those of official datasets have none.
 
         Raises DataError where the queries' folder is broken.
         """
         if self.root is None or self.adapter is not None:
             return False
-        return bool(KaptureFolder(self.root / QUERY).read().records_depth)
+        return _has_depth(self.root / QUERY)
 
     def has_map_depth(self) -> bool:
         """Whether the map's images come with depth maps, as far as options and folders tell.
@@ -95,7 +99,7 @@ class DatasetChoice:
             return bool(getattr(getattr(self.adapter, "options", None), "depth", False))
         if self.root is None:
             return bool(getattr(self.twin and self.twin.options, "depth", False))
-        return bool(KaptureFolder(self.root / MAPPING).read().records_depth)
+        return _has_depth(self.root / MAPPING)
 
     def settings(self) -> dict[str, Any]:
         """What, beside the files, determines an import."""
@@ -380,3 +384,16 @@ def read_benchmark(path: Path) -> BenchmarkFile:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         raise DataError(f"{where}: {first['msg']}", path=path) from error
+
+
+def _has_depth(root: Path) -> bool:
+    """Whether images of a kapture folder have depth; warns of depth maps that are of none."""
+    # who chooses a dataset does not wait for the stages
+    from megloc_kapture.stages.scene import depth_records
+
+    data = KaptureFolder(root).read()
+    found = bool(depth_records(data))
+    if data.records_depth and not found:
+        said = "%s: no rig joins the depth sensors to cameras of their moments; depth is not used"
+        _log.warning(said, root)
+    return found

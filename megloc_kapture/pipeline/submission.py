@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -48,6 +49,8 @@ from megloc_kapture.pipeline.datasets import (
 from megloc_kapture.pipeline.workspace import Manifest, read_manifest
 from megloc_kapture.stages import scene
 from megloc_kapture.values import Pose, RigidTransform
+
+_log = logging.getLogger(__name__)
 
 # a row of MLAD for a query without a pose; kapture's own exporter writes the same
 _DUMMY = RigidTransform.identity()
@@ -242,9 +245,19 @@ def _ltvl(
         every = sorted({*result.data.image_names(), *unreadable})
         images = [image for image in every if groups.get(image, ImageGroup()).scored]
     posed = [image for image in images if image in result.poses]
+    if not names and (unnamed := [image for image in posed if _has_blanks(image)]):
+        said = "%d images have no row in the pose file, whose names hold no white space: %s%s"
+        more = ", ..." if len(unnamed) > 1 else ""
+        _log.warning(said, len(unnamed), repr(unnamed[0]), more)
+        posed = [image for image in posed if not _has_blanks(image)]
     official = {image: world.pose_in_official(result.poses[image]) for image in posed}
     text = format_pose_file(official, names=names or rules.pose_file_names)
-    return {"": text}, posed, [(image, image) for image in images if image not in result.poses]
+    with_row = set(posed)
+    return {"": text}, posed, [(image, image) for image in images if image not in with_row]
+
+
+def _has_blanks(name: str) -> bool:
+    return name.split() != [name]
 
 
 def _mlad(result: _Result, tables: Path) -> _Content:

@@ -35,7 +35,8 @@ def query_units(data: KaptureData, *, rigs: bool) -> list[Unit]:
     ``rigs``: whether cameras of one rig and one timestamp are localized together. A camera on
     several rigs goes with the first by name. Without, every image is by itself.
     """
-    rigs_of = _rigs_of(data) if rigs else {}
+    carried = _carried(data) if rigs else {}
+    rigs_of = _rigs_of(carried)
     units: list[Unit] = []
     together: dict[tuple[int, str], list[str]] = {}
     for image in data.image_names():
@@ -48,7 +49,7 @@ def query_units(data: KaptureData, *, rigs: bool) -> list[Unit]:
         if len(images) == 1:
             units.append(((images[0], RigidTransform.identity()),))
         else:
-            members = data.rigs[rig]
+            members = carried[rig]
             units.append(tuple((image, members[data.record_of(image)[1]]) for image in images))
     return sorted(units, key=lambda unit: [image for image, _ in unit])
 
@@ -66,7 +67,8 @@ def poses_through_rig(
     data : sensors, rigs (``sensor_from_rig``) and records of the images.
     localized : the images that were localized.
     """
-    rigs_of = _rigs_of(data)
+    carried = _carried(data)
+    rigs_of = _rigs_of(carried)
     at_time: dict[int, list[tuple[str, str]]] = {}
     for (timestamp, sensor), image in data.records_camera.items():
         at_time.setdefault(timestamp, []).append((sensor, image))
@@ -77,7 +79,7 @@ def poses_through_rig(
             (-result.num_inliers, other, sensor_from_other @ result.cam_from_world)
             for other_sensor, other in at_time[timestamp]
             if (result := localized.get(other)) is not None
-            and (sensor_from_other := _between(data, rigs_of, sensor, other_sensor)) is not None
+            and (sensor_from_other := _between(carried, rigs_of, sensor, other_sensor)) is not None
         ]
         if poses:
             _, other, pose = min(poses, key=itemgetter(0, 1))
@@ -106,7 +108,8 @@ def depth_records(data: KaptureData) -> dict[str, DepthRecord]:
 
     Where several depth sensors share the rig, the one nearest to the camera counts.
     """
-    rigs_of = _rigs_of(data)
+    carried = _carried(data)
+    rigs_of = _rigs_of(carried)
     at_time: dict[int, list[tuple[str, str]]] = {}
     for (timestamp, sensor), path in sorted(data.records_depth.items()):
         at_time.setdefault(timestamp, []).append((sensor, path))
@@ -115,7 +118,7 @@ def depth_records(data: KaptureData) -> dict[str, DepthRecord]:
         options = [
             (image_from_depth, sensor, path)
             for sensor, path in at_time.get(timestamp, ())
-            if (image_from_depth := _between(data, rigs_of, camera, sensor)) is not None
+            if (image_from_depth := _between(carried, rigs_of, camera, sensor)) is not None
         ]
         if options:
             image_from_depth, sensor, path = min(
@@ -131,22 +134,47 @@ def read_depth(folder: KaptureFolder, record: DepthRecord) -> NDArray[np.float32
     return read_depth_map(folder.depth_path(record.path), **size)
 
 
-def _rigs_of(data: KaptureData) -> dict[str, list[str]]:
+_Carried = Mapping[str, Mapping[str, RigidTransform]]
+
+
+def _carried(data: KaptureData) -> _Carried:
+    """Of the rigs that are on no other: sensor -> ``sensor_from_rig``, through the rigs on them.
+
+    DataError: a rig contains itself.
+    """
+
+    def members(rig: str, above: frozenset[str]) -> dict[str, RigidTransform]:
+        if rig in above:
+            raise DataError(f"rig {rig!r} contains itself")
+        found = {}
+        for member, member_from_rig in data.rigs[rig].items():
+            if member not in data.rigs:
+                found[member] = member_from_rig
+                continue
+            for sensor, sensor_from_member in members(member, above | {rig}).items():
+                found[sensor] = sensor_from_member @ member_from_rig
+        return found
+
+    on_others = {member for one in data.rigs.values() for member in one}
+    return {rig: members(rig, frozenset()) for rig in sorted(data.rigs) if rig not in on_others}
+
+
+def _rigs_of(carried: _Carried) -> dict[str, list[str]]:
     """The rigs that a sensor is on, sorted by name."""
     rigs_of: dict[str, list[str]] = {}
-    for rig, members in sorted(data.rigs.items()):
+    for rig, members in sorted(carried.items()):
         for sensor in members:
             rigs_of.setdefault(sensor, []).append(rig)
     return rigs_of
 
 
 def _between(
-    data: KaptureData, rigs_of: Mapping[str, list[str]], sensor: str, other: str
+    carried: _Carried, rigs_of: Mapping[str, list[str]], sensor: str, other: str
 ) -> RigidTransform | None:
     """``sensor_from_other`` where one rig carries both."""
     for rig in rigs_of.get(sensor, ()):
-        if other in data.rigs[rig]:
-            return data.rigs[rig][sensor] @ data.rigs[rig][other].inverse()
+        if other in carried[rig]:
+            return carried[rig][sensor] @ carried[rig][other].inverse()
     return None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from megloc_kapture import plugin_loading
 from megloc_kapture.datasets.official import Count, DatasetCard, Missing, OfficialDataset
 from megloc_kapture.errors import DataError, OptionError, PluginError
 from megloc_kapture.io.dataset_tables import Protocol, read_protocol
-from megloc_kapture.io.kapture import KaptureData, Sensor
+from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.pipeline.datasets import (
     SUMMARY_FILE,
     TWIN_PREFIX,
@@ -217,3 +218,18 @@ def test_a_broken_benchmark_file_is_named(
         (tmp_path / "b.toml").write_bytes(content)
     with pytest.raises(DataError, match=message):
         read_benchmark(tmp_path / "b.toml")
+
+
+def test_depth_that_no_rig_joins_to_a_camera_is_told_and_not_used(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    camera = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 10, 8, (9.0, 5.0, 4.0)))
+    data = KaptureData({"cam": camera, "deep": replace(camera, sensor_type="depth")})
+    data.records_camera[1, "cam"] = "1.jpg"
+    data.records_depth[1, "deep"] = "1.depth"
+    for rigs in ({}, {"rig": dict.fromkeys(("cam", "deep"), RigidTransform.identity())}):
+        for part in ("mapping", "query"):
+            write_sensors(tmp_path / part, replace(data, rigs=rigs))
+        chosen = choose_dataset("kapture", tmp_path)
+        assert chosen.has_query_depth() == chosen.has_map_depth() == bool(rigs)
+        assert caplog.text.count("depth is not used") == 2

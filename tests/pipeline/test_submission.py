@@ -139,6 +139,21 @@ def test_scored_images_by_the_rule(dataset: Dataset, tmp_path: Path) -> None:
     assert beside["missing"] == ["dawn/rear/20.jpg", "night/rear/30.jpg"]
 
 
+def test_names_with_white_space_have_no_row(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    images = ["a b.jpg", "c d/e.jpg", "f.jpg"]
+    records = {(time, "rear"): image for time, image in enumerate(images)}
+    poses = dict(zip(records, random_poses(3), strict=True))
+    data = KaptureData({"rear": CAMERA}, {}, poses, records)
+    write_sensors(tmp_path / "localized", data)
+    place = tmp_path / "poses.txt"
+    counts = write_submission(tmp_path / "localized", place, tables=None, provenance={})
+    assert list(read_pose_file(place)) == ["f.jpg"]
+    assert (counts["poses"], counts["missing"]) == (1, 2)
+    assert "2 images have no row in the pose file" in caplog.text and "'a b.jpg'" in caplog.text
+
+
 def test_doubtful_are_those_that_the_file_lacks(dataset: Dataset, tmp_path: Path) -> None:
     doubted = {**FAILED, "confidence": 0.3}
     guessed = {**doubted, "fallback": "retrieval"}

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import kapture
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import KaptureData, Sensor
-from megloc_kapture.stages.scene import poses_through_rig, query_units
+from megloc_kapture.stages.scene import depth_records, poses_through_rig, query_units
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
 CAMERA = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 100, 80, (90.0, 50.0, 40.0)))
@@ -47,6 +50,36 @@ def test_a_sibling_gives_its_pose_through_the_rig(data: KaptureData) -> None:
     np.testing.assert_allclose(abs(np.dot(pose.quat_wxyz, expected.r_raw)), 1, atol=1e-12)
     data.rigs.clear()
     assert poses_through_rig(data, {"left/1.jpg": Pose(left, 20, 12)}) == {}
+
+
+def test_a_rig_on_a_rig_is_as_one(data: KaptureData) -> None:
+    flat = query_units(data, rigs=True)
+    localized = {"left/1.jpg": Pose(random_pose(9), 20, 12)}
+    expected = poses_through_rig(data, localized)
+    car, front = data.rigs["car"], random_pose(8)
+    nested = {name: car.pop(name) @ front.inverse() for name in ("left", "rear")}
+    data.rigs = {"car": {**car, "front": front}, "front": nested}
+    for unit, other in zip(query_units(data, rigs=True), flat, strict=True):
+        assert [image for image, _ in unit] == [image for image, _ in other]
+        for (_, one), (_, same) in zip(unit, other, strict=True):
+            np.testing.assert_allclose(one.matrix(), same.matrix(), atol=1e-12)
+    found = poses_through_rig(data, localized)
+    assert found.keys() == expected.keys()
+    for image, (source, pose) in found.items():
+        assert source == expected[image][0]
+        np.testing.assert_allclose(pose.matrix(), expected[image][1].matrix(), atol=1e-12)
+    data.sensors["depth"] = replace(CAMERA, sensor_type="depth")
+    data.rigs["car"]["depth"] = random_pose(7)
+    data.records_depth[1, "depth"] = "1.depth"
+    of_image = depth_records(data)
+    assert of_image.keys() == {"left/1.jpg", "rear/1.jpg", "right/1.jpg"}
+    to_depth = data.rigs["front"]["left"] @ front @ random_pose(7).inverse()
+    found_depth = of_image["left/1.jpg"].image_from_depth.matrix()
+    np.testing.assert_allclose(found_depth, to_depth.matrix(), atol=1e-12)
+    data.rigs["front"]["car"] = front
+    data.rigs["roof"] = {"car": front}
+    with pytest.raises(DataError, match="contains itself"):
+        query_units(data, rigs=True)
 
 
 def test_the_sibling_with_the_most_inliers_counts(data: KaptureData) -> None:
