@@ -7,6 +7,7 @@ images, which finds most of what a model of SIFT was made of, and the observatio
 
 from __future__ import annotations
 
+import logging
 import os
 import tempfile
 from collections.abc import Iterator
@@ -46,6 +47,8 @@ from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.work import HERE, Work
 
 SPARSE, IMAGES, DATABASE = "sparse", "images", "database.db"
+_log = logging.getLogger(__name__)
+
 _SIFT = "sift"
 
 
@@ -163,11 +166,17 @@ class ColmapReconstruction:
         if source.images is not None:
             missing = sorted(name for name in names if not (source.images / name).is_file())
             if missing:
-                raise DataError(
+                told = (
                     f"{len(missing)} of the model's {len(names)} images are not here, the first "
-                    f"is {missing[0]}; --images names their folder",
-                    path=source.images,
+                    f"is {missing[0]}"
                 )
+                if source.database is None:
+                    raise DataError(
+                        f"{told}; `megloc import colmap` takes their folder by --images",
+                        path=source.images,
+                    )
+                # features come from the database
+                _log.warning("%s: %s", source.images, told)
         return cls(source, model, kapture_data(model, names, rigs), names)
 
     @property
@@ -209,8 +218,9 @@ class ColmapReconstruction:
                 local_type = None if found is None else found.name
         if local_type is None and source.images is None:
             raise DataError(
-                "there are no descriptors to match queries with: give the database that the model "
-                "was made of (--database), or the images to extract them from (--images)",
+                "there are no descriptors to match queries with: `megloc import colmap` takes the "
+                "database that the model was made of (--database), or the images to extract them "
+                "from (--images)",
                 path=source.model,
             )
         if not len(self.model.points):

@@ -304,7 +304,7 @@ def test_the_parts_are_found(own: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_what_is_missing_is_said_before_the_work(own: Path, tmp_path: Path) -> None:
-    found, output = find_colmap(own), tmp_path / "map"
+    found, output = replace(find_colmap(own), database=None), tmp_path / "map"
     with pytest.raises(DataError, match="no descriptors .*--database.* or the images .*--images"):
         import_colmap(ColmapFolders(found.model, None, None), output)
     for gone, message in (
@@ -315,6 +315,18 @@ def test_what_is_missing_is_said_before_the_work(own: Path, tmp_path: Path) -> N
         with pytest.raises(DataError, match=message):
             import_colmap(found, output)
     assert list(output.iterdir()) == []
+
+
+def test_of_images_that_are_not_there_the_database_has_the_features(
+    own: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    before, counts = imported(find_colmap(own), tmp_path / "before")
+    (own / "images" / "0003.jpg").unlink()
+    found, again = imported(find_colmap(own), tmp_path / "map")
+    assert again == counts
+    assert "1 of the model's 7 images are not here, the first is 0003.jpg" in caplog.text
+    kept = found.descriptors("sift").read("0003.jpg")
+    assert np.array_equal(kept, before.descriptors("sift").read("0003.jpg"))
 
 
 def test_models_of_other_features_or_without_points_are_refused(own: Path, tmp_path: Path) -> None:
