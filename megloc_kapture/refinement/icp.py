@@ -3,12 +3,13 @@
 The query's cloud is fitted to the map's around the estimated pose, point to plane, from coarse to
 fine, in the end with every pixel weighted by its noise. Geometry can be wrong as features can: it
 may fit the wrong wall, or slide along the right one. So the new pose counts only where it explains
-more of the query, better, from nearby, and the surfaces say where it is in every direction;
+no less of the query, better, from nearby, and the surfaces say where it is in every direction;
 otherwise the old one stays, with the reason.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -183,7 +184,7 @@ def refine_by_icp(
         "moved_deg": moved_deg,
         "condition": condition,
     }
-    if reason := _reason_to_refuse(before, after, condition, options):
+    if reason := _reason_to_refuse(before, after, len(fine_points), condition, options):
         return PoseRefinement(cam_from_world, reason, measures)
     x, y, z = (center + np.array(moved.translation)).tolist()
     world_from_cam = RigidTransform(moved.quat_wxyz, (x, y, z))
@@ -256,7 +257,7 @@ def _reason_too_far(start: RigidTransform, end: RigidTransform, options: IcpOpti
 
 
 def _reason_to_refuse(
-    before: SurfaceFit, after: SurfaceFit, condition: float, options: IcpOptions
+    before: SurfaceFit, after: SurfaceFit, num_points: int, condition: float, options: IcpOptions
 ) -> str:
     """Reason why a refined pose is not taken; empty where it is."""
     if after.overlap < options.min_overlap:
@@ -269,7 +270,9 @@ def _reason_to_refuse(
             f"the surfaces do not determine the pose: condition number {condition:.0f}, "
             f"at most {options.max_condition:g} is allowed"
         )
-    if after.overlap < before.overlap:
+    # shares of points are of points that happen to be taken: voxels follow the world's axes
+    noise = 2 * math.sqrt(before.overlap * (1 - before.overlap) / num_points)
+    if after.overlap < before.overlap - noise:
         return f"the overlap fell from {before.overlap:.4f} to {after.overlap:.4f}"
     if after.residual_m >= before.residual_m:
         return (

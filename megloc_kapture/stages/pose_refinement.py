@@ -401,7 +401,7 @@ class RefinePoses(PipelineStage):
     """Refine the poses of localized queries by ICP or by rendering."""
 
     name = "refine_poses"
-    version = 2
+    version = 3
     uses = ("pose_refinement",)
     inputs = (SIDE_TABLES, Layout.query, MAP, UNREFINED_POSES)
     outputs = (LOCALIZED, REFINEMENT_TIMING)

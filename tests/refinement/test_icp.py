@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.plugins import DepthView, PoseRefinement, PoseRefiner
+from megloc_kapture.refinement import icp
 from megloc_kapture.refinement.icp import Icp, IcpOptions, map_cloud, refine_by_icp
 from megloc_kapture.refinement.icp_surface import depth_cloud
 from megloc_kapture.values import Camera, RigidTransform
@@ -238,6 +240,18 @@ def test_bounds_of_movement_and_overlap(furnished: Any) -> None:
     # a pose that is right does not get worse
     distance_m, angle_deg = errors(refine(furnished, QUERY).cam_from_world)
     assert distance_m < 0.003 and angle_deg < 0.1
+
+
+def test_an_overlap_that_falls_by_the_noise_of_counting_is_as_good() -> None:
+    def reason(overlap: float, residual_m: float, num_points: int) -> str:
+        before: Any = SimpleNamespace(overlap=0.98, residual_m=0.004)
+        after: Any = SimpleNamespace(overlap=overlap, residual_m=residual_m)
+        return icp._reason_to_refuse(before, after, num_points, 10.0, IcpOptions())
+
+    # two deviations of 2000 points are 0.0063
+    assert reason(0.974, 0.0039, 2000) == "" and "overlap fell" in reason(0.973, 0.0039, 2000)
+    assert "overlap fell" in reason(0.974, 0.0039, 4000)
+    assert "residual did not fall" in reason(0.974, 0.0041, 2000)
 
 
 def test_without_depth(furnished: Any) -> None:
