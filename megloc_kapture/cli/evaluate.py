@@ -148,10 +148,11 @@ class Submit(Common):
         if place.is_dir() != folder and place.exists():
             kind = "folder, one file per relocalization file" if folder else "file"
             raise OptionError(f"{place} exists and is not what is to be written, a {kind}")
-        there = place.exists() and (not folder or any(place.iterdir()))
-        for path, exists in ((place, there), (beside := provenance_path(place), beside.exists())):
-            if exists and not self.force:
-                raise OptionError(f"{path} exists; -f overwrites it")
+        empty = folder and place.exists() and not any(place.iterdir())
+        paths = [provenance_path(place)] if empty else [place, provenance_path(place)]
+        there = [path for path in paths if path.exists()]
+        if there and not self.force:
+            raise OptionError(f"{there[0]} exists; -f overwrites it")
 
 
 def summary(counts: Mapping[str, int]) -> str:

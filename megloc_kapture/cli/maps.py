@@ -164,7 +164,7 @@ class Densify(Reading, StageCommand):
         source = self.kapture_map(self.input)
         with self.staged(self.output, MAP, force=self.force) as (out, work):
             counts = densify_map(
-                source, out, options, restrictions=restrictions_beside(self.input), work=work
+                source, out, options, restrictions=restrictions_beside(source.root), work=work
             )
             console.say(
                 f"depth of {counts['images_with_depth']} of {counts['images']} images, on "

@@ -102,7 +102,7 @@ class PairsMapping(Reading, StageCommand):
                 mapping,
                 options,
                 retrieval=retrieval,
-                restrictions=restrictions_beside(self.input),
+                restrictions=restrictions_beside(mapping.root),
                 covisible=None if covisible is None else self.kapture_map(covisible),
                 work=work,
             )

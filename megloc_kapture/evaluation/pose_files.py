@@ -50,6 +50,16 @@ Poses = Mapping[str, RigidTransform]
 Names = PoseFileNames | Mapping[str, str]
 
 
+def name_by_rule(image: str, rule: PoseFileNames) -> str:
+    """What an image is called in a pose file, by the rule of its challenge."""
+    return image if rule == "full" else image.rsplit("/", 1)[-1]
+
+
+def is_name(text: str) -> bool:
+    """Whether a row can begin with it: it has no white space, and is not empty."""
+    return text.split() == [text]
+
+
 def names_in_pose_file(images: Iterable[str], names: Names) -> dict[str, str]:
     """Image -> the name it bears in a pose file, in the order of the file.
 
@@ -63,12 +73,12 @@ def names_in_pose_file(images: Iterable[str], names: Names) -> dict[str, str]:
     """
     wanted = set(images)
     if isinstance(names, str):
-        called = {i: i if names == "full" else i.rsplit("/", 1)[-1] for i in sorted(wanted)}
+        called = {image: name_by_rule(image, names) for image in sorted(wanted)}
     else:
         called = {image: name for image, name in names.items() if image in wanted}
     bearer: dict[str, str] = {}
     for image, name in called.items():
-        if not name or name.split() != [name]:
+        if not is_name(name):
             raise DataError(f"image {image!r}: a pose file cannot hold the name {name!r}")
         if name in bearer:
             raise DataError(

@@ -187,7 +187,7 @@ def _listed(mark: bytes | None, kind: str) -> set[str]:
 
 
 def _through_link(folder: Path, name: str) -> bool:
-    return any((folder / one).is_symlink() for one in list(Path(name).parents)[:-1])
+    return any((folder / one).is_symlink() for one in _parents({name}))
 
 
 def _check_ways(folder: Path, new: set[str], stale: set[str]) -> None:

@@ -149,17 +149,17 @@ def estimate_with_intrinsics(
     free = focal_from_matches(
         problem.points_px, problem.points, given, options.max_error_px, options.seed
     )
-    doubting = None
-    if free is not None:
-        other = _with_camera(problem, scale_focal(given, free / focal_px(given)))
-        if not _is_doubted(other.views[0].camera, given):
-            of_other = estimate_pose(other, options)
-            if isinstance(of_other, PoseEstimate) and of_other.num_inliers > found.num_inliers:
-                problem, found = other, of_other
-        elif given.focal_deviation >= _MIN_DOUBTED:
-            of_other = estimate_pose(other, options)
-            if isinstance(of_other, PoseEstimate) and of_other.num_inliers > found.num_inliers:
+    may_doubt, doubting = given.focal_deviation >= _MIN_DOUBTED, None
+    camera = given if free is None else scale_focal(given, free / focal_px(given))
+    far = _is_doubted(camera, given)
+    if free is not None and (may_doubt or not far):
+        other = _with_camera(problem, camera)
+        of_other = estimate_pose(other, options)
+        if isinstance(of_other, PoseEstimate) and of_other.num_inliers > found.num_inliers:
+            if far:
                 doubting = other, of_other
+            else:
+                problem, found = other, of_other
     if isinstance(found, PoseEstimate):
         fit = _fit(problem, found.rig_from_world, found.inliers, given)
         if fit is not None:
@@ -168,31 +168,31 @@ def estimate_with_intrinsics(
             if isinstance(of_better, PoseEstimate) and of_better.num_inliers >= found.num_inliers:
                 problem, found = better, of_better
         doubting = doubting or (problem, found)
-    if doubting is not None and given.focal_deviation >= _MIN_DOUBTED:
-        other, of_doubts = _doubted(*doubting, given, options)
-        if of_doubts is not None and of_doubts.num_inliers >= found.num_inliers:
-            return other, of_doubts
+    if doubting is not None and may_doubt:
+        doubted = _doubted(*doubting, given, options)
+        if doubted is not None and doubted[1].num_inliers >= found.num_inliers:
+            return doubted
     return problem, found
 
 
 def _doubted(
     problem: PoseProblem, found: PoseEstimate, given: Camera, options: AbsolutePoseOptions
-) -> tuple[PoseProblem, PoseEstimate | None]:
+) -> tuple[PoseProblem, PoseEstimate] | None:
     """The estimate that believes little of what is known of the camera; None where the matches do
     not contradict that beyond doubt."""
     for _ in range(_DOUBT_ROUNDS):
         if found.num_inliers < _MIN_INLIERS:
-            return problem, None
+            return None
         fit = _fit(problem, found.rig_from_world, found.inliers, given, doubting=True)
         if fit is None:
-            return problem, None
+            return None
         camera = _changed(problem.views[0].camera, fit.change)
         if not _is_doubted(camera, given, _MAX_DEVIATIONS * fit.deviations):
-            return problem, None
+            return None
         problem = _with_camera(problem, camera)
         estimate = estimate_pose(problem, options)
         if not isinstance(estimate, PoseEstimate):
-            return problem, None
+            return None
         found = estimate
     return problem, found
 

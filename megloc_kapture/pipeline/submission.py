@@ -18,6 +18,8 @@ from megloc_kapture.evaluation.pose_files import (
     RelativePose,
     format_mlad_file,
     format_pose_file,
+    is_name,
+    name_by_rule,
     provenance_path,
     relative_pose,
     timestamp_of,
@@ -245,19 +247,17 @@ def _ltvl(
         every = sorted({*result.data.image_names(), *unreadable})
         images = [image for image in every if groups.get(image, ImageGroup()).scored]
     posed = [image for image in images if image in result.poses]
-    if not names and (unnamed := [image for image in posed if _has_blanks(image)]):
+    rule = rules.pose_file_names
+    unnamed = [] if names else [i for i in posed if not is_name(name_by_rule(i, rule))]
+    if unnamed:
         said = "%d images have no row in the pose file, whose names hold no white space: %s%s"
         more = ", ..." if len(unnamed) > 1 else ""
         _log.warning(said, len(unnamed), repr(unnamed[0]), more)
-        posed = [image for image in posed if not _has_blanks(image)]
+        posed = sorted(set(posed) - set(unnamed))
     official = {image: world.pose_in_official(result.poses[image]) for image in posed}
-    text = format_pose_file(official, names=names or rules.pose_file_names)
+    text = format_pose_file(official, names=names or rule)
     with_row = set(posed)
     return {"": text}, posed, [(image, image) for image in images if image not in with_row]
-
-
-def _has_blanks(name: str) -> bool:
-    return name.split() != [name]
 
 
 def _mlad(result: _Result, tables: Path) -> _Content:

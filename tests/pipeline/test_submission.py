@@ -152,6 +152,12 @@ def test_names_with_white_space_have_no_row(
     assert list(read_pose_file(place)) == ["f.jpg"]
     assert (counts["poses"], counts["missing"]) == (1, 2)
     assert "2 images have no row in the pose file" in caplog.text and "'a b.jpg'" in caplog.text
+    # by its last part the second can be called
+    write_protocol(tmp_path / "megloc", Protocol(pose_file_names="basename"))
+    counts = write_submission(
+        tmp_path / "localized", place, tables=tmp_path / "megloc", provenance={}
+    )
+    assert list(read_pose_file(place)) == ["e.jpg", "f.jpg"] and counts["missing"] == 1
 
 
 def test_doubtful_are_those_that_the_file_lacks(dataset: Dataset, tmp_path: Path) -> None:

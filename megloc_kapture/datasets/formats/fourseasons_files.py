@@ -156,20 +156,23 @@ def read_gnss_poses(path: Path) -> dict[int, GnssPose]:
     A row has 8 to 11 fields, ``timestamp tx ty tz qx qy qz qw [scale [fusion_quality [v3]]]``; the
     published header announces 11, the published rows have 10. DataError names file and line.
     """
-    lines = read_lines(path, comments=True)
-    longest = max((len(line.comma_fields) for line in lines), default=0)
-    # one that ends within a number would be read with another one
-    if longest and len(lines[-1].comma_fields) < longest and not read_text(path).endswith("\n"):
-        raise lines[-1].error("has fewer fields and is not ended: the file may be cut short")
+    counts: list[int] = []
 
     def parse(line: Line) -> GnssPose:
         fields = line.comma_fields
         line.expect(fields, range(8, 12), f"{_POSE} scale fusion_quality v3")
+        counts.append(len(fields))
         scale = _scale(line, fields[8]) if len(fields) > 8 else None
         quality = line.number_of(fields[9], "fusion_quality") if fields[9:] else None
         return GnssPose(_transform(line, fields[1:8]), scale, quality, line.number)
 
-    return _by_timestamp(path, "pose", parse)
+    poses = _by_timestamp(path, "pose", parse)
+    # one that ends within a number would be read with another one
+    if counts[-1] < max(counts) and not read_text(path).endswith("\n"):
+        *_, last = poses.values()
+        message = "has fewer fields and is not ended: the file may be cut short"
+        raise DataError(message, path=path, line=last.line)
+    return poses
 
 
 def read_poses(path: Path) -> dict[int, RigidTransform]:
