@@ -34,6 +34,9 @@ ONE_FOCAL_MODELS = frozenset(
     {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 )
 
+# `megloc localize`, `Localizer` and `megloc serve` reject poses below it; benchmarks keep every pose
+MIN_CONFIDENCE = 0.6
+
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 """Where a network computes: auto (a GPU where there is one), cpu, cuda, or cuda:N."""
 

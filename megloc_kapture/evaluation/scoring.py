@@ -168,6 +168,20 @@ class Evaluation(Reported):
         """The confidences of the result against the truth; None where it brings none."""
         return confidence_of(self.queries, self.thresholds[-1], self.nowhere)
 
+    def rows_above(self, min_confidence: float) -> tuple[RecallRow, ...]:
+        """The recall rows when each pose below a confidence counts as a miss; empty where no pose
+        has a confidence."""
+        if all(query.confidence is None for query in self.queries):
+            return ()
+        doubtful = [
+            query.confidence is not None and query.confidence < min_confidence
+            for query in self.queries
+        ]
+        position_m = np.where(doubtful, np.inf, self.errors.position_m)
+        angle_deg = np.where(doubtful, np.inf, self.errors.angle_deg)
+        errors = PoseErrors(self.errors.names, position_m, angle_deg)
+        return _rows(self.queries, errors, self.thresholds, self.members)
+
     def compare(self, *others: Evaluation) -> Comparison:
         """Test the differences from results on the same queries, which need other labels; see
         :func:`megloc_kapture.evaluation.statistics.compare`."""

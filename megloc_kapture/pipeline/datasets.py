@@ -41,6 +41,8 @@ _log = logging.getLogger(__name__)
 KAPTURE, SYNTHETIC = "kapture", "synthetic"
 DATA_VARIABLE = "MEGLOC_DATA"
 SUMMARY_FILE = f"{SIDE_TABLES}/summary.txt"
+# an evaluation server counts a missing pose as a wrong one, so benchmarks keep every pose
+EVERY_POSE = {"localization": {"min_confidence": 0.0}}
 
 _PACKAGE = Path(__file__).resolve().parent.parent
 # in a wheel the files lie inside the package, in a checkout beside it
@@ -334,7 +336,7 @@ class BenchmarkFile(Options):
     def changes(self, preset: str, *, query_depth: bool) -> list[dict[str, Any]]:
         """Changes to a preset, in order, for data whose queries have depth or not."""
         own = self.presets.get(preset, PresetOptions()).options
-        return [self.options, own, *([self.options_with_query_depth] if query_depth else [])]
+        return [EVERY_POSE, self.options, own, *([self.options_with_query_depth] if query_depth else [])]
 
     def import_options_of(self, preset: str) -> dict[str, Any]:
         """The adapter's options, where this preset is run."""

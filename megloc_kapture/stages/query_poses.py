@@ -64,7 +64,7 @@ from megloc_kapture.stages.work import (
     feature_inputs,
     map_inputs,
 )
-from megloc_kapture.values import Failure, Options, Pose, RigidTransform
+from megloc_kapture.values import MIN_CONFIDENCE, Failure, Options, Pose, RigidTransform
 
 _FIRST_TURN = 5  # candidates; every turn has twice as many as the one before
 # of a pose that is sure: the right pose of a dozen inliers can be decimetres off, and more
@@ -82,10 +82,10 @@ class LocalizationOptions(Options):
     )
     pose: AbsolutePoseOptions = AbsolutePoseOptions()
     min_confidence: float = Field(
-        default=0.6,
+        default=MIN_CONFIDENCE,
         ge=0,
         le=1,
-        description="a pose that is less likely to be right is a failure; 0: none is",
+        description="a pose that is less likely to be right is rejected; 0, as in benchmarks: none",
     )
     sure_confidence: float | None = Field(
         default=None,

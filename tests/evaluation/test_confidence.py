@@ -142,6 +142,28 @@ def test_json_of_something_else_beside_a_pose_file(
     assert "poses.txt.json is of another pose file" in caplog.text
 
 
+def test_recall_also_counts_doubtful_poses_as_misses() -> None:
+    truth = {name: at(float(row)) for row, name in enumerate("abcd")}
+    statuses = {
+        name: status(name, confidence)
+        for name, confidence in zip("abc", (0.9, 0.6, 0.59), strict=True)
+    }
+    found = evaluate_poses(
+        {name: truth[name] for name in "abc"},
+        truth,
+        statuses=statuses,
+        conditions=dict(zip("abcd", ("day", "night", "night", "night"), strict=True)),
+    )
+    assert [row.recall[-1].num_within for row in found.rows] == [1, 2, 3]
+    above = found.rows_above(0.6)
+    assert [row.name for row in above] == [row.name for row in found.rows]
+    assert [row.recall[-1].num_within for row in above] == [1, 1, 2]
+    assert [row.num_missing for row in above] == [0, 2, 2]
+    assert "misses" in report_text(found)
+    # without confidences there is nothing to add
+    assert evaluate_poses(truth, truth).rows_above(0.6) == ()
+
+
 def test_confidences_beside_a_pose_file(tmp_path: Path) -> None:
     poses = tmp_path / "poses.txt"
     poses.write_text("a 1 0 0 0 0 0 0\nb 1 0 0 0 50 0 0\n")

@@ -38,6 +38,7 @@ from megloc_kapture.evaluation.report.queries import (
 from megloc_kapture.evaluation.report.refinement import refinement_blocks
 from megloc_kapture.evaluation.report.wording import (
     FEW,
+    CONFIDENT,
     INTERVALS,
     agreement_sentence,
     comparison_sentences,
@@ -275,6 +276,8 @@ def _confidence(evaluation: Evaluation) -> list[Block]:
         return []
     said = confidence_sentences(confidence, evaluation.thresholds[-1])
     blocks: list[Block] = [Paragraph(_as_sentence(one)) for one in said]
+    if (confident := tables.confident_table(evaluation)) is not None:
+        blocks += [Paragraph(f"{CONFIDENT}:"), confident]
     if confidence.num_poses < FEW:
         return [*blocks, Paragraph(f"Too few poses ({confidence.num_poses}) for a diagram.")]
     told = (

@@ -25,6 +25,7 @@ from megloc_kapture.evaluation.report.document import (
 )
 from megloc_kapture.evaluation.report.queries import StoredInliers, shown_queries
 from megloc_kapture.evaluation.report.wording import (
+    CONFIDENT,
     INTERVALS,
     agreement_sentence,
     bounds,
@@ -39,6 +40,7 @@ from megloc_kapture.evaluation.results import Poses, first_map_poses
 from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.evaluation.statistics import Comparison, MedianDifference, PairedTest, Seeds
 from megloc_kapture.evaluation.without_truth import CAUTION, ResultWithoutTruth, WithoutTruth
+from megloc_kapture.values import MIN_CONFIDENCE
 
 RECALL_JSON, RECALL_TEXT = "recall.json", "recall.txt"
 VIEW_HTML = "view.html"
@@ -187,6 +189,8 @@ def _text_sections(reported: AnyReported) -> list[Section]:
         sections.append(_lines(_line(evaluations[0].label)))
     sections += _recall_sections(evaluations)
     for evaluation in evaluations:
+        if (confident := tables.confident_table(evaluation)) is not None:
+            sections.append(_lines(_line(f"{CONFIDENT} (%)"), confident))
         if (confidence := evaluation.confidence) is not None:
             whose = f" of {evaluation.label}" if several else ""
             said = "; ".join(confidence_sentences(confidence, evaluation.thresholds[-1]))
@@ -268,6 +272,7 @@ def _recall_data(evaluation: Evaluation) -> dict[str, Any]:
         "rows": evaluation.rows,
         "notes": notes(evaluation),
         **({} if confidence is None else {"confidence": asdict(confidence)}),
+        "rows_above_min_confidence": evaluation.rows_above(MIN_CONFIDENCE),
         "without_truth": evaluation.without_truth,
         "not_scored": evaluation.not_scored,
         **({} if by_center is None else {"rows_by_center": by_center.rows}),

@@ -29,6 +29,7 @@ from megloc_kapture.evaluation.without_truth import (
     WithoutTruth,
 )
 from megloc_kapture.io.dataset_tables import METRES
+from megloc_kapture.values import MIN_CONFIDENCE
 
 _MAX_LABEL_WIDTH = 22
 # Okabe and Ito's palette: told apart with any colour vision, in print too; then four more, for
@@ -132,6 +133,20 @@ def interval_table(evaluations: Sequence[Evaluation]) -> Table:
             names.append(f"{name}, {label}" if evaluations[1:] else shortened(name))
             cells.append([format_interval(at) for at in row.recall])
     return _slashed(names, cells)
+
+
+def confident_table(evaluation: Evaluation) -> Table | None:
+    """Recall when poses below the usual confidence count as misses; None without confidences."""
+    rows = evaluation.rows_above(MIN_CONFIDENCE)
+    if not rows:
+        return None
+    columns = (
+        column("condition" if rows[1:] else "", rows, _name_cell),
+        _count("queries", rows, _queries),
+        _count("accepted", rows, _localized_cell),
+        *_recall_columns("recall (%)", rows, lambda row: row.recall),
+    )
+    return Table(columns, styles=_total_last(rows), rules=(0, len(rows) - 1))
 
 
 def seeds_table(seeds: Seeds) -> Table:

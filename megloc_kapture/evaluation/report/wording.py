@@ -27,8 +27,10 @@ from megloc_kapture.evaluation.without_truth import (
     WithoutTruth,
 )
 from megloc_kapture.io.dataset_tables import METRES
+from megloc_kapture.values import MIN_CONFIDENCE
 
 INTERVALS = "95 % confidence intervals of recall, queries taken as independent"
+CONFIDENT = f"Recall if poses with a confidence below {MIN_CONFIDENCE:g} are misses"
 # fewer are an example, not a measurement
 FEW = 10
 _NO_CONDITION = "(no condition)"
