@@ -34,7 +34,7 @@ ONE_FOCAL_MODELS = frozenset(
     {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 )
 
-# `megloc localize`, `Localizer` and `megloc serve` reject poses below it; benchmarks keep every pose
+# `megloc localize`, `Localizer` and `megloc serve` reject poses below it; benchmarks keep them
 MIN_CONFIDENCE = 0.6
 
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]

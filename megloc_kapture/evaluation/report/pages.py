@@ -37,8 +37,8 @@ from megloc_kapture.evaluation.report.queries import (
 )
 from megloc_kapture.evaluation.report.refinement import refinement_blocks
 from megloc_kapture.evaluation.report.wording import (
-    FEW,
     CONFIDENT,
+    FEW,
     INTERVALS,
     agreement_sentence,
     comparison_sentences,
