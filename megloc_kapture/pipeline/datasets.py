@@ -336,7 +336,12 @@ class BenchmarkFile(Options):
     def changes(self, preset: str, *, query_depth: bool) -> list[dict[str, Any]]:
         """Changes to a preset, in order, for data whose queries have depth or not."""
         own = self.presets.get(preset, PresetOptions()).options
-        return [EVERY_POSE, self.options, own, *([self.options_with_query_depth] if query_depth else [])]
+        return [
+            EVERY_POSE,
+            self.options,
+            own,
+            *([self.options_with_query_depth] if query_depth else []),
+        ]
 
     def import_options_of(self, preset: str) -> dict[str, Any]:
         """The adapter's options, where this preset is run."""
