@@ -1,16 +1,16 @@
 """Guided pyramid matching: a pair with few matches is tried again at other scales and turns.
 
-MegLoc, section "Guided pyramid matching". Where a pair has fewer than 100 verified matches,
-features are extracted from the image scaled and turned, and matched with the other image as it is.
-An image's variants are probed on a few of its pairs, and those that match nothing there are not
-tried on the rest: what has nothing in common with the image costs no more than that.
-What is verified is either all put together (``all``) or the richest is kept (``max``).
+MegLoc, section "Guided pyramid matching". Where a pair has fewer than 100 matches, features are
+extracted from the image scaled and turned, and matched with the other image as it is. The paper
+counts the matcher's matches; counting those that verification leaves suits any matcher. An image's
+variants may be probed on a few of its pairs, and those that match nothing there are not tried on
+the rest. The matches are put together (``all``), or the richest variant's are kept (``max``).
 
-Each variant is verified by itself: most of them are turned the wrong way and have matches by chance
-only, in which a two-view model over all variants together would drown. But without poses a few
-matches fit some model by chance, a different one for each variant, so all must then agree with that
-of the richest. Only keypoints that take part in a verified match are added to an image, for a
-variant has as many keypoints as the image itself.
+With verification each variant is verified by itself: most of them are turned the wrong way and
+have matches by chance only, in which a two-view model over all variants together would drown. But
+without poses a few matches fit some model by chance, a different one for each variant, so all must
+then agree with that of the richest. Only keypoints that take part in a match are added to an image,
+for a variant has as many keypoints as the image itself.
 
 The array functions here know of no file; extraction, matching and verification are given to them.
 """
@@ -138,7 +138,12 @@ class GuidedPyramidOptions(Options):
         default="off", description="matches of all variants together, or of the richest"
     )
     min_matches: int = Field(
-        default=100, gt=0, description="a pair with fewer verified matches is tried again"
+        default=100, gt=0, description="a pair with fewer matches is tried again"
+    )
+    count: Literal["matches", "verified"] = Field(
+        default="verified",
+        description="matches that min_matches counts: all that the matcher returns, or those that "
+        "verification leaves",
     )
     scales: tuple[float, ...] = Field(
         default=(1 / 3, 0.5, 1.0, 2.0, 3.0),
@@ -153,14 +158,14 @@ class GuidedPyramidOptions(Options):
         gt=0,
         description="an image is not enlarged beyond this; memory grows with the pixels",
     )
-    probed_pairs: int = Field(
+    probed_pairs: int | None = Field(
         default=5,
         gt=0,
         description="pairs of an image that all variants are tried on: those with most matches; "
-        "on the rest only the variants that matched one of them",
+        "on the rest only the variants that matched one of them; none: all variants on all pairs",
     )
     probe_matches: int = Field(
-        default=30, gt=0, description="verified matches with which a variant matched a probed pair"
+        default=30, gt=0, description="matches with which a variant matched a probed pair"
     )
 
     def idle(self) -> dict[str, str]:
@@ -181,6 +186,15 @@ class GuidedPyramidOptions(Options):
         if any(rotation % 90 for rotation in rotations):
             raise ValueError("rotations are multiples of 90 degrees")
         return tuple(sorted({rotation % 360 for rotation in rotations}))
+
+    def is_hard(self, num_found: int, num_verified: int) -> bool:
+        """Whether a pair with so many matches, before and after verification, is tried again."""
+        count = num_found if self.count == "matches" else num_verified
+        return self.mode != "off" and count < self.min_matches
+
+    def num_probed(self, num_pairs: int) -> int:
+        """How many of an image's pairs all its variants are tried on."""
+        return num_pairs if self.probed_pairs is None else min(self.probed_pairs, num_pairs)
 
     def variants(self, width: int, height: int) -> list[ImageVariant]:
         """List the variants of an image of this size, sorted; not the image as it is.
@@ -293,8 +307,8 @@ def extract_variants(
     Parameters
     ----------
     image, mask : uint8 (H, W, 3), RGB; bool (H, W), True = use, changed along with the image.
-    extract : image and mask to features; whatever it raises skips the variant, for networks refuse
-        images that are too small for them in ways of their own.
+    extract : image and mask to features. A DataError that names no file is about the image, for
+        example one that is too small for the network: that variant is skipped.
     like : features of the image as it is: what is added has as many columns, else it is a
         DataError.
     """
@@ -305,9 +319,10 @@ def extract_variants(
             features = extract(
                 variant.of_image(image), None if mask is None else variant.of_mask(mask)
             )
-        except Exception as error:
-            first_line = (str(error).splitlines() or [""])[0]
-            skipped[variant] = f"{type(error).__name__}: {first_line}"
+        except DataError as error:
+            if error.path is not None:
+                raise
+            skipped[variant] = error.message
             continue
         if len(features.keypoints_px) == 0:
             skipped[variant] = "no keypoints"
@@ -377,7 +392,7 @@ def match_probed(
     -------
     For each image the variants that match it, and the number that was tried on the last ones.
     """
-    first = min(options.probed_pairs, num_others)
+    first = options.num_probed(num_others)
     found = list(match(variants, range(first)))
     matched = {
         one.variant for of_pair in found for one in of_pair if len(one) >= options.probe_matches

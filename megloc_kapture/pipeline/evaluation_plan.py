@@ -79,7 +79,7 @@ def plan_evaluation(run: Run) -> list[Stage]:
     """
     options = run.options
     check_weights(options)
-    options.local_types()
+    options.reranking.counted_types(options.local_types())
     options.retrieval()
     given = options.uses_given_map()
     if given and options.changes_frames():
@@ -87,7 +87,6 @@ def plan_evaluation(run: Run) -> list[Stage]:
             f"map = {options.map}: the given map's keypoints are in the original images; "
             "pre-processing may mask them, but not resize or undistort"
         )
-    options.check()
     if given or options.pairs_by_points():
         run = replace(run, source=_with_model(run, given))
     run.source.check()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -150,13 +150,13 @@ class LocalType:
         return [found[image] for image in images]
 
     def match_again(
-        self, query: Features, matches: Sequence[ImageMatches], image: QueryImage
+        self, query: Features, pairs: Mapping[str, VerifiedMatches], image: QueryImage
     ) -> tuple[NDArray[np.float32], list[ImageMatches], str]:
         """Try map images with few matches again by guided pyramid matching, where it is on.
 
         Parameters
         ----------
-        matches : of each map image: its name, verified matches (K, 2), scores (K,).
+        pairs : the matches with each map image, by its name.
 
         Returns
         -------
@@ -164,13 +164,14 @@ class LocalType:
         out although it is on; empty where it was not.
         """
         options = self._options
-        few = any(len(found) < options.guided_pyramid.min_matches for _, found, _ in matches)
-        if not options.matches_again() or not few:
-            return query.keypoints_px, list(matches), ""
+        is_hard = options.guided_pyramid.is_hard
+        matches = [(name, pair.matches, pair.scores) for name, pair in pairs.items()]
+        if not any(is_hard(pair.num_found, len(pair.matches)) for pair in pairs.values()):
+            return query.keypoints_px, matches, ""
         if reason := self.pyramid_obstacle or ("" if image.query.has_image() else "no image"):
-            return query.keypoints_px, list(matches), f"guided pyramid matching: {reason}"
+            return query.keypoints_px, matches, f"guided pyramid matching: {reason}"
         method = PyramidMethod(
-            self.extractor, self.matcher, options.query_verification, options.guided_pyramid
+            self.extractor, self.matcher, options.verify_queries(), options.guided_pyramid
         )
         found = retry_query(
             query,
@@ -178,9 +179,12 @@ class LocalType:
             lambda name: self._map_features(self.points, name),
             method,
             lambda: (image.pixels, image.feature_mask),
+            num_found={name: pair.num_found for name, pair in pairs.items()},
             name=image.query.name,
         )
-        return np.concatenate([query.keypoints_px, found.added_px]), found.matches, ""
+        skipped = next((row[-1] for row in found.rows), "")
+        remark = f"guided pyramid matching: skipped {skipped}" if skipped else ""
+        return np.concatenate([query.keypoints_px, found.added_px]), found.matches, remark
 
     @cached_property
     def pyramid_obstacle(self) -> str:

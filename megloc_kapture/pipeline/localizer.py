@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.localization.cluster_poses import Clock, interleave
-from megloc_kapture.localization.map_index import ImageMatches, QueryView, TypedMatches
+from megloc_kapture.localization.map_index import QueryView, TypedMatches
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.local_types import local_types_of
@@ -91,13 +91,13 @@ class Localizer:
             raise OptionError("give the device and the precision in the options")
         where = {"device": device, "precision": precision}
         self.options = options or options_of_preset(preset, changes=[where])
-        self.options.check()
         self._ranker = self.options.localization.make_ranker()
         self._preprocessor = Preprocessor(self.options)
         self.refiners = MapRefiners(
             kapture_map.folder, kapture_map.restrictions, self.options.pose_refinement
         )
         self.types = local_types_of(kapture_map, self.options, FeatureCache())
+        self._counted = self.options.reranking.counted_types([one.name for one in self.types])
         for local in self.types:
             local.prepare()
         self._retrieval = MapRetrieval(kapture_map, self.options, self.types, self._preprocessor)
@@ -319,10 +319,8 @@ class Localizer:
         kept = self._kept(camera.of_types)
         typed, left_out = [], []
         for local, own, found in zip(self.types, features, camera.of_types, strict=True):
-            named: list[ImageMatches] = [
-                (ranked[at], found[at].matches, found[at].scores) for at in kept
-            ]
-            keypoints_px, named, remark = local.match_again(own, named, camera.image)
+            pairs = {ranked[at]: found[at] for at in kept}
+            keypoints_px, named, remark = local.match_again(own, pairs, camera.image)
             left_out += [remark] if remark else []
             typed.append(TypedMatches(local.points.index, keypoints_px, named))
         image = camera.image
@@ -334,7 +332,9 @@ class Localizer:
     def _kept(self, of_types: Sequence[Sequence[VerifiedMatches]]) -> list[int]:
         """Positions of the candidates that reranking leaves, best first."""
         how = self.options.reranking
-        return rerank([[counted(one, how.by) for one in own] for own in of_types], how)[0]
+        of_named = zip(self.types, of_types, strict=True)
+        counted_types = [own for local, own in of_named if local.name in self._counted]
+        return rerank([[counted(one, how.by) for one in own] for own in counted_types], how)[0]
 
     def _candidates(self, image: QueryImage, features: Sequence[Features]) -> list[str]:
         """The map images to match a query with, best first where they can be ranked."""

@@ -287,7 +287,6 @@ def plan_photographs(
     """
     check_weights(options)
     options.retrieval()
-    options.check()
     if len(photographs.names) < MIN_IMAGES:
         raise _too_few(len(photographs.names), photographs.unreadable)
     stages: list[Stage] = [ImportPhotographs(photographs)]

@@ -11,7 +11,9 @@ one into T-pyramid, and what reads kapture reads it.
 
 from __future__ import annotations
 
+import logging
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from functools import partial
@@ -39,16 +41,14 @@ from megloc_kapture.matching.guided_pyramid import (
     pyramid_type,
 )
 from megloc_kapture.matching.pyramid_combination import Combined, KeypointUnion, combine
-from megloc_kapture.matching.verification import (
-    KnownPoseOptions,
-    TwoViewOptions,
-    two_view_of_variants,
-)
+from megloc_kapture.matching.verification import KnownPoseOptions, two_view_of_variants
 from megloc_kapture.plugins import LocalFeatureExtractor, Matcher
 from megloc_kapture.stages.devices import BATCH
 from megloc_kapture.stages.local_features import extract_all
-from megloc_kapture.stages.matches import Features, match_all
+from megloc_kapture.stages.matches import Features, NoVerification, Verification, match_all
 from megloc_kapture.stages.work import batched
+
+_log = logging.getLogger(__name__)
 
 COLUMNS = (
     "image",
@@ -72,13 +72,13 @@ class PyramidMethod:
 
     extractor: LocalFeatureExtractor
     matcher: Matcher
-    verification: KnownPoseOptions | TwoViewOptions
+    verification: Verification
     options: GuidedPyramidOptions
     mask_margin_px: float = 0.0
 
-    def is_hard(self, num_matches: int) -> bool:
-        """Whether a pair with so many verified matches is tried again."""
-        return self.options.mode != "off" and num_matches < self.options.min_matches
+
+UNVERIFIED = PairVerifier(lambda _, matches: np.ones(len(matches), dtype=bool))
+"""Keeps every match of every variant."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ def match_image_again(
     of_scale = [one for one in variants if one.variant.scale != 1.0]
     for names, used, num in ((others, variants, every), (only_scaled, of_scale, scaled)):
         matches, num_left = match_probed(used, len(names), partial(match, names), method.options)
-        probed = min(len(names), method.options.probed_pairs)
+        probed = method.options.num_probed(len(names))
         found += matches
         counts += [len(num)] * probed + [num_left] * (len(names) - probed)
     return MatchedVariants(found, counts, _described(skipped), time.perf_counter() - started)
@@ -183,9 +183,15 @@ def write_tried(
 ) -> dict[str, float]:
     """Write the table of pairs that were tried; returns its sums for the log.
 
-    ``seconds`` are those that all workers took together.
+    ``seconds`` are those that all workers took together. Warns of variants that were skipped.
     """
-    write_csv_table(table_path(output, local_type), COLUMNS, rows)
+    path = table_path(output, local_type)
+    write_csv_table(path, COLUMNS, rows)
+    skipped = Counter(row[-1] for row in rows if row[-1])
+    if skipped:
+        said = "guided pyramid of %s: variants of %d pairs are skipped, most often %s; see %s"
+        often = skipped.most_common(1)[0][0]
+        _log.warning(said, local_type, skipped.total(), often, path.name)
     numbers = np.array([row[2:6] for row in rows], np.int64).reshape(-1, 4)
     before, after = numbers[:, 0], numbers[:, 1]
     return {
@@ -359,6 +365,7 @@ def retry_query(
     method: PyramidMethod,
     frame: Callable[[], tuple[NDArray[np.uint8], NDArray[np.bool_] | None]],
     *,
+    num_found: Mapping[str, int] | None = None,
     name: str = "query",
 ) -> RetriedQuery:
     """Try a query's candidates with few matches again: its variants with the map's keypoints.
@@ -368,23 +375,32 @@ def retry_query(
     matches : of each candidate, best first: its name, verified matches (K, 2), scores (K,).
     load : features of a candidate.
     frame : pixels and mask of the query; called only where a candidate has few matches.
+    num_found : matches of each candidate before verification; as many as in ``matches`` unless
+        given.
 
     Raises
     ------
     DataError : the image cannot be read, or its features are of another size than the query's.
     """
     base = {other: pairs for other, pairs, _ in matches}
-    hard = [other for other, pairs in base.items() if method.is_hard(len(pairs))]
+    found = num_found or {}
+    hard = [
+        other
+        for other, pairs in base.items()
+        if method.options.is_hard(found.get(other, len(pairs)), len(pairs))
+    ]
     hard.sort(key=lambda other: -len(base[other]))
     mode, verification = method.options.mode, method.verification
     if mode == "off" or not hard:
         return RetriedQuery(
             query.keypoints_px[:0], query.descriptors[:0], list(matches), [], seconds=0.0
         )
-    if not isinstance(verification, TwoViewOptions):
+    if isinstance(verification, KnownPoseOptions):
         raise ValueError("a query has no pose to verify with")
 
     def judge(other: str, features: Features) -> PairVerifier:
+        if isinstance(verification, NoVerification):
+            return UNVERIFIED
         return two_view_of_variants(
             query.camera, query.keypoints_px, features.camera, features.keypoints_px, base[other],
             verification,
@@ -399,12 +415,12 @@ def retry_query(
     rows = []
     for other, pairs, scores in matches:
         if other in of_other:
-            found, num_variants = of_other[other]
-            tried_ones = [(0, each) for each in found]
+            variants, num_variants = of_other[other]
+            tried_ones = [(0, each) for each in variants]
             combined = combine((pairs, scores), tried_ones, mode, (keypoints, None))
-            best = "" if combined.best is None else f"image {found[combined.best].variant}"
+            best = "" if combined.best is None else f"image {variants[combined.best].variant}"
             rows.append(tried_row((name, other), len(pairs), combined, num_variants, best, skipped))
-            descriptors += [found[at].descriptors[k] for at, k in combined.added[0].tolist()]
+            descriptors += [variants[at].descriptors[k] for at, k in combined.added[0].tolist()]
             pairs, scores = combined.matches, combined.scores
         richer.append((other, pairs, scores))
     added = np.array(descriptors, query.descriptors.dtype).reshape(-1, query.descriptors.shape[1])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OptionError, suggestion
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.kapture import ImagePair, KaptureData, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.io.kapture.vectors import KaptureVectors
@@ -26,6 +26,7 @@ from megloc_kapture.mapping.pairs import (
     pairs_by_poses,
     pairs_by_sequence,
 )
+from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.retrieval.fusion import greedy_coverage
 from megloc_kapture.stages.candidates import (
     UNRESTRICTED,
@@ -310,17 +311,40 @@ class RerankingOptions(Options):
     by: Literal["none", "matches", "verified", "coverage"] = Field(
         default="none",
         description="matches: their number; verified: of those that two-view geometry leaves; "
-        "coverage: of these, at keypoints that the images before do not match. All types of local "
-        "features together",
+        "coverage: of these, at keypoints that the images before do not match",
+    )
+    local_type: str | None = Field(
+        default=None,
+        description="type of local features whose matches count, by its name or that of its "
+        "plugin; none: all types together",
     )
     keep: int = Field(default=20, gt=0, description="images that stay, N")
 
     def idle(self) -> dict[str, str]:
-        return {} if self.reranks() else {"keep": "reranking.by is none"}
+        reason = "reranking.by is none"
+        return {} if self.reranks() else dict.fromkeys(self.all_but("by"), reason)
 
     def reranks(self) -> bool:
         """Whether anything is done."""
         return self.by != "none"
+
+    def counted_types(self, local_types: Sequence[str]) -> list[str]:
+        """Those of the types whose matches count.
+
+        Raises OptionError: ``local_type`` names none of them.
+        """
+        name = self.local_type
+        if name is None or not self.reranks():
+            return list(local_types)
+        # a type may be named after its weights, which begin with the plugin's name
+        found = [one for one in local_types if base_type(one) == name]
+        found = found or [one for one in local_types if one.startswith(name)]
+        if not found:
+            raise OptionError(
+                f"reranking.local_type: no local features of type {name!r}; "
+                f"{suggestion(name, map(base_type, local_types))}"
+            )
+        return found
 
 
 def rerank(
@@ -379,7 +403,8 @@ def reranked(
     """
     if not options.reranks():
         return list(pairs)
-    stored = [_stored(query, matches, name, options.by) for name in local_types]
+    counted_types = options.counted_types(local_types)
+    stored = [_stored(query, matches, name, options.by) for name in counted_types]
     found = []
     for image, candidates in iterate_candidates(pairs):
         of_types = [[matched(image, other) for other in candidates] for matched in stored]

@@ -80,8 +80,10 @@ class PipelineOptions(Options):
     matching: PluginChoice = Field(
         default=PluginChoice(name="nn"), description="of types that name no matcher of their own"
     )
-    verification: Literal["geometric", "none"] = Field(
-        default="geometric", description="of matches, by known poses or a two-view model"
+    verification: Literal["geometric", "mapping", "none"] = Field(
+        default="geometric",
+        description="of matches: within the map by known poses, of queries by a two-view model; "
+        "mapping: within the map only",
     )
     mapping_verification: KnownPoseOptions = KnownPoseOptions()
     query_verification: TwoViewOptions = TwoViewOptions()
@@ -139,13 +141,6 @@ class PipelineOptions(Options):
             verifications = ("mapping_verification", "query_verification")
             idle |= dict.fromkeys(verifications, "verification is none")
         return idle
-
-    def check(self) -> None:
-        """Refuse steps that contradict each other; raises OptionError: names them."""
-        if self.matches_again() and self.verification == "none":
-            raise OptionError(
-                "guided pyramid matching counts verified matches; verification = none has none"
-            )
 
     def make_extractors(self) -> list[LocalFeatureExtractor]:
         """The extractors of local features, in order; raises PluginError, MissingWeightsError."""
@@ -263,6 +258,10 @@ class PipelineOptions(Options):
         """How mapping pairs are verified."""
         return NoVerification() if self.verification == "none" else self.mapping_verification
 
+    def verify_photographs(self) -> Verification:
+        """How pairs of photographs without poses are verified."""
+        return NoVerification() if self.verification == "none" else self.query_verification
+
     def verify_queries(self) -> Verification:
         """How query pairs are verified."""
-        return NoVerification() if self.verification == "none" else self.query_verification
+        return self.query_verification if self.verification == "geometric" else NoVerification()

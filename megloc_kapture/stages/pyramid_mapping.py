@@ -28,17 +28,15 @@ from megloc_kapture.io.kapture import (
     MatchesWriter,
     read_pairs,
 )
+from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.mapping.pairs import views_can_overlap
 from megloc_kapture.matching.guided_pyramid import ImageVariant, PairVerifier, pyramid_type
 from megloc_kapture.matching.pyramid_combination import Combined, KeypointUnion, combine
-from megloc_kapture.matching.verification import (
-    KnownPoseOptions,
-    TwoViewOptions,
-    known_pose_of_variants,
-)
+from megloc_kapture.matching.verification import KnownPoseOptions, known_pose_of_variants
 from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.stages.given_map import matched_images
 from megloc_kapture.stages.guided_pyramid import (
+    UNVERIFIED,
     MatchedVariants,
     MatchSpool,
     PyramidFeatures,
@@ -54,6 +52,8 @@ from megloc_kapture.stages.local_features import image_inputs, read_frame
 from megloc_kapture.stages.matches import (
     MATCHING_OPTIONS,
     Features,
+    NoVerification,
+    Verification,
     cached_features,
     mapping_pairs,
     matched_inputs,
@@ -84,6 +84,7 @@ def pyramid_mapping(
     method: PyramidMethod,
     output: Path,
     *,
+    num_found: Mapping[_Pair, int] | None = None,
     work: Work = HERE,
 ) -> dict[str, float]:
     """Try mapping pairs with few matches again, each image's variants with the other as it is.
@@ -94,6 +95,7 @@ def pyramid_mapping(
     pairs : those that were matched.
     output : gets ``local_features/T-pyramid``: keypoints, descriptors, matches of all pairs, and
         ``guided_pyramid.csv``, a row per pair that was tried.
+    num_found : matches of each pair before verification; as many as are stored unless given.
 
     Returns
     -------
@@ -108,14 +110,16 @@ def pyramid_mapping(
 
     def can_gain(a: str, b: str) -> bool:
         if not (a in poses and b in poses):
-            return False  # poses are what verifies
+            return False  # an image without a pose gives no points
         return views_can_overlap(data.camera_of(a), poses[a], data.camera_of(b), poses[b])
 
     # kept in one file, so (a, b) and (b, a) are one pair
     named = sorted({(min(p.query, p.map), max(p.query, p.map)) for p in pairs})
     stored, keypoints = mapping.matches(local_type), mapping.keypoints(local_type)
     counts = {pair: len(stored.read(*pair)[0]) for pair in named}
-    hard = [pair for pair in named if method.is_hard(counts[pair]) and can_gain(*pair)]
+    found = num_found or {}
+    is_hard = method.options.is_hard
+    hard = [p for p in named if is_hard(found.get(p, counts[p]), counts[p]) and can_gain(*p)]
     hard.sort(key=lambda pair: -counts[pair])
     others: dict[str, tuple[list[str], list[str]]] = defaultdict(lambda: ([], []))
     for a, b in hard:
@@ -142,8 +146,8 @@ def pyramid_mapping(
     plugins = method.extractor, method.matcher
     results = work.map(again, todo, items.label("guided pyramid"), plugins=plugins)
     for (image, *_), matched in zip(todo, results, strict=True):
-        file, found = spool.write(image, matched.found)
-        told = [found, matched.num_variants, matched.skipped, matched.seconds]
+        file, spooled = spool.write(image, matched.found)
+        told = [spooled, matched.num_variants, matched.skipped, matched.seconds]
         items.add(image, [file], told)
     variants = _AllMatched(spool, keypoints)
     for image in images:
@@ -182,6 +186,8 @@ def _match_again(
     itself = cached_features(mapping, local_type, image)
 
     def judge(other: str, features: Features) -> PairVerifier:
+        if isinstance(verification, NoVerification):
+            return UNVERIFIED
         image_from_world = folder.read().cam_from_world(image)
         other_from_world = folder.read().cam_from_world(other)
         if image_from_world is None or other_from_world is None:
@@ -285,6 +291,7 @@ def pyramid_queries(
     method: PyramidMethod,
     output: Path,
     *,
+    num_found: Mapping[_Pair, int] | None = None,
     work: Work = HERE,
 ) -> dict[str, float]:
     """Try query pairs with few matches again: the query's variants with the map's keypoints.
@@ -296,8 +303,9 @@ def pyramid_queries(
     ----------
     query : images, with the features and the matches of ``local_type``.
     mapping : images of the map with features of ``local_type``.
-    pairs, output : see :func:`pyramid_mapping`, as what is returned and raised.
+    pairs, output, num_found : see :func:`pyramid_mapping`, as what is returned and raised.
     """
+    before = num_found or {}
     larger = pyramid_type(local_type)
     there = all(larger in mapping.types(kind) for kind in ("keypoints", "descriptors"))
     types = local_type, larger if there else local_type
@@ -313,20 +321,29 @@ def pyramid_queries(
 
     def inputs(image: str, digest: Digest) -> object:
         of_pairs = [
-            [other, side(1, other, digest), content_of(stored.read(image, other))]
+            [
+                other,
+                side(1, other, digest),
+                content_of(stored.read(image, other)),
+                before.get((image, other)),
+            ]
             for other in candidates[image]
         ]
         read = image_inputs(query, image, digest)
         return [method.mask_margin_px, read, side(0, image, digest), of_pairs]
 
     items = work.items(local_type, list(candidates), inputs)
-    jobs = [job for job in candidates.items() if job[0] not in items.done]
+    jobs = [
+        (image, others, {one: before[image, one] for one in others if (image, one) in before})
+        for image, others in candidates.items()
+        if image not in items.done
+    ]
     features = PyramidFeatures(output, query, local_type, items.done)
     retry = partial(_retry, FolderSpec(query), FolderSpec(mapping), types, method)
     plugins = method.extractor, method.matcher
     with closing(MatchesWriter(output, larger, orphan=True)) as writer:
         results = work.map(retry, jobs, items.label("guided pyramid"), plugins=plugins)
-        for (image, _), found in zip(jobs, results, strict=True):
+        for (image, *_), found in zip(jobs, results, strict=True):
             files = [writer.write(image, *one) for one in found.matches]
             files += features.write(image, found.added_px, found.added_descriptors)
             tried = {"rows": found.rows, "seconds": found.seconds}
@@ -348,9 +365,9 @@ def _retry(
     mapping: FolderSpec,
     types: tuple[str, str],
     method: PyramidMethod,
-    job: tuple[str, Sequence[str]],
+    job: tuple[str, Sequence[str], Mapping[str, int]],
 ) -> RetriedQuery:
-    image, candidates = job
+    image, candidates, num_found = job
     folder, stored = query.open(), query.open().matches(types[0])
     return retry_query(
         cached_features(query, types[0], image),
@@ -358,8 +375,15 @@ def _retry(
         partial(cached_features, mapping, types[1]),
         method,
         lambda: read_frame(folder, image, margin_px=method.mask_margin_px),
+        num_found=num_found,
         name=image,
     )
+
+
+def _num_found(work: StageWork, matches: str, local_type: str) -> dict[_Pair, int]:
+    """Matches of each pair before verification, as the stage that matched them wrote them."""
+    rows = read_match_counts(work.path(matches), local_type)
+    return {(row.image, row.other): row.matches for row in rows}
 
 
 class _PyramidStage(PipelineStage):
@@ -370,9 +394,7 @@ class _PyramidStage(PipelineStage):
         extractors = self._extractors()
         return [*extractors, *(self.options.make_matcher(one.name) for one in extractors)]
 
-    def _methods(
-        self, verification: KnownPoseOptions | TwoViewOptions
-    ) -> Iterator[tuple[str, PyramidMethod]]:
+    def _methods(self, verification: Verification) -> Iterator[tuple[str, PyramidMethod]]:
         """How pairs are tried again, by keypoints type."""
         options = self.options
         for extractor in self._extractors():
@@ -404,8 +426,9 @@ class PyramidMapping(_PyramidStage):
         counts: dict[str, float] = {}
         mapping = work.folder(self.layout.mapping(), FEATURES, MAPPING_MATCHES)
         pairs, out = mapping_pairs(work, mapping), work.out / MAPPING_PYRAMID
-        for name, method in self._methods(self.options.mapping_verification):
-            found = pyramid_mapping(mapping, pairs, name, method, out, work=work)
+        for name, method in self._methods(self.options.verify_mapping()):
+            before = _num_found(work, MAPPING_MATCHES, name)
+            found = pyramid_mapping(mapping, pairs, name, method, out, num_found=before, work=work)
             counts |= {f"{name} {key}": count for key, count in found.items()}
         return counts
 
@@ -426,10 +449,13 @@ class PyramidQueries(_PyramidStage):
         counts: dict[str, float] = {}
         query = work.folder(self.layout.query(), FEATURES, QUERY_MATCHES)
         pairs, out = read_pairs(work.path(QUERY_PAIRS)), work.out / QUERY_PYRAMID
-        for name, method in self._methods(self.options.query_verification):
+        for name, method in self._methods(self.options.verify_queries()):
+            before = _num_found(work, QUERY_MATCHES, name)
             mapping = matched_images(work, self, name)
             described = mapping.descriptors(name)
             some = [pair for pair in pairs if pair.map in described]
-            found = pyramid_queries(query, mapping, some, name, method, out, work=work)
+            found = pyramid_queries(
+                query, mapping, some, name, method, out, num_found=before, work=work
+            )
             counts |= {f"{name} {key}": count for key, count in found.items()}
         return counts

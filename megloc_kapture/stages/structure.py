@@ -74,7 +74,7 @@ class MatchPhotographs(MatchMapping):
     outputs = (PHOTOGRAPH_MATCHES,)
 
     def verification(self) -> Verification:
-        return self.options.verify_queries()
+        return self.options.verify_photographs()
 
 
 class FindPoses(PipelineStage):

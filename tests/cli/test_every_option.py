@@ -140,6 +140,9 @@ CASES: dict[str, Case] = {
     "query_pairs.diversity.radius": Case("0.9", "pairs/query.txt", few_places(1, 0.1)),
     "query_pairs.diversity.angle_deg": Case("0.5", "pairs/query.txt", few_places(1, 0.9)),
     "reranking.by": Case('"verified"', "pairs/query.txt", also=("reranking.keep=3",)),
+    "reranking.local_type": Case(
+        '"rootsift"', "pairs/query.txt", (*TWO, "reranking.by=verified", "reranking.keep=2")
+    ),
     "reranking.keep": Case("2", "pairs/query.txt", ("reranking.by=coverage",)),
     "matching": Case('{name="nn",options={max_ratio=0.6}}', "matches/"),
     "verification": Case('"none"', "matches/"),
@@ -159,6 +162,7 @@ CASES: dict[str, Case] = {
     ),
     "guided_pyramid.mode": Case('"all"', "pyramid/", also=("guided_pyramid.min_matches=200",)),
     "guided_pyramid.min_matches": Case("200", "pyramid/", PYRAMID[:1]),
+    "guided_pyramid.count": Case('"matches"', "pyramid/", (*PYRAMID, LOOSE[0])),
     "guided_pyramid.scales": Case("[1.0,2.0]", "pyramid/", PYRAMID),
     "guided_pyramid.rotations_deg": Case("[0]", "pyramid/", PYRAMID),
     "guided_pyramid.max_side_px": Case("500", "pyramid/", PYRAMID),

@@ -115,6 +115,19 @@ def test_equal_to_all_pairs(
     assert found.tolist() == by_all_distances(cameras, options)
 
 
+def test_an_angle_of_180_degrees_is_no_bound() -> None:
+    # back to back at one place: rounding puts the cosine of some below -1
+    pairs = PairsByPosesOptions(num_neighbours=1, max_angle_deg=180.0)
+    cosines = []
+    for rotation in Rotation.random(300, random_state=0):
+        back = Rotation.from_euler("y", 180, degrees=True) * rotation
+        cameras = [camera_at(np.ones(3), each) for each in (rotation, back)]
+        first, second = (camera.rotation_matrix()[2] for camera in cameras)
+        cosines.append(float(first @ second))
+        assert pairs_by_poses(cameras, pairs).tolist() == [[0, 1]]
+    assert min(cosines) < -1.0
+
+
 def test_a_distance_of_exactly_the_maximum_is_near_and_many_may_stand_at_one_place() -> None:
     cameras = [camera_at(np.array([10.0 * k, 0, 0]), Rotation.identity()) for k in range(4)]
     found = pairs_by_poses(cameras, PairsByPosesOptions(max_distance=10.0))

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.matching.guided_pyramid import (
@@ -138,7 +137,7 @@ def test_a_masked_pixel_gives_no_keypoint_in_any_variant() -> None:
 def test_a_variant_that_cannot_be_extracted_is_skipped_and_says_why() -> None:
     def picky(image: np.ndarray, mask: np.ndarray | None) -> LocalFeatures:
         if min(image.shape[:2]) < 100:
-            raise cv2.error("too small\nfor me")
+            raise DataError("too small for me")
         if image.shape[0] > image.shape[1]:
             empty = np.zeros((0, 2), np.float32)
             return LocalFeatures(empty, empty[:, 0], np.zeros((0, 128), np.float32))
@@ -148,9 +147,30 @@ def test_a_variant_that_cannot_be_extracted_is_skipped_and_says_why() -> None:
     found, skipped = extract_variants(IMAGE, None, variants, picky, like=LIKE)
     assert [each.variant for each in found] == variants[:1]
     assert list(skipped.items()) == [
-        (variants[1], "error: too small"),
+        (variants[1], "too small for me"),
         (variants[2], "no keypoints"),
     ]
+
+
+@pytest.mark.parametrize(
+    "error", [RuntimeError("of a plugin"), DataError("damaged", path="net.pth"), PluginError("no")]
+)
+def test_an_error_that_is_not_about_the_image_is_raised(error: Exception) -> None:
+    def broken(image: np.ndarray, mask: np.ndarray | None) -> LocalFeatures:
+        raise error
+
+    with pytest.raises(type(error), match=str(error)):
+        extract_variants(IMAGE, None, ALL_VARIANTS[:1], broken, like=LIKE)
+
+
+def test_a_pair_is_hard_by_the_matches_that_are_counted() -> None:
+    by_count = {"matches": [(99, 0), (99, 99)], "verified": [(99, 99), (500, 99), (99, 0)]}
+    for count, hard in by_count.items():
+        options = GuidedPyramidOptions(mode="all", count=count)
+        assert all(options.is_hard(*pair) for pair in hard)
+        assert not options.is_hard(100, 100)
+        assert not GuidedPyramidOptions(count=count).is_hard(0, 0)  # the mode is off
+    assert not GuidedPyramidOptions(mode="all", count="matches").is_hard(100, 0)
 
 
 def test_columns_beside_the_place_are_kept_as_they_are_stored_and_must_fit() -> None:
@@ -298,6 +318,12 @@ def test_on_the_rest_only_what_matched_a_probed_pair_is_tried(enough: int, left:
     # fewer pairs than are probed, and none
     assert len(match_probed(variants, 2, match, options)[0]) == 2
     assert match_probed(variants, 0, match, options)[0] == []
+    # without probing, all variants are tried on all
+    asked.clear()
+    unprobed = GuidedPyramidOptions(mode="all", probed_pairs=None)
+    found, num_tried = match_probed(variants, 10, match, unprobed)
+    assert [len(of_pair) for of_pair in found] == [len(variants)] * 10
+    assert asked == [(len(variants), range(10))]
 
 
 SIZES = st.tuples(st.integers(1, 900), st.integers(1, 900))

@@ -106,6 +106,13 @@ def with_rig(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
                     "guided_pyramid.scales=[0.5,1.0]",
                     "guided_pyramid.min_matches=400",
                 ],
+                "pyramid of unverified matches": [
+                    *(*TWO_TYPES, "reranking.by=verified", "reranking.local_type=rootsift"),
+                    *("reranking.keep=4", "verification=mapping", "guided_pyramid.mode=max"),
+                    *("guided_pyramid.count=matches", "guided_pyramid.probed_pairs=null"),
+                    "guided_pyramid.scales=[0.5,1.0]",
+                    "guided_pyramid.min_matches=100",
+                ],
                 "unverified": ["verification=none", "localization.clusters.by=none"],
             }.items()
         ),
@@ -153,9 +160,9 @@ def test_a_fallback_is_the_pose_of_the_first_candidate_after_reranking(
     map_poses = workspace.folder("map").read().poses()
     assert found == {name: map_poses[image] for name, image in first[1].items()}
     assert found == workspace.folder("localized").read().poses()
-    # options that contradict each other are refused by both
-    wrong = options_of_preset(assignments=["verification=none", "guided_pyramid.mode=all"])
-    message = "guided pyramid matching counts verified matches"
+    # a type of features that the map lacks is refused by both
+    wrong = options_of_preset(assignments=[*sets, "reranking.local_type=superpoint"])
+    message = "no local features of type 'superpoint'; known: rootsift"
     with pytest.raises(OptionError, match=message):
         evaluated(tmp_path / "wrong", scene, wrong)
     with pytest.raises(OptionError, match=message):

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from megloc_kapture import Camera, KaptureMap, Localizer
-from megloc_kapture.errors import OptionError
 from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.io.kapture import KaptureFolder, Sensor, write_sensors
 from megloc_kapture.pipeline.presets import options_of_preset
@@ -101,9 +100,6 @@ def test_turned_queries_are_found_with_it_and_easy_pairs_are_not_tried(
 def test_upright_queries_are_left_alone(
     fountain: Path, options: PipelineOptions, tmp_path: Path
 ) -> None:
-    unverified = pyramid(options, mode="all").model_copy(update={"verification": "none"})
-    with pytest.raises(OptionError, match="guided pyramid matching counts verified matches"):
-        evaluated(tmp_path / "unverified", fountain, unverified)
     workspace = Workspace(tmp_path / "runs")
     reports = run_in(workspace, fountain, pyramid(options, mode="max", min_matches=15))
     counts = reports["query_pyramid"].counts

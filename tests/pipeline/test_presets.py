@@ -57,7 +57,7 @@ SEVERAL = 'local_features=["sift", "rootsift"]'
         (["query_pairs.top_k=many"], "option query_pairs.top_k: "),
         (["query_pairs.top_k=0"], "option query_pairs.top_k: "),
         (["query_pairs=3"], "option query_pairs: "),
-        (["verification=maybe"], "option verification: .*'geometric' or 'none'"),
+        (["verification=maybe"], "option verification: .*'geometric', 'mapping' or 'none'"),
         (["localization.fallback=guess"], "option localization.fallback: "),
         (["local_features=[]"], "local_features: .*at least 1 item"),
         (

@@ -32,7 +32,7 @@ from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.stages.guided_pyramid import COLUMNS, PyramidMethod, retry_query, table_path
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.map_points import triangulate_map
-from megloc_kapture.stages.matches import Features, match_pairs
+from megloc_kapture.stages.matches import Features, NoVerification, match_pairs
 from megloc_kapture.stages.pyramid_mapping import pyramid_mapping, pyramid_queries
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
 from megloc_kapture.stages.work import HERE, Work
@@ -64,7 +64,7 @@ class Upright:
         self.calls += 1
         assert self.calls <= self.most, "extracted again, although no pair asks for it"
         if min(image.shape[:2]) < 100:
-            raise ValueError("smaller than 100 pixels")
+            raise DataError("smaller than 100 pixels")
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         wanted = None if mask is None else mask.astype(np.uint8)
         corners = cv2.goodFeaturesToTrack(gray, 500, 0.005, 4, mask=wanted)
@@ -112,16 +112,18 @@ class Scene:
         query: KaptureFolder | None = None,
         pairs: list[ImagePair] | None = None,
         work: Work = HERE,
+        num_found: dict[tuple[str, str], int] | None = None,
         **more: Any,
     ) -> dict[str, float]:
         mapping, pairs = mapping or self.mapping(), pairs or self.pairs(name)
+        beside: Any = {"num_found": num_found, "work": work}
         with single_threaded():
             if name == "mapping":
-                how = method(verification=KnownPoseOptions(), **more)
-                return pyramid_mapping(mapping, pairs, "upright", how, output, work=work)
+                how = method(**{"verification": KnownPoseOptions()} | more)
+                return pyramid_mapping(mapping, pairs, "upright", how, output, **beside)
             query = query or self.folder(name)
             how = method(**more)
-            return pyramid_queries(query, mapping, pairs, "upright", how, output, work=work)
+            return pyramid_queries(query, mapping, pairs, "upright", how, output, **beside)
 
 
 def method(**more: Any) -> PyramidMethod:
@@ -354,7 +356,9 @@ def test_workers_write_the_same_bytes_and_extract_an_image_once(
         assert counting.calls == 5 + 5 + 3
 
 
-def test_the_mask_goes_with_the_image(scene: Scene, tmp_path: Path) -> None:
+def test_the_mask_goes_with_the_image(
+    scene: Scene, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     root = tmp_path / "masked"
     write_images(root, scene.world.query(), scene.world.query_poses, QUERIES, "turned_")
     for image in scene.folder("turned").read().image_names():
@@ -371,7 +375,8 @@ def test_the_mask_goes_with_the_image(scene: Scene, tmp_path: Path) -> None:
         assert len(added) > 20
         assert (added[:, 0] >= 110).all()
     skipped = {row["skipped"] for row in rows(tmp_path / "out")}
-    assert skipped == {"image 0.2@0 0.2@90 0.2@270: ValueError: smaller than 100 pixels"}
+    assert skipped == {"image 0.2@0 0.2@90 0.2@270: smaller than 100 pixels"}
+    assert "0.2@270: smaller than 100 pixels; see guided_pyramid.csv" in caplog.text
 
 
 def test_what_is_not_tried(scene: Scene, tmp_path: Path) -> None:
@@ -426,3 +431,33 @@ def test_a_pair_with_as_many_matches_as_asked_for_is_left(
     least = min(len(matches.read(p.query, p.map)[0]) for p in scene.pairs(kind))
     options = ALL.model_copy(update={"min_matches": least + more})
     assert bool(scene.retry(kind, tmp_path, options=options)["pairs_tried"]) == tried
+
+
+@pytest.mark.parametrize("kind", ["mapping", "turned"])
+def test_matches_before_verification_decide_where_they_are_counted(
+    scene: Scene, tmp_path: Path, kind: str
+) -> None:
+    stored = scene.folder(kind).matches("upright")
+    # all but one pair have 100 matches that verification does not leave
+    found = {(p.query, p.map): 100 for p in scene.pairs(kind)}
+    hard = {pair for pair in found if len(stored.read(*pair)[0]) < 100}
+    few = max(hard)
+    found[few] = 99
+    for count, expected in (("matches", {few}), ("verified", hard)):
+        options = ALL.model_copy(update={"count": count})
+        scene.retry(kind, tmp_path / count, options=options, num_found=found)
+        assert {(row["image"], row["other"]) for row in rows(tmp_path / count)} == expected
+    assert len(hard) > 1
+
+
+@pytest.mark.parametrize("kind", ["mapping", "turned"])
+def test_without_verification_every_match_of_a_variant_is_kept(
+    scene: Scene, tmp_path: Path, kind: str
+) -> None:
+    one_turn = GuidedPyramidOptions(mode="max", scales=(1.0,), rotations_deg=(270,))
+    for name, how in (("none", NoVerification()), ("verified", None)):
+        more = {} if how is None else {"verification": how}
+        assert scene.retry(kind, tmp_path / name, options=one_turn, **more)["pairs_tried"] > 0
+    unverified, verified = (list(rows(tmp_path / name)) for name in ("none", "verified"))
+    for one, other in zip(unverified, verified, strict=True):
+        assert int(one["matches_after"]) > int(other["matches_after"])

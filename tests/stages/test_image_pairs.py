@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.poses import movement
 from megloc_kapture.io.dataset_tables import ImageGroup
@@ -343,6 +343,24 @@ def test_most_correspondences_first_and_no_more_than_asked(tmp_path: Path) -> No
         run(tmp_path, "a", "verified", 1)
     with pytest.raises(DataError, match=r"match_counts\.csv"):
         run(tmp_path, "n", "verified", 1)
+
+
+def test_one_type_may_count_alone(tmp_path: Path) -> None:
+    write_matches(tmp_path, {("q1", "w"): (9, 9), ("q1", "y"): (1, 1)}, "superpoint-mine")
+    write_matches(tmp_path, {("q1", "y"): (30, 20), ("q1", "z"): (3, 3)}, "aslfeat")
+    query, types = KaptureFolder(tmp_path, features_dirs=[tmp_path]), ["superpoint-mine", "aslfeat"]
+    first = {None: "y", "aslfeat": "y", "superpoint": "w", "superpoint-mine": "w"}
+    for name, image in first.items():
+        options = RerankingOptions(by="verified", local_type=name)
+        assert reranked(PAIRS, query, tmp_path, types, options)[0].map == image
+    # the name of a type goes before that of a plugin, and a pyramid's is that of its base
+    options = RerankingOptions(by="verified", local_type="sift")
+    assert options.counted_types(["sift-mine", "sift-pyramid"]) == ["sift-pyramid"]
+    unknown = RerankingOptions(by="verified", local_type="superpint")
+    message = r"reranking\.local_type: no local features of type 'superpint'; did you mean"
+    with pytest.raises(OptionError, match=message):
+        reranked(PAIRS, query, tmp_path, types, unknown)
+    assert RerankingOptions(local_type="superpint").counted_types(types) == types  # it is off
 
 
 def test_coverage_counts_each_keypoint_once(tmp_path: Path) -> None:
