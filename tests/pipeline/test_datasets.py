@@ -161,13 +161,22 @@ def test_a_benchmark_file(tmp_path: Path) -> None:
         'dataset = "kapture"\nthresholds = [[0.25, 2], [0.5, 5]]\n'
         "[options.query_pairs]\ntop_k = 9\n"
         "[options_with_query_depth.pose_refinement]\nby = ['icp']\n"
+        "[presets.modern.options_with_map_depth.pose_refinement]\nby = ['rendering']\n"
+        "[presets.modern.options_with_both_depths.query_pairs]\ntop_k = 8\n"
     )
     benchmark = read_benchmark(path)
     assert benchmark.thresholds == ((0.25, 2.0), (0.5, 5.0))
-    for query_depth, refiners in ((False, []), (True, ["icp"])):
-        changes = benchmark.changes(benchmark.preset, query_depth=query_depth)
-        options = options_of_preset(benchmark.preset, changes=changes)
-        assert options.query_pairs.top_k == 9
+    for preset, map_depth, query_depth, refiners, top_k in (
+        ("classic", True, False, [], 9),
+        ("classic", True, True, ["icp"], 9),
+        ("modern", False, False, [], 9),
+        ("modern", False, True, ["icp"], 9),
+        ("modern", True, False, ["rendering"], 9),
+        ("modern", True, True, ["rendering"], 8),
+    ):
+        changes = benchmark.changes(preset, map_depth=map_depth, query_depth=query_depth)
+        options = options_of_preset(preset, changes=changes)
+        assert options.query_pairs.top_k == top_k
         assert [one.name for one in options.pose_refinement.by] == refiners
 
 
@@ -176,7 +185,8 @@ def test_our_own_benchmark_files_are_good(path: Path) -> None:
     benchmark = read_benchmark(path)
     assert benchmark.dataset == path.stem
     for preset in PRESETS:
-        options_of_preset(preset, changes=benchmark.changes(preset, query_depth=True))
+        changes = benchmark.changes(preset, map_depth=True, query_depth=True)
+        options_of_preset(preset, changes=changes)
     benchmark.change(Protocol())
     if benchmark.import_options:
         choose_dataset(benchmark.dataset, Path(), import_options=benchmark.import_options)
