@@ -6,11 +6,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from types import UnionType
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from megloc_kapture.errors import DataError
 
@@ -41,10 +42,31 @@ Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 """Where a network computes: auto (a GPU where there is one), cpu, cuda, or cuda:N."""
 
 
+def _is_list(annotation: Any) -> bool:
+    """True for ``tuple[X, ...]``, also where it may be None."""
+    kinds = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
+    return any(get_origin(one) is tuple and get_args(one)[-1] is Ellipsis for one in kinds)
+
+
+def listed(value: Any) -> Any:
+    """A list that is given as one name, as names between commas, or as one table."""
+    if isinstance(value, str):
+        return tuple(name.strip() for name in value.split(","))
+    return (value,) if isinstance(value, dict) else value
+
+
 class Options(BaseModel):
     """Base of all option models: frozen, validated, unknown keys refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_is_a_list(cls, values: Any) -> Any:
+        if not isinstance(values, dict):
+            return values
+        lists = {name for name, one in cls.model_fields.items() if _is_list(one.annotation)}
+        return {key: listed(one) if key in lists else one for key, one in values.items()}
 
     def idle(self) -> dict[str, str]:
         """Options that change nothing while the others are as they are: name to the reason.

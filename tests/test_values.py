@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.values import (
     CAMERA_MODEL_NUM_PARAMS,
     Camera,
@@ -130,3 +132,40 @@ def test_options_are_frozen_and_refuse_unknown_keys() -> None:
         _Example.model_validate({"sizes": 4})
     with pytest.raises(ValidationError, match="frozen"):
         _Example().size = 4  # type: ignore[misc]
+
+
+class Lists(Options):
+    """Options that are lists, and others."""
+
+    names: tuple[str, ...] = ()
+    choices: tuple[PluginChoice, ...] = ()
+    optional: tuple[Literal["a", "b"], ...] | None = None
+    by_name: dict[str, tuple[str, ...]] = {}
+    pair: tuple[str, str] = ("x", "y")
+    text: str = ""
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"names": "one"}, {"names": ("one",)}),
+        ({"names": "one, two"}, {"names": ("one", "two")}),
+        ({"names": ["one, two"]}, {"names": ("one, two",)}),
+        ({"choices": "icp"}, {"choices": (PluginChoice(name="icp"),)}),
+        (
+            {"choices": {"name": "icp", "options": {"a": 1}}},
+            {"choices": (PluginChoice(name="icp", options={"a": 1}),)},
+        ),
+        ({"optional": "b"}, {"optional": ("b",)}),
+        ({"optional": None}, {"optional": None}),
+        ({"by_name": {"a": ("b",)}}, {"by_name": {"a": ("b",)}}),
+        ({"text": "one, two"}, {"text": "one, two"}),
+    ],
+)
+def test_one_name_is_a_list_of_one(given: dict[str, Any], expected: dict[str, Any]) -> None:
+    assert Lists.model_validate(given) == Lists().model_copy(update=expected)
+
+
+def test_a_name_is_no_list_of_fixed_length() -> None:
+    with pytest.raises(ValidationError, match="pair"):
+        Lists.model_validate({"pair": "x, y"})

@@ -12,6 +12,7 @@ import os
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -295,21 +296,37 @@ class PublishedResult(Options):
 
 
 class PresetOptions(Options):
-    """What a dataset wants different of one preset alone, after what it wants of all of them."""
-
-    import_options: dict[str, Any] = Field(default_factory=dict)
-    options: dict[str, Any] = Field(default_factory=dict)
-
-
-class BenchmarkFile(Options):
-    """``benchmarks/<dataset>.toml``: how one dataset is run.
+    """Changes that a dataset makes to presets.
 
     Parameters
     ----------
     import_options : the adapter's.
-    options : changes to every preset.
-    presets : further ones to the preset of a name.
-    options_with_query_depth : further ones, where the queries come with depth maps of their own.
+    options : changes in any case.
+    options_with_map_depth, options_with_query_depth, options_with_both_depths : further ones where
+        the images of the map, of the queries, or of both come with depth maps; in this order.
+    """
+
+    import_options: dict[str, Any] = Field(default_factory=dict)
+    options: dict[str, Any] = Field(default_factory=dict)
+    options_with_map_depth: dict[str, Any] = Field(default_factory=dict)
+    options_with_query_depth: dict[str, Any] = Field(default_factory=dict)
+    options_with_both_depths: dict[str, Any] = Field(default_factory=dict)
+
+    def _changes(self, *, map_depth: bool, query_depth: bool) -> list[dict[str, Any]]:
+        return [
+            self.options,
+            self.options_with_map_depth if map_depth else {},
+            self.options_with_query_depth if query_depth else {},
+            self.options_with_both_depths if map_depth and query_depth else {},
+        ]
+
+
+class BenchmarkFile(PresetOptions):
+    """``benchmarks/<dataset>.toml``: how one dataset is run, with changes to every preset.
+
+    Parameters
+    ----------
+    presets : further changes to the preset of a name.
     thresholds, conditions, pools : instead of the dataset's own (see the side tables' Protocol).
     published : what others have reached.
     """
@@ -319,10 +336,7 @@ class BenchmarkFile(Options):
     thresholds: tuple[tuple[float, float | None], ...] | None = None
     conditions: tuple[str, ...] | None = None
     pools: dict[str, tuple[str, ...]] | None = None
-    import_options: dict[str, Any] = Field(default_factory=dict)
-    options: dict[str, Any] = Field(default_factory=dict)
     presets: dict[str, PresetOptions] = Field(default_factory=dict)
-    options_with_query_depth: dict[str, Any] = Field(default_factory=dict)
     published: tuple[PublishedResult, ...] = ()
 
     @field_validator("presets")
@@ -333,15 +347,11 @@ class BenchmarkFile(Options):
             raise ValueError(f"unknown preset {unknown[0]!r}; known: {', '.join(PRESETS)}")
         return presets
 
-    def changes(self, preset: str, *, query_depth: bool) -> list[dict[str, Any]]:
-        """Changes to a preset, in order, for data whose queries have depth or not."""
-        own = self.presets.get(preset, PresetOptions()).options
-        return [
-            EVERY_POSE,
-            self.options,
-            own,
-            *([self.options_with_query_depth] if query_depth else []),
-        ]
+    def changes(self, preset: str, *, map_depth: bool, query_depth: bool) -> list[dict[str, Any]]:
+        """Changes to a preset, in order, for data with depth maps or without."""
+        layers = self, self.presets.get(preset, PresetOptions())
+        changed = [one._changes(map_depth=map_depth, query_depth=query_depth) for one in layers]
+        return [EVERY_POSE, *chain.from_iterable(changed)]
 
     def import_options_of(self, preset: str) -> dict[str, Any]:
         """The adapter's options, where this preset is run."""

@@ -30,7 +30,7 @@ from megloc_kapture.stages.image_pairs import MappingPairsOptions, RerankingOpti
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
 from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
-from megloc_kapture.values import Options
+from megloc_kapture.values import Options, listed
 
 OptionsT = TypeVar("OptionsT", bound=Options)
 
@@ -232,8 +232,7 @@ def _merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:
         if isinstance(value, dict) and isinstance(present, dict):
             _merge(present, value)
         elif isinstance(value, dict) and isinstance(present, list | tuple | str):
-            several = [present] if isinstance(present, str) else present
-            tree[key] = _merged_choices(key, several, value)
+            tree[key] = _merged_choices(key, listed(present), value)
         else:
             tree[key] = value
 
@@ -250,7 +249,7 @@ def _merged_choices(
         {"name": one} if isinstance(one, str) else dict(one)
         for one in choices
         if isinstance(one, str | dict)
-    ]
+    ] or [{}]
     named = {one.get("name"): one for one in merged}
     if set(changes) <= set(named):
         for name, change in changes.items():

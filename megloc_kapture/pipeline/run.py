@@ -74,7 +74,9 @@ class Run:
         """The steps of the paper in its order, and whether the run does them; nothing is loaded."""
         if self.facts is None:
             return []
-        changes = self.benchmark.changes(self.preset, query_depth=self.facts.query_depth)
+        changes = self.benchmark.changes(
+            self.preset, map_depth=self.facts.map_depth, query_depth=self.facts.query_depth
+        )
         of_preset = options_of_preset(self.preset)
         of_file = options_of_preset(self.preset, changes=changes)
         layers = (_steps_of(one, self.facts) for one in (self.options, of_file, of_preset))
@@ -142,7 +144,7 @@ def choose_run(
     facts = DatasetFacts(
         source.has_map_depth(), source.has_query_depth(), with_model(source) is not None
     )
-    changes = benchmark.changes(preset, query_depth=facts.query_depth)
+    changes = benchmark.changes(preset, map_depth=facts.map_depth, query_depth=facts.query_depth)
     options = options_of_preset(preset, changes=changes, assignments=assignments)
     return Run(source, preset, options, benchmark, facts)
 

@@ -81,6 +81,7 @@ class ReferenceImages:
         first: Sequence[str],
         *,
         max_references: int,
+        only_first: bool = False,
         max_angle_deg: float = 60.0,
         min_distance_m: float = 0.0,
     ) -> list[str]:
@@ -89,6 +90,7 @@ class ReferenceImages:
         Parameters
         ----------
         first : images that the pose comes from: they are known to match.
+        only_first : take no other images.
         max_angle_deg : between the viewing directions; images beyond it stay out.
         min_distance_m : of the centres; images within it stay out, unit of the map.
         """
@@ -98,7 +100,10 @@ class ReferenceImages:
         usable = facing & (distances >= min_distance_m)
         order = [int(at) for at in np.argsort(distances, kind="stable") if usable[at]]
         known = set(first)
-        chosen = [at for at in order if self.names[at] in known][: (max_references + 1) // 2]
+        chosen = [at for at in order if self.names[at] in known]
+        if only_first:
+            return [self.names[at] for at in chosen[:max_references]]
+        chosen = chosen[: (max_references + 1) // 2]
         chosen += [at for at in order if at not in set(chosen)][: max_references - len(chosen)]
         return [self.names[at] for at in chosen]
 

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.colmap import TriangulationOptions
@@ -107,12 +107,6 @@ class PipelineOptions(Options):
         default_factory=dict,
         description="stages of other packages that run as well, by name, with their options",
     )
-
-    @field_validator("local_features", "global_features", mode="before")
-    @classmethod
-    def _several(cls, value: Any) -> Any:
-        """One choice stands for a list of one."""
-        return (value,) if isinstance(value, str | dict) else value
 
     @model_validator(mode="after")
     def _placed(self) -> PipelineOptions:

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, astuple, fields, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field, TypeAdapter
 
@@ -74,6 +75,11 @@ class PoseRefinementOptions(Options):
     by: tuple[PluginChoice, ...] = Field(
         default=(), description="pose refiners, one after another; none: poses stay"
     )
+    references: Literal["cluster", "frame"] = Field(
+        default="frame",
+        description="map images a refiner may choose from: those of the cluster that the pose "
+        "comes from, or others of its coordinate frame as well",
+    )
     max_references: int = Field(
         default=30,
         gt=0,
@@ -81,7 +87,8 @@ class PoseRefinementOptions(Options):
     )
 
     def idle(self) -> dict[str, str]:
-        return {} if self.refines() else {"max_references": "pose_refinement.by is empty"}
+        names = () if self.refines() else ("references", "max_references")
+        return dict.fromkeys(names, "pose_refinement.by is empty")
 
     def with_refiners(self, names: Sequence[str]) -> PoseRefinementOptions:
         """With these refiners, in this order, each with the options that it has here."""
@@ -197,7 +204,10 @@ class MapRefiners:
         """
         frame = self._frame(pose)
         near = self._by_frame[frame].near(
-            pose.cam_from_world, pose.candidates, max_references=self._options.max_references
+            pose.cam_from_world,
+            pose.candidates,
+            max_references=self._options.max_references,
+            only_first=self._options.references == "cluster",
         )
         return tuple(near), tuple(one.reason if one else "" for one in self._verdicts[frame])
 
@@ -349,7 +359,7 @@ def refine_poses(
         write_consistency(output / CONSISTENCY_FILE, tested)
     if timing is not None:
         write_timing(timing, found.items())
-    counts: dict[str, float] = {"queries": len(jobs)}
+    counts: dict[str, float] = {"queries": len(poses)}
     for refiner in refiners.refiners:
         counts[f"accepted_by_{refiner.name}"] = sum(
             row.accepted

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
@@ -26,6 +26,7 @@ from megloc_kapture.pipeline.datasets import (
     twin_of,
 )
 from megloc_kapture.pipeline.presets import PRESETS, options_of_preset
+from megloc_kapture.pipeline.run import choose_run
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import DATASETS, RENDERED_DATASETS, DatasetAdapter, RenderedDataset
 from megloc_kapture.values import Camera, RigidTransform
@@ -161,13 +162,22 @@ def test_a_benchmark_file(tmp_path: Path) -> None:
         'dataset = "kapture"\nthresholds = [[0.25, 2], [0.5, 5]]\n'
         "[options.query_pairs]\ntop_k = 9\n"
         "[options_with_query_depth.pose_refinement]\nby = ['icp']\n"
+        "[presets.modern.options_with_map_depth.pose_refinement]\nby = ['rendering']\n"
+        "[presets.modern.options_with_both_depths.query_pairs]\ntop_k = 8\n"
     )
     benchmark = read_benchmark(path)
     assert benchmark.thresholds == ((0.25, 2.0), (0.5, 5.0))
-    for query_depth, refiners in ((False, []), (True, ["icp"])):
-        changes = benchmark.changes(benchmark.preset, query_depth=query_depth)
-        options = options_of_preset(benchmark.preset, changes=changes)
-        assert options.query_pairs.top_k == 9
+    for preset, map_depth, query_depth, refiners, top_k in (
+        ("classic", True, False, [], 9),
+        ("classic", True, True, ["icp"], 9),
+        ("modern", False, False, [], 9),
+        ("modern", False, True, ["icp"], 9),
+        ("modern", True, False, ["rendering"], 9),
+        ("modern", True, True, ["rendering"], 8),
+    ):
+        changes = benchmark.changes(preset, map_depth=map_depth, query_depth=query_depth)
+        options = options_of_preset(preset, changes=changes)
+        assert options.query_pairs.top_k == top_k
         assert [one.name for one in options.pose_refinement.by] == refiners
 
 
@@ -176,7 +186,8 @@ def test_our_own_benchmark_files_are_good(path: Path) -> None:
     benchmark = read_benchmark(path)
     assert benchmark.dataset == path.stem
     for preset in PRESETS:
-        options_of_preset(preset, changes=benchmark.changes(preset, query_depth=True))
+        changes = benchmark.changes(preset, map_depth=True, query_depth=True)
+        options_of_preset(preset, changes=changes)
     benchmark.change(Protocol())
     if benchmark.import_options:
         choose_dataset(benchmark.dataset, Path(), import_options=benchmark.import_options)
@@ -233,3 +244,30 @@ def test_depth_that_no_rig_joins_to_a_camera_is_told_and_not_used(
         chosen = choose_dataset("kapture", tmp_path)
         assert chosen.has_query_depth() == chosen.has_map_depth() == bool(rigs)
         assert caplog.text.count("depth is not used") == 2
+
+
+@pytest.mark.parametrize(
+    ("preset", "with_depth", "rank", "refiners"),
+    [
+        ("megloc", (), None, []),
+        ("megloc", ("mapping",), "lpips", ["rendering"]),
+        ("megloc", ("query",), None, ["icp"]),
+        ("megloc", ("mapping", "query"), "lpips", ["icp", "rendering"]),
+        ("classic", ("mapping", "query"), None, ["icp"]),
+    ],
+)
+def test_kapture_folders_get_the_steps_that_their_depth_permits(
+    tmp_path: Path, preset: str, with_depth: Sequence[str], rank: str | None, refiners: list[str]
+) -> None:
+    camera = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 10, 8, (9.0, 5.0, 4.0)))
+    rig = {"rig": dict.fromkeys(("cam", "deep"), RigidTransform.identity())}
+    for part in ("mapping", "query"):
+        data = KaptureData({"cam": camera}, records_camera={(1, "cam"): "1.jpg"})
+        if part in with_depth:
+            deep = replace(camera, sensor_type="depth")
+            data = replace(data, sensors={"cam": camera, "deep": deep}, rigs=rig)
+            data.records_depth[1, "deep"] = "1.depth"
+        write_sensors(tmp_path / part, data)
+    options = choose_run("kapture", tmp_path, preset=preset).options
+    distance = options.localization.rank.options.get("distance", {}).get("name")
+    assert (distance, [one.name for one in options.pose_refinement.by]) == (rank, refiners)

@@ -48,7 +48,7 @@ def test_only_steps_that_are_there_are_left_out() -> None:
 
 
 def test_a_variant_lacks_its_step_and_nothing_else() -> None:
-    changes = find_benchmark("aachen").changes("megloc", query_depth=False)
+    changes = find_benchmark("aachen").changes("megloc", map_depth=False, query_depth=False)
     options = options_of_preset("megloc", changes=changes)
     assert list(variants(options)) == list(STEPS)
     whole = options.model_dump()

@@ -55,15 +55,13 @@ OFF = {
         "the own car masked",
         COVISIBLE,
         SEQUENCE,
-        "clusters ranked by LPIPS of aligned views",
-        "poses refined by rendering",
     },
 }
 
 
 def run_of(dataset: str, preset: str, *assignments: str) -> Run:
     benchmark, facts = find_benchmark(dataset), FACTS[dataset]
-    changes = benchmark.changes(preset, query_depth=facts.query_depth)
+    changes = benchmark.changes(preset, map_depth=facts.map_depth, query_depth=facts.query_depth)
     options = options_of_preset(preset, changes=changes, assignments=assignments)
     return Run(DatasetChoice(dataset, None), preset, options, benchmark, facts)
 

@@ -137,6 +137,21 @@ def test_references_look_the_same_way_and_are_of_one_frame(
     assert images[0] in refiner.asked[first]
 
 
+def test_references_of_the_cluster_are_none_but_the_pose_s_candidates(
+    world: Any, localized: KaptureFolder, tmp_path: Path
+) -> None:
+    first = min(world.query_poses)
+    asked = {}
+    for references in ("cluster", "frame"):
+        refiner = Shift()
+        options = Chosen(refiners=(refiner,), references=references)
+        out = tmp_path / references
+        refine_poses(world.mapping(), world.query(), localized, out, options)
+        asked[references] = refiner.asked[first]
+    assert asked["cluster"] == [min(world.map_poses)]
+    assert set(asked["cluster"]) < set(asked["frame"])
+
+
 def test_wrong_refiners_are_refused(world: Any, localized: KaptureFolder, tmp_path: Path) -> None:
     wrong = Chosen(refiners=(Shift(name="wrong"),))
     with pytest.raises(PluginError, match="'wrong' on image .*: refine returned NoneType"):

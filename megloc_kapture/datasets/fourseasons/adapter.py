@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from megloc_kapture.datasets.formats.fourseasons_files import (
     StereoCalibration,
@@ -90,12 +90,6 @@ class FourSeasonsOptions(Options):
         le=2,
         description="keyframes with less are dropped: 2 fused with GNSS, 1 interpolated, 0 none",
     )
-
-    @field_validator("reference", "queries", mode="before")
-    @classmethod
-    def _listed(cls, value: Any) -> Any:
-        # one name, or several between commas, as a command line gives them
-        return tuple(name.strip() for name in value.split(",")) if isinstance(value, str) else value
 
 
 class FourSeasons:
