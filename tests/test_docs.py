@@ -123,6 +123,40 @@ def test_files_of_the_repository_that_are_named_exist(page: Path) -> None:
             assert any((folder / name).is_file() for folder in folders), name
 
 
+def paper_rows() -> list[list[str]]:
+    """Cells of the rows of docs/paper.md that quote the paper."""
+    text = (REPOSITORY / "docs" / "paper.md").read_text().split("## What we added")[0]
+    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| ")]
+    return [row for row in rows if row[0] != "step"]
+
+
+def test_each_statement_of_the_paper_has_its_section_quote_and_files() -> None:
+    rows = paper_rows()
+    assert len(rows) > 30
+    for _, section, quotes, files, ours in rows:
+        assert section and ours and re.fullmatch(r'"[^"]+"(; "[^"]+")*', quotes), quotes
+        named = re.findall(r"`([^`]+)`", files)
+        assert named or files.startswith("["), files
+        for name in named:
+            if name.endswith(".py"):
+                assert (REPOSITORY / "megloc_kapture" / name).is_file(), name
+
+
+def test_quotes_of_the_paper_are_its_words(shared_data: Path) -> None:
+    def words(text: str) -> str:
+        text = re.sub(r"~?\\cite\{[^}]*\}|\\cref\{para:global\}", "", text)
+        return " ".join(re.sub(r"[$\\{}]", "", text).split())
+
+    paper = shared_data.parent / "reference" / "paper.tex"
+    if not paper.is_file():
+        pytest.skip("the paper's text is not at hand")
+    text = words(paper.read_text())
+    for _, _, quotes, *_ in paper_rows():
+        for quote in re.findall(r'"([^"]+)"', quotes):
+            for part in re.split(r"\[[^\]]*\]", quote):
+                assert part.strip() in text, quote
+
+
 def test_commands_have_their_options(capsys: pytest.CaptureFixture[str]) -> None:
     known: dict[str, str] = {}
     for page in PAGES:

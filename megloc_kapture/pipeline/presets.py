@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from megloc_kapture.errors import OptionError, suggestion
 from megloc_kapture.io.weights import MissingWeightsError, all_missing
+from megloc_kapture.mapping.pairs import PairsByPosesOptions
 from megloc_kapture.mapping.uncertainty import UncertaintyOptions
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions
 from megloc_kapture.plugin_loading import load_plugin
@@ -29,13 +30,15 @@ from megloc_kapture.stages.global_features import GlobalFeaturesChoice
 from megloc_kapture.stages.image_pairs import MappingPairsOptions, RerankingOptions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
 from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
+from megloc_kapture.stages.pose_refinement import PoseRefinementOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
-from megloc_kapture.values import Options, listed
+from megloc_kapture.stages.query_poses import LocalizationOptions
+from megloc_kapture.values import Options
 
 OptionsT = TypeVar("OptionsT", bound=Options)
 
-# every step of the paper that needs nothing of the dataset; what hangs on it (masks, co-visibility,
-# sequences, weights for rooms) stands in benchmarks/*.toml, and docs/paper.md has all of them
+# the paper as printed; benchmarks/*.toml have the steps that depend on the dataset (masks,
+# co-visibility, sequences, indoor weights), docs/paper.md has a row for each
 _MEGLOC = PipelineOptions(
     # cameras without distortion stay as they are; enlarging: docs/experiments/preprocessing.md
     preprocessing=PreprocessingOptions(max_size_px=1600, upscale=True, undistort=True),
@@ -43,18 +46,22 @@ _MEGLOC = PipelineOptions(
         LocalFeaturesChoice(name="superpoint", matching=PluginChoice(name="superglue")),
         LocalFeaturesChoice(
             name="aslfeat",
-            # as its authors match it; which matcher MegLoc gave it, the paper does not say
+            # the paper does not name ASLFeat's matcher; this is its authors'
             matching=PluginChoice(name="nn", options={"max_ratio": 0.8}),
         ),
     ),
     global_features=tuple(
         GlobalFeaturesChoice(name=name) for name in ("netvlad", "delg", "apgem", "openibl")
     ),
-    mapping_pairs=MappingPairsOptions(by=("poses", "retrieval")),
+    mapping_pairs=MappingPairsOptions(
+        by=("poses", "retrieval"), poses=PairsByPosesOptions(max_angle_deg=180.0)
+    ),
     query_pairs=QueryPairsOptions(top_k=50),
-    reranking=RerankingOptions(by="coverage"),
-    guided_pyramid=GuidedPyramidOptions(mode="all"),
+    reranking=RerankingOptions(by="verified", local_type="superpoint"),
+    guided_pyramid=GuidedPyramidOptions(mode="all", count="matches", probed_pairs=None),
     refinement=MapRefinementOptions(uncertainty=UncertaintyOptions(max_robust_sigmas=2.5)),
+    localization=LocalizationOptions(rank=PluginChoice(name="inliers")),
+    pose_refinement=PoseRefinementOptions(references="cluster"),
 )
 # chosen by benchmarks/features.py among weights free for any use: docs/experiments/presets.md
 _MODERN = PipelineOptions(
@@ -232,7 +239,8 @@ def _merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:
         if isinstance(value, dict) and isinstance(present, dict):
             _merge(present, value)
         elif isinstance(value, dict) and isinstance(present, list | tuple | str):
-            tree[key] = _merged_choices(key, listed(present), value)
+            several = [present] if isinstance(present, str) else present
+            tree[key] = _merged_choices(key, several, value)
         else:
             tree[key] = value
 
@@ -249,7 +257,7 @@ def _merged_choices(
         {"name": one} if isinstance(one, str) else dict(one)
         for one in choices
         if isinstance(one, str | dict)
-    ] or [{}]
+    ]
     named = {one.get("name"): one for one in merged}
     if set(changes) <= set(named):
         for name, change in changes.items():

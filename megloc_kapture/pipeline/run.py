@@ -13,6 +13,7 @@ from typing import Any
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.dataset_tables import read_protocol
 from megloc_kapture.pipeline.datasets import (
+    EVERY_POSE,
     KAPTURE,
     TWIN_PREFIX,
     BenchmarkFile,
@@ -77,7 +78,7 @@ class Run:
         changes = self.benchmark.changes(
             self.preset, map_depth=self.facts.map_depth, query_depth=self.facts.query_depth
         )
-        of_preset = options_of_preset(self.preset)
+        of_preset = options_of_preset(self.preset, changes=[EVERY_POSE])
         of_file = options_of_preset(self.preset, changes=changes)
         layers = (_steps_of(one, self.facts) for one in (self.options, of_file, of_preset))
         return [_explained(self.preset, *each) for each in zip(*layers, strict=True)]
@@ -205,6 +206,12 @@ def _steps_of(options: PipelineOptions, facts: DatasetFacts) -> list[_Step]:
     rank = options.localization.rank
     pairs = options.mapping_pairs.by
     stereo = options.mvs.mode != "off"
+    pyramid = options.guided_pyramid
+    counted = "matches of the matcher" if pyramid.count == "matches" else "verified matches"
+    reranking = options.reranking
+    ranked_by = "coverage" if reranking.by == "coverage" else f"{reranking.by} matches"
+    if reranking.local_type:
+        ranked_by += f" of {reranking.local_type}"
 
     not_matched = no_uncertainty = ""
     if options.map == "lift":
@@ -300,14 +307,14 @@ def _steps_of(options: PipelineOptions, facts: DatasetFacts) -> list[_Step]:
         _Step(
             "M images retrieved, N kept by local matches",
             "reranking.by",
-            options.reranking.reranks(),
-            figures=f"M = {options.query_pairs.top_k}, N = {options.reranking.keep}",
+            reranking.reranks(),
+            figures=f"M = {options.query_pairs.top_k}, N = {reranking.keep}, by {ranked_by}",
         ),
         _Step(
             "guided pyramid matching",
             "guided_pyramid.mode",
             options.matches_again(),
-            figures=f"pairs with fewer than {options.guided_pyramid.min_matches} verified matches",
+            figures=f"pairs with fewer than {pyramid.min_matches} {counted}",
         ),
         _Step(
             "one pose per cluster of candidates",
@@ -316,12 +323,24 @@ def _steps_of(options: PipelineOptions, facts: DatasetFacts) -> list[_Step]:
             figures=f"by {options.localization.clusters.by}",
         ),
         _Step(
+            "clusters ranked by the number of inliers",
+            "localization.rank",
+            rank.name == "inliers",
+            figures="rank inliers",
+        ),
+        _Step(
             "clusters ranked by LPIPS of aligned views",
             "localization.rank",
             rank.name == "perceptual" and rank.options.get("distance", {}).get("name") == "lpips",
             "the paper's indoor strategy; the map images have no depth to make views of"
             if no_depth_to_render
             else "",
+        ),
+        _Step(
+            "references of the top-1 cluster only",
+            "pose_refinement.references",
+            options.pose_refinement.references == "cluster",
+            figures="" if refiners else "no pose is refined here",
         ),
         _Step(
             "poses refined by ICP",
@@ -336,9 +355,15 @@ def _steps_of(options: PipelineOptions, facts: DatasetFacts) -> list[_Step]:
             no_depth_to_render,
         ),
         _Step(
-            "rendering by a neural field (NeRF-W)",
+            "a map as a neural field (NeRF-W)",
             "pose_refinement.by",
             "field" in refiners,
             "" if "field" in refiners else "it needs a field of the map (megloc train-field)",
+        ),
+        _Step(
+            "every pose kept",
+            "localization.min_confidence",
+            options.localization.min_confidence == 0.0,
+            figures="min_confidence 0; the confidence is reported next to the pose",
         ),
     ]

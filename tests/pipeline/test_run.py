@@ -23,7 +23,7 @@ TRAINED = "descriptors and matcher trained anew"
 STEREO = "depth of map images by multi-view stereo"
 # on each dataset: stereo gains nothing that was shown, and the paper's weights are not public
 OFF_EVERYWHERE = {STEREO, TRAINED}
-WITHOUT_FIELD = "rendering by a neural field (NeRF-W)"
+WITHOUT_FIELD = "a map as a neural field (NeRF-W)"
 WITHOUT_DEPTH = {
     WITHOUT_FIELD,
     "points verified by depth",
@@ -31,6 +31,7 @@ WITHOUT_DEPTH = {
     "poses refined by ICP",
     "poses refined by rendering",
 }
+BY_INLIERS = "clusters ranked by the number of inliers"
 SEQUENCE, COVISIBLE = "map pairs by sequence", "map pairs by co-visibility"
 OFF = {
     "aachen": {*WITHOUT_DEPTH, "the own car masked", SEQUENCE},
@@ -46,6 +47,7 @@ OFF = {
         SEQUENCE,
         "points triangulated with known poses",
         "uncertain points rejected",
+        BY_INLIERS,
         "poses refined by ICP",
     },
     # nobody knows what is in a user's folders
@@ -55,6 +57,7 @@ OFF = {
         "the own car masked",
         COVISIBLE,
         SEQUENCE,
+        BY_INLIERS,
     },
 }
 
@@ -75,6 +78,12 @@ def test_the_preset_does_every_step_that_a_dataset_permits(dataset: str) -> None
     steps = steps_of(dataset, "megloc")
     assert {name for name, step in steps.items() if not step.on} == OFF[dataset] | OFF_EVERYWHERE
     assert all(step.why for step in steps.values())
+    # the paper's rules, each with the option that has it
+    kept = steps["M images retrieved, N kept by local matches"]
+    assert kept.why.endswith("by verified matches of superpoint")
+    assert "100 matches of the matcher" in steps["guided pyramid matching"].why
+    assert steps["references of the top-1 cluster only"].on
+    assert "min_confidence 0" in steps["every pose kept"].why
     # outdoors and indoors differ as the networks do
     network = {"inloc": "4 px, superglue_indoor", "kapture": ""}.get(
         dataset, "3 px, superglue_outdoor"
@@ -156,7 +165,7 @@ def test_all_weights_that_the_steps_need_are_named_at_once(
 def test_the_page_about_the_paper_has_every_step() -> None:
     page = (Path(__file__).parents[2] / "docs" / "paper.md").read_text(encoding="utf-8")
     for name in steps_of("aachen", "megloc"):
-        assert f"| {name} |" in page
+        assert f"| **{name}** |" in page
 
 
 def test_explaining_runs_nothing_and_needs_no_data(
