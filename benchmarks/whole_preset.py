@@ -76,9 +76,6 @@ sequence = {{ window = 1 }}
 [options.query_pairs]
 top_k = 8
 
-[options.reranking]
-keep = 5
-
 [options.guided_pyramid]
 min_matches = 30
 scales = [0.5, 1.0]
@@ -88,6 +85,9 @@ rotations_deg = [0, 90]
 by = {REFINERS}
 """
 _RANDOM = """
+[options.reranking]
+keep = 5
+
 [options.preprocessing]
 max_size_px = 304
 masks = { segmenter = { name = "deeplabv3plus" } }
@@ -109,6 +109,10 @@ name = "perceptual"
 options = { distance = { name = "lpips" } }
 """
 _FREE = """
+[options.reranking]
+keep = 5
+local_type = "xfeat"
+
 [options.preprocessing]
 max_size_px = 384
 
