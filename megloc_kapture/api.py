@@ -69,6 +69,11 @@ class Map:
         self.kapture_map, self.options = kapture_map, options
         self._localizers: dict[tuple[str, ...], Localizer] = {}
 
+    def __repr__(self) -> str:
+        own = self.kapture_map
+        types = ", ".join(own.stored_types())
+        return f"Map({str(own.folder.root)!r}: {len(own.images)} images, features {types})"
+
     def localizer(self, refine: str | Sequence[str] = ()) -> Localizer:
         """The localizer that :meth:`localize` uses, with these pose refiners; kept.
 
@@ -207,7 +212,7 @@ def _query_of(
     name, orientation = "query", 1
     permitted = None if prior is None else tuple(prior)
     if isinstance(image, Path):
-        name = str(image)
+        name = image.name  # as a list or a folder names it
         if camera is None:
             photo = read_photo(image)
             camera, orientation = photo.upright_camera, photo.orientation

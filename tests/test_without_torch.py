@@ -41,6 +41,29 @@ def test_a_network_says_what_to_install(environment: dict[str, str], scene: Path
     assert HINT in megloc(environment, "doctor").stdout
 
 
+def test_a_map_of_networks_serves_queries_that_bring_their_features(
+    environment: dict[str, str], shared_data: Path, tmp_path: Path
+) -> None:
+    gallery = shared_data / "foreign_maps" / "virtual_gallery"
+    queries = ("-i", gallery / "map", "--query", gallery / "query")
+    done = megloc(environment, "localize", *queries, "-o", tmp_path / "localized", "--quiet")
+    assert done.returncode == 0, done.stderr
+    result = ("-i", tmp_path / "localized", "--gt", gallery / "query_gt", "--thresholds", "0.05,5")
+    done = megloc(environment, "evaluate", *result)
+    assert "100.0" in done.stdout, done.stdout + done.stderr
+    opens = (
+        "import megloc_kapture as megloc\n"
+        f"m = megloc.open_map({str(gallery / 'map')!r})\n"
+        f"found = m.localize({str(gallery / 'query')!r})\n"
+        "assert len(found) == 4 and all(found.values()), dict(found)\n"
+        "from megloc_kapture.service.app import make_app\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", opens], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.slow
 def test_classic_runs(environment: dict[str, str], scene: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"

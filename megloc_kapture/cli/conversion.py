@@ -50,10 +50,10 @@ class Import(Common):
 
     Images are linked, not copied."""
 
-    dataset: tyro.conf.Positional[str]
+    dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
     """aachen, robotcar, 4seasons, inloc, kapture: any pair of kapture folders; colmap: a model;
     megadepth: to train on, DIR/SCENE each."""
-    root: tyro.conf.Positional[Path]
+    root: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ROOT")]
     """Folder of the dataset, laid out as it is published; of colmap the model (sparse/0), or the
     workspace around it."""
     output: Output

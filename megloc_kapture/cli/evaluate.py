@@ -105,7 +105,7 @@ class Evaluate(Common):
 class Submit(Common):
     """Write the pose file of a localized kapture folder, and its provenance beside it."""
 
-    dataset: tyro.conf.Positional[str]
+    dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
     """Dataset whose rules hold: aachen, robotcar, 4seasons, inloc, kapture, synthetic or a twin."""
     input: Input
     """Localized kapture folder."""
@@ -178,7 +178,7 @@ _RUNS = Path("runs")
 class Check(Common):
     """Check a pose file, ours or foreign, against the rules of its challenge and the map."""
 
-    dataset: tyro.conf.Positional[str]
+    dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
     """Dataset whose rules hold: aachen, robotcar, 4seasons, inloc, kapture, synthetic or a twin."""
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """Pose file; for 4seasons also the folder of all of them."""

@@ -20,6 +20,7 @@ import time
 import traceback
 import weakref
 from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
@@ -169,15 +170,29 @@ def one_line_errors(arguments: Sequence[str]) -> Iterator[None]:
             yield
     except SystemExit as end:
         if end.code:
-            print(f"megloc: {summary(drawn.getvalue())}", file=sys.stderr)
+            print(f"megloc: {summary(drawn.getvalue())}{_did_you_mean(arguments)}", file=sys.stderr)
         elif asks_help:
             print(examples_text(arguments))
         raise
     print(drawn.getvalue(), end="", file=sys.stderr)
 
 
+def _did_you_mean(arguments: Sequence[str]) -> str:
+    """A suggestion for a misspelt command or flag; empty where none is close."""
+    if not arguments or arguments[0] not in COMMANDS:
+        words, known = list(arguments[:1]), list(COMMANDS)
+    else:
+        names = getattr(command_class(arguments[0]), "__dataclass_fields__", {})
+        known = [f"--{name.replace('_', '-')}" for name in names]
+        words = [word.split("=")[0] for word in arguments if word.startswith("--")]
+    unknown = [word for word in words if word not in known]
+    close = [match for word in unknown for match in get_close_matches(word, known, n=1)]
+    return f"; did you mean {' '.join(close)}?" if close else ""
+
+
 def summary(drawn: str) -> str:
     """The text of a drawn box without its frame and what stands in it besides, on one line."""
+    drawn = drawn.replace("__tyro-dummy-inner__.", "")  # tyro's own name of our command
     first, *lines = _COLOUR.sub("", drawn).splitlines() or [""]
     # where standard output knows no more than ASCII, the frame is of blanks, with a rule
     if not (first.startswith("╭") or (lines and _RULE.fullmatch(lines[0].strip()))):

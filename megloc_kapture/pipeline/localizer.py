@@ -30,7 +30,7 @@ from megloc_kapture.pipeline.queries import (
     Unit,
 )
 from megloc_kapture.pipeline.query_folders import KaptureQueries
-from megloc_kapture.stages.devices import Precision, unheeded
+from megloc_kapture.stages.devices import Precision
 from megloc_kapture.stages.image_pairs import counted, rerank
 from megloc_kapture.stages.localized_folder import unreadable_image
 from megloc_kapture.stages.matches import FeatureCache, Features, VerifiedMatches
@@ -101,10 +101,6 @@ class Localizer:
         for local in self.types:
             local.prepare()
         self._retrieval = MapRetrieval(kapture_map, self.options, self.types, self._preprocessor)
-        choices = (one.choice for one in self._retrieval.known)
-        chosen = self.options, *choices, *(local.brought() for local in self.types)
-        if lacking := unheeded(chosen, self.options.device, self.options.precision):
-            raise OptionError(f"{lacking[0]} changes nothing: no network is chosen that has it")
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled it is its map's name and its options; another process makes it again, once."""
@@ -416,7 +412,7 @@ class _Matching:
 
 
 def _query_of(image: Path | str | NDArray[np.uint8], camera: Camera) -> Query:
-    return Query(camera, image, str(image) if isinstance(image, str | Path) else "query")
+    return Query(camera, image, Path(image).name if isinstance(image, str | Path) else "query")
 
 
 @lru_cache(maxsize=2)

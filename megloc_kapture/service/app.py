@@ -65,7 +65,7 @@ _STATUSES = {
     408: "the request came in too slowly",
     413: "too many bytes or pixels",
     415: "neither JPEG nor PNG",
-    422: "the image is broken, or its camera is missing, wrong, or of another size",
+    422: "the image is broken, or its camera is wrong, or of another size",
     429: "too many requests of this client; Retry-After says when",
     503: "too many images are waiting; Retry-After says when",
     504: "it took too long",
@@ -412,7 +412,12 @@ async def _image_of(request: Request, body: bytes) -> tuple[bytes, str | None]:
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != "multipart/form-data":
         if kind not in ("image/jpeg", "image/png", "application/octet-stream", ""):
-            raise HTTPException(415, "send a form with an image, or a JPEG or PNG as it is")
+            raise HTTPException(
+                415,
+                f"the header Content-Type says {kind}: send image/jpeg or image/png (curl -H "
+                "'Content-Type: image/jpeg' --data-binary @photo.jpg), or a form (curl -F "
+                "image=@photo.jpg)",
+            )
         return body, None
 
     async def whole() -> AsyncIterator[bytes]:

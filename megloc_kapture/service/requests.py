@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from megloc_kapture.errors import DataError, MeglocError
-from megloc_kapture.io.images import GUESS_DEVIATION, Photo, decode_image_rgb, photo_of
+from megloc_kapture.io.images import Photo, decode_image_rgb, photo_of
 from megloc_kapture.values import (
     CAMERA_MODEL_NUM_PARAMS,
     ONE_FOCAL_MODELS,
@@ -248,18 +248,15 @@ class Photograph:
             )
         return pixels
 
-    def exif(self) -> Photo | None:
-        """Camera and orientation by EXIF; None where it says no focal length, as a PNG's."""
-        if self.suffix != ".jpg":
-            return None
+    def header(self) -> Photo:
+        """Camera and orientation by EXIF; a guessed focal length where EXIF has none."""
         from PIL import Image
 
         try:
-            with Image.open(BytesIO(self.content), formats=["JPEG"]) as image:
-                found = photo_of(image)
+            with Image.open(BytesIO(self.content), formats=["JPEG", "PNG"]) as image:
+                return photo_of(image)
         except Exception as error:  # pillow raises many kinds on broken headers
             raise DataError("the image is broken: its header cannot be read") from error
-        return found if found.camera.focal_deviation < GUESS_DEVIATION else None
 
 
 def _png_size(content: bytes) -> tuple[int, int]:
@@ -425,12 +422,7 @@ def _finite(value: Any) -> Any:
 def camera_of(photograph: Photograph, camera: str | None) -> tuple[Camera, int]:
     """The camera, and how the pixels are to be turned before (1: not); raises DataError."""
     if not camera:
-        found = photograph.exif()
-        if found is None:
-            raise DataError(
-                "the camera is missing, and the image has no EXIF with a focal length: send "
-                "`camera`, JSON with model, width, height and params as COLMAP defines them"
-            )
+        found = photograph.header()
         return found.upright_camera, found.orientation
     given = read_camera(camera)
     if (given.width, given.height) != (photograph.width, photograph.height):

@@ -316,5 +316,3 @@ def test_a_localizer_is_told(world: Any) -> None:
     assert chosen.options == {"device": "cpu"}
     with pytest.raises(OptionError, match="give the device and the precision in the options"):
         Localizer(opened, options=options, device="cuda")
-    with pytest.raises(OptionError, match="device changes nothing: no network is chosen"):
-        Localizer(opened, device="cpu")
