@@ -66,7 +66,7 @@ WAYS: dict[str, GuidedPyramidOptions] = {
     "off": GuidedPyramidOptions(),
     "all": GuidedPyramidOptions(mode="all"),
     "max": GuidedPyramidOptions(mode="max"),
-    "all pairs": GuidedPyramidOptions(mode="all", probed_pairs=1_000_000),
+    "all pairs": GuidedPyramidOptions(mode="all", probed_pairs=None),
 }
 SETS: dict[str, GuidedPyramidOptions] = {
     "1/3 1/2 1 2 3, four turns": GuidedPyramidOptions(mode="all"),

@@ -65,7 +65,11 @@ class LocalFeatureExtractor(Protocol):
     def extract(
         self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
     ) -> LocalFeatures:
-        """Features of an RGB image, uint8 (H, W, 3); none on False pixels of the mask (H, W)."""
+        """Features of an RGB image, uint8 (H, W, 3); none on False pixels of the mask (H, W).
+
+        Raises DataError where it refuses an image, for example one that is too small: guided
+        pyramid matching then does without that scale.
+        """
         ...
 
 
