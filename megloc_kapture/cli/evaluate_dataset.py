@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from megloc_kapture.cli.common import Console, Deciding, Overwrite, Working
+from megloc_kapture.cli.common import Console, Deciding, Overwrite, Texts, Working
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.document import REPORT_HTML
@@ -27,6 +27,7 @@ from megloc_kapture.pipeline.evaluation_plan import (
     write_outcomes,
 )
 from megloc_kapture.pipeline.plan import all_kept, run_plan
+from megloc_kapture.pipeline.presets import assigned
 from megloc_kapture.pipeline.run import choose_run, steps_text
 from megloc_kapture.pipeline.submission import FOLDER, keep_submission
 from megloc_kapture.pipeline.workspace import Workspace
@@ -51,6 +52,9 @@ class Eval(Deciding, Working):
     submissions: Path | None = None
     """Folder that gets a copy of the pose file and its provenance, and overwrites none of another
     result; submissions/ unless --workspace is given."""
+    import_option: Texts = ()
+    """An option of the dataset, as megloc import --set takes it: key=value (version=1.0,
+    location_prior=false); may be repeated."""
     config: Path | None = None
     """A benchmark file (TOML) with this dataset's options, instead of the one that we bring."""
     thresholds: tuple[str, ...] = ()
@@ -82,6 +86,7 @@ class Eval(Deciding, Working):
             self.root,
             preset=self.preset,
             assignments=self.assignments(),
+            import_options=assigned(self.import_option, flag="--import-option"),
             config=self.config,
             query_prefix=self.query_prefix,
             allow_missing=self.allow_missing,

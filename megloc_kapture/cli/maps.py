@@ -106,7 +106,9 @@ class RefineMap(Reading, StageCommand):
         options = self.options(changes).refinement
         source = self.kapture_map(self.input)
         with self.staged(self.output, MAP, force=self.force) as (out, work):
-            refine_map(source, out, options, work=work)
+            refine_map(
+                source, out, options, restrictions=restrictions_beside(source.root), work=work
+            )
         for row in report_lines(self.output):
             console.say(row)
 

@@ -111,6 +111,25 @@ def tell_of_truth_without_query(folder: Path, images: Sequence[str]) -> None:
     _log.warning(said, folder, len(images), images[0])
 
 
+def checked_folders(root: Path, query_prefix: str = "") -> tuple[KaptureFolder, KaptureFolder]:
+    """The map's and the queries' folder, checked; see :func:`import_kapture_folders`."""
+    root = check_root(root)
+    mapping, query = KaptureFolder(root / MAPPING), KaptureFolder(root / QUERY)
+    map_names, query_names = set(mapping.read().image_names()), query.read().image_names()
+    check_images(mapping)
+    _map_poses(mapping)
+    if not query_names:
+        raise DataError("there are no query images", path=query.root)
+    shared = sorted(map_names & set(map(prefixed(query_prefix), query_names)))
+    if shared:
+        raise DataError(
+            f"{len(shared)} images have the same name in map and query, the first is "
+            f"{shared[0]}; give the queries a folder of their own with --query-prefix",
+            path=root,
+        )
+    return mapping, query
+
+
 def import_kapture_folders(
     root: Path,
     output: Path,
@@ -134,21 +153,8 @@ def import_kapture_folders(
     ------
     DataError : something is missing or broken, or map and queries share names.
     """
-    root = check_root(root)
-    mapping, query = KaptureFolder(root / MAPPING), KaptureFolder(root / QUERY)
-    map_data, query_data = mapping.read(), query.read()
-    check_images(mapping)
-    poses = _map_poses(mapping)
-    if not query_data.records_camera:
-        raise DataError("there are no query images", path=query.root)
-    rename = prefixed(query_prefix)
-    shared = sorted(set(map_data.image_names()) & {rename(n) for n in query_data.image_names()})
-    if shared:
-        raise DataError(
-            f"{len(shared)} images have the same name in map and query, the first is "
-            f"{shared[0]}; give the queries a folder of their own with --query-prefix",
-            path=root,
-        )
+    mapping, query = checked_folders(root, query_prefix)
+    map_data, query_data, rename = mapping.read(), query.read(), prefixed(query_prefix)
     write_sensors(output / MAPPING, map_data)
     link_images(mapping.root, output / MAPPING)
     # a query folder with poses in it must not let a stage see them
@@ -170,7 +176,7 @@ def import_kapture_folders(
     write_side_tables(output / SIDE_TABLES, tables)
     return {
         "map_images": len(map_data.image_names()),
-        "map_images_with_pose": len(poses),
+        "map_images_with_pose": len(map_data.poses()),
         "queries": len(query_data.image_names()),
         "queries_with_truth": truth,
     }

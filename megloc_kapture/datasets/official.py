@@ -152,14 +152,13 @@ class OfficialDataset(SideTables):
     write_more: Callable[[Path], None] | None = None
 
 
-def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: bool = False) -> None:
-    """Write a dataset below ``output``: mapping/, query/, query_gt/ and megloc/.
+def check_official(dataset: OfficialDataset, *, allow_missing: bool = False) -> None:
+    """Check that a dataset is complete enough to be written.
 
     Raises
     ------
     DataError : files are missing and that was not allowed, nothing is left of the map (or of the
         queries, where nothing may be missing), or map and queries share names.
-    OutputError : something cannot be written.
     """
     if dataset.missing is not None and not allow_missing:
         dataset.missing.refuse()
@@ -171,6 +170,17 @@ def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: boo
     shared = set(dataset.mapping.image_names()) & set(dataset.query.image_names())
     if shared:
         raise DataError(f"image {min(shared)!r} is in the map and a query", path=root)
+
+
+def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: bool = False) -> None:
+    """Write a dataset below ``output``: mapping/, query/, query_gt/ and megloc/.
+
+    Raises
+    ------
+    DataError : see :func:`check_official`.
+    OutputError : something cannot be written.
+    """
+    check_official(dataset, allow_missing=allow_missing)
     for part, data in ((MAPPING, dataset.mapping), (QUERY, dataset.query)):
         write_sensors(output / part, data)
         link_records(output / part, dataset.links)

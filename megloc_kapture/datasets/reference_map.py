@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -36,6 +36,13 @@ class ReferenceModel:
 
     read: Callable[[], tuple[Sequence[str], SparsePoints]]
     database: Path | None
+
+
+def check_model_files(files: Iterable[Path]) -> None:
+    """Raise DataError where a file of the model that a dataset comes with is missing."""
+    for file in files:
+        if not file.is_file():
+            raise DataError("missing; the reference model is read from it", path=file)
 
 
 def write_reference_map(

@@ -233,10 +233,36 @@ def contradicted_by_depth(
     Masks (N,): contradicted, never where there is no depth; and where there is depth to compare
         with.
     """
+    own = 0.0 if deviations is None else np.nan_to_num(deviations) * options.keypoint_noise_px
+    before, behind, checked = compare_with_depth(
+        points_in_image, depth_m, depth_camera, image_from_depth, options, own
+    )
+    return before | behind, checked
+
+
+def compare_with_depth(
+    points_in_image: Floats,
+    depth_m: NDArray[np.float32],
+    depth_camera: Camera,
+    image_from_depth: RigidTransform,
+    options: DepthVerificationOptions,
+    sigmas: Floats | float,
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Compare points with the surface of a depth map; see :func:`contradicted_by_depth`.
+
+    Parameters
+    ----------
+    sigmas : float64 (N,) or one for all, standard deviations of the points, metres.
+
+    Returns
+    -------
+    Masks (N,): clearly before the surface, which the camera then sees through the point; clearly
+        behind it, hidden; and where there is depth to compare with.
+    """
     points = image_from_depth.inverse().apply(np.asarray(points_in_image, np.float64))
-    contradicted, checked = np.zeros(len(points), bool), np.zeros(len(points), bool)
+    before, behind, checked = np.zeros((3, len(points)), bool)
     if options.max_sigmas is None or not len(points):
-        return contradicted, checked
+        return before, behind, checked
     height, width = depth_m.shape
     pixels = px_from_cam(depth_camera, points)
     with np.errstate(invalid="ignore"):
@@ -253,12 +279,12 @@ def contradicted_by_depth(
     whole = known.all(axis=1)
     rows, window = rows[whole], window[whole]
     z, low, high = points[rows, 2], window.min(axis=1), window.max(axis=1)
-    own = np.zeros(len(rows)) if deviations is None else np.nan_to_num(deviations[rows])
-    own = own * options.keypoint_noise_px
-    checked[rows] = True
+    own = np.broadcast_to(sigmas, len(points))[rows]
     below, above = (
         options.max_sigmas * np.hypot(depth_noise(depth, options.noise), own)
         for depth in (low, high)
     )
-    contradicted[rows] = (z < low - below) | (z > high + above)
-    return contradicted, checked
+    checked[rows] = True
+    before[rows] = z < low - below
+    behind[rows] = z > high + above
+    return before, behind, checked

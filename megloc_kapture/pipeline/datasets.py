@@ -23,11 +23,12 @@ from megloc_kapture.datasets.kapture_folders import (
     QUERY,
     QUERY_GT,
     check_root,
+    checked_folders,
     import_kapture_folders,
     input_files,
 )
-from megloc_kapture.datasets.official import OfficialDataset, write_official
-from megloc_kapture.errors import DataError, OptionError, PluginError, suggestion
+from megloc_kapture.datasets.official import OfficialDataset, check_official, write_official
+from megloc_kapture.errors import DataError, MeglocError, OptionError, PluginError, suggestion
 from megloc_kapture.evaluation.protocols import TWIN_PREFIX as TWIN_PREFIX
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol
 from megloc_kapture.io.files import write_bytes
@@ -116,6 +117,17 @@ class DatasetChoice:
     def input_files(self, root: Path) -> Iterator[Path]:
         """Every file an import depends on."""
         return input_files(root) if self.adapter is None else self.adapter.input_files(root)
+
+    def rehearse(self) -> None:
+        """Raise what an import of the root would refuse; nothing is written."""
+        if self.root is None:
+            return
+        root = self.root.resolve()
+        if self.adapter is None:
+            checked_folders(root, self.query_prefix)
+        else:
+            dataset: OfficialDataset = self.adapter.read(root, allow_missing=self.allow_missing)
+            check_official(dataset, allow_missing=self.allow_missing)
 
     def import_to(
         self, root: Path, output: Path, change: ProtocolChange | None = None
@@ -237,6 +249,17 @@ def with_model(choice: DatasetChoice, *, features: bool = False) -> DatasetChoic
     if twin is not None and features:
         twin = twin_of(layout, **{**twin.options.model_dump(), "model_features": True})
     return replace(choice, adapter=adapter, import_options=options, twin=twin)
+
+
+def has_model(choice: DatasetChoice) -> bool:
+    """Whether the data have the model of points that the dataset comes with."""
+    found = with_model(choice)
+    try:
+        if found is not None:
+            found.check()
+    except MeglocError:  # :meth:`DatasetChoice.check` passes without the model
+        return False
+    return found is not None
 
 
 def _root_in_environment(name: str, adapter: DatasetAdapter | None) -> Path:

@@ -78,18 +78,18 @@ def plan_evaluation(run: Run) -> list[Stage]:
     MeglocError : the dataset or the options cannot be used; nothing has been written by then.
     """
     options = run.options
+    given = options.uses_given_map()
+    if given or options.pairs_by_points():
+        run = replace(run, source=_with_model(run, given))
+    run.source.check()
     check_weights(options)
     options.reranking.counted_types(options.local_types())
     options.retrieval()
-    given = options.uses_given_map()
     if given and options.changes_frames():
         raise OptionError(
             f"map = {options.map}: the given map's keypoints are in the original images; "
             "pre-processing may mask them, but not resize or undistort"
         )
-    if given or options.pairs_by_points():
-        run = replace(run, source=_with_model(run, given))
-    run.source.check()
     stages: list[Stage] = [Render(run)] if run.source.twin is not None else []
     stages.append(Import(run))
     stages += wanted_stages(PIPELINE, options)
@@ -177,6 +177,9 @@ class Import(_RunStage):
         root = source.root.resolve()
         content = hashes.of_files(root, source.input_files(root))
         return {"dataset files": content, "dataset root": str(root)}
+
+    def check(self) -> None:
+        self._run.source.rehearse()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         source = self._run.source

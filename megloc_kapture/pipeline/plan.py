@@ -113,6 +113,7 @@ def run_plan(
             outputs[stage.name] = made.output
             report = StageReport(stage.name, "kept", made.seconds, made.counts, "")
         elif dry_run:
+            stage.check()
             same = made is not None and made.fingerprint == due.mark
             outputs[stage.name] = made.output if made is not None and same else due.mark
             report = StageReport(stage.name, "pending", 0.0, {}, why)

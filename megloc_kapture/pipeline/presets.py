@@ -158,7 +158,9 @@ def _validated(model: type[OptionsT], tree: Mapping[str, Any]) -> OptionsT:
         raise OptionError(f"option {where}: {first['msg']}") from error
 
 
-def assigned(assignments: Sequence[str] | Mapping[str, Any]) -> dict[str, Any]:
+def assigned(
+    assignments: Sequence[str] | Mapping[str, Any], *, flag: str = "--set"
+) -> dict[str, Any]:
     """Nested tables of ``key.key=value`` texts, or of ``key.key`` to values.
 
     Raises
@@ -166,7 +168,8 @@ def assigned(assignments: Sequence[str] | Mapping[str, Any]) -> dict[str, Any]:
     OptionError : a text that is none.
     """
     tree: dict[str, Any] = {}
-    pairs = assignments.items() if isinstance(assignments, Mapping) else map(_typed, assignments)
+    typed = partial(_typed, flag=flag)
+    pairs = assignments.items() if isinstance(assignments, Mapping) else map(typed, assignments)
     for key, value in pairs:
         nested: Any = value
         for part in reversed(key.split(".")):
@@ -175,11 +178,11 @@ def assigned(assignments: Sequence[str] | Mapping[str, Any]) -> dict[str, Any]:
     return tree
 
 
-def _typed(assignment: str) -> tuple[str, Any]:
+def _typed(assignment: str, flag: str) -> tuple[str, Any]:
     """Key and value of ``key=value``: a TOML value, or the text itself where it is none."""
     key, equals, text = assignment.partition("=")
     if not equals or not key:
-        raise OptionError(f"--set takes key=value, got {assignment!r}")
+        raise OptionError(f"{flag} takes key=value, got {assignment!r}")
     key, text = key.strip(), text.strip()
     if text.lower() in ("none", "null") and text != "none":  # which is a choice of some options
         return key, None

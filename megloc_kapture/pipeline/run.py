@@ -5,6 +5,7 @@ Peng et al., MegLoc, arXiv 2111.13063; docs/paper.md has the same steps with the
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,12 +21,14 @@ from megloc_kapture.pipeline.datasets import (
     DatasetChoice,
     choose_dataset,
     find_benchmark,
+    has_model,
     read_benchmark,
-    with_model,
 )
-from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.presets import assigned, options_of_preset
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.stage import SUBMISSIONS
+
+_log = logging.getLogger(__name__)
 
 RETRIEVAL = frozenset({"netvlad", "delg", "apgem", "openibl"})
 
@@ -80,7 +83,8 @@ class Run:
         )
         of_preset = options_of_preset(self.preset, changes=[EVERY_POSE])
         of_file = options_of_preset(self.preset, changes=changes)
-        layers = (_steps_of(one, self.facts) for one in (self.options, of_file, of_preset))
+        wanted = (self.options, *(_permitted(one, self.facts) for one in (of_file, of_preset)))
+        layers = (_steps_of(one, self.facts) for one in wanted)
         return [_explained(self.preset, *each) for each in zip(*layers, strict=True)]
 
     def submission_below(self, folder: Path, tables: Path) -> Path:
@@ -108,6 +112,7 @@ def choose_run(
     *,
     preset: str | None = None,
     assignments: Sequence[str] | Mapping[str, Any] = (),
+    import_options: Mapping[str, Any] | None = None,
     config: Path | None = None,
     query_prefix: str = "",
     allow_missing: bool = False,
@@ -120,6 +125,7 @@ def choose_run(
     root : folder of the dataset as it is published; looked for below MEGLOC_DATA unless given.
     preset : that of the benchmark file unless given.
     assignments : what a user changes: ``key.key=value`` texts, or ``key.key`` to values.
+    import_options : options of the dataset, after those of the benchmark file.
     config : a benchmark file instead of the one that we bring.
     find_root : false: an official dataset may be without a root; it cannot be imported then.
 
@@ -136,18 +142,30 @@ def choose_run(
     source = choose_dataset(
         dataset,
         root,
-        import_options=benchmark.import_options_of(preset),
+        import_options=benchmark.import_options_of(preset) | dict(import_options or {}),
         query_prefix=query_prefix,
         allow_missing=allow_missing,
         find_root=find_root,
     )
     source.check()
-    facts = DatasetFacts(
-        source.has_map_depth(), source.has_query_depth(), with_model(source) is not None
-    )
+    facts = DatasetFacts(source.has_map_depth(), source.has_query_depth(), has_model(source))
     changes = benchmark.changes(preset, map_depth=facts.map_depth, query_depth=facts.query_depth)
     options = options_of_preset(preset, changes=changes, assignments=assignments)
+    if "by" not in assigned(assignments).get("mapping_pairs", {}):
+        permitted = _permitted(options, facts)
+        if permitted != options:
+            _log.warning("no reference model in this data: no map pairs by co-visibility")
+        options = permitted
     return Run(source, preset, options, benchmark, facts)
+
+
+def _permitted(options: PipelineOptions, facts: DatasetFacts) -> PipelineOptions:
+    """Options without pairs by co-visibility where the data have no model to see it in."""
+    others = tuple(method for method in options.mapping_pairs.by if method != "covisibility")
+    if facts.model or not others or not options.pairs_by_points():
+        return options
+    pairs = options.mapping_pairs.model_copy(update={"by": others})
+    return options.model_copy(update={"mapping_pairs": pairs})
 
 
 def steps_text(steps: Sequence[PaperStep]) -> str:

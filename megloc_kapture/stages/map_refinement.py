@@ -8,7 +8,7 @@ in ``reconstruction/point_covariances.npy``.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.files import link_images, write_json_model
 from megloc_kapture.io.kapture import (
     FeatureReader,
@@ -30,7 +34,12 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.io.kapture.points import write_point_covariances
-from megloc_kapture.mapping.depth import DepthVerificationOptions, contradicted_by_depth
+from megloc_kapture.mapping.depth import (
+    DepthVerificationOptions,
+    compare_with_depth,
+    contradicted_by_depth,
+    depth_noise,
+)
 from megloc_kapture.mapping.map_check import ObservedKeypoints, find_pixel_origin
 from megloc_kapture.mapping.uncertainty import (
     ConsistencyOptions,
@@ -45,13 +54,17 @@ from megloc_kapture.mapping.uncertainty import (
     too_uncertain,
     track_lengths,
 )
+from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.given_map import copy_features
 from megloc_kapture.stages.scene import DepthRecord, depth_records, read_depth
 from megloc_kapture.stages.stage import UNREFINED, Layout, PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
-from megloc_kapture.values import Options
+from megloc_kapture.values import Options, RigidTransform
 
 _SAMPLED_IMAGES = 50
+# images with one centre are one scan; a lifted point is compared with the scans nearest to its own
+_SAME_CENTRE_M = 1e-3
+_NEIGHBOURING_SCANS = 10
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -279,6 +292,7 @@ def refine_map(
     output: Path,
     options: MapRefinementOptions,
     *,
+    restrictions: Restrictions = UNRESTRICTED,
     link_features: bool = False,
     work: Work = HERE,
 ) -> dict[str, float]:
@@ -286,6 +300,7 @@ def refine_map(
 
     Points of any keypoints type, renumbered without gaps, and of several at once. Observations by
     images without a pose cannot be judged; they stay as long as their point does.
+    ``restrictions``: the coordinate frames of the images, which are never compared.
     ``link_features``: the features in the source's own folder may become hard links (they are a map
     of ours, not somebody's data); those beside it always do. Returns counts for the log: points and
     observations after, and what each filter removed. Raises DataError: no points, or something
@@ -298,7 +313,7 @@ def refine_map(
         )
     selection = MapSelection(source, options.min_observations)
     before = selection.covariances() if options.ply else None
-    _verify_depth(selection, options.depth, work)
+    _verify_depth(selection, options.depth, restrictions, work)
     _check_consistency(selection, options.consistency)
     _reject_uncertain(selection, options.uncertainty)
     kept = selection.kept_points
@@ -326,12 +341,24 @@ def refine_map(
         "observations": report.observations_after,
     }
     for removed in report.filters:
+        counts[f"checked_by_{removed.name}"] = removed.checked
         counts[f"points_removed_by_{removed.name}"] = removed.points
         counts[f"observations_removed_by_{removed.name}"] = removed.observations
     return counts
 
 
-def _verify_depth(selection: MapSelection, options: DepthVerificationOptions, work: Work) -> None:
+def _verify_depth(
+    selection: MapSelection,
+    options: DepthVerificationOptions,
+    restrictions: Restrictions,
+    work: Work,
+) -> None:
+    """Compare points with the depth of the images that see them.
+
+    A point that was lifted agrees with the depth it comes from, so it is compared with that of
+    other scans: more of them must see through it than have a surface there. Points that one image
+    alone sees, which has depth, count as lifted.
+    """
     records = depth_records(selection.data) if options.max_sigmas is not None else {}
     folder = selection.source
     with_depth = {
@@ -343,7 +370,13 @@ def _verify_depth(selection: MapSelection, options: DepthVerificationOptions, wo
         return
     covariances = selection.covariances()
     observed, placed = selection.observed()
-    rows_of = [(image, rows) for image, rows in observed.by_image() if image in with_depth]
+    once = track_lengths(observed)[observed.point_ids] == 1
+    lifted = once & np.isin(observed.image_ids, list(with_depth))
+    rows_of = [
+        (image, chosen)
+        for image, rows in observed.by_image()
+        if image in with_depth and len(chosen := rows[~lifted[rows]])
+    ]
 
     def job(image: int, rows: NDArray[np.int64]) -> _DepthJob:
         points, depth = observed.point_ids[rows], with_depth[image]
@@ -360,7 +393,113 @@ def _verify_depth(selection: MapSelection, options: DepthVerificationOptions, wo
     for (_, rows), (contradicted, checked) in zip(rows_of, results, strict=True):
         dropped[placed[rows[contradicted]]] = True
         num_checked += checked
+    if lifted.any():
+        scans = _scans(selection, with_depth, restrictions)
+        rows = np.flatnonzero(lifted)
+        votes, judged = _votes_of_other_scans(
+            observed, rows, scans, FolderSpec(folder), options, work
+        )
+        dropped[placed[rows[votes < 0]]] = True
+        num_checked += int(judged.sum())
     selection.drop_observations("depth", dropped, num_checked)
+
+
+# an image's depth, and its pose
+_DepthView = tuple[DepthRecord, RigidTransform]
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """Depth maps of one centre by their images, and the numbers of the nearest other scans."""
+
+    views: Mapping[int, _DepthView]
+    neighbours: frozenset[int]
+
+
+def _scans(
+    selection: MapSelection, with_depth: Mapping[int, DepthRecord], restrictions: Restrictions
+) -> list[_Scan]:
+    """The scans of the images with depth, by their rows in the selection."""
+    poses = selection.data.poses()
+    images = [row for row in with_depth if selection.images[row] in poses]
+    scans: list[_Scan] = []
+    for members in restrictions.frames([selection.images[row] for row in images]):
+        rows = [images[member] for member in members]
+        cams = [poses[selection.images[row]] for row in rows]
+        centres = np.array([cam.center() for cam in cams])
+        pairs = cKDTree(centres).query_pairs(_SAME_CENTRE_M, output_type="ndarray")
+        links = csr_array((np.ones(len(pairs)), pairs.T), shape=(len(rows), len(rows)))
+        count, scan_of = connected_components(links, directed=False)
+        views: list[dict[int, _DepthView]] = [{} for _ in range(count)]
+        for scan, row, cam in zip(scan_of.tolist(), rows, cams, strict=True):
+            views[scan][row] = with_depth[row], cam
+        centres = centres[np.unique(scan_of, return_index=True)[1]]
+        # the nearest scan is the scan itself
+        nearest = range(1, min(_NEIGHBOURING_SCANS + 1, count) + 1)
+        found = cKDTree(centres).query(centres, k=nearest)[1] + len(scans)
+        scans += [
+            _Scan(own, frozenset(others) - {len(scans) + number})
+            for number, (own, others) in enumerate(zip(views, found.tolist(), strict=True))
+        ]
+    return scans
+
+
+def _votes_of_other_scans(
+    observed: ObservedPoints,
+    lifted: NDArray[np.int64],
+    scans: Sequence[_Scan],
+    folder: FolderSpec,
+    options: DepthVerificationOptions,
+    work: Work,
+) -> tuple[NDArray[np.int64], Mask]:
+    """Of lifted points, by rows (L,) of their observations: how many more of the scans near theirs
+    have a surface there than see through them, and which points a scan could judge."""
+    scan_of = np.full(len(observed.cameras), -1)
+    for number, scan in enumerate(scans):
+        scan_of[list(scan.views)] = number
+    own = scan_of[observed.image_ids[lifted]]
+    order = np.argsort(own, kind="stable")
+    of_scan = np.split(order, np.searchsorted(own[order], np.arange(1, len(scans))))
+    members: list[list[NDArray[np.int64]]] = [[] for _ in scans]
+    for rows, scan in zip(of_scan, scans, strict=True):
+        for other in scan.neighbours:
+            members[other].append(rows)
+    asked = [(scan, np.concatenate(of)) for scan, of in zip(scans, members, strict=True) if of]
+    points = observed.point_ids[lifted]
+    sigmas = depth_noise(mean_depths(observed)[points], options.noise)
+    jobs = (
+        (list(scan.views.values()), observed.xyz[points[rows]], sigmas[rows])
+        for scan, rows in asked
+    )
+    judge = partial(_judge, folder, options)
+    votes, judged = np.zeros(len(lifted), np.int64), np.zeros(len(lifted), bool)
+    results = work.map(judge, jobs, "depth of other scans", len(asked))
+    for (_, rows), (through, there) in zip(asked, results, strict=True):
+        votes[rows] += there.astype(np.int64) - through
+        judged[rows] |= there | through
+    return votes, judged
+
+
+def _judge(
+    folder: FolderSpec,
+    options: DepthVerificationOptions,
+    job: tuple[list[_DepthView], Floats, Floats],
+) -> tuple[Mask, Mask]:
+    """Masks (N,) of the points that a scan sees through, and of those on its surface."""
+    views, xyz, sigmas = job
+    through, there = np.zeros((2, len(xyz)), dtype=bool)
+    for record, cam_from_world in views:
+        before, behind, checked = compare_with_depth(
+            cam_from_world.apply(xyz),
+            read_depth(folder.open(), record),
+            record.camera,
+            record.image_from_depth,
+            options,
+            sigmas,
+        )
+        through |= before
+        there |= checked & ~before & ~behind
+    return through & ~there, there
 
 
 # of an image: its depth, points (N, 3) in its frame, their deviations (N,) along the depth's axis
@@ -439,11 +578,18 @@ class RefineMap(PipelineStage):
     """Take out of the map what its images or their depth contradict, and what is uncertain."""
 
     name = "map"
-    version = 2
+    version = 3
     uses = ("refinement",)
-    inputs = (UNREFINED,)
+    inputs = (UNREFINED, SIDE_TABLES)
     outputs = (Layout.sparse_map,)
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         folder, out = work.folder(UNREFINED), work.out / self.layout.sparse_map()
-        return refine_map(folder, out, self.options.refinement, link_features=True, work=work)
+        return refine_map(
+            folder,
+            out,
+            self.options.refinement,
+            restrictions=Restrictions.read(work.path(SIDE_TABLES)),
+            link_features=True,
+            work=work,
+        )

@@ -195,6 +195,9 @@ class Stage(ABC):
         # mypy does not take a class for something that can be hashed
         return {name: code_of(kind) for name, kind in names.items()}  # type: ignore[arg-type]
 
+    def check(self) -> None:  # noqa: B027  # most stages read only what others write
+        """Raise what :meth:`run` would refuse, as far as that shows quickly; for dry runs."""
+
     @abstractmethod
     def run(self, work: StageWork) -> Mapping[str, float]:
         """Write the outputs; returns counts for the log.

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from aachen_files import write_v1_0
 
 from megloc_kapture.io.images import write_depth_map, write_image
 from megloc_kapture.io.kapture import KaptureFolder, Sensor, read_pairs, write_sensors
@@ -222,6 +223,26 @@ def test_a_changed_image_reruns_everything_and_a_touched_one_nothing(
 
 
 # ------------------------------------------------------------------ parts of a run
+
+
+def test_a_dry_run_refuses_what_the_import_would(
+    evaluate: Any, dataset: Path, tmp_path: Path
+) -> None:
+    image = dataset / "mapping/sensors/records_data/0005.jpg"
+    write_image(image, np.zeros((4, 4, 3), np.uint8))
+    dry, real = (
+        evaluate(dataset, tmp_path / "run", flag, *until, status=2).err.splitlines()[-1]
+        for flag, *until in (("--dry-run",), ("--until", "import"))
+    )
+    assert dry == real and "0005.jpg: the image is 4x4" in dry
+
+
+def test_import_options_are_those_of_the_dataset(megloc: Any, tmp_path: Path) -> None:
+    version = ("--root", write_v1_0(tmp_path / "root"), "--import-option", "version=1.1")
+    done = megloc("eval", "aachen", *version, "-w", tmp_path / "run", "--dry-run")
+    assert done.status == 2 and "the model of Aachen Day-Night v1.1 is missing" in done.err
+    done = megloc("eval", "aachen", "--root", tmp_path / "root", "--import-option", "version")
+    assert done.status == 2 and "--import-option takes key=value" in done.err
 
 
 def test_queries_with_depth_are_refined_and_others_are_not(

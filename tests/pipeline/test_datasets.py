@@ -107,7 +107,7 @@ def test_the_root_is_found_below_the_environment(
 def test_what_cannot_be_is_refused() -> None:
     with pytest.raises(OptionError, match="unknown dataset 'venice'; known: kapture, "):
         choose_dataset("venice", None)
-    with pytest.raises(PluginError, match="refuses its options: colour"):
+    with pytest.raises(PluginError, match="colour: unknown option; known: version"):
         choose_dataset("aachen", Path(), import_options={"colour": "red"})
     with pytest.raises(OptionError, match="kapture has no import options: version"):
         choose_dataset("kapture", Path(), import_options={"version": "1.0"})
@@ -143,7 +143,11 @@ def test_an_import_leaves_a_summary_and_takes_a_changed_protocol(tmp_path: Path)
     choice.check()
     with pytest.raises(DataError, match="1 files are missing: 2.jpg; --allow-missing"):
         choice.import_to(root, tmp_path / "out")
+    with pytest.raises(DataError, match="1 files are missing: 2.jpg; --allow-missing"):
+        choice.rehearse()
     choice = DatasetChoice("toy", root, Toy(), allow_missing=True)
+    choice.rehearse()
+    assert not (tmp_path / "out").exists()
     counts = choice.import_to(
         root, tmp_path / "out", lambda given: given.model_copy(update={"truth": "mine"})
     )

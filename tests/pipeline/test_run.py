@@ -5,12 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from aachen_files import write_v1_0, write_v1_1
+from kapture_forms import aachen_with_kapture
 
 from megloc_kapture.cli.main import main
+from megloc_kapture.errors import MeglocError
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.pipeline.datasets import DatasetChoice, find_benchmark
+from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
 from megloc_kapture.pipeline.presets import check_weights, options_of_preset
-from megloc_kapture.pipeline.run import DatasetFacts, PaperStep, Run, steps_text
+from megloc_kapture.pipeline.run import DatasetFacts, PaperStep, Run, choose_run, steps_text
 
 FACTS = {
     "aachen": DatasetFacts(map_depth=False, query_depth=False, model=True),
@@ -19,6 +23,7 @@ FACTS = {
     "inloc": DatasetFacts(map_depth=True, query_depth=False, model=False),
     "kapture": DatasetFacts(map_depth=True, query_depth=True, model=False),
 }
+MISSING = "3D-models/aachen_v_1_1/points3D.txt: missing"
 TRAINED = "descriptors and matcher trained anew"
 STEREO = "depth of map images by multi-view stereo"
 # on each dataset: stereo gains nothing that was shown, and the paper's weights are not public
@@ -142,6 +147,26 @@ def test_who_turned_a_step_on_is_said() -> None:
     asked = steps_of("aachen", "classic", 'pose_refinement.by=["icp"]')
     assert asked[icp] == PaperStep(icp, False, "the queries have no depth")
     assert steps_of("kapture", "classic")[icp].on
+
+
+def test_pairs_by_covisibility_are_off_where_the_data_have_no_model(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("MEGLOC_WEIGHTS", str(tmp_path / "none"))
+    official = write_v1_1(write_v1_0(tmp_path / "official"))
+    whole = choose_run("aachen", official, preset="megloc")
+    assert "covisibility" in whole.options.mapping_pairs.by
+    kapture = aachen_with_kapture(official, tmp_path / "kapture")
+    (official / "3D-models" / "aachen_v_1_1" / "points3D.txt").unlink()
+    for root, error in ((kapture, "has kapture folders"), (official, MISSING)):
+        run = choose_run("aachen", root, preset="megloc")
+        assert run.options.mapping_pairs.by == ("poses", "retrieval")
+        step = {one.name: one for one in run.steps()}[COVISIBLE]
+        assert not step.on and step.why.startswith("the dataset comes with no model")
+        # one that is asked for by hand is refused before any weights are asked for
+        typed = ['mapping_pairs.by=["covisibility"]']
+        with pytest.raises(MeglocError, match=error):
+            plan_evaluation(choose_run("aachen", root, preset="megloc", assignments=typed))
 
 
 @pytest.mark.parametrize("dataset", ["aachen", "robotcar", "4seasons", "inloc"])

@@ -13,6 +13,7 @@ import pytest
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project
+from megloc_kapture.io.dataset_tables import ImageGroup
 from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.images import write_depth_map
 from megloc_kapture.io.kapture import (
@@ -28,6 +29,7 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.mapping.uncertainty import point_covariances
+from megloc_kapture.stages.candidates import Restrictions
 from megloc_kapture.stages.map_refinement import (
     KEPT_FILE,
     REJECTED_FILE,
@@ -334,3 +336,40 @@ def test_pictures_hold_all_points(wall: KaptureFolder, tmp_path: Path) -> None:
         grey = (128, 128, 128)
         assert (grey in colours) == (name == KEPT_FILE)  # the lifted ones
         assert len(colours) > 5
+
+
+def lifted_from(wall: KaptureFolder, shares: Sequence[float]) -> KaptureFolder:
+    """Put the lifted points at shares of their distance from the image that sees them."""
+    points = wall.points3d().copy()
+    for point, share in zip(LIFTED, shares, strict=True):
+        centre = pose(point % NUM_IMAGES).center()
+        in_sight = np.array([0.5 + 0.05 * (point - LIFTED.start), 0.8, WALL_M])
+        points[point, :3] = centre + share * (in_sight - centre)
+    write_points3d(wall.root, points)
+    return KaptureFolder(wall.root)
+
+
+def test_lifted_points_are_compared_with_the_depth_of_other_images(tmp_path: Path) -> None:
+    before, behind = 0.9, 1.8
+    shares = [1.0] * 4 + [before] * 4 + [behind] * 2
+    wall = lifted_from(write_wall(tmp_path / "map"), shares)
+    # an image whose depth is wrong has one vote of many
+    depth = np.full((120, 160), 1.5 * WALL_M, np.float32)
+    write_depth_map(wall.root / "sensors" / "records_data" / "wall/0.depth", depth)
+    folder, report = refined(wall, tmp_path / "out", min_observations=1)
+    lifted = rows_of(wall, LIFTED)
+    removed = rows_of(wall, LIFTED[4:8]) - rows_of(wall, [53, 59])  # whose image has no depth
+    assert lifted - rows_of(folder) == removed
+    # others see the wall before what lies behind it: it may be there, and is not judged
+    hidden = rows_of(wall, LIFTED[8:])
+    assert hidden < rows_of(folder)
+    # within one image's frame, or from one centre, there is nothing to compare with
+    alone = Restrictions({name: ImageGroup(frame=name) for name in NAMES})
+    counts = refine_map(wall, tmp_path / "apart", MapRefinementOptions(), restrictions=alone)
+    assert lifted <= rows_of(KaptureFolder(tmp_path / "apart"))
+    assert counts["checked_by_depth"] < report.filters[0].checked
+    data = wall.read()
+    data.trajectories = dict.fromkeys(data.trajectories, pose(0))
+    write_sensors(wall.root, data)
+    folder, _ = refined(KaptureFolder(wall.root), tmp_path / "one", min_observations=1)
+    assert lifted <= rows_of(folder)

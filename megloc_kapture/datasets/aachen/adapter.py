@@ -30,7 +30,7 @@ from megloc_kapture.datasets.official import (
     last_part,
     read_ground_truth,
 )
-from megloc_kapture.datasets.reference_map import ReferenceModel
+from megloc_kapture.datasets.reference_map import ReferenceModel, check_model_files
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.dataset_tables import ImageGroup, World
@@ -96,7 +96,10 @@ class Aachen:
         layout = Layout(root)
         if absent := layout.absent():
             raise self.card.without(root, absent)
-        layout.model_files(layout.version(self.options.version), with_points=False)
+        reference = self.options.reference_model
+        files = layout.model_files(layout.version(self.options.version), with_points=reference)
+        if reference:
+            check_model_files(files)
 
     def input_files(self, root: Path) -> Iterator[Path]:
         """Every file an import may depend on, images included."""

@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from megloc_kapture.datasets.formats.colmap_reading import read_colmap_model
+from megloc_kapture.datasets.formats.colmap_reading import colmap_model_files, read_colmap_model
 from megloc_kapture.datasets.formats.sparse_models import SparsePoints, read_single_nvm
 from megloc_kapture.datasets.formats.text_lines import Line, read_lines, shown
 from megloc_kapture.datasets.official import Missing
@@ -30,6 +30,8 @@ _FILE_TYPES = (".jpg", ".png")
 _MODEL = re.compile(r"([0-9]{1,6})_aligned")
 _QUERY_LIST = re.compile(r"queries_location_([0-9]{1,6})\.txt")
 INTRINSICS_KEYS = ("fx", "fy", "cx", "cy")
+
+ModelChoice = Literal["auto", "merged", "individual"]
 
 _PART = r"[A-Za-z0-9][A-Za-z0-9_-]*"
 _IMAGE = re.compile(
@@ -193,6 +195,19 @@ class Layout:
         found = _numbered(self.individual_model("").parent, _MODEL)
         return {location: folder for location, folder in found.items() if folder.is_dir()}
 
+    def is_merged(self, model: ModelChoice) -> bool:
+        """Whether the reference poses come from the merged model."""
+        return model == "merged" or (
+            model == "auto" and (self.merged_model.is_file() or not self.individual_models())
+        )
+
+    def points_files(self, model: ModelChoice) -> list[Path]:
+        """The files that :func:`read_points` reads; DataError where a folder holds no model."""
+        if self.is_merged(model):
+            return [self.merged_model]
+        folders = self.individual_models().values()
+        return [file for folder in folders for file in colmap_model_files(folder)]
+
     def query_lists(self) -> dict[str, Path]:
         """Lists of queries that are there, by location, sorted."""
         return _numbered(self.query_list("").parent, _QUERY_LIST)
@@ -246,9 +261,6 @@ def _sorted_names(folder: Path) -> list[str]:
         return []
 
 
-ModelChoice = Literal["auto", "merged", "individual"]
-
-
 @dataclass(frozen=True, eq=False)
 class Reference:
     """``cam_from_world`` by image, in the models' order; locations as far as models tell."""
@@ -272,9 +284,7 @@ def read_reference(
         have to come from them.
     """
     individual = layout.individual_models()
-    merged = model == "merged" or (
-        model == "auto" and (layout.merged_model.is_file() or not individual)
-    )
+    merged = layout.is_merged(model)
     locations: dict[ImageKey, str] = {}
     located_poses: dict[ImageKey, RigidTransform] = {}
     for location, folder in individual.items():

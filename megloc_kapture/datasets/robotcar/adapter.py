@@ -20,7 +20,7 @@ from megloc_kapture.datasets.official import (
     ground_truth_files,
     read_ground_truth,
 )
-from megloc_kapture.datasets.reference_map import ReferenceModel
+from megloc_kapture.datasets.reference_map import ReferenceModel, check_model_files
 from megloc_kapture.datasets.robotcar import (
     CAMERAS,
     REFERENCE_CONDITION,
@@ -134,6 +134,8 @@ class RobotCar:
                 raise without_model(root)
         elif absent := Layout(root).absent():
             raise self.card.without(root, absent)
+        elif self.options.reference_model:
+            check_model_files(Layout(root).points_files(self.options.model))
 
     def input_files(self, root: Path) -> Iterator[Path]:
         """Every file an import may depend on, images included."""
