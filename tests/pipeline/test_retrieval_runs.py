@@ -37,6 +37,7 @@ def options(tmp_path_factory: pytest.TempPathFactory) -> PipelineOptions:
             'global_features=["vlad","eigenplaces"]',
             f"global_features.eigenplaces.options.weights={file}",
             "global_features.vlad.options.num_clusters=8",
+            "global_features.vlad.options.dimensions=6",
             "global_features.vlad.weight=3",
             "query_pairs.top_k=5",
             "reranking.by=coverage",
@@ -94,6 +95,14 @@ def test_the_localizer_ranks_and_keeps_the_same_images(
         assert set(found.candidates) <= set(kept[query.name])
         ranked = localizer.ranked(query)
         assert set(kept[query.name]) <= set(ranked[:5])
+
+
+def test_a_map_with_whitened_vectors_can_be_localized_in(
+    finished: Workspace, fountain: Path, options: PipelineOptions
+) -> None:
+    only = options.model_copy(update={"global_features": options.global_features[:1]})
+    localizer = Localizer(KaptureMap.open(finished.path("map")), options=only)
+    assert all(found for _, found in localizer.localize_kapture(fountain / "query"))
 
 
 def test_vectors_that_the_map_lacks_are_made_from_its_images(
