@@ -149,7 +149,7 @@ def with_confidence(
     weakest = min(model.weights, key=lambda name: model.weights[name] * evidence[name])
     why, remarks = TERMS[weakest], pose.remarks
     if misfit is not None:
-        confidence *= min(1.0, (_TOLERATED_SHIFT / misfit.shift) ** 2)
+        confidence *= (_TOLERATED_SHIFT / max(misfit.shift, _TOLERATED_SHIFT)) ** 2
         why = misfit.remark
         remarks = (*remarks, why)
     asked = confidence >= min_confidence and _is_asked(confidence)

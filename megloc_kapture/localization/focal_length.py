@@ -51,7 +51,7 @@ Floats = NDArray[np.float64]
 # errors of a map are alike in neighbouring points, and lenses are no pinholes: deviations that
 # take every match for independent are too small by a factor (measured: docs/photos.md)
 _CORRELATED, _MIN_ERROR_PX = 5.0, 0.5
-_MIN_CHANGE, _MIN_SIGMAS = 0.025, 3.0
+_MIN_SIGMAS = 2.5
 _MIN_INLIERS = 30
 _DOES_NOT_FIT = "does not fit"
 _ROUNDS = 12
@@ -64,8 +64,11 @@ _MAX_DEVIATIONS = 3.0
 # standard deviations of what nobody tells of a camera: the principal point's as a share of the
 # larger side, and the radial distortion's
 _PRINCIPAL_POINT_DEVIATION, _DISTORTION_DEVIATION = 0.01, 0.1
-# the radial distortion that a calibration may leave
-_CALIBRATED_DISTORTION = 0.02
+# a calibrated camera may be off by as much: the focal length, and the radial distortion
+_CALIBRATED, _CALIBRATED_DISTORTION = 0.01, 0.02
+# matches were verified with the given focal length: another that they tell is off by such a share
+# of the difference
+_BIASED_BY = 0.1
 # what is believed where the matches contradict it, instead of EXIF's 0.1 and the above
 _DOUBTED_FOCAL, _DOUBTED_PRINCIPAL_POINT = 0.7, 0.3
 # a focal length that was calibrated, or estimated of several images, is not doubted
@@ -144,11 +147,10 @@ def focal_misfit(problem: PoseProblem, pose: Pose, max_error_px: float) -> Focal
     principal_point = _PRINCIPAL_POINT_DEVIATION * larger
     deviations = np.array([1.0, principal_point, principal_point, _CALIBRATED_DISTORTION])
     inliers, start = pose.inliers[usable], view.cam_from_rig @ pose.cam_from_world
-    moved = start
+    moved, change, expected = start, np.zeros(4), np.zeros(4)
     for _ in range(_ROUNDS):
-        solved = _free_camera(
-            rays[inliers], moved.apply(points[inliers]), focal, np.zeros(4), deviations, 1.0
-        )
+        in_camera = moved.apply(points[inliers])
+        solved = _free_camera(rays[inliers], in_camera, focal, change, expected, deviations, 1.0)
         if solved is None:
             return None
         change, motion, _, covariance = solved
@@ -163,8 +165,10 @@ def focal_misfit(problem: PoseProblem, pose: Pose, max_error_px: float) -> Focal
         if (again == inliers).all():
             break
         inliers = again
-    deviation = _ALIKE * math.sqrt(covariance[6, 6])
-    if abs(change[0]) < max(_MIN_CHANGE, _MIN_SIGMAS * deviation):
+    deviation = math.hypot(
+        _ALIKE * math.sqrt(covariance[6, 6]), _CALIBRATED, _BIASED_BY * change[0]
+    )
+    if abs(change[0]) < _MIN_SIGMAS * deviation:
         return None
     better = focal * math.exp(change[0])
     distance = np.median(np.linalg.norm(in_camera[inliers], axis=1))
@@ -359,6 +363,7 @@ def _fit(
         normalized_from_px(view.camera, problem.points_px[inliers]),
         start.apply(problem.points[inliers] + problem.offset),
         focal_px(view.camera),
+        np.zeros(len(expected)),
         expected,
         deviations,
         _CORRELATED,
@@ -380,6 +385,7 @@ def _free_camera(
     rays: Floats,
     points: Floats,
     focal: float,
+    change: Floats,
     expected: Floats,
     deviations: Floats,
     correlated: float,
@@ -389,7 +395,8 @@ def _free_camera(
     Parameters
     ----------
     rays, points : (N, 2) undistorted, (N, 3) in the camera.
-    expected, deviations : of the change, see :class:`_Fit`, before the matches are looked at.
+    change : of the camera to begin with, see :class:`_Fit`.
+    expected, deviations : of the change before the matches are looked at.
     correlated : deviations are this much larger than of independent errors.
 
     Returns
@@ -399,7 +406,6 @@ def _free_camera(
     """
     rotation, translation = np.eye(3), np.zeros(3)
     prior_weight = (correlated / deviations) ** 2
-    change = np.zeros(len(expected))
     own = np.arange(6, 6 + len(change))
     for _ in range(_ROUNDS):
         ahead = points[:, 2] > 0
@@ -435,7 +441,7 @@ def _free_camera(
 
 
 def _linearized(rays: Floats, points: Floats, change: Floats) -> tuple[Floats, Floats]:
-    """Residuals (N, 2) of points in the camera, in front of it, and their derivatives (N, 2, 6 + C).
+    """Residuals (N, 2) of points in front of the camera, and derivatives (N, 2, 6 + changes).
 
     By a left rotation and a translation of the points (without the distortion's own slope, which
     changes nothing where the change is small), then by ``change``, see :class:`_Fit`.

@@ -23,7 +23,7 @@ from megloc_kapture.features.vlad import (
 )
 from megloc_kapture.io.files import read_json_model, write_json_model
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
-from megloc_kapture.plugin_loading import load_plugin, plugin_names
+from megloc_kapture.plugin_loading import load_plugin, option_fault, plugin_names
 from megloc_kapture.plugins import GLOBAL_FEATURES as PLUGINS
 from megloc_kapture.plugins import GlobalFeatureExtractor, PluginChoice
 from megloc_kapture.stages.devices import in_batches
@@ -232,9 +232,8 @@ class GlobalFeaturesChoice(PluginChoice):
         try:
             return VladChoiceOptions(**self.options)
         except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"])
-            raise OptionError(f"global features vlad: option {where}: {first['msg']}") from error
+            fault = option_fault(error, VladChoiceOptions)
+            raise OptionError(f"global features {VLAD!r} refuse their options: {fault}") from error
 
     def make(self) -> GlobalFeatureExtractor:
         """The extractor of an image network.

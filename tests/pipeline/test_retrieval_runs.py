@@ -124,8 +124,9 @@ def test_all_missing_weights_are_told_at_once(fountain: Path, tmp_path: Path) ->
     root = tmp_path / "workspace"
     with pytest.raises(MissingWeightsError) as caught:
         evaluated(root, fountain, options_of_preset("megloc"))
-    said = str(caught.value).splitlines()
+    *said, together = str(caught.value).splitlines()
     assert len(said) == len(set(said)) == 7
+    assert "megloc weights fetch --preset megloc" in together
     for name in ("superpoint_v1", "superglue", "aslfeat", "netvlad", "delg", "apgem", "openibl"):
         assert any(name in line for line in said), name
     assert not root.exists()
