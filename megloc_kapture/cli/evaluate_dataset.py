@@ -18,6 +18,7 @@ from megloc_kapture.evaluation.report.reports import (
 )
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.tables import STATUS_FILE, read_status
+from megloc_kapture.localization.focal_length import misfits_text
 from megloc_kapture.pipeline.datasets import BenchmarkFile, DatasetChoice
 from megloc_kapture.pipeline.evaluation_plan import (
     ablate,
@@ -168,6 +169,9 @@ class Eval(Deciding, Working):
         statuses = read_status(workspace.path(LOCALIZED) / STATUS_FILE)
         if statuses and all(status.status == "failed" for status in statuses.values()):
             console.say("warning: no query was localized; reasons are in localized/status.csv")
+        remarks = (status.remarks for status in statuses.values())
+        if misfits := misfits_text(remarks, f"{LOCALIZED}/{STATUS_FILE}"):
+            console.say(misfits)
         for text in (RECALL_TEXT, AGREEMENT_TEXT):
             if (evaluation / text).is_file():
                 console.result((evaluation / text).read_text(encoding="utf-8"))

@@ -32,6 +32,7 @@ from megloc_kapture.io.files import read_text
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.io.tables import STATUS_FILE
+from megloc_kapture.localization.focal_length import misfits_text
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 from megloc_kapture.pipeline.local_types import LocalType, local_types_of
@@ -115,9 +116,8 @@ class Localize(Reading, Deciding, Common):
             console.say(f"left out of {remarks[remark]} queries: {remark}")
         if kapture_map.unit != METRES:
             console.say(f"positions are in {kapture_map.unit} of the map, whose scale is not known")
-        if focal:
-            number = sum(remarks[remark] for remark in focal)
-            console.say(f"focal length: {number} remarks in {STATUS_FILE}")
+        if misfits := misfits_text(("; ".join(r.remarks) for _, r in named), STATUS_FILE):
+            console.say(misfits)
         console.result(
             f"{counts['localized']} of {counts['queries']} queries localized in {seconds:.1f} s; "
             f"poses and status.csv in {self.output}"

@@ -32,12 +32,11 @@ from megloc_kapture.cli.common import (
     side_tables_beside,
 )
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.files import first_problem
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
 from megloc_kapture.pipeline.workspace import Workspace
-from megloc_kapture.plugin_loading import load_plugin, plugin_class
+from megloc_kapture.plugin_loading import load_plugin, option_fault, plugin_class
 from megloc_kapture.plugins import MATCHERS, STAGES, chosen_by_name
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.devices import placed
@@ -340,7 +339,7 @@ class Preprocess(Linked, Computing, Working):
         try:
             options = PreprocessingOptions.model_validate({**tree, "masks": {**masks, **changes}})
         except ValidationError as error:
-            raise OptionError(f"option {first_problem(error)}") from error
+            raise OptionError(f"option {option_fault(error, PreprocessingOptions)}") from error
         self.check_computes(options)
         return placed(options, self.device or "auto", self.precision or "full")
 

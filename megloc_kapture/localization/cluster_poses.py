@@ -33,7 +33,7 @@ from megloc_kapture.localization.absolute_pose import (
 from megloc_kapture.localization.confidence import MatchSources, match_sources, with_confidence
 from megloc_kapture.localization.focal_length import (
     estimate_with_intrinsics,
-    focal_remark,
+    focal_misfit,
     is_uncertain,
     refine_with_intrinsics,
 )
@@ -245,11 +245,11 @@ def localize_in_clusters(
                 seen = partial(displacements_rad, problem, views, found, scene)
                 reflected = partial(_mirror_matches, views, ranked[best].images, sources, scene)
                 sources = replace(sources, displacements_rad=seen, mirror_matches=reflected)
-            result = with_confidence(problem, result, sources, options.max_error_px, min_confidence)
-            if isinstance(result, Pose) and result.camera is None:
-                remark = focal_remark(problem, result)
-                remarks = (*result.remarks, remark) if remark else result.remarks
-                result = replace(result, remarks=remarks)
+            known = result.camera is None
+            misfit = focal_misfit(problem, result, options.max_error_px) if known else None
+            result = with_confidence(
+                problem, result, sources, options.max_error_px, min_confidence, misfit
+            )
             clock.lap("confidence")
     result = replace(result, candidates=ranked[best].images, clusters=ranked, seconds=clock.seconds)
     if isinstance(result, Failure):

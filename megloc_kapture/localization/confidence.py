@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import focal_px, project
 from megloc_kapture.localization.absolute_pose import center_deviation, match_errors
+from megloc_kapture.localization.focal_length import FocalMisfit
 from megloc_kapture.localization.map_index import Correspondences, PoseProblem, QueryView
 from megloc_kapture.localization.mirrored import chance_of, is_mirrored
 from megloc_kapture.values import Failure, Pose, RigidTransform
@@ -39,6 +40,8 @@ _MIN_NOISE_PX = 0.3
 # an image of the scene fits worse than the map makes expected by less than that, and fewer inliers
 # than these say nothing about it
 _USUAL_RATIO, _FEW = 2.9, 20
+# a wrong focal length may move the camera by as much, a share of the distance to what it sees
+_TOLERATED_SHIFT = 0.03
 # of confidences from the one to below the other it is asked whether the image is mirrored, which
 # takes 0.3 s
 MIRROR_ASKED = 0.1, 0.995
@@ -133,13 +136,22 @@ def with_confidence(
     sources: MatchSources,
     max_error_px: float,
     min_confidence: float,
+    misfit: FocalMisfit | None = None,
 ) -> Pose | Failure:
-    """The pose with its confidence and the evidence for it; a failure where that is too little."""
+    """The pose with its confidence and the evidence for it; a failure where that is too little.
+
+    A focal length that does not fit moves the camera along with it: the confidence then falls with
+    the square of that shift.
+    """
     evidence = evidence_of(problem, pose, sources, max_error_px)
     model = calibration_for(sources.local_types)
     confidence = model.probability(evidence)
     weakest = min(model.weights, key=lambda name: model.weights[name] * evidence[name])
     why, remarks = TERMS[weakest], pose.remarks
+    if misfit is not None:
+        confidence *= (_TOLERATED_SHIFT / max(misfit.shift, _TOLERATED_SHIFT)) ** 2
+        why = misfit.remark
+        remarks = (*remarks, why)
     asked = confidence >= min_confidence and _is_asked(confidence)
     if asked and sources.mirror_matches is not None:
         as_it_is, mirrored = sources.mirror_matches(pose)
@@ -159,6 +171,7 @@ def with_confidence(
         num_matches=pose.num_matches,
         num_inliers=pose.num_inliers,
         confidence=confidence,
+        remarks=() if misfit is None else (misfit.remark,),
     )
 
 

@@ -19,7 +19,7 @@ Of a flat scene seen straight on matches say nothing: then what was known before
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,8 +51,9 @@ Floats = NDArray[np.float64]
 # errors of a map are alike in neighbouring points, and lenses are no pinholes: deviations that
 # take every match for independent are too small by a factor (measured: docs/photos.md)
 _CORRELATED, _MIN_ERROR_PX = 5.0, 0.5
-_MIN_CHANGE, _MIN_SIGMAS = 0.025, 5.0
+_MIN_SIGMAS = 2.5
 _MIN_INLIERS = 30
+_DOES_NOT_FIT = "does not fit"
 _ROUNDS = 12
 _SMALL_STEP = 1e-4
 # intrinsics are settled when the focal length moves by less, as a share
@@ -63,6 +64,11 @@ _MAX_DEVIATIONS = 3.0
 # standard deviations of what nobody tells of a camera: the principal point's as a share of the
 # larger side, and the radial distortion's
 _PRINCIPAL_POINT_DEVIATION, _DISTORTION_DEVIATION = 0.01, 0.1
+# a calibrated camera may be off by as much: the focal length, and the radial distortion
+_CALIBRATED, _CALIBRATED_DISTORTION = 0.01, 0.02
+# matches were verified with the given focal length: another that they tell is off by such a share
+# of the difference
+_BIASED_BY = 0.1
 # what is believed where the matches contradict it, instead of EXIF's 0.1 and the above
 _DOUBTED_FOCAL, _DOUBTED_PRINCIPAL_POINT = 0.7, 0.3
 # a focal length that was calibrated, or estimated of several images, is not doubted
@@ -108,20 +114,77 @@ def is_uncertain(problem: PoseProblem) -> bool:
     return len(problem.views) == 1 and problem.views[0].camera.focal_deviation > 0
 
 
-def focal_remark(problem: PoseProblem, pose: Pose) -> str | None:
-    """Say that another focal length fits better; None where the given one may be right, or of a
-    rig."""
+@dataclass(frozen=True)
+class FocalMisfit:
+    """A focal length that fits the matches far better than the given one.
+
+    Attributes
+    ----------
+    remark : names both.
+    shift : how far the camera moves with the better one, as a share of the distance to the points.
+    """
+
+    remark: str
+    shift: float
+
+
+def focal_misfit(problem: PoseProblem, pose: Pose, max_error_px: float) -> FocalMisfit | None:
+    """Find another focal length that fits better; None where the given one may be right, where the
+    matches do not tell, or of a rig.
+
+    The focal length is set free, and so are principal point and radial distortion as far as a
+    calibrated camera may be off. What agrees with the camera is decided again each time, for the
+    inliers of a wrong focal length are those that fit it.
+    """
     if len(problem.views) != 1 or pose.inliers is None or pose.num_inliers < _MIN_INLIERS:
         return None
-    found = _fit(problem, pose.cam_from_world, pose.inliers)
-    if found is None or abs(found.change[0]) < max(_MIN_CHANGE, _MIN_SIGMAS * found.deviation):
-        return None
-    given = focal_px(problem.views[0].camera)
-    better = given * math.exp(found.change[0])
-    return (
-        f"the focal length of {given:.0f} px does not fit: {better:.0f} +- "
-        f"{better * found.deviation:.0f} px would"
+    (view,) = problem.views
+    focal = focal_px(view.camera)
+    rays, points = normalized_from_px(view.camera, problem.points_px), problem.points
+    usable = np.isfinite(rays).all(axis=1) & np.isfinite(points).all(axis=1)
+    rays, points = rays[usable], points[usable] + problem.offset
+    larger = max(view.camera.width, view.camera.height) / focal
+    principal_point = _PRINCIPAL_POINT_DEVIATION * larger
+    deviations = np.array([1.0, principal_point, principal_point, _CALIBRATED_DISTORTION])
+    inliers, start = pose.inliers[usable], view.cam_from_rig @ pose.cam_from_world
+    moved, change, expected = start, np.zeros(4), np.zeros(4)
+    for _ in range(_ROUNDS):
+        in_camera = moved.apply(points[inliers])
+        solved = _free_camera(rays[inliers], in_camera, focal, change, expected, deviations, 1.0)
+        if solved is None:
+            return None
+        change, motion, _, covariance = solved
+        moved = motion @ moved
+        in_camera = moved.apply(points)
+        ahead = in_camera[:, 2] > 0
+        residuals = np.full(rays.shape, np.inf)
+        residuals[ahead], _ = _linearized(rays[ahead], in_camera[ahead], change)
+        again = np.linalg.norm(residuals, axis=1) * focal <= max_error_px
+        if again.sum() < _MIN_INLIERS:
+            return None
+        if (again == inliers).all():
+            break
+        inliers = again
+    deviation = math.hypot(
+        _ALIKE * math.sqrt(covariance[6, 6]), _CALIBRATED, _BIASED_BY * change[0]
     )
+    if abs(change[0]) < _MIN_SIGMAS * deviation:
+        return None
+    better = focal * math.exp(change[0])
+    distance = np.median(np.linalg.norm(in_camera[inliers], axis=1))
+    return FocalMisfit(
+        f"the focal length of {focal:.0f} px {_DOES_NOT_FIT}: {better:.0f} +- "
+        f"{better * deviation:.0f} px would",
+        float(np.linalg.norm(moved.center() - start.center()) / distance),
+    )
+
+
+def misfits_text(remarks: Iterable[str], where: str) -> str | None:
+    """Say how many queries have a focal length that does not fit, by the remarks of each."""
+    count = sum(_DOES_NOT_FIT in of_query for of_query in remarks)
+    if not count:
+        return None
+    return f"the given focal length {_DOES_NOT_FIT} in {count} queries: see the remarks in {where}"
 
 
 def estimate_remark(camera: Camera, given: Camera) -> str:
@@ -284,62 +347,78 @@ def _fit(
     problem: PoseProblem,
     rig_from_world: RigidTransform,
     inliers: NDArray[np.bool_],
-    given: Camera | None = None,
+    given: Camera,
     *,
     doubting: bool = False,
 ) -> _Fit | None:
     """The camera that fits the inliers best; None where nothing determines it.
 
-    Without ``given``, the camera as it is known before, with its deviation, nothing is known of the
-    focal length, and the rest is as it is. ``doubting``: little of it is believed.
+    ``given``: the camera as it is known before, with its deviation. ``doubting``: little of it is
+    believed.
     """
     (view,) = problem.views
-    rays = normalized_from_px(view.camera, problem.points_px[inliers])
+    expected, deviations = _prior_of(view.camera, given, doubting=doubting)
     start = view.cam_from_rig @ rig_from_world
-    points = start.apply(problem.points[inliers] + problem.offset)
+    solved = _free_camera(
+        normalized_from_px(view.camera, problem.points_px[inliers]),
+        start.apply(problem.points[inliers] + problem.offset),
+        focal_px(view.camera),
+        np.zeros(len(expected)),
+        expected,
+        deviations,
+        _CORRELATED,
+    )
+    if solved is None:
+        return None
+    change, moved, depth, covariance = solved
+    of_camera, between = covariance[6:, 6:], covariance[:6, 6:]
+    return _Fit(
+        change=change,
+        deviations=np.sqrt(np.diagonal(of_camera)),
+        rig_from_world=view.cam_from_rig.inverse() @ moved @ start,
+        pose_covariance=between @ np.linalg.solve(of_camera, between.T),
+        depth=depth,
+    )
+
+
+def _free_camera(
+    rays: Floats,
+    points: Floats,
+    focal: float,
+    change: Floats,
+    expected: Floats,
+    deviations: Floats,
+    correlated: float,
+) -> tuple[Floats, RigidTransform, float, Floats] | None:
+    """Fit a pose and a change of the camera to inliers; None where these do not determine it.
+
+    Parameters
+    ----------
+    rays, points : (N, 2) undistorted, (N, 3) in the camera.
+    change : of the camera to begin with, see :class:`_Fit`.
+    expected, deviations : of the change before the matches are looked at.
+    correlated : deviations are this much larger than of independent errors.
+
+    Returns
+    -------
+    The change, the motion of the points, their median depth, and the covariance of a left
+    perturbation of the motion and of the change.
+    """
     rotation, translation = np.eye(3), np.zeros(3)
-    if given is None:
-        expected, prior_weight, min_inliers = np.zeros(1), np.zeros(1), _MIN_INLIERS
-    else:
-        expected, deviations = _prior_of(view.camera, given, doubting=doubting)
-        prior_weight, min_inliers = (_CORRELATED / deviations) ** 2, 4
-    change = np.zeros(len(expected))
+    prior_weight = (correlated / deviations) ** 2
     own = np.arange(6, 6 + len(change))
     for _ in range(_ROUNDS):
         ahead = points[:, 2] > 0
-        if ahead.sum() < min_inliers:
+        if ahead.sum() < 4:
             return None
-        x, y, z = points[ahead].T
-        u, v = x / z, y / z
-        scale, shift, bend = math.exp(change[0]), change[1:3], change[3:].sum()
-        zero, one, radius2 = np.zeros_like(u), np.ones_like(u), u * u + v * v
-        slope = scale * (1 + bend * radius2)
-        at = np.stack([slope * u, slope * v], axis=1)
-        residuals = at - rays[ahead] + (shift if len(shift) else 0.0)
-        # columns: a left rotation, a translation in the camera (without the distortion's own slope,
-        # which changes nothing where the change is small), then those of ``change``
-        pose_columns = slope[:, None, None] * np.stack(
-            [
-                np.stack([-u * v, 1 + u * u, -v, 1 / z, zero, -u / z], axis=1),
-                np.stack([-1 - v * v, u * v, u, zero, 1 / z, -v / z], axis=1),
-            ],
-            axis=1,
-        )
-        columns = [
-            at,
-            np.stack([one, zero], axis=1),
-            np.stack([zero, one], axis=1),
-            (scale * radius2)[:, None] * np.stack([u, v], axis=1),
-        ]
-        camera_columns = np.stack(columns[: len(change)], axis=2)
-        jacobian = np.concatenate([pose_columns, camera_columns], axis=2)
+        residuals, jacobian = _linearized(rays[ahead], points[ahead], change)
         squared = (residuals**2).sum(axis=1)
         variance = max(float(np.median(squared)) / (2 * math.log(2)), 1e-14)
         weights = 1 / (1 + squared / (5.7 * variance))
         information = np.einsum("nik,n,nil->kl", jacobian, weights, jacobian)
         gradient = np.einsum("nik,n,ni->k", jacobian, weights, residuals)
         # what lenses do is not noise: more matches do not average it out
-        trusted = max(variance, (_MIN_ERROR_PX / focal_px(view.camera)) ** 2)
+        trusted = max(variance, (_MIN_ERROR_PX / focal) ** 2)
         information[own, own] += trusted * prior_weight
         gradient[own] += trusted * prior_weight * (change - expected)
         size = np.sqrt(np.diagonal(information)) + 1e-300
@@ -356,16 +435,38 @@ def _fit(
         change = change + step[6:]
         if abs(step[6]) < _SMALL_STEP:
             break
-    moved = RigidTransform.from_matrix(rotation, translation) @ start
-    covariance = covariance * (variance if given is None else _CORRELATED**2 * trusted)
-    of_camera, between = covariance[6:, 6:], covariance[:6, 6:]
-    return _Fit(
-        change=change,
-        deviations=np.sqrt(np.diagonal(of_camera)),
-        rig_from_world=view.cam_from_rig.inverse() @ moved,
-        pose_covariance=between @ np.linalg.solve(of_camera, between.T),
-        depth=float(np.median(z)),
+    motion = RigidTransform.from_matrix(rotation, translation)
+    depth = float(np.median(points[ahead, 2]))
+    return change, motion, depth, covariance * correlated**2 * trusted
+
+
+def _linearized(rays: Floats, points: Floats, change: Floats) -> tuple[Floats, Floats]:
+    """Residuals (N, 2) of points in front of the camera, and derivatives (N, 2, 6 + changes).
+
+    By a left rotation and a translation of the points (without the distortion's own slope, which
+    changes nothing where the change is small), then by ``change``, see :class:`_Fit`.
+    """
+    x, y, z = points.T
+    u, v = x / z, y / z
+    zero, one, radius2 = np.zeros_like(u), np.ones_like(u), u * u + v * v
+    scale = math.exp(change[0])
+    slope = scale * (1 + change[3:].sum() * radius2)
+    at = np.stack([slope * u, slope * v], axis=1)
+    pose_columns = slope[:, None, None] * np.stack(
+        [
+            np.stack([-u * v, 1 + u * u, -v, 1 / z, zero, -u / z], axis=1),
+            np.stack([-1 - v * v, u * v, u, zero, 1 / z, -v / z], axis=1),
+        ],
+        axis=1,
     )
+    columns = [
+        at,
+        np.stack([one, zero], axis=1),
+        np.stack([zero, one], axis=1),
+        (scale * radius2)[:, None] * np.stack([u, v], axis=1),
+    ]
+    camera_columns = np.stack(columns[: len(change)], axis=2)
+    return at + change[1:3] - rays, np.concatenate([pose_columns, camera_columns], axis=2)
 
 
 def shared_camera(cameras: Sequence[Camera]) -> Camera:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
@@ -214,7 +215,7 @@ class Localizer:
                 "pose_refinement refines the poses of cameras, not of rigs: use localize_units"
             )
         with single_threaded():
-            images = [self._preprocessor.of(query) for query, _ in views]
+            images = self._images(views)
             (found,), _ = self._solve(views, images, self._scene(images), as_rig=True)
             return found
 
@@ -230,11 +231,11 @@ class Localizer:
 
     def _localize_unit(self, unit: Unit) -> list[Pose | Failure]:
         with single_threaded():
-            images = [self._preprocessor.of(query) for query, _ in unit]
+            images = self._images(unit)
             scene = self._scene(images)
             results, cameras = self._solve(unit, images, scene)
             found = []
-            for camera, result in zip(cameras, results, strict=True):
+            for (query, _), camera, result in zip(unit, cameras, results, strict=True):
                 image = camera.image
                 if isinstance(result, Pose):
                     intrinsics = result.camera or image.camera
@@ -243,7 +244,7 @@ class Localizer:
                 found.append(
                     replace(
                         result,
-                        name=image.query.name,
+                        name=query.name,
                         remarks=(*result.remarks, *camera.left_out),
                         seconds={**camera.clock.seconds, **result.seconds},
                     )
@@ -290,6 +291,16 @@ class Localizer:
         lists = [camera.candidates if whole else camera.ranked for camera in cameras]
         longest = max(map(len, lists), default=0)
         return in_turn(localize, longest, self.options.localization), cameras
+
+    def _images(self, unit: Sequence[tuple[Query, RigidTransform]]) -> list[QueryImage]:
+        """The images of a unit by unique names: their pixels are looked up by name."""
+        named = Counter(query.name for query, _ in unit)
+        return [
+            self._preprocessor.of(
+                query if named[query.name] == 1 else replace(query, name=f"{query.name} ({number})")
+            )
+            for number, (query, _) in enumerate(unit, 1)
+        ]
 
     def _scene(self, images: Iterable[QueryImage]) -> KaptureScene:
         return KaptureScene(self.map.folder, QueryImages(images), map_camera=self.map.camera)

@@ -7,16 +7,16 @@ import tomllib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from pydantic import ValidationError
 
 from megloc_kapture.errors import OptionError, suggestion
-from megloc_kapture.io.weights import MissingWeightsError, all_missing
+from megloc_kapture.io.weights import MissingWeightsError, all_missing, lookup
 from megloc_kapture.mapping.pairs import PairsByPosesOptions
 from megloc_kapture.mapping.uncertainty import UncertaintyOptions
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions
-from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugin_loading import load_plugin, option_fault
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
@@ -155,7 +155,7 @@ def _validated(model: type[OptionsT], tree: Mapping[str, Any]) -> OptionsT:
         where = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             raise OptionError(f"unknown option {where}; {_known(where, model)}") from error
-        raise OptionError(f"option {where}: {first['msg']}") from error
+        raise OptionError(f"option {option_fault(error, model)}") from error
 
 
 def assigned(
@@ -197,7 +197,10 @@ def _known(path: str, root: type[Options]) -> str:
     model: Any = root
     *parents, name = path.split(".")
     for part in parents:
+        if part.isdigit():  # a place in a list
+            continue
         annotation = model.model_fields[part].annotation if part in model.model_fields else None
+        annotation = next(iter(get_args(annotation)), annotation)
         if not (isinstance(annotation, type) and issubclass(annotation, Options)):
             break
         model = annotation
@@ -334,17 +337,36 @@ def check_weights(options: PipelineOptions) -> None:
 
     Raises
     ------
-    MissingWeightsError : names each checkpoint that is not there, and how to get it.
+    MissingWeightsError : names each checkpoint that is not there, and how to get it; and the
+        command that fetches those of a preset at once.
     PluginError : a plugin is not there, or refuses its options.
     """
+    if (error := _missing(options)) is None:
+        return
+    of_presets = {name: _missing(preset) for name, preset in PRESETS.items()}
+    fetching = {
+        name: lacks.names
+        for name, lacks in of_presets.items()
+        if lacks is not None and set(lacks.names) <= set(error.names)
+    }
+    if fetching and len(error.names) > 1:
+        preset = max(fetching, key=lambda name: len(fetching[name]))
+        free = all(lookup(name).commercial for name in fetching[preset])
+        command = f"megloc weights fetch --preset {preset}{'' if free else ' --accept-licence'}"
+        told = f"{error}\nthe weights of preset {preset} are fetched together by: {command}"
+        error = MissingWeightsError(told, names=error.names)
+    raise error
+
+
+def _missing(options: PipelineOptions) -> MissingWeightsError | None:
+    """What says of all missing checkpoints how to get them; None where none is missing."""
     missing = []
     for make in _makers(options):
         try:
             make()
         except MissingWeightsError as error:
             missing.append(error)
-    if missing:
-        raise all_missing(missing)
+    return all_missing(missing) if missing else None
 
 
 def _makers(options: PipelineOptions) -> Iterator[Callable[[], object]]:

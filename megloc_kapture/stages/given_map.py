@@ -332,7 +332,9 @@ _READ = {
     "global_features": KaptureFolder.global_features,
 }
 _KINDS: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_features")
-_VOCABULARY_FILES = ("vlad.json", "vocabulary.npy")
+VOCABULARY_FILE, SETTINGS_FILE = "vocabulary.npy", "vlad.json"
+MEAN_FILE, PROJECTION_FILE = "whitening_mean.npy", "whitening_projection.npy"
+_VLAD_FILES = (VOCABULARY_FILE, SETTINGS_FILE, MEAN_FILE, PROJECTION_FILE)
 
 
 def copy_features(
@@ -377,7 +379,7 @@ def _copy_type(
             if image not in kept and file.is_file() and not copy.exists():  # the first has it
                 hard_link(file, copy)
     if kind == "global_features":
-        for folder, name in product(beside, _VOCABULARY_FILES):
+        for folder, name in product(beside, _VLAD_FILES):
             if (folder / name).is_file() and not (copies / name).exists():
                 hard_link(folder / name, copies / name)
     reader = _READ[kind](source, type_name)

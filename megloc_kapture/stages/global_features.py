@@ -23,11 +23,17 @@ from megloc_kapture.features.vlad import (
 )
 from megloc_kapture.io.files import read_json_model, write_json_model
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
-from megloc_kapture.plugin_loading import load_plugin, plugin_names
+from megloc_kapture.plugin_loading import load_plugin, option_fault, plugin_names
 from megloc_kapture.plugins import GLOBAL_FEATURES as PLUGINS
 from megloc_kapture.plugins import GlobalFeatureExtractor, PluginChoice
 from megloc_kapture.stages.devices import in_batches
-from megloc_kapture.stages.given_map import described_images
+from megloc_kapture.stages.given_map import (
+    MEAN_FILE,
+    PROJECTION_FILE,
+    SETTINGS_FILE,
+    VOCABULARY_FILE,
+    described_images,
+)
 from megloc_kapture.stages.local_features import image_inputs, images_of, read_image_of
 from megloc_kapture.stages.shared_index import write_array
 from megloc_kapture.stages.stage import (
@@ -40,10 +46,6 @@ from megloc_kapture.stages.stage import (
 )
 from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, feature_inputs, ordered_map
 from megloc_kapture.values import Camera, Options
-
-VOCABULARY_FILE = "vocabulary.npy"
-MEAN_FILE, PROJECTION_FILE = "whitening_mean.npy", "whitening_projection.npy"
-SETTINGS_FILE = "vlad.json"
 
 
 class VladSettings(Options):
@@ -230,9 +232,8 @@ class GlobalFeaturesChoice(PluginChoice):
         try:
             return VladChoiceOptions(**self.options)
         except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"])
-            raise OptionError(f"global features vlad: option {where}: {first['msg']}") from error
+            fault = option_fault(error, VladChoiceOptions)
+            raise OptionError(f"global features {VLAD!r} refuse their options: {fault}") from error
 
     def make(self) -> GlobalFeatureExtractor:
         """The extractor of an image network.

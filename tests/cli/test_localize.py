@@ -6,6 +6,7 @@ import hashlib
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,14 @@ import pytest
 from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.evaluation.evaluate import evaluate
+from megloc_kapture.geometry.cameras import focal_px, scale_focal
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import (
     ImagePair,
     KaptureFolder,
+    Sensor,
     write_pairs,
+    write_sensors,
 )
 from megloc_kapture.io.tables import read_status
 from tests.cli.foreign import DESCRIPTORS, FOREIGN_MAPS, KEYPOINTS, rename_type
@@ -71,6 +75,21 @@ def test_a_second_result_in_the_same_folder_has_no_pose_of_the_first(
     assert evaluate(result, scene / "query_gt").row().num_localized == 0
     assert not KaptureFolder(result).read().poses()
     assert (result / "notes.txt").read_text() == "mine"
+
+
+def test_a_wrong_focal_length_is_the_reason(megloc: Any, foreign: Path) -> None:
+    query, result = foreign / "query", foreign.parent / "localized"
+    data = KaptureFolder(query).read()
+    cameras = {name: sensor.camera() for name, sensor in data.sensors.items()}
+    wrong = {name: Sensor.from_camera(scale_focal(c, 1.2)) for name, c in cameras.items()}
+    write_sensors(query, replace(data, sensors=wrong))
+    done = megloc(*queries_of(foreign, result))
+    assert "the given focal length does not fit in 4 queries: see the remarks in" in done.err
+    for image, status in read_status(result / "status.csv").items():
+        assert status.status == "failed" and status.reason.endswith(f"and {status.remarks}")
+        (named, deviation) = re.findall(r"fit: (\d+) \+- (\d+) px would", status.remarks)[0]
+        right_px = focal_px(data.camera_of(image))
+        assert abs(float(named) - right_px) <= 3 * float(deviation) < 0.1 * right_px
 
 
 @pytest.mark.slow

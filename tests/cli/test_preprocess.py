@@ -65,7 +65,7 @@ def test_flags_make_the_options() -> None:
         (("--polygon", "c=0,0 1,1"), "at least 3"),
         (("--polygon", "c=0,0 1,1 1"), r"polygon\.2"),
         (("--resize", "0"), "max_size_px: .*greater than 0"),
-        (("--set", "resize=1600"), "resize: Extra inputs"),
+        (("--set", "resize=1600"), "unknown option 'resize'; known: .*max_size_px"),
     ],
 )
 def test_values_that_cannot_be_used(arguments: tuple[str, ...], message: str) -> None:

@@ -74,7 +74,7 @@ def test_what_it_refuses(megloc: Any, inputs: Path, tmp_path: Path) -> None:
     for words, message in (
         (("--set", "step=3"), r"unknown option step; did you mean 'steps'"),
         (("--set", "pairs.labels.positive=3"), r"unknown option pairs\.labels\.positive"),
-        (("--set", "layers=3"), r"option layers: Input should be a multiple of 2"),
+        (("--set", "layers=3"), r"option layers: it should be a multiple of 2"),
         (("--set", "through=products", "--set", "layers=4"), r"layers changes nothing: through="),
         (("--licence", "MIT"), r"--licence takes FOLDER=TEXT, got 'MIT'"),
         (("--features", "rootsift"), r"superpoint and xfeat can be trained"),

@@ -113,6 +113,7 @@ def test_each_missing_file_of_a_preset_has_a_line(
     lines = done.err.splitlines()
     assert done.status == 2 and len(lines) > 5
     assert all(line.startswith("megloc: the weights ") and len(line) < 500 for line in lines)
+    assert "megloc weights fetch --preset megloc" in lines[-1]
 
 
 def test_consent(megloc: Any, folder: Path) -> None:

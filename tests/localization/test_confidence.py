@@ -24,6 +24,7 @@ from megloc_kapture.localization.confidence import (
     evidence_of,
     with_confidence,
 )
+from megloc_kapture.localization.focal_length import FocalMisfit
 from megloc_kapture.localization.map_index import PoseProblem, View
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
@@ -124,6 +125,19 @@ def test_right_and_chance() -> None:
     )
     assert refused.confidence is not None and refused.confidence < 0.5
     assert isinstance(with_confidence(problem, pose, sources, ERROR_PX, 0.0), Pose)
+
+
+def test_a_focal_length_that_does_not_fit_lowers_the_confidence() -> None:
+    problem, pose, sources = scene(100, 60)
+    alone = with_confidence(problem, pose, sources, ERROR_PX, 0.6)
+    near, far = FocalMisfit("remark", 0.03), FocalMisfit("remark", 0.06)
+    kept = with_confidence(problem, pose, sources, ERROR_PX, 0.6, near)
+    assert isinstance(kept, Pose) and kept.remarks == ("remark",)
+    assert kept.confidence == alone.confidence
+    refused = with_confidence(problem, pose, sources, ERROR_PX, 0.6, far)
+    assert isinstance(refused, Failure) and refused.remarks == ("remark",)
+    assert refused.confidence == pytest.approx((alone.confidence or 0) / 4)
+    assert refused.reason.endswith("matches agree, and remark")
 
 
 def test_what_surrounds_keypoints_excuses_their_errors() -> None:

@@ -21,6 +21,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.features.r2d2 import R2D2, R2D2Options
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder
+from megloc_kapture.localization import cluster_poses, confidence
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.query_folders import KaptureQueries
 from megloc_kapture.pipeline.results import Results
@@ -302,6 +303,28 @@ def test_a_rig_is_localized_as_one_and_a_blind_camera_does_no_harm(
     assert errors(localizer.localize_rig([blind, *views]), rig_from_world)[0] < 0.01
     assert not localizer.localize_rig([blind])
     assert not localizer.localize_rig([])
+
+
+def test_two_unnamed_views_of_a_rig_have_their_own_pixels(
+    localizer: Localizer, truth: KaptureData, scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, cams = made_up_rig(truth)
+    images = [read_image_rgb(KaptureFolder(scene / "query").image_path(name)) for name in cams]
+    cameras = [truth.camera_of(name) for name in cams]
+    views = [
+        (Query(camera, image), at)
+        for camera, image, at in zip(cameras, images, cams.values(), strict=True)
+    ]
+    looked_at: list[np.ndarray] = []
+
+    def look(views: Any, scene: Any) -> tuple[int, int]:
+        looked_at.extend(scene.query_image(name) for name, _ in views)
+        return 10, 0
+
+    monkeypatch.setattr(confidence, "MIRROR_ASKED", (0.0, 2.0))
+    monkeypatch.setattr(cluster_poses, "mirror_matches", look)
+    assert localizer.localize_rig(views)
+    assert [image.tobytes() for image in looked_at] == [image.tobytes() for image in images]
 
 
 # ------------------------------------------------------------------ maps of others

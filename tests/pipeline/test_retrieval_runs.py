@@ -37,6 +37,7 @@ def options(tmp_path_factory: pytest.TempPathFactory) -> PipelineOptions:
             'global_features=["vlad","eigenplaces"]',
             f"global_features.eigenplaces.options.weights={file}",
             "global_features.vlad.options.num_clusters=8",
+            "global_features.vlad.options.dimensions=6",
             "global_features.vlad.weight=3",
             "query_pairs.top_k=5",
             "reranking.by=coverage",
@@ -96,6 +97,14 @@ def test_the_localizer_ranks_and_keeps_the_same_images(
         assert set(kept[query.name]) <= set(ranked[:5])
 
 
+def test_a_map_with_whitened_vectors_can_be_localized_in(
+    finished: Workspace, fountain: Path, options: PipelineOptions
+) -> None:
+    only = options.model_copy(update={"global_features": options.global_features[:1]})
+    localizer = Localizer(KaptureMap.open(finished.path("map")), options=only)
+    assert all(found for _, found in localizer.localize_kapture(fountain / "query"))
+
+
 def test_vectors_that_the_map_lacks_are_made_from_its_images(
     finished: Workspace, options: PipelineOptions, tmp_path: Path
 ) -> None:
@@ -115,8 +124,9 @@ def test_all_missing_weights_are_told_at_once(fountain: Path, tmp_path: Path) ->
     root = tmp_path / "workspace"
     with pytest.raises(MissingWeightsError) as caught:
         evaluated(root, fountain, options_of_preset("megloc"))
-    said = str(caught.value).splitlines()
+    *said, together = str(caught.value).splitlines()
     assert len(said) == len(set(said)) == 7
+    assert "megloc weights fetch --preset megloc" in together
     for name in ("superpoint_v1", "superglue", "aslfeat", "netvlad", "delg", "apgem", "openibl"):
         assert any(name in line for line in said), name
     assert not root.exists()

@@ -21,6 +21,7 @@ from megloc_kapture.features.rootsift import (
     RootSift,
     RootSiftOptions,
 )
+from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import (
     FeatureConfig,
@@ -32,6 +33,7 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.stages.given_map import (
+    copy_features,
     given_map,
     given_type,
     has_descriptors,
@@ -39,6 +41,7 @@ from megloc_kapture.stages.given_map import (
     rows_at_their_places,
     rows_found_again,
 )
+from megloc_kapture.stages.global_features import extract_vlad, read_vocabulary
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.values import RigidTransform
 
@@ -100,6 +103,14 @@ def test_a_map_with_descriptors_is_taken_as_it_is(world, tmp_path: Path, folder_
     # nothing differs: sensors, points, observations, local and global features
     for part in ("sensors", "reconstruction"):
         assert folder_bytes(tmp_path / "map" / part) == folder_bytes(reference.root / part)
+
+
+def test_the_vocabulary_and_its_whitening_are_copied(world: Any, tmp_path: Path) -> None:
+    options = VladOptions(num_clusters=8, training_descriptors=2000, dimensions=3)
+    extract_vlad(world.mapping(), [world.mapping()], TYPE, tmp_path, options)
+    copy_features(world.mapping().with_features([tmp_path]), tmp_path / "map")
+    copy = read_vocabulary(tmp_path / "map/reconstruction/global_features/vlad_rootsift")
+    assert copy is not None and copy[0].size == 3 and copy[1].options == options
 
 
 def test_without_descriptors_the_observations_move_to_the_features_extracted_anew(
