@@ -42,7 +42,7 @@ from megloc_kapture.geometry.cameras import principal_point_px, shift_principal_
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.localization import confidence
-from megloc_kapture.localization.confidence import MIRRORED, TERMS
+from megloc_kapture.localization.confidence import MAP_POINTS, MIRRORED, TERMS
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import assigned
 from megloc_kapture.preprocessing.frames import scaled_camera
@@ -213,7 +213,7 @@ def fitted(table: pd.DataFrame, terms: Sequence[str], origin: str) -> confidence
 def confidences(table: pd.DataFrame, model: confidence.Calibration) -> NDArray[np.float64]:
     """Confidences of the rows; NaN without a pose."""
     found = np.full(len(table), np.nan)
-    for at, row in enumerate(table.fillna({MIRRORED: 1.0}).to_dict("records")):
+    for at, row in enumerate(table.fillna({MAP_POINTS: 1.0, MIRRORED: 1.0}).to_dict("records")):
         if row["localized"]:
             found[at] = model.probability(row)
     return found

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
@@ -210,7 +210,7 @@ class Working(Common):
             staged_output(output, kind=kind, force=force, adds=adds) as out,
             self.working(out) as work,
         ):
-            yield out, work
+            yield out, replace(work, force=force)
 
     @contextmanager
     def working_in(self, workspace: Workspace) -> Iterator[Work]:

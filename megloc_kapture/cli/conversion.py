@@ -71,7 +71,9 @@ class Import(Common):
     """An option of the dataset: key=value (version=1.0, reference_model=true); may be repeated."""
     query_prefix: str = ""
     """Put the queries into a folder of this name, where they share names with the map."""
-    force: Force = False
+    force: Overwrite = False
+    """Write into a folder that has other things in it; of colmap: map poses that contradict the
+    matches of their images."""
 
     def run(self, console: Console) -> None:
         name = self.dataset.removeprefix(TWIN_PREFIX)
@@ -112,7 +114,8 @@ class Import(Common):
             staged_output(self.output, kind=MAP, force=self.force) as out,
             open_executor("processes") as executor,
         ):
-            counts = import_colmap(source, out, work=Work(executor, console.track))
+            work = Work(executor, console.track, force=self.force)
+            counts = import_colmap(source, out, work=work)
             if self.unit != METRES:
                 write_unit(out, self.unit)
         for what, found in (("images", source.images), ("database", source.database)):

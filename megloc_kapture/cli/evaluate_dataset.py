@@ -78,7 +78,8 @@ class Eval(Deciding, Working):
     fail_below: float | None = None
     """Exit with 3 when the share of queries at the last threshold is lower (0 to 1)."""
     force: Overwrite = False
-    """Use a workspace folder that has other things in it."""
+    """Use a workspace folder that has other things in it, and map poses that contradict the
+    matches of their images."""
 
     def run(self, console: Console) -> int:
         """Run it; returns the exit status."""
@@ -106,6 +107,7 @@ class Eval(Deciding, Working):
         submissions = self.submissions or (None if self.workspace else Path(FOLDER))
         workspace = Workspace(place, force=self.force)
         with self.working_in(workspace) as work:
+            work = replace(work, force=self.force)
             stages = plan_evaluation(run)
             reports = run_plan(
                 stages,

@@ -24,6 +24,7 @@ from megloc_kapture.cli.common import (
     Inputs,
     Linked,
     Output,
+    Overwrite,
     Reading,
     Texts,
     Working,
@@ -33,6 +34,7 @@ from megloc_kapture.cli.common import (
 )
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
+from megloc_kapture.matching.verification import KnownPoseOptions
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
 from megloc_kapture.pipeline.workspace import Workspace
@@ -42,7 +44,7 @@ from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.devices import placed
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.map_points import triangulate_map
-from megloc_kapture.stages.matches import match_pairs
+from megloc_kapture.stages.matches import check_given_poses, match_pairs
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.preprocessing import (
     PreprocessingOptions,
@@ -175,7 +177,9 @@ class Match(Reading, StageCommand):
     """Type of local features; needed where there are several."""
     matcher: str | None = None
     """Matcher plugin; the preset's unless given."""
-    force: Force = False
+    force: Overwrite = False
+    """Write into a folder that has other things in it, and match with poses that contradict the
+    matches."""
 
     def run(self, console: Console) -> None:
         mapping = self.kapture_map(self.input)
@@ -193,6 +197,8 @@ class Match(Reading, StageCommand):
             mapping.check_features_apart(first)
         pairs = _read_pairs_of(self.pairs, first, mapping)
         with self.staged(self.output, FEATURES, force=self.force, adds=True) as (out, work):
+            if self.query is None and isinstance(verification, KnownPoseOptions):
+                check_given_poses(mapping, pairs, local_type, matcher, work)
             counts = match_pairs(
                 first, mapping, pairs, local_type, matcher, verification, out, work=work
             )

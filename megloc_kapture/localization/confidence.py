@@ -32,6 +32,8 @@ Floats = NDArray[np.float64]
 _SAMPLE = 3
 # inliers so near to each other count once, as a share of the image's diagonal
 _CELL = 0.01
+# a wrong map of few points agrees with itself: a pose is doubtful where the camera sees fewer
+_MIN_VISIBLE = 50
 # as many points tell how many of all could be seen
 _MAX_PROJECTED = 2048
 _MIN_ERROR_PX = 0.5
@@ -61,6 +63,10 @@ TERMS: dict[str, str] = {
 MIRRORED = "mirrored"
 """Beside the terms: by what probability chance makes features match better in the mirror so much.
 There only where the image seems to be mirrored, see :meth:`Calibration.probability`."""
+
+MAP_POINTS = "map_points"
+"""Besides the terms: the number of map points in the camera's view over the number that a trusted
+pose needs. Present only where it is below 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,10 +117,12 @@ def evidence_of(
     center = rig_from_world.center()
     points = problem.points[inliers] + problem.offset
     distances = np.linalg.norm(points - center, axis=1)
-    matchable = min(sources.num_keypoints, _num_visible(problem, rig_from_world, sources.seen))
+    visible = _num_visible(problem, rig_from_world, sources.seen)
+    matchable = min(sources.num_keypoints, visible)
     sighted = np.repeat(inliers, sources.support)
     angles, ratios = _viewpoints(points, center, sources, inliers, sighted)
     images = np.unique(sources.images[sighted], return_counts=True)[1]
+    share = max(visible, count) / _MIN_VISIBLE
     return {
         "surprise": math.log10(1.0 + _surprise(problem, errors_px, max_error_px)),
         "agreement": math.log(count / (num - count + 1.0)),
@@ -127,6 +135,7 @@ def evidence_of(
         "viewing_angle": angles,
         "distance_ratio": ratios,
         "support": math.log(1.0 + float((images >= 5).sum())),
+        **({MAP_POINTS: share} if share < 1.0 else {}),
     }
 
 
@@ -148,6 +157,8 @@ def with_confidence(
     confidence = model.probability(evidence)
     weakest = min(model.weights, key=lambda name: model.weights[name] * evidence[name])
     why, remarks = TERMS[weakest], pose.remarks
+    if MAP_POINTS in evidence and confidence >= min_confidence * evidence[MAP_POINTS]:
+        why = "the map has too few points where the camera looks"
     if misfit is not None:
         confidence *= (_TOLERATED_SHIFT / max(misfit.shift, _TOLERATED_SHIFT)) ** 2
         why = misfit.remark
@@ -312,12 +323,14 @@ class Calibration:
     def probability(self, evidence: Mapping[str, float]) -> float:
         """The probability that a pose of this evidence is right, from 0 to 1.
 
-        That of the terms, and times :data:`MIRRORED` where that was asked and is in the evidence.
+        That of the terms, times :data:`MAP_POINTS` and :data:`MIRRORED` where the evidence has
+        them.
         """
         logit = self.bias + sum(
             weight * evidence[name] for name, weight in sorted(self.weights.items())
         )
         of_terms = 1.0 / (1.0 + math.exp(-min(max(logit, -700.0), 700.0)))
+        of_terms *= evidence.get(MAP_POINTS, 1.0)
         return of_terms * evidence.get(MIRRORED, 1.0) if _is_asked(of_terms) else of_terms
 
 

@@ -30,6 +30,7 @@ from megloc_kapture.geometry.cameras import (
     scale_focal,
     swap_principal_point,
 )
+from megloc_kapture.geometry.conventions import CONVENTIONS
 from megloc_kapture.values import Camera, RigidTransform
 
 Origin = Literal["corner", "centre"]
@@ -43,8 +44,6 @@ _MAX_SHARE = 0.01
 _MIN_LIMIT_PX = 8.0
 # images that may fail: some poses of a good map are wrong
 _MAX_FAILING = 0.2
-# y up and z to the back, against y down and z to the front
-_COLMAP_FROM_OPENGL = RigidTransform((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 _UNITS = {1000.0: "millimetres", 100.0: "centimetres", 1 / 1000: "kilometres", 1 / 0.3048: "feet"}
 
 
@@ -274,12 +273,8 @@ def _readings(images: Sequence[ObservedKeypoints], xyz: Floats) -> Iterator[tupl
     for by in (1, -1):
         yield f"keypoint ids moved by {by:+d}", next_rows(by)
         yield f"point ids moved by {by:+d}", changed(point_shift=by)
-    yield "poses read as world_from_cam", changed(pose=RigidTransform.inverse)
-    yield "quaternions read as x, y, z, w", changed(pose=_quaternion_last)
-    yield "translations read as camera centres", changed(pose=_centre_given)
-    yield "poses read with OpenGL's axes", changed(pose=lambda p: _COLMAP_FROM_OPENGL @ p)
-    inverted = changed(pose=lambda p: _COLMAP_FROM_OPENGL @ p.inverse())
-    yield "poses read as OpenGL's world_from_cam", inverted
+    for name, convention in CONVENTIONS.items():
+        yield name, changed(pose=convention)
     for scale, unit in _UNITS.items():
         yield f"points in {unit}", changed(points=partial(np.multiply, 1 / scale))
         yield f"poses in {unit}", changed(pose=partial(_scaled, 1 / scale))
@@ -325,16 +320,6 @@ def _factors(images: Sequence[ObservedKeypoints], xyz: Floats) -> dict[str, floa
     finite = {name: ratios[np.isfinite(ratios)] for name, ratios in found.items()}
     medians = {name: float(np.median(ratios)) for name, ratios in finite.items() if len(ratios)}
     return {name: value for name, value in medians.items() if 0.02 < value < 50.0}
-
-
-def _quaternion_last(pose: RigidTransform) -> RigidTransform:
-    x, y, z, w = pose.quat_wxyz
-    return RigidTransform((w, x, y, z), pose.translation)
-
-
-def _centre_given(pose: RigidTransform) -> RigidTransform:
-    t = -pose.rotation_matrix() @ np.array(pose.translation)
-    return RigidTransform(pose.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
 
 
 def _scaled(factor: float, pose: RigidTransform) -> RigidTransform:

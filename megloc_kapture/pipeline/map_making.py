@@ -370,8 +370,11 @@ def import_colmap(source: ColmapFolders, output: Path, *, work: Work = HERE) -> 
         read.write_images(images)
         workspace = Workspace(Path(scratch) / "workspace")
         stages = plan_map(KaptureFolder(images), options_of_preset(DEFAULT_PRESET))
-        with workspace.lock(), single_threaded():
-            run_plan(stages, workspace, work)
+        try:
+            with workspace.lock(), single_threaded():
+                run_plan(stages, workspace, work)
+        except DataError as error:  # the workspace will be gone
+            raise DataError(error.message, path=source.model) from error
         for made in workspace.path(MAP).iterdir():
             made.rename(output / made.name)
     read.link_images(output)

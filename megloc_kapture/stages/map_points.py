@@ -79,7 +79,7 @@ def triangulate_map(
 
     Raises
     ------
-    DataError : no image has a pose, or a type is not there.
+    DataError : no image has a pose, or a type is not there; or there is no point.
     """
     types = tuple(dict.fromkeys([local_types] if isinstance(local_types, str) else local_types))
     data = mapping.read()
@@ -110,6 +110,13 @@ def triangulate_map(
         errors_px = np.concatenate([errors_px, found.errors_px])
         by_type[f"points_{name}"] = len(found.xyz)
         by_type[f"observations_{name}"] = len(found.point_ids)
+    if not len(xyz):
+        raise DataError(
+            f"no point could be triangulated: {sum(map(len, of_type.values()))} of the image pairs "
+            "have verified matches. Check that the images overlap, and that their poses "
+            "(cam_from_world) and cameras are right",
+            path=mapping.root,
+        )
     write_sensors(output, data)
     link_images(mapping.root, output)
     # with a pyramid's type the one it begins with: queries are matched with that at first
@@ -125,8 +132,8 @@ def triangulate_map(
         "points": len(xyz),
         "observations": num_observations,
         **(by_type if len(types) > 1 else {}),
-        "mean_track_length": round(num_observations / max(len(xyz), 1), 3),
-        "mean_reprojection_error_px": round(float(errors_px.mean()), 4) if len(xyz) else 0.0,
+        "mean_track_length": round(num_observations / len(xyz), 3),
+        "mean_reprojection_error_px": round(float(errors_px.mean()), 4),
     }
 
 

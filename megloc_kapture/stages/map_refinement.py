@@ -585,7 +585,7 @@ class RefineMap(PipelineStage):
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         folder, out = work.folder(UNREFINED), work.out / self.layout.sparse_map()
-        return refine_map(
+        counts = refine_map(
             folder,
             out,
             self.options.refinement,
@@ -593,3 +593,9 @@ class RefineMap(PipelineStage):
             link_features=True,
             work=work,
         )
+        if not counts["points"]:
+            raise DataError(
+                f"refinement leaves none of the {len(folder.points3d())} points. Check the map's "
+                "poses and cameras, or loosen the limits (--set refinement.KEY=VALUE)"
+            )
+        return counts

@@ -5,6 +5,7 @@ Mapping pairs are verified with their known poses, query pairs by a two-view mod
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
@@ -23,9 +24,11 @@ from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, MatchesWriter, read_pairs
 from megloc_kapture.io.tables import PairCount, write_match_counts
 from megloc_kapture.matching.guided_pyramid import verify_best_first
+from megloc_kapture.matching.pose_check import PairEvidence, count_fitting, pose_contradiction
 from megloc_kapture.matching.verification import (
     KnownPoseOptions,
     TwoViewOptions,
+    agree_by_chance,
     ray_slopes,
     verify_two_view,
     verify_with_poses,
@@ -54,8 +57,12 @@ from megloc_kapture.stages.work import (
 )
 from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
 
+_log = logging.getLogger(__name__)
+
 _CACHE_BYTES = 256 << 20  # descriptors kept per process: about a hundred images
 _PAIRS_PER_ITEM = 32  # of one image, whose features are read once for them
+# images, and pairs of each, that say whether the given poses contradict the matches
+_CHECKED_IMAGES, _CHECKED_PAIRS = 24, 4
 
 
 class NoVerification(Options):
@@ -166,6 +173,82 @@ def match_pairs(
         "pairs_with_matches": sum(count.verified > 0 for count in counts),
         "matches": sum(count.verified for count in counts),
     }
+
+
+def check_given_poses(
+    mapping: KaptureFolder,
+    pairs: Sequence[ImagePair],
+    local_type: str,
+    matcher: Matcher,
+    work: Work = HERE,
+) -> None:
+    """Compare the given poses of map images with two-view models of a sample of their pairs.
+
+    Logs a warning where some poses contradict the matches; where most do, raises DataError unless
+    ``work.force``.
+    """
+    specs = FolderSpec(mapping), FolderSpec(mapping)
+    read, finish = partial(_read, specs, local_type), partial(_evidence, specs, local_type)
+    match: Any = partial(_match, matcher)
+    steps: Batched[_Job, list[PairEvidence]] = Batched(
+        read, match, matcher, "match_many", None, finish
+    )
+    found = work.map(steps, _sampled(pairs), "checking the given poses")
+    contradiction = pose_contradiction([pair for of_image in found for pair in of_image])
+    if contradiction is None:
+        return
+    message, most = contradiction
+    if most and not work.force:
+        raise DataError(f"{message} (--force goes on all the same)", path=mapping.root)
+    _log.warning("%s", message)
+
+
+def _sampled(pairs: Sequence[ImagePair]) -> list[_Job]:
+    """Images spread over the map, each with some of its pairs, near and far ones."""
+    others: dict[str, dict[str, None]] = {}
+    for pair in sorted(pairs, key=lambda pair: (-pair.score, pair.query, pair.map)):
+        others.setdefault(pair.query, {})[pair.map] = None
+        others.setdefault(pair.map, {})[pair.query] = None
+    jobs: dict[str, list[str]] = {}
+    seen = set()
+    for image in _spread(sorted(others), _CHECKED_IMAGES):
+        for other in _spread(list(others[image]), _CHECKED_PAIRS):
+            pair = min(image, other), max(image, other)
+            if pair not in seen:
+                seen.add(pair)
+                jobs.setdefault(image, []).append(other)
+    return list(jobs.items())
+
+
+def _spread(items: Sequence[str], count: int) -> list[str]:
+    every = max(1.0, len(items) / count)
+    return [items[int(number * every)] for number in range(min(count, len(items)))]
+
+
+def _evidence(
+    specs: tuple[FolderSpec, FolderSpec],
+    local_type: str,
+    found: tuple[_Job, Sequence[_PairMatches]],
+) -> list[PairEvidence]:
+    """The pairs of an image that a two-view model explains better than chance would."""
+    (image, others), matched = found
+    data, options = specs[0].open().read(), TwoViewOptions()
+    a, *read = _read(specs, local_type, (image, others))
+    evidence = []
+    for other, b, pair in zip(others, read, matched, strict=True):
+        poses = data.cam_from_world(image), data.cam_from_world(other)
+        if poses[0] is None or poses[1] is None:
+            continue
+        rows, _, number = verified(a, b, pair, verification_of(options))
+        i, j = rows.T
+        pixels_a, pixels_b = a.keypoints_px[i, :2], b.keypoints_px[j, :2]
+        if agree_by_chance(pixels_a, a.camera, pixels_b, b.camera, number, options):
+            continue
+        rays = a.rays[i], a.slopes[i], b.rays[j], b.slopes[j]
+        side_px = max(a.width, a.height, b.width, b.height)
+        fitting = count_fitting(*rays, (poses[0], poses[1]), side_px)
+        evidence.append(PairEvidence(image, other, len(rows), fitting))
+    return evidence
 
 
 def matched_inputs(
@@ -393,6 +476,10 @@ class MatchMapping(PipelineStage):
     def run(self, work: StageWork) -> Mapping[str, float]:
         mapping = work.folder(self.layout.mapping(), FEATURES)
         pairs, out = mapping_pairs(work, mapping), work.out / self.writes[0]
+        # the poses of photographs are made of matches
+        if isinstance(self.verification(), KnownPoseOptions) and not self.layout.posed:
+            name = self.options.own_types()[0]
+            check_given_poses(mapping, pairs, name, self.options.make_matcher(name), work)
         counts: Counter[str] = Counter()
         for name in self.options.own_types():
             matcher, how = self.options.make_matcher(name), self.verification()

@@ -286,12 +286,14 @@ class Work:
     executor : None stands for this process.
     num_threads : for what has threads of its own, as COLMAP's triangulation.
     kept : what runs before have done of it; None where nothing is kept.
+    force : go on where the given data contradict themselves.
     """
 
     executor: Executor | None = None
     track: Track = untracked
     num_threads: int = 1
     kept: KeptItems | None = None
+    force: bool = False
 
     def map(
         self,

@@ -432,3 +432,16 @@ def test_verify_finds_what_size_and_time_do_not_show(
         "local_features"
     ]
     assert (workspace / name).read_bytes() == before[name]
+
+
+def test_inverted_poses_are_refused_unless_forced(
+    evaluate: Callable[..., Any], dataset: Path, tmp_path: Path
+) -> None:
+    folder = KaptureFolder(dataset / "mapping")
+    data = folder.read()
+    inverted = {key: pose.inverse() for key, pose in data.trajectories.items()}
+    write_sensors(folder.root, replace(data, trajectories=inverted))
+    done = evaluate(dataset, tmp_path / "ws", status=2)
+    assert "; poses inverted (camera-to-world, world_from_cam), " in done.err
+    done = evaluate(dataset, tmp_path / "ws", "--force", "--until", "mapping_matches")
+    assert "up to date" in done.err and "mapping_matches: " in done.err

@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from colmap_workspace import write_workspace
+from scipy.spatial.transform import Rotation
 
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.io.kapture import KaptureFolder
@@ -76,6 +78,39 @@ def test_what_changes_nothing_is_refused(
     arguments = (word.format(room=colmap_room, scene=scene) for word in words.split())
     megloc("import", *arguments, "-o", tmp_path / "map").refused(told)
     assert not (tmp_path / "map").exists()
+
+
+def write_poses(folder: Path, colmap_room: Path, matrices: dict[str, np.ndarray]) -> None:
+    """Write a COLMAP model of poses alone, beside the room's images."""
+    (folder / "sparse").mkdir(parents=True)
+    (folder / "images").symlink_to(colmap_room / "images")
+    pycolmap.Reconstruction(colmap_room / "sparse" / "0").write_text(folder / "sparse")
+    for name in ("points3D.txt", "frames.txt", "rigs.txt"):
+        (folder / "sparse" / name).unlink()
+    (folder / "sparse" / "points3D.txt").touch()
+    lines = []
+    for number, (name, matrix) in enumerate(matrices.items(), start=1):
+        x, y, z, w = Rotation.from_matrix(matrix[:3, :3]).as_quat().tolist()
+        tx, ty, tz = matrix[:3, 3].tolist()
+        lines.append(f"{number} {w} {x} {y} {z} {tx} {ty} {tz} 1 {name}\n\n")
+    (folder / "sparse" / "images.txt").write_text("".join(lines))
+
+
+def test_poses_in_another_convention(
+    megloc: Any, colmap_room: Path, scene: Path, tmp_path: Path
+) -> None:
+    poses = KaptureFolder(scene / "mapping").read().poses()
+    opengl = np.diag([1.0, -1.0, -1.0, 1.0])
+    given = {name: np.linalg.inv(opengl @ pose.matrix()) for name, pose in poses.items()}
+    write_poses(tmp_path / "wrong", colmap_room, given)
+    arguments = ("import", "colmap", tmp_path / "wrong", "-o", tmp_path / "map")
+    done = megloc(*arguments)
+    assert done.status == 2 and not (tmp_path / "map").exists()
+    (line,) = (line for line in done.err.splitlines() if line.startswith("megloc:"))
+    assert f"{tmp_path}/wrong/sparse: the given poses contradict the matches" in line
+    assert "poses inverted and with OpenGL's axes (camera-to-world, y up, z back)" in line
+    done = megloc(*arguments, "-f")
+    assert done.status == 0 and "observations" in done.out, done
 
 
 @pytest.mark.slow

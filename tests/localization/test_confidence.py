@@ -107,7 +107,7 @@ def test_the_number_of_views_does_not_matter() -> None:
 
 def test_more_wrong_matches_never_speak_for_a_pose() -> None:
     for model in calibrations().values():
-        found = [model.probability(terms(40, wrong)) for wrong in (0, 40, 160, 640)]
+        found = [model.probability(terms(50, wrong)) for wrong in (0, 40, 160, 640)]
         assert found == sorted(found, reverse=True)
 
 
@@ -216,6 +216,17 @@ def test_the_calibrations_of_the_package() -> None:
     assert calibration_for(["rootsift"]) is of_all and calibration_for([]) is of_all
     assert calibration_for(["aliked-n16", "aliked-n16_pyramid"]) is of_aliked
     assert calibration_for(["aliked-n16", "xfeat"]) is of_all
+
+
+def test_a_map_of_few_points_is_not_trusted() -> None:
+    """All 25 points that a camera sees may agree and be wrong together; with 100 they count."""
+    problem, pose, sources = scene(25, 0, noise_px=0.1)
+    refused = with_confidence(problem, pose, sources, ERROR_PX, 0.6)
+    assert isinstance(refused, Failure) and "too few points where the camera" in refused.reason
+    assert refused.confidence is not None and 0.3 < refused.confidence < 0.6
+    more = np.concatenate([sources.seen[0]] * 4)
+    trusted = with_confidence(problem, pose, replace(sources, seen=[more]), ERROR_PX, 0.6)
+    assert isinstance(trusted, Pose) and trusted.evidence.keys() == set(TERMS)
 
 
 def test_what_is_not_known() -> None:

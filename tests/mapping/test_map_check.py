@@ -103,14 +103,17 @@ MISTAKES: dict[str, tuple[Callable[[Map], Map], str]] = {
     ),
     "half the resolution": (with_pixels(lambda k: k / 2), "images 2 times as large"),
     "larger images": (with_pixels(lambda k: k * 1.6), "images 0.625 times as large"),
-    "world_from_cam": (with_pose(RigidTransform.inverse), "world_from_cam"),
+    "world_from_cam": (with_pose(RigidTransform.inverse), r"poses inverted \(camera-to-world"),
     "xyzw": (
         with_pose(lambda p: RigidTransform((*p.quat_wxyz[1:], p.quat_wxyz[0]), p.translation)),
         "quaternions read as x, y, z, w",
     ),
     "centres": (with_pose(lambda p: with_translation(p, p.center())), "camera centres"),
     "OpenGL": (with_pose(lambda p: OPENGL @ p), "OpenGL's axes"),
-    "OpenGL, inverse": (with_pose(lambda p: (OPENGL @ p).inverse()), "OpenGL's world_from_cam"),
+    "OpenGL, inverse": (
+        with_pose(lambda p: (OPENGL @ p).inverse()),
+        "inverted and with OpenGL's axes",
+    ),
     "points in mm": (with_points(lambda p: 1000 * p), "points in millimetres"),
     "points in feet": (with_points(lambda p: p / 0.3048), "points in feet"),
     "poses in mm": (

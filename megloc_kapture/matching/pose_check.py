@@ -1,0 +1,105 @@
+"""Given poses against the matches of the images: do they contradict each other, and why."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.geometry.conventions import CONVENTIONS, better_conventions
+from megloc_kapture.matching.verification import Floats, KnownPoseOptions, verify_with_poses
+from megloc_kapture.values import RigidTransform
+
+# poses of depth sensors are off by centimetres, wrong ones by more than this, also in pixels of
+# the larger side
+_MIN_ERROR_PX, _MAX_ERROR_SHARE = 8.0, 0.01
+_AGREEING = 0.5  # share of a pair's matches that have to fit its poses
+_MOST = 0.5
+
+
+@dataclass(frozen=True)
+class PairEvidence:
+    """A pair of images, how many of its matches a two-view model explains, and how many of these
+    fit the poses: as given, then in each of :data:`CONVENTIONS`."""
+
+    image: str
+    other: str
+    num: int
+    fitting: tuple[int, ...]
+
+    @property
+    def agrees(self) -> bool:
+        """Whether most matches fit the poses as given."""
+        return self.fitting[0] >= _AGREEING * self.num
+
+
+def count_fitting(
+    rays_a: Floats,
+    slopes_a: Floats,
+    rays_b: Floats,
+    slopes_b: Floats,
+    poses: tuple[RigidTransform, RigidTransform],
+    side_px: int,
+) -> tuple[int, ...]:
+    """Count the matches that fit the given poses of both images, and those of each convention.
+
+    Of matched rays and slopes as in :func:`verify_with_poses`; ``side_px`` is the images' larger
+    side.
+    """
+    error_px = max(_MIN_ERROR_PX, _MAX_ERROR_SHARE * side_px)
+    options = KnownPoseOptions(max_error_px=error_px, min_matches=0)
+    counts = []
+    for read in (lambda pose: pose, *CONVENTIONS.values()):
+        a, b = map(read, poses)
+        good = verify_with_poses(rays_a, slopes_a, rays_b, slopes_b, b @ a.inverse(), options)
+        counts.append(int(good.sum()))
+    return tuple(counts)
+
+
+def pose_contradiction(pairs: Sequence[PairEvidence]) -> tuple[str, bool] | None:
+    """Return how the poses contradict the matches, and whether most do; None where they agree."""
+    if not pairs:
+        return None
+    total = sum(pair.num for pair in pairs)
+    counts: NDArray[np.int64] = np.sum([pair.fitting for pair in pairs], axis=0)
+    if better := better_conventions((counts / total).tolist()):
+        message = (
+            f"the given poses contradict the matches: of {total} matches in {len(pairs)} image "
+            f"pairs {counts[0]} fit the poses; {' or '.join(better)}, {counts[1:].max()} would "
+            "fit. Convert the poses to cam_from_world with x right, y down, z forward"
+        )
+        return message, True
+    wrong, right = _split(pairs)
+    if not wrong:
+        return None
+    shown = ", ".join(wrong[:5]) + (", ..." if len(wrong) > 5 else "")
+    message = (
+        f"the given poses of {len(wrong)} of {len(wrong) + right} compared images contradict their "
+        f"matches: {shown}"
+    )
+    if len(wrong) <= _MOST * (len(wrong) + right):
+        return message, False
+    return f"{message}. No usual convention explains it: check poses, names and cameras", True
+
+
+def _split(pairs: Sequence[PairEvidence]) -> tuple[list[str], int]:
+    """Return the images whose poses most of their pairs contradict, and the number of the others.
+
+    A wrong pose spoils the pairs of right images too: the worst image is taken out with its pairs
+    before the next one is judged.
+    """
+    wrong, left = [], list(pairs)
+    while True:
+        contradict: dict[str, list[bool]] = defaultdict(list)
+        for pair in left:
+            contradict[pair.image].append(not pair.agrees)
+            contradict[pair.other].append(not pair.agrees)
+        shares = [(np.mean(of_image), len(of_image), i) for i, of_image in contradict.items()]
+        share, _, worst = max(shares, default=(0.0, 0, ""))
+        if share <= _MOST:
+            return sorted(wrong), len(contradict)
+        wrong.append(worst)
+        left = [pair for pair in left if worst not in (pair.image, pair.other)]

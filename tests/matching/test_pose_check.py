@@ -1,0 +1,123 @@
+"""Given poses against matches: each convention by matrices, poses wrong by chance, and noise."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.geometry.cameras import bearing_rays, project
+from megloc_kapture.matching.pose_check import PairEvidence, count_fitting, pose_contradiction
+from megloc_kapture.matching.verification import ray_slopes
+from megloc_kapture.values import Camera, RigidTransform
+
+CAMERA = Camera.pinhole(640, 480, 500.0)
+Matrix = NDArray[np.float64]
+
+
+def poses_around(number: int) -> list[Matrix]:
+    """``cam_from_world`` of cameras on an arc around points near the origin, far from the world's
+    axes."""
+    found = []
+    for at in range(number):
+        angle = 0.9 * at / number - 0.4
+        rotation = Rotation.from_euler("yxz", [-angle, 0.1 * (at % 3), 0.05 * (at % 2)]).as_matrix()
+        center = 8 * np.array([np.sin(angle), 0.1 * (-1) ** at, -np.cos(angle)])
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
+        world = np.eye(4)
+        world[:3, :3], world[:3, 3] = Rotation.from_rotvec([0.3, 0.9, -0.5]).as_matrix(), (5, -9, 3)
+        found.append(pose @ world)
+    return found
+
+
+def evidence(right: list[Matrix], given: list[RigidTransform]) -> list[PairEvidence]:
+    """Of all pairs; noise of a pixel."""
+    rng = np.random.default_rng(0)
+    points = np.linalg.inv(right[0]) @ np.append(rng.uniform(-1.5, 1.5, (80, 3)) + (0, 0, 8),
+                                                 np.ones((80, 1)), axis=1).T  # fmt: skip
+    seen = []
+    for pose in right:
+        px = project(CAMERA, transform(pose), points[:3].T) + rng.normal(0, 0.7, (80, 2))
+        rays = bearing_rays(CAMERA, px)
+        seen.append((rays, ray_slopes(CAMERA, px, rays)))
+    return [
+        PairEvidence(
+            f"{a}.jpg", f"{b}.jpg", 80, count_fitting(*seen[a], *seen[b], (given[a], given[b]), 640)
+        )
+        for a, b in itertools.combinations(range(len(right)), 2)
+    ]
+
+
+def transform(matrix: Matrix) -> RigidTransform:
+    return RigidTransform.from_matrix(matrix[:3, :3], matrix[:3, 3])
+
+
+def turned(pose: Matrix) -> RigidTransform:
+    (w, *xyz), t = transform(pose).quat_wxyz, transform(pose).translation
+    return RigidTransform((*xyz, w), t)
+
+
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+GIVEN: dict[str, Callable[[Matrix], RigidTransform]] = {
+    "poses inverted (camera-to-world": lambda pose: transform(np.linalg.inv(pose)),
+    "read with OpenGL's axes (y up, z back)": lambda pose: transform(OPENGL @ pose),
+    "inverted and with OpenGL's axes": lambda pose: transform(np.linalg.inv(OPENGL @ pose)),
+    "translations read as camera centres": lambda pose: RigidTransform(
+        transform(pose).quat_wxyz, tuple(np.linalg.inv(pose)[:3, 3].tolist())
+    ),
+    "quaternions read as x, y, z, w": turned,
+}
+
+
+@pytest.mark.parametrize("name", GIVEN)
+@pytest.mark.parametrize("wrong", [0, 2], ids=["all", "two of nine wrong besides"])
+def test_each_convention_is_named(name: str, wrong: int) -> None:
+    right = poses_around(9)
+    given = [GIVEN[name](pose) for pose in right]
+    given[:wrong] = by_chance(right[:wrong])
+    contradiction = pose_contradiction(evidence(right, given))
+    assert contradiction is not None and contradiction[1]
+    named = [other for other in GIVEN if other in contradiction[0]]
+    assert named == [name], contradiction
+
+
+def by_chance(right: list[Matrix]) -> list[RigidTransform]:
+    rotations = Rotation.random(len(right), random_state=1).as_matrix()
+    return [
+        transform(np.block([[rotation, pose[:3, 3:]], [np.zeros(3), 1]]))
+        for rotation, pose in zip(rotations, right, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 4, 5, 9])
+def test_poses_wrong_by_chance_are_counted(wrong: int) -> None:
+    """Up to half of the images it is a warning, beyond that the map is refused."""
+    right = poses_around(9)
+    given = [*by_chance(right[:wrong]), *map(transform, right[wrong:])]
+    contradiction = pose_contradiction(evidence(right, given))
+    if wrong == 0:
+        assert contradiction is None
+        return
+    assert contradiction is not None
+    message, most = contradiction
+    assert most == (wrong > 4) and ".jpg" in message
+    if wrong <= 5:
+        assert message.startswith(f"the given poses of {wrong} of 9 compared images")
+
+
+def test_noise_is_no_contradiction() -> None:
+    """Of 3 cm and 0.3 deg, 8 m from the points."""
+    right, rng = poses_around(9), np.random.default_rng(0)
+    given = []
+    for pose in right:
+        off = np.eye(4)
+        off[:3, :3] = Rotation.from_rotvec(np.deg2rad(0.3) * rng.normal(size=3) / 1.7).as_matrix()
+        off[:3, 3] = 0.03 * rng.normal(size=3) / 1.7
+        given.append(transform(off @ pose))
+    assert pose_contradiction(evidence(right, given)) is None
+    assert pose_contradiction([]) is None
