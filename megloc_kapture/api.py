@@ -22,7 +22,13 @@ from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.document import REPORT_HTML
 from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
-from megloc_kapture.io.images import guessed_camera, photo_of, read_photo, turned_upright
+from megloc_kapture.io.images import (
+    guessed_camera,
+    photo_of,
+    pillow_pixels,
+    read_photo,
+    turned_upright,
+)
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, recall_rows
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
@@ -218,7 +224,7 @@ def _query_of(
             camera, orientation = photo.upright_camera, photo.orientation
     elif not isinstance(image, np.ndarray):
         photo = photo_of(image)
-        image = np.asarray(image.convert("RGB"))
+        image = pillow_pixels(image)
         if camera is None:
             camera, image = photo.upright_camera, turned_upright(image, photo.orientation)
     elif camera is None:
@@ -344,7 +350,8 @@ def map_photographs(
     options = options_of_photographs(preset, set or {})
     photographs = Photographs(paths, camera)
     asked = () if scale is None else (scale,) if scale == "gps" else tuple(map(str, scale))
-    structure = structure_options(photographs, mapper, asked, known_cameras=camera is not None)
+    known = photographs.known_cameras()
+    structure = structure_options(photographs, mapper, asked, known_cameras=known)
     title = paths[0].resolve().stem if paths else "photographs"
     place = workspace or Path("runs") / f"{title}-{preset}"
     stages = plan_photographs(photographs, options, structure)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 import tyro
 
 from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.io.camera_list import CameraList, read_cameras
 from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
@@ -148,6 +149,13 @@ def camera_of_text(text: str) -> Camera:
             f"--camera {text}: {reason}; give MODEL,WIDTH,HEIGHT,PARAMETERS, as in "
             "SIMPLE_RADIAL,4032,3024,3100,2016,1512,0.02"
         ) from error
+
+
+def cameras_of_text(text: str | None) -> Camera | CameraList | None:
+    """As :func:`camera_of_text`, or of a file with a list of cameras; raises DataError too."""
+    if text is None:
+        return None
+    return read_cameras(Path(text)) if Path(text).is_file() else camera_of_text(text)
 
 
 def side_tables_beside(result: Path) -> Path | None:

@@ -15,6 +15,7 @@ import tyro
 
 from megloc_kapture.cli.common import Common, Console, Reading, opened_map
 from megloc_kapture.cli.maps import report_lines
+from megloc_kapture.datasets.kapture_folders import cameras_of_folder
 from megloc_kapture.errors import MeglocError, OptionError
 from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.io.dataset_tables import METRES
@@ -65,8 +66,12 @@ class Info(Reading, Common):
         folder = self.kapture(opened_map(self.input, console))
         describe_content(console, folder)
         folder.validate(deep=self.deep)
-        checked = "everything, image by image" if self.deep else "files: no fault found"
-        line(console, "checked", checked)
+        if sizes := list(describe_sizes(folder)):
+            for text in sizes:
+                line(console, "FAULT", text)
+        else:
+            checked = "everything, image by image" if self.deep else "files: no fault found"
+            line(console, "checked", checked)
         if folder.has_points():
             self._describe_map(console, folder.root)
         else:
@@ -124,6 +129,19 @@ def describe_content(console: Console, folder: KaptureFolder) -> None:
         for name, seen in sorted(folder.observations().items()):
             line(console, "observations", f"{name}: {len(seen.point_ids)}")
         describe_refinement(console, folder)
+
+
+def describe_sizes(folder: KaptureFolder) -> Iterator[str]:
+    """Where images are of another size than their cameras, in words; reads headers only."""
+    scaled, errors = cameras_of_folder(folder)
+    for sensor_id, camera in scaled.items():
+        known = folder.read().sensors[sensor_id].camera()
+        yield (
+            f"the images of camera {sensor_id} are {camera.width}x{camera.height}, scaled from the "
+            f"{known.width}x{known.height} of the camera and of keypoints"
+        )
+    if errors:
+        yield f"{len(errors)} images are of another size than their cameras, the first: {errors[0]}"
 
 
 def describe_refinement(console: Console, folder: KaptureFolder) -> None:

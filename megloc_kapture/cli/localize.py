@@ -22,10 +22,11 @@ from megloc_kapture.cli.common import (
     Overwrite,
     Reading,
     Texts,
-    camera_of_text,
+    cameras_of_text,
     opened_map,
     refuse_given,
 )
+from megloc_kapture.datasets.kapture_folders import is_kapture
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.dataset_tables import METRES
 from megloc_kapture.io.files import read_text
@@ -61,7 +62,8 @@ class Localize(Reading, Deciding, Common):
     from EXIF or guessed, and estimated with the poses."""
     camera: str | None = None
     """Camera of all --images, whose pixels are then taken as they are stored:
-    MODEL,WIDTH,HEIGHT,PARAMETERS as COLMAP has them."""
+    MODEL,WIDTH,HEIGHT,PARAMETERS as COLMAP has them; or a file with a camera for each image, rows
+    of NAME MODEL WIDTH HEIGHT PARAMETERS."""
     every: int | None = None
     """Of videos among --images every so many frames one is taken; 30 unless given."""
     output: Output = Path("localized")
@@ -81,16 +83,17 @@ class Localize(Reading, Deciding, Common):
     def run(self, console: Console) -> None:
         self._check_queries()
         workers = available_cores() if self.workers is None else self.workers
+        folder: KaptureFolder | Photographs
+        if self.query is None:
+            folder = Photographs(self.images, cameras_of_text(self.camera), every=self.every)
+            for text in folder.describe():
+                console.say(text)
+        else:
+            folder = self.kapture(self.query)
         path = opened_map(self.input, console)
         kapture_map = self.opening(path, self.keypoints_type, self.pixel_origin)()
         _check_consistent(kapture_map, self.input, force=self.force)
         options = _options_of(self)
-        folder: KaptureFolder | Photographs
-        if self.query is None:
-            camera = None if self.camera is None else camera_of_text(self.camera)
-            folder = Photographs(self.images, camera, every=self.every)
-        else:
-            folder = self.kapture(self.query)
         given = None if self.pairs is None else dict(iterate_candidates(read_pairs(self.pairs)))
         # what is wrong is found before the first query, and before anything is written
         localizer = Localizer(kapture_map, options=options)
@@ -130,6 +133,14 @@ class Localize(Reading, Deciding, Common):
         """Raise OptionError unless the queries are given, in one way."""
         if (self.query is None) == (not self.images):
             raise OptionError("give the queries: either --query, a kapture folder, or --images")
+        if self.query is not None and self.query.is_file():
+            raise OptionError(
+                f"--query {self.query}: takes a kapture folder; a list of cameras goes to "
+                "--camera, the images to --images"
+            )
+        for path in self.images:
+            if is_kapture(path):
+                raise OptionError(f"--images {path}: a kapture folder; give it by --query")
         if self.query is not None:
             refuse_given("--images", camera=self.camera, every=self.every)
 

@@ -17,7 +17,7 @@ from megloc_kapture.cli.common import (
     Reading,
     Texts,
     Working,
-    camera_of_text,
+    cameras_of_text,
 )
 from megloc_kapture.cli.stages import StageCommand, restrictions_beside
 from megloc_kapture.errors import OptionError
@@ -51,7 +51,7 @@ class MapPhotographs(Choosing, Working):
     """Make a map of photographs without poses; what is done and still true is kept."""
 
     images: tyro.conf.Positional[tuple[Path, ...]]
-    """Photographs and videos, or folders of them."""
+    """Photographs and videos, or folders of them; or a kapture folder of images without poses."""
     output: Output
     """Workspace, a map for all commands: the kapture map is its folder map/."""
     mapper: Mapper = "incremental"
@@ -61,7 +61,8 @@ class MapPhotographs(Choosing, Working):
     the distance of their cameras. Without it the map has units of its own."""
     camera: str | None = None
     """Camera of all images, whose pixels are then taken as they are stored:
-    MODEL,WIDTH,HEIGHT,PARAMETERS as COLMAP has them. It stays as it is."""
+    MODEL,WIDTH,HEIGHT,PARAMETERS as COLMAP has them. It stays as it is. Or a file with a camera
+    for each image, rows of NAME MODEL WIDTH HEIGHT PARAMETERS."""
     every: int | None = None
     """Of videos every so many frames one is taken; 30 unless given."""
     force: Force = False
@@ -70,11 +71,11 @@ class MapPhotographs(Choosing, Working):
         options = options_of_photographs(
             self.preset or DEFAULT_PRESET, self.assignments(), used=MAPPING_OPTIONS
         )
-        camera = None if self.camera is None else camera_of_text(self.camera)
-        photographs = Photographs(self.images, camera, every=self.every)
-        structure = structure_options(
-            photographs, self.mapper, self.scale, known_cameras=camera is not None
-        )
+        photographs = Photographs(self.images, cameras_of_text(self.camera), every=self.every)
+        for text in photographs.describe():
+            console.say(text)
+        known = photographs.known_cameras()
+        structure = structure_options(photographs, self.mapper, self.scale, known_cameras=known)
         stages = plan_photographs(photographs, options, structure)
         workspace = Workspace(self.output, force=self.force)
         with self.working_in(workspace) as work:

@@ -11,7 +11,7 @@ import logging
 import os
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,11 @@ from megloc_kapture.datasets.formats.colmap_reading import (
     read_colmap_rigs,
     rig_files,
 )
-from megloc_kapture.datasets.kapture_folders import is_kapture
+from megloc_kapture.datasets.kapture_folders import (
+    cameras_of_images,
+    is_kapture,
+    warn_of_scaled,
+)
 from megloc_kapture.datasets.reference_map import write_reference_map
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import link_records
@@ -45,6 +49,7 @@ from megloc_kapture.plugins import LOCAL_FEATURES
 from megloc_kapture.stages.given_map import given_map
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.work import HERE, Work
+from megloc_kapture.values import Camera
 
 SPARSE, IMAGES, DATABASE = "sparse", "images", "database.db"
 _log = logging.getLogger(__name__)
@@ -150,12 +155,15 @@ class ColmapReconstruction:
     data : sensors, rigs, records and poses. The images of a frame of a rig share a timestamp, the
         frame's id; elsewhere the timestamp is the image's id.
     names : name in kapture of each image of the model, by its name there.
+    scales : of the images, by their names in kapture, that are smaller or larger than in the model,
+        as ``data`` has their cameras: in x and y.
     """
 
     source: ColmapFolders
     model: ColmapModel
     data: KaptureData
     names: dict[str, str]
+    scales: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @classmethod
     def read(cls, source: ColmapFolders) -> ColmapReconstruction:
@@ -177,7 +185,14 @@ class ColmapReconstruction:
                     )
                 # features come from the database
                 _log.warning("%s: %s", source.images, told)
-        return cls(source, model, kapture_data(model, names, rigs), names)
+        scaled = _scaled_cameras(source, model)
+        scales = {
+            names[image.name]: (new.width / old.width, new.height / old.height)
+            for image in model.images
+            if (new := scaled.get(image.camera_id)) and (old := model.cameras[image.camera_id])
+        }
+        as_images = replace(model, cameras={**model.cameras, **scaled})
+        return cls(source, model, kapture_data(as_images, names, rigs), names, scales)
 
     @property
     def renamed(self) -> dict[str, str]:
@@ -263,7 +278,9 @@ class ColmapReconstruction:
         ordered = [self.names[image.name] for image in self.model.images]
         points = self.model.points
         return dict(
-            write_reference_map(output, self.data, self._links(), ordered, points, **features)
+            write_reference_map(
+                output, self.data, self._links(), ordered, points, scales=self.scales, **features
+            )
         )
 
     def _links(self) -> dict[str, Path]:
@@ -274,6 +291,23 @@ class ColmapReconstruction:
         if not self.renamed:
             return {"": images}
         return {new: images / old for old, new in self.names.items()}
+
+
+def _scaled_cameras(source: ColmapFolders, model: ColmapModel) -> dict[int, Camera]:
+    """The cameras whose images are scaled; a warning says so. DataError where one is otherwise of
+    another size."""
+    if source.images is None:
+        return {}
+    files = ((image.camera_id, source.images / image.name) for image in model.images)
+    scaled, errors = cameras_of_images(model.cameras, files)
+    if errors:
+        raise DataError(
+            f"{errors[0].message}; `megloc import colmap` takes the folder of the images that the "
+            "model was made of by --images",
+            path=errors[0].path,
+        )
+    warn_of_scaled(source.images, [(model.cameras[key], new) for key, new in scaled.items()])
+    return scaled
 
 
 def kapture_names(model: ColmapModel, folder: Path) -> dict[str, str]:

@@ -9,9 +9,11 @@ same. Images keep their official names, and the queries have no poses.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.dataset_tables import (
@@ -35,10 +37,13 @@ from megloc_kapture.io.dataset_tables import (
 )
 from megloc_kapture.io.files import check_relative, link_images
 from megloc_kapture.io.images import image_size
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
+from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.values import Camera, RigidTransform
 
 _log = logging.getLogger(__name__)
+Key = TypeVar("Key")
 
 MAPPING, QUERY, QUERY_GT = "mapping", "query", "query_gt"
 _SENSORS = "sensors/sensors.txt"
@@ -111,23 +116,27 @@ def tell_of_truth_without_query(folder: Path, images: Sequence[str]) -> None:
     _log.warning(said, folder, len(images), images[0])
 
 
-def checked_folders(root: Path, query_prefix: str = "") -> tuple[KaptureFolder, KaptureFolder]:
-    """The map's and the queries' folder, checked; see :func:`import_kapture_folders`."""
+def checked_folders(
+    root: Path, query_prefix: str = ""
+) -> tuple[KaptureFolder, KaptureData, KaptureFolder, KaptureData]:
+    """The map's and the queries' folders, checked, with the cameras of the images as they are; see
+    :func:`import_kapture_folders`."""
     root = check_root(root)
     mapping, query = KaptureFolder(root / MAPPING), KaptureFolder(root / QUERY)
-    map_names, query_names = set(mapping.read().image_names()), query.read().image_names()
-    check_images(mapping)
+    map_data, query_data = with_cameras_of_images(mapping), with_cameras_of_images(query)
+    check_images(mapping, map_data)
     _map_poses(mapping)
-    if not query_names:
+    if not query_data.records_camera:
         raise DataError("there are no query images", path=query.root)
-    shared = sorted(map_names & set(map(prefixed(query_prefix), query_names)))
+    renamed = map(prefixed(query_prefix), query_data.image_names())
+    shared = sorted(set(map_data.image_names()) & set(renamed))
     if shared:
         raise DataError(
             f"{len(shared)} images have the same name in map and query, the first is "
             f"{shared[0]}; give the queries a folder of their own with --query-prefix",
             path=root,
         )
-    return mapping, query
+    return mapping, map_data, query, query_data
 
 
 def import_kapture_folders(
@@ -153,8 +162,8 @@ def import_kapture_folders(
     ------
     DataError : something is missing or broken, or map and queries share names.
     """
-    mapping, query = checked_folders(root, query_prefix)
-    map_data, query_data, rename = mapping.read(), query.read(), prefixed(query_prefix)
+    mapping, map_data, query, query_data = checked_folders(root, query_prefix)
+    rename = prefixed(query_prefix)
     write_sensors(output / MAPPING, map_data)
     link_images(mapping.root, output / MAPPING)
     # a query folder with poses in it must not let a stage see them
@@ -184,8 +193,8 @@ def import_kapture_folders(
 
 def import_mapping(mapping: KaptureFolder, output: Path) -> dict[str, float]:
     """Import images with poses, without queries; see :func:`import_kapture_folders`."""
-    check_images(mapping)
-    poses, data = _map_poses(mapping), mapping.read()
+    poses, data = _map_poses(mapping), with_cameras_of_images(mapping)
+    check_images(mapping, data)
     write_sensors(output / MAPPING, data)
     link_images(mapping.root, output / MAPPING)
     names = set(data.image_names())
@@ -213,25 +222,104 @@ def _map_poses(mapping: KaptureFolder) -> dict[str, RigidTransform]:
     return poses
 
 
-def check_images(folder: KaptureFolder) -> None:
-    """Check each image as :func:`check_image` does; DataError names the first that fails."""
-    for image in folder.read().image_names():
-        check_image(folder, image)
+def check_images(folder: KaptureFolder, data: KaptureData) -> None:
+    """Raise DataError for the first image that :func:`check_image_size` refuses.
 
-
-def check_image(folder: KaptureFolder, image: str) -> None:
-    """Raise DataError where an image's header is missing, none, or not of its camera's size."""
-    check_image_size(folder.image_path(image), folder.read().camera_of(image))
+    ``data``: of the folder, with the cameras that the images should have.
+    """
+    for image in data.image_names():
+        check_image_size(folder.image_path(image), data.camera_of(image))
 
 
 def check_image_size(path: Path, camera: Camera) -> None:
-    """As :func:`check_image`, of a file."""
-    width, height = image_size(path)
-    if (width, height) != (camera.width, camera.height):
-        raise DataError(
-            f"the image is {width}x{height}, its camera says {camera.width}x{camera.height}",
-            path=path,
-        )
+    """Raise DataError where an image's header is missing, none, or not of its camera's size."""
+    size = image_size(path)
+    if size != (camera.width, camera.height):
+        raise _other_size(path, size, camera)
+
+
+def _other_size(path: Path, size: tuple[int, int], camera: Camera) -> DataError:
+    return DataError(
+        f"the image is {size[0]}x{size[1]}, its camera says {camera.width}x{camera.height}",
+        path=path,
+    )
+
+
+def cameras_of_images(
+    cameras: Mapping[Key, Camera], images: Iterable[tuple[Key, Path]]
+) -> tuple[dict[Key, Camera], list[DataError]]:
+    """Compare cameras with the sizes of their images, which headers say.
+
+    Parameters
+    ----------
+    images : camera and file of each; those that are missing or no image are not looked at.
+
+    Returns
+    -------
+    The cameras that are of another size, scaled to it, where all images of one have the same, with
+    both sides scaled by one factor up to rounding; and an error for each image that is of another
+    size otherwise.
+    """
+    of_camera: dict[Key, dict[tuple[int, int], list[Path]]] = {}
+    for key, path in images:
+        with suppress(DataError):
+            of_camera.setdefault(key, {}).setdefault(image_size(path), []).append(path)
+    scaled, errors = {}, []
+    for key, sizes in of_camera.items():
+        camera, size = cameras[key], next(iter(sizes))
+        if len(sizes) == 1 and size != (camera.width, camera.height) and is_scaled(camera, size):
+            scaled[key] = camera = scaled_camera(camera, *size)
+        errors += [
+            _other_size(path, size, camera)
+            for size, paths in sizes.items()
+            if size != (camera.width, camera.height)
+            for path in paths
+        ]
+    return scaled, errors
+
+
+def is_scaled(camera: Camera, size: tuple[int, int]) -> bool:
+    """Whether an image has both sides of its camera, scaled by one factor up to rounding."""
+    width, height = size
+    difference = abs(width * camera.height - height * camera.width)
+    return difference <= max(width, height, camera.width, camera.height)
+
+
+def cameras_of_folder(folder: KaptureFolder) -> tuple[dict[str, Camera], list[DataError]]:
+    """:func:`cameras_of_images` of a kapture folder, by the ids of its sensors."""
+    data = folder.read()
+    taken = {sensor_id for _, sensor_id in data.records_camera}
+    known = {
+        sensor_id: data.sensors[sensor_id].camera()
+        for sensor_id in taken
+        if data.sensors[sensor_id].params[:1] != (UNKNOWN_CAMERA,)
+    }
+    images = (
+        (sensor_id, folder.image_path(name))
+        for (_, sensor_id), name in data.records_camera.items()
+        if sensor_id in known
+    )
+    return cameras_of_images(known, images)
+
+
+def with_cameras_of_images(folder: KaptureFolder) -> KaptureData:
+    """The data of a folder with its cameras scaled to its images; a warning says where."""
+    data, (scaled, _) = folder.read(), cameras_of_folder(folder)
+    warn_of_scaled(folder.root, [(data.sensors[key].camera(), one) for key, one in scaled.items()])
+    sensors = {
+        key: Sensor.from_camera(camera, name=data.sensors[key].name)
+        for key, camera in scaled.items()
+    }
+    return replace(data, sensors={**data.sensors, **sensors})
+
+
+def warn_of_scaled(place: Path, cameras: Sequence[tuple[Camera, Camera]]) -> None:
+    """Warn of cameras that were scaled: each as it is stored, and as its images have it."""
+    if cameras:
+        stored, scaled = cameras[0]
+        said = "%s: %d cameras are scaled to their images, the first from %dx%d to %dx%d"
+        sizes = (stored.width, stored.height, scaled.width, scaled.height)
+        _log.warning(said, place, len(cameras), *sizes)
 
 
 def prefixed(prefix: str) -> Callable[[str], str]:
@@ -333,7 +421,7 @@ def read_images(folder: Path, is_there: Callable[[Path], bool]) -> list[KaptureI
         if not is_there(file):
             continue
         if sensor_id not in checked:
-            check_image(kapture, name)
+            check_image_size(file, data.camera_of(name))
             checked.add(sensor_id)
         pose = data.device_from_world(timestamp, sensor_id)
         camera = data.camera_of(name)

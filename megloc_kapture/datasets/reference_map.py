@@ -55,6 +55,7 @@ def write_reference_map(
     keypoints_type: str = "sift",
     database: Path | None = None,
     database_names: Mapping[str, str] | None = None,
+    scales: Mapping[str, tuple[float, float]] | None = None,
 ) -> dict[str, int]:
     """Write a sparse model as a kapture map: sensors, poses, keypoints, points, observations.
 
@@ -77,6 +78,7 @@ def write_reference_map(
     database : COLMAP database with the features of the model; its images have the names of
         ``image_names``, or these with another suffix.
     database_names : of images that have quite another name there.
+    scales : of images whose camera in ``data`` is another size than in the model, in x and y.
 
     Returns
     -------
@@ -112,7 +114,7 @@ def write_reference_map(
         stack.enter_context(writer)
         with_empty = database is not None
         observations, num_keypoints = _write_features(
-            names, image_names, points, features, writer, with_empty=with_empty
+            names, image_names, points, features, writer, scales or {}, with_empty=with_empty
         )
     write_observations(output, {keypoints_type: observations})
     return {
@@ -248,6 +250,7 @@ def _write_features(
     points: SparsePoints,
     features: Features,
     writer: FeatureWriter,
+    scales: Mapping[str, tuple[float, float]],
     *,
     with_empty: bool,
 ) -> tuple[Observations, int]:
@@ -265,6 +268,8 @@ def _write_features(
         # ascending, as the order among equals is kept
         rows = order[ends[position] : ends[position + 1]]
         keypoints, numbers_of_image = features(name, rows)
+        if name in scales:
+            keypoints = keypoints * np.float32(scales[name])
         num_keypoints += len(keypoints)
         if len(keypoints) or with_empty:
             writer.write(name, keypoints)

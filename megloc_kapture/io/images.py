@@ -12,13 +12,14 @@ rounded millimetres are in it, so a camera that comes from here is not certain o
 from __future__ import annotations
 
 import math
+import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,7 +32,11 @@ from megloc_kapture.values import Camera
 if TYPE_CHECKING:
     from PIL import Image
 
+T = TypeVar("T")
+
 WRITABLE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".tif", ".tiff", ".webp")
+# pillow's names of the formats that photographs are read from
+_FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "JPEG2000")
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp"}
 )
@@ -42,14 +47,22 @@ EXIF_DEVIATION, GUESS_DEVIATION = 0.1, 0.7
 # COLMAP's guess, times the larger side
 _GUESS = 1.2
 _ORIENTATION, _MAKE, _MODEL, _EXIF, _GPS = 0x0112, 0x010F, 0x0110, 0x8769, 0x8825
+# what COLMAP reads of the focal length: its millimetres, those of 35 mm film, pixels per unit of
+# the focal plane, the unit, and the size of the image
+_FOCAL_TAGS = (0x920A, 0xA405, 0xA20E, 0xA20F, 0xA210, 0xA002, 0xA003)
 _JPEG = (".jpg", ".jpeg")
+# files of other suffixes are written in the nearest of these formats; readers look at the content
+_LOSSLESS = (".pgm", ".pnm", ".gif", ".jp2")
+# an image that uses more than this share of the range of its numbers is scaled, else stretched
+_MIN_RANGE = 0.5
+_STRETCHED_PERCENT = (0.1, 99.9)
 
 
 def read_image_rgb(path: Path | str) -> NDArray[np.uint8]:
     """Read an image as uint8 (H, W, 3), RGB.
 
-    Grey images are repeated over three channels, transparency is dropped, 16-bit images are
-    scaled to 8 bit (``value / 257`` rounded).
+    Grey images are repeated over three channels, transparency is dropped, and more than 8 bits
+    become 8, see :func:`with_8_bits`.
 
     Raises DataError: missing, not an image, or truncated.
     """
@@ -71,21 +84,61 @@ def decode_image_rgb(content: bytes, path: Path | str | None = None) -> NDArray[
     ------
     DataError : not an image, or truncated.
     """
+    image = _decoded_by_opencv(content)
+    if image is None:
+        try:
+            image = _decoded_by_pillow(content)
+        except Exception as error:  # pillow raises many kinds on broken data
+            raise DataError("not an image, or broken", path=path) from error
+    else:
+        _check_complete(path, content)
+    return with_8_bits(image)
+
+
+def _decoded_by_opencv(content: bytes) -> NDArray[Any] | None:
     import cv2  # 0.1 s, and most commands that import io never read an image
 
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # errors are ours to say
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error:
-        image = None
-    if image is None:
-        raise DataError("not an image, or broken", path=path)
-    _check_complete(path, content)
-    if image.dtype == np.uint16:
-        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
-    elif image.dtype != np.uint8:
-        raise DataError(f"pixels are {image.dtype}; 8 or 16 bit expected", path=path)
-    return np.ascontiguousarray(image[:, :, ::-1])
+        return None
+    return None if image is None else np.asarray(image)[:, :, ::-1]
+
+
+def _decoded_by_pillow(content: bytes) -> NDArray[Any]:
+    from PIL import Image
+
+    with Image.open(BytesIO(content)) as image:
+        return pillow_pixels(image)
+
+
+def pillow_pixels(image: Image.Image) -> NDArray[np.uint8]:
+    """The pixels of an image that pillow has opened, as :func:`read_image_rgb` gives them."""
+    if image.mode[0] in "IF":  # more than 8 bits, which pillow would cut off
+        return with_8_bits(np.repeat(np.asarray(image)[:, :, None], 3, axis=2))
+    return np.ascontiguousarray(image.convert("RGB"))
+
+
+def with_8_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
+    """An image (H, W, 3) of any numbers as uint8.
+
+    16 bits that use more than half of their range are scaled (``value / 257`` rounded), and so are
+    fractions between 0 and 1. What uses less of it, as 12 bits in 16, counts of a thermal camera or
+    other floats, is stretched: percentiles 0.1 and 99.9 of all channels become 0 and 255.
+    """
+    if pixels.dtype == np.uint8:
+        return np.ascontiguousarray(pixels)
+    values = pixels.astype(np.float32)
+    known = values[np.isfinite(values)]
+    whole = 65535.0 if pixels.dtype == np.uint16 else 1.0
+    low, high = np.percentile(known, _STRETCHED_PERCENT) if len(known) else (0.0, 0.0)
+    is_fraction = 0 <= low <= high <= whole
+    if high == low or (is_fraction and high - low > _MIN_RANGE * whole):
+        low, high = 0.0, whole
+    stretched = np.clip((np.nan_to_num(values, nan=low) - low) * (255.0 / (high - low)), 0, 255)
+    return np.ascontiguousarray(np.rint(stretched), np.uint8)
 
 
 def image_size(path: Path | str) -> tuple[int, int]:
@@ -98,13 +151,21 @@ def image_size(path: Path | str) -> tuple[int, int]:
 
 
 @contextmanager
+def _quiet() -> Iterator[None]:
+    """No warnings: pillow has them for whatever is broken in EXIF."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+@contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
     """The header of an image file, by pillow."""
     from PIL import Image
 
     check_image_file(path)
     try:
-        with Image.open(path) as image:
+        with _quiet(), Image.open(path) as image:
             yield image
     except Exception as error:  # pillow raises many kinds on broken headers
         raise DataError("not an image, or broken", path=path) from error
@@ -113,11 +174,12 @@ def _opened(path: Path) -> Iterator[Image.Image]:
 def write_image(path: Path | str, image: NDArray[np.uint8], *, jpeg_quality: int = 95) -> None:
     """Write uint8 (H, W, 3) RGB or (H, W) grey as its suffix says, atomically.
 
-    The same pixels give the same bytes: no dates, no metadata.
+    The same pixels give the same bytes: no dates, no metadata. A suffix that is none of
+    WRITABLE_SUFFIXES becomes JPEG, or PNG where its format is without loss.
 
     Raises
     ------
-    ValueError : the array is not such an image or the suffix is none of WRITABLE_SUFFIXES.
+    ValueError : the array is not such an image.
     OutputError : the file cannot be written.
     """
     path = Path(path)
@@ -133,7 +195,7 @@ def image_as_read_back(
     ----------
     name : of the file that it would be; only its suffix counts.
     """
-    if not name.lower().endswith(_JPEG):
+    if _format_suffix(name) not in _JPEG:
         return image
     import cv2
 
@@ -144,12 +206,18 @@ def image_as_read_back(
     return np.ascontiguousarray(decoded[:, :, ::-1], np.uint8)
 
 
+def _format_suffix(name: str) -> str:
+    """The suffix of the format that an image of this name is written in."""
+    suffix = Path(name).suffix.lower()
+    if suffix in WRITABLE_SUFFIXES:
+        return suffix
+    return ".png" if suffix in _LOSSLESS else ".jpg"
+
+
 def _encoded(path: Path, image: NDArray[np.uint8], jpeg_quality: int) -> bytes:
     import cv2
 
-    suffix = path.suffix.lower()
-    if suffix not in WRITABLE_SUFFIXES:
-        raise ValueError(f"{path}: suffix must be one of {', '.join(WRITABLE_SUFFIXES)}")
+    suffix = _format_suffix(path.name)
     pixels = np.asarray(image)
     if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or 0 in pixels.shape:
         raise ValueError(f"expected uint8 (H, W, 3) or (H, W), got {pixels.dtype} {pixels.shape}")
@@ -292,6 +360,20 @@ def guessed_camera(width: int, height: int) -> Camera:
     return _centred(width, height, _GUESS * max(width, height), GUESS_DEVIATION)
 
 
+def is_image(path: Path) -> bool:
+    """Whether a file is an image of a format that is read, by its content."""
+    from PIL import Image
+
+    try:
+        if not path.is_file():  # reading a pipe might never end
+            return False
+        with _quiet():
+            Image.open(path, formats=_FORMATS).close()
+        return True
+    except Exception:  # pillow raises many kinds on broken headers
+        return False
+
+
 def read_photo(path: Path | str) -> Photo:
     """Read the header of a photograph.
 
@@ -299,33 +381,73 @@ def read_photo(path: Path | str) -> Photo:
     """
     path = Path(path)
     check_image_file(path)
-    if path.suffix.lower() not in WRITABLE_SUFFIXES:
-        known = ", ".join(WRITABLE_SUFFIXES)
-        raise DataError(f"{path.suffix or 'such a file'} cannot be read; {known} can", path=path)
+    if path.suffix.lower() in UNREAD_SUFFIXES:
+        raise DataError(f"{path.suffix} cannot be read; JPEG, PNG, TIFF and WebP can", path=path)
     with _opened(path) as image:
+        if image.format not in _FORMATS:
+            raise DataError(
+                f"{image.format} cannot be read; JPEG, PNG, TIFF and WebP can", path=path
+            )
         return photo_of(image)
 
 
 def photo_of(image: Image.Image) -> Photo:
     """The header of an image that pillow has opened."""
     width, height = image.size
-    try:
-        with warnings.catch_warnings():  # pillow warns of what is broken in EXIF
-            warnings.simplefilter("ignore")
-            exif = image.getexif()
-            orientation, make, model = (exif.get(tag) for tag in (_ORIENTATION, _MAKE, _MODEL))
-            focal = focal_from_exif(_blank_with_exif(exif, width, height)) if exif else None
-            gps = _position(exif.get_ifd(_GPS))
-    except Exception:  # broken EXIF is as none: pillow raises many kinds on it
-        orientation = make = model = focal = gps = None
+    with _quiet():
+        exif = _tried(image.getexif) or {}
+        orientation = _number(_tried(lambda: exif.get(_ORIENTATION)))
+        make, model = (_text(_tried(lambda tag=tag: exif.get(tag))) for tag in (_MAKE, _MODEL))
+        gps = _tried(lambda: _position(exif.get_ifd(_GPS)))
+        focal = _tried(lambda: focal_from_exif(_blank_with_exif(exif, make, model, image.size)))
     # pillow and OpenCV have turned TIFF files already
     turned = orientation in range(2, 9) and image.format != "TIFF"
     if focal is None:
         camera = guessed_camera(width, height)
     else:
         camera = _centred(width, height, focal, EXIF_DEVIATION)
-    named = " ".join(str(text).strip("\0 ") for text in (make, model) if text)
+    named = " ".join(text for text in (make, model) if text)
     return Photo(camera, int(orientation or 1) if turned else 1, named, gps)
+
+
+def _tried(read: Callable[[], T]) -> T | None:
+    """What is read, None where that fails: a damaged part of EXIF is as one that is missing."""
+    try:
+        return read()
+    except Exception:  # pillow raises many kinds
+        return None
+
+
+def _numbers(value: Any) -> list[float]:
+    """The numbers in an EXIF tag of any type, up to the first that is not finite."""
+    if isinstance(value, bytes):
+        text = value.decode("latin-1")
+        value = text if re.search(r"\d", text) else list(value)
+    if isinstance(value, str):
+        value = re.findall(r"[-+]?\d+(?:\.\d+)?", value)
+    elif not isinstance(value, tuple | list):
+        value = () if value is None else (value,)
+    found = []
+    for number in map(float, value):
+        if not math.isfinite(number):
+            break
+        found.append(number)
+    return found
+
+
+def _number(value: Any) -> float | None:
+    """The first number in an EXIF tag; None where there is none."""
+    return next(iter(_tried(lambda: _numbers(value)) or ()), None)
+
+
+def _text(value: Any) -> str:
+    """The printable text of an EXIF tag, up to its first NUL; empty where it is none."""
+    if isinstance(value, bytes):
+        value = value.decode("latin-1")
+    if not isinstance(value, str):
+        return ""
+    printable = "".join(c if c.isprintable() else " " for c in value.strip("\0").partition("\0")[0])
+    return " ".join(printable.split())
 
 
 def turned_upright(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
@@ -345,34 +467,41 @@ def _centred(width: int, height: int, focal: float, deviation: float) -> Camera:
 
 
 def _position(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
-    """Latitude, longitude and height of EXIF's GPS table (EXIF 2.3, table 15)."""
-    if not {1, 2, 3, 4} <= gps.keys():
-        return None
+    """Latitude, longitude and height of EXIF's GPS table (EXIF 2.3, table 15).
+
+    Also of angles that are not degrees, minutes and seconds but fewer numbers, or text.
+    """
     found = []
-    for reference, tag, negative in ((1, 2, "S"), (3, 4, "W")):
-        degrees, minutes, seconds = map(float, gps[tag])
-        value = degrees + minutes / 60 + seconds / 3600
-        found.append(-value if gps[reference] == negative else value)
+    for reference, tag, sides, limit in ((1, 2, "NS", 90), (3, 4, "EW", 180)):
+        side, parts = _text(gps.get(reference))[:1].upper(), _numbers(gps.get(tag))
+        if side not in sides or not side or not parts:
+            return None
+        value = sum(part / 60**at for at, part in enumerate(parts[:3]))
+        if abs(value) > limit:
+            return None
+        found.append(-value if side == sides[1] else value)
     below = gps.get(5) in (1, b"\x01")
-    height = float(gps.get(6, 0.0)) * (-1 if below else 1)
-    if not (abs(found[0]) <= 90 and abs(found[1]) <= 180 and math.isfinite(height)):
-        return None
+    height = (_number(gps.get(6)) or 0.0) * (-1 if below else 1)
     return found[0], found[1], height
 
 
-def _blank_with_exif(exif: Image.Exif, width: int, height: int) -> bytes:
+def _blank_with_exif(exif: Image.Exif, make: str, model: str, size: tuple[int, int]) -> bytes:
     """A JPEG of that size that has nothing but what the EXIF says of the camera.
 
     COLMAP reads EXIF from files only, and decodes them; a blank one takes a tenth of the time, and
     may come from formats that COLMAP does not read.
     """
     from PIL import Image
+    from PIL.TiffImagePlugin import IFDRational
 
     kept = Image.Exif()
-    for tag in (_MAKE, _MODEL):
-        if tag in exif:
-            kept[tag] = exif[tag]
-    kept.get_ifd(_EXIF).update(exif.get_ifd(_EXIF))
+    kept[_MAKE], kept[_MODEL] = make, model
+    stored = exif.get_ifd(_EXIF)
+    for tag in _FOCAL_TAGS:
+        value = _number(_tried(lambda tag=tag: stored.get(tag)))
+        if value is not None and 0 < value < 2**31:
+            whole = value.is_integer()  # pillow takes the type of a tag from its value
+            kept.get_ifd(_EXIF)[tag] = int(value) if whole else IFDRational(value)
     content = BytesIO()
-    Image.new("L", (width, height)).save(content, "JPEG", quality=1, exif=kept)
+    Image.new("L", size).save(content, "JPEG", quality=1, exif=kept)
     return content.getvalue()

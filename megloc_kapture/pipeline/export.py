@@ -24,6 +24,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.datasets.kapture_folders import cameras_of_folder, warn_of_scaled
 from megloc_kapture.errors import DataError, OptionError, OutputError, suggestion
 from megloc_kapture.evaluation.report.scene import corner_rays
 from megloc_kapture.geometry.cameras import principal_point_px
@@ -36,6 +37,7 @@ from megloc_kapture.io.kapture.points import write_ply
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.map_making import kapture_of
+from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
 
 _MAP_COLOUR, _QUERY_COLOUR = (120, 120, 120), (220, 50, 32)
@@ -377,21 +379,30 @@ def _posed_images(
     ----------
     opened : the map, which cameras are described as; None without one.
     """
-    data = folder.read()
+    data, (scaled, errors) = folder.read(), cameras_of_folder(folder)
+    if errors:
+        raise errors[0]
+    stored = {key: data.sensors[key].camera() for key in scaled}
+    warn_of_scaled(folder.root, [(stored[key], scaled[key]) for key in scaled])
     found = []
     for image, pose in sorted(data.poses().items()):
         timestamp, device = data.record_of(image)
         if sensor not in (None, device):
             continue
         camera = data.camera_of(image)
+        camera = camera if opened is None else opened.to_colmap(camera)
         keypoints, rows, points = np.zeros((0, 2)), _NO_ROWS, _NO_ROWS
         if opened is not None and not is_query:
             keypoints, rows, points = _observed(opened, image)
+        if device in scaled:
+            width, height = scaled[device].width, scaled[device].height
+            keypoints = keypoints * (width / camera.width, height / camera.height)
+            camera = scaled_camera(camera, width, height)
         found.append(
             PosedImage(
                 name=image,
                 path=folder.image_path(image),
-                camera=camera if opened is None else opened.to_colmap(camera),
+                camera=camera,
                 cam_from_world=pose,
                 timestamp=timestamp,
                 sensor=device,

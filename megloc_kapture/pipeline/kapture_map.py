@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -31,6 +32,8 @@ AS_ASKED = "as asked for"
 
 _SAMPLED_IMAGES = 50
 _NETWORKS = ("aliked", "aslfeat", "r2d2", "superpoint", "xfeat")
+# extractor of SIFT by whether descriptors are bytes
+_SIFT_OF = {True: "sift", False: "rootsift"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +82,12 @@ class MapKeypoints:
         names = [self.name, base_type(self.name)]
         if self.name in self.folder.types("keypoints"):
             names.append(self._keypoints.config.name)
-        return next((found for name in names if (found := _extractor_named(name))), None)
+        found = next((found for name in names if (found := _extractor_named(name))), None)
+        has_descriptors = self.name in self.folder.types("descriptors")
+        if found is not None and found.name in _SIFT_OF.values() and has_descriptors:
+            # other tools call both SIFT; COLMAP's and OpenMVG's descriptors are bytes
+            found = PluginChoice(name=_SIFT_OF[self._descriptors.config.dtype.kind == "u"])
+        return found
 
     def check(self, images: Collection[str]) -> None:
         """Compare the sizes of the images' feature files; reads none of them.
@@ -302,15 +310,23 @@ def check_lengths(keypoints: FeatureReader, descriptors: FeatureReader, image: s
         )
 
 
+def plain_name(local_type: str) -> str:
+    """A type's name without case and separators, which tools write as they like."""
+    return re.sub("[^a-z0-9]", "", local_type.lower())
+
+
 def _extractor_named(name: str) -> PluginChoice | None:
-    known = plugin_names(LOCAL_FEATURES)
-    if name in known:
-        return PluginChoice(name=name)
-    # a network's types are called as its weights are: aliked-n16, r2d2_WASF_N16
-    plugin = next((plugin for plugin in known if name.startswith(plugin)), None)
-    if plugin is None or name not in registry():
-        return None
-    return PluginChoice(name=plugin, options={"weights": name})
+    """The plugin that a type is called as, or its weights (aliked-n16, r2d2_WASF_N16); a number at
+    the end of a name that is neither is that of the keypoints: r2d2_500."""
+    plugins = {plain_name(plugin): plugin for plugin in plugin_names(LOCAL_FEATURES)}
+    weights = {plain_name(one): one for one in registry()}
+    for plain in (plain_name(name), plain_name(re.sub(r"[-_ ]\d+k?$", "", name))):
+        if plain in plugins:
+            return PluginChoice(name=plugins[plain])
+        plugin = next((plugins[one] for one in plugins if plain.startswith(one)), None)
+        if plugin is not None and plain in weights:
+            return PluginChoice(name=plugin, options={"weights": weights[plain]})
+    return None
 
 
 def _opened_again(
@@ -349,8 +365,11 @@ def _is_ours(folder: KaptureFolder, local_type: str) -> bool:
     Other toolkits write types named after the same networks, in the networks' own convention.
     """
     refined = (folder.root / "reconstruction" / REPORT_FILE).is_file()
-    found = _extractor_named(base_type(local_type))
-    return found is not None and (refined or found.name not in _NETWORKS)
+    name = base_type(local_type)
+    found = _extractor_named(name)
+    if found is None or name not in (found.name, found.options.get("weights")):
+        return False
+    return refined or found.name not in _NETWORKS
 
 
 def _find_origins(folder: KaptureFolder, indices: Mapping[str, MapIndex]) -> dict[str, PixelOrigin]:

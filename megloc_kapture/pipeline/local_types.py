@@ -13,9 +13,9 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.localization.map_index import ImageMatches
 from megloc_kapture.matching.guided_pyramid import base_type, equivalent_types
-from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints
+from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, plain_name
 from megloc_kapture.pipeline.queries import QueryImage
-from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugin_loading import load_plugin, plugin_names
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
@@ -106,7 +106,9 @@ class LocalType:
         if found is None:
             raise DataError(
                 f"features of type {self.name!r} are missing and no extractor for them is "
-                "installed; give them with --features-dir, or in the kapture folder",
+                f"installed (known: {', '.join(plugin_names(LOCAL_FEATURES))}); give them with "
+                "--features-dir, or in the kapture folder; or, if one of the known ones made "
+                f"them, write its name first into {self.name}/keypoints.txt",
                 path=self._map.folder.root,
             )
         extractor: LocalFeatureExtractor = load_plugin(LOCAL_FEATURES, found.name, found.options)
@@ -115,7 +117,7 @@ class LocalType:
     def brought(self) -> PluginChoice | None:
         """The extractor, where one is known by the options or by the map's name of the type."""
         found = self.first.extractor()
-        if self.choice is None:  # the options do not know it
+        if self.choice is None or (found is not None and found.name != self.choice.name):
             return placed(found, self._options.device, self._options.precision)
         known = {} if found is None else found.options
         return PluginChoice(name=self.choice.name, options={**self.choice.options, **known})
@@ -257,11 +259,14 @@ def _rank(local_type: str, choices: Sequence[LocalFeaturesChoice]) -> int:
     Types are called as their plugin, or their weights, which begin with its name.
     """
     base = base_type(local_type)
-    fitting = [rank for rank, one in enumerate(choices) if base.startswith(one.name)]
+    plain = plain_name(base)
+    fitting = [rank for rank, one in enumerate(choices) if plain.startswith(plain_name(one.name))]
 
     def distance(rank: int) -> int:
         weights = str(choices[rank].options.get("weights", "")).removesuffix(".pth")
-        return 0 if weights == base else 1 if choices[rank].name == base else 2
+        if plain_name(weights) == plain:
+            return 0
+        return 1 if plain_name(choices[rank].name) == plain else 2
 
     return min(fitting, key=distance, default=len(choices))
 

@@ -5,15 +5,23 @@ from __future__ import annotations
 import os
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
 
-from megloc_kapture.datasets.kapture_folders import check_image, check_image_size
+from megloc_kapture.datasets.kapture_folders import (
+    check_image_size,
+    is_kapture,
+    is_scaled,
+    warn_of_scaled,
+    with_cameras_of_images,
+)
 from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.io.camera_list import CameraList
 from megloc_kapture.io.files import (
     check_relative,
     hard_link,
@@ -26,22 +34,28 @@ from megloc_kapture.io.images import (
     VIDEO_SUFFIXES,
     WRITABLE_SUFFIXES,
     extract_frames,
+    guessed_camera,
+    image_size,
+    is_image,
     read_image_rgb,
     read_photo,
     turned_upright,
     write_image,
 )
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, writable_name
+from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.output_folders import MARKER
 from megloc_kapture.matching.guided_pyramid import equivalent_types
-from megloc_kapture.pipeline.kapture_map import KaptureMap, check_lengths
+from megloc_kapture.pipeline.kapture_map import KaptureMap, check_lengths, plain_name
 from megloc_kapture.pipeline.queries import Query, Unit
+from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.stages import scene
 from megloc_kapture.stages.local_features import mask_path
 from megloc_kapture.stages.scene import depth_of
-from megloc_kapture.values import Camera, LocalFeatures
+from megloc_kapture.values import Camera, LocalFeatures, RigidTransform
 
 FRAMES_EVERY = 30
+_LIST_SUFFIXES = (".txt", ".csv")
 
 
 class Queries(ABC):
@@ -99,21 +113,28 @@ class Queries(ABC):
 class KaptureQueries(Queries):
     """The images of a kapture folder as queries, with the features it brings; read one by one.
 
-    Its cameras and keypoints are taken to be described as the map describes its own.
+    Its cameras and keypoints are taken to be described as the map describes its own. Where it
+    brings no features, its cameras are scaled to its images. A camera that is not calibrated is
+    that of a photograph: its focal length is EXIF's or a guess, and estimated with the pose.
     """
 
     def __init__(self, folder: KaptureFolder, kapture_map: KaptureMap) -> None:
         super().__init__()
         self._folder, self._map = folder, kapture_map
-        self._data = folder.read()
-        self.names = self._data.image_names()
+        self.names = folder.read().image_names()
         self._stored = stored = kapture_map.stored_types()
         wanted = {other for name in stored for other in equivalent_types(name)}
         brought = set(folder.types("keypoints")).intersection(folder.types("descriptors"))
-        self._local = {
-            name: (folder.keypoints(name), folder.descriptors(name))
-            for name in sorted(wanted & brought)
+        plain = {plain_name(name): name for name in sorted(brought)}
+        sources = {
+            name: name if name in brought else plain.get(plain_name(name)) for name in wanted
         }
+        self._local = {
+            name: (folder.keypoints(source), folder.descriptors(source))
+            for name, source in sorted(sources.items())
+            if source is not None
+        }
+        self._data = folder.read() if self._local else with_cameras_of_images(folder)
         # what the map says of keypoints of each type; looked up here, not for every query
         self._like = {
             name: kapture_map.keypoints_of(
@@ -150,7 +171,10 @@ class KaptureQueries(Queries):
             if any(name in keypoints for keypoints, _ in self._local.values()):
                 continue
             try:
-                check_image(self._folder, name)
+                if self._is_unknown(name):
+                    read_photo(self._folder.image_path(name))
+                else:
+                    check_image_size(self._folder.image_path(name), self._data.camera_of(name))
             except DataError as error:
                 self.unreadable[name] = error.message
                 errors.append(error)
@@ -158,8 +182,36 @@ class KaptureQueries(Queries):
         if not self.names:
             raise errors[0]
 
+    def units(self, *, rigs: bool) -> list[scene.Unit]:
+        units = []
+        for unit in super().units(rigs=rigs):
+            if any(self._is_unknown(name) for name, _ in unit):  # one is estimated by itself
+                units += [((name, RigidTransform.identity()),) for name, _ in unit]
+            else:
+                units.append(unit)
+        return units
+
     def data(self) -> KaptureData:
         return self._data
+
+    def _is_unknown(self, name: str) -> bool:
+        return self._sensor(name).params[:1] == (UNKNOWN_CAMERA,)
+
+    def _sensor(self, name: str) -> Sensor:
+        return self._data.sensors[self._data.record_of(name)[1]]
+
+    def _camera(self, name: str) -> Camera:
+        if not self._is_unknown(name):
+            return self._map.to_colmap(self._data.camera_of(name))
+        width, height = map(int, self._sensor(name).params[1:])
+        try:
+            found = read_photo(self._folder.image_path(name)).camera
+        except DataError:  # features are enough
+            return guessed_camera(width, height)
+        # keypoints are in pixels of the size that the sensor says
+        is_other = min(width, height) > 0 and (width, height) != (found.width, found.height)
+        brings = any(name in keypoints for keypoints, _ in self._local.values())
+        return scaled_camera(found, width, height) if is_other and brings else found
 
     def write_images(self, output: Path) -> None:
         link_images(self._folder.root, output)
@@ -201,7 +253,7 @@ class KaptureQueries(Queries):
             self.faults[name] = str(error)
             features, of_image, candidates = self._no_features(), {}, ()
         return Query(
-            camera=self._map.to_colmap(self._data.camera_of(name)),
+            camera=self._camera(name),
             image=self._folder.image_path(name),
             name=name,
             features=features,
@@ -265,17 +317,24 @@ class Photographs(Queries):
 
     Without a camera an image is turned upright by its EXIF orientation, its camera is of the turned
     image, and its focal length is EXIF's or a guess, estimated with the pose in any case. A given
-    camera is of the pixels as they are stored. Images of one size, make and focal length share a
-    camera.
+    camera is of the pixels as they are stored, and is scaled to an image of another size with both
+    sides scaled by one factor. Images of one size, make and focal length share a camera.
 
     Parameters
     ----------
     paths : files and folders. An image is named by its path below the folder that was given, a
         file that was given by its own name, a frame by its video and number:
-        ``walk.mp4/000120.jpg``. Of a folder images and videos are taken, also behind links; hidden
-        files are not, nor kapture folders and what else we have written below it.
-    camera : of all images; EXIF is not looked at then.
+        ``walk.mp4/000120.jpg``. Of a folder images, by their content, and videos are taken, also
+        behind links; hidden files are not, nor kapture folders and what else we have written below
+        it. Of a kapture folder that is given its images are taken, with its calibrated cameras.
+    camera : of all images, EXIF is not looked at then; or a list of cameras, those of images
+        without a row are estimated.
     every : of a video, every n-th frame; 30 unless given.
+
+    Attributes
+    ----------
+    passed_over : files of the folders that are no images.
+    without_row : images that the list of cameras does not have.
 
     Raises
     ------
@@ -285,12 +344,20 @@ class Photographs(Queries):
     """
 
     def __init__(
-        self, paths: Sequence[Path | str], camera: Camera | None = None, *, every: int | None = None
+        self,
+        paths: Sequence[Path | str],
+        camera: Camera | CameraList | None = None,
+        *,
+        every: int | None = None,
     ) -> None:
         super().__init__()
         if every is not None and every < 1:
             raise OptionError(f"every {every}th frame cannot be taken; give 1 or more")
-        files = _named_files([Path(path) for path in paths])
+        roots = [Path(path) for path in paths]
+        files, self.passed_over = _named_files(roots)
+        self.without_row: list[str] = []
+        self._calibrated = {k: v for root in roots for k, v in _calibrated(root).items()}
+        self._scaled: list[tuple[Camera, Camera]] = []
         videos = [name for name in files if Path(name).suffix.lower() in VIDEO_SUFFIXES]
         if every is not None and not videos:
             raise OptionError("--every changes nothing: there is no video among the images")
@@ -305,6 +372,27 @@ class Photographs(Queries):
             except DataError as error:
                 self.unreadable[name] = error.message
         self.names = sorted(self._images)
+        warn_of_scaled(roots[0], self._scaled)
+        if self.names and self.without_row == self.names:
+            raise OptionError(
+                f"the list of cameras has no row of any image, as of {self.names[0]}: its first "
+                "fields are names of images"
+            )
+
+    def known_cameras(self) -> bool:
+        """Whether the cameras of all images are given."""
+        return all(image.camera.focal_deviation == 0 for image in self._images.values())
+
+    def describe(self) -> list[str]:
+        """What is special about the files, in lines for people."""
+        lines = []
+        if self.passed_over:
+            said = f"{len(self.passed_over)} files that are no images are left out"
+            lines.append(f"{said}: {_first(self.passed_over)}")
+        if self.without_row:
+            said = f"{len(self.without_row)} images are not in the list of cameras"
+            lines.append(f"{said}, their cameras are estimated: {_first(self.without_row)}")
+        return lines
 
     def check(self) -> None:
         """Nothing more is known without reading pixels."""
@@ -349,17 +437,30 @@ class Photographs(Queries):
                     continue
                 write_image(place, turned_upright(pixels, image.orientation))
 
-    def _add(self, name: str, path: Path, camera: Camera | None, *, is_frame: bool = False) -> None:
+    def _add(
+        self, name: str, path: Path, given: Camera | CameraList | None, *, is_frame: bool = False
+    ) -> None:
+        camera = given if isinstance(given, Camera) else self._calibrated.get(name)
+        if isinstance(given, CameraList):
+            camera = given.of(name)
         if camera is None:
             photo = read_photo(path)
             self._images[name] = _Image(
                 path, photo.upright_camera, photo.orientation, photo.make, is_frame, photo.gps
             )
+            if given is not None:
+                self.without_row.append(name)
             return
+        size = image_size(path)
+        if size != (camera.width, camera.height) and is_scaled(camera, size):
+            self._scaled.append((camera, scaled_camera(camera, *size)))
+            camera = self._scaled[-1][1]
         check_image_size(path, camera)
         self._images[name] = _Image(path, camera, 1, "", is_frame)
 
-    def _add_video(self, name: str, path: Path, camera: Camera | None, every: int) -> None:
+    def _add_video(
+        self, name: str, path: Path, camera: Camera | CameraList | None, every: int
+    ) -> None:
         if self._frames is None:
             self._frames = tempfile.TemporaryDirectory(prefix=f".{owned_name()}")
         folder = Path(self._frames.name) / name
@@ -367,17 +468,39 @@ class Photographs(Queries):
             self._add(f"{name}/{frame}", folder / frame, camera, is_frame=True)
 
 
-def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
-    """Name to path of all files that were given, sorted by name."""
+def _first(names: Sequence[str]) -> str:
+    """The first few of some names, and how many more there are."""
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    return ", ".join(names[:5]) + more
+
+
+def _calibrated(root: Path) -> dict[str, Camera]:
+    """The calibrated cameras of a kapture folder's images by their names; none of a plain one."""
+    if not is_kapture(root):
+        return {}
+    data, found = KaptureFolder(root).read(), {}
+    for name in data.image_names():
+        with suppress(DataError):
+            found[name] = data.camera_of(name)
+    return found
+
+
+def _named_files(paths: Sequence[Path]) -> tuple[dict[str, Path], list[str]]:
+    """Name to path of all images that were given, sorted by name; and names of the other files."""
     found: dict[str, Path] = {}
+    others: list[str] = []
     for path in paths:
-        if (path / "sensors" / "sensors.txt").is_file():
-            raise DataError("a kapture folder is no folder of plain images: --query", path=path)
-        if path.is_dir():
-            files = {str(file.relative_to(path)): file for file in _images_below(path)}
+        if is_kapture(path):
+            files = _images_of_kapture(KaptureFolder(path))
+        elif path.is_dir():
+            wanted, passed_over = _images_below(path)
+            files = {str(file.relative_to(path)): file for file in wanted}
+            others += [str(file.relative_to(path)) for file in passed_over]
             if not files:
                 raise DataError("no image or video in this folder", path=path)
         elif path.exists():
+            if path.suffix.lower() in _LIST_SUFFIXES:
+                raise DataError("not an image; a list of cameras is given by --camera", path=path)
             files = {path.name: path}
         else:
             raise DataError("no such file or folder", path=path)
@@ -390,11 +513,22 @@ def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
                 )
             _check_name(name, file)
             found[name] = file
-    return dict(sorted(found.items()))
+    return dict(sorted(found.items())), others
 
 
-def _images_below(folder: Path) -> Iterable[Path]:
-    wanted = {*WRITABLE_SUFFIXES, *UNREAD_SUFFIXES, *VIDEO_SUFFIXES}
+def _images_of_kapture(folder: KaptureFolder) -> dict[str, Path]:
+    data = folder.read()
+    if data.poses():
+        raise DataError(
+            "a kapture folder of images with poses: `megloc triangulate` makes a map of them, "
+            "`megloc localize --query` localizes them",
+            path=folder.root,
+        )
+    return {name: folder.image_path(name) for name in data.image_names()}
+
+
+def _images_below(folder: Path) -> tuple[list[Path], list[Path]]:
+    """The images and videos below a folder, and the other files."""
     found, seen = list[Path](), set[str]()
     for place, folders, files in os.walk(folder, followlinks=True):
         here, real = Path(place), os.path.realpath(place)
@@ -407,7 +541,9 @@ def _images_below(folder: Path) -> Iterable[Path]:
         shown = (name for name in folders if not name.startswith("."))
         folders[:] = sorted(shown, key=lambda name: ((here / name).is_symlink(), name))
         found += [here / name for name in files if not name.startswith(".")]
-    return sorted(path for path in found if path.suffix.lower() in wanted)
+    named = {*WRITABLE_SUFFIXES, *UNREAD_SUFFIXES, *VIDEO_SUFFIXES}
+    wanted = {path for path in found if path.suffix.lower() in named or is_image(path)}
+    return sorted(wanted), sorted(set(found) - wanted)
 
 
 def _check_name(name: str, path: Path) -> None:

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, replace
 from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from megloc_kapture.io.files import (
     write_json,
     write_json_model,
 )
-from megloc_kapture.io.images import WRITABLE_SUFFIXES, image_size, write_image
+from megloc_kapture.io.images import image_size, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import SEGMENTERS, Segmenter
@@ -272,12 +272,6 @@ def _plans(data: KaptureData, options: FrameOptions) -> dict[str, FramePlan]:
     for (_, sensor_id), image in sorted(data.records_camera.items()):
         if sensor_id not in plans:
             plans[sensor_id] = plan_frame(data.camera_of(image), options)
-        suffix = PurePosixPath(image).suffix.lower()
-        if plans[sensor_id].changes_pixels and suffix not in WRITABLE_SUFFIXES:
-            raise DataError(
-                f"image {image!r} changes, but what its name says it is cannot be written; "
-                f"can be: {', '.join(WRITABLE_SUFFIXES)}"
-            )
     return plans
 
 

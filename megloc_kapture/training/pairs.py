@@ -24,7 +24,7 @@ from pydantic import Field, field_validator
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import read_content
-from megloc_kapture.io.images import WRITABLE_SUFFIXES, read_depth_map, read_image_rgb
+from megloc_kapture.io.images import is_image, read_depth_map, read_image_rgb
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.mapping.pairs import PairsByPosesOptions, pairs_by_poses
 from megloc_kapture.plugins import DepthView
@@ -211,7 +211,7 @@ class Photographs:
         self._paths = [
             path
             for path in sorted(self.folder.rglob("*"))
-            if path.suffix.lower() in WRITABLE_SUFFIXES and path.is_file()
+            if is_image(path)
         ]
         if not self._paths:
             raise DataError("no image in this folder", path=self.folder)

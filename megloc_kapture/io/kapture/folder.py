@@ -233,6 +233,8 @@ class KaptureFolder:
         self, descriptors: FeatureReader, keypoints_by_type: dict[str, FeatureReader]
     ) -> None:
         keypoints_type = cast(str, descriptors.config.keypoints_type)
+        if keypoints_type not in keypoints_by_type:  # kapture's import of OpenMVG: SIFT_Regions
+            keypoints_type = descriptors.type_name
         keypoints = keypoints_by_type.get(keypoints_type)
         for image in descriptors.names:
             if keypoints is None or image not in keypoints:

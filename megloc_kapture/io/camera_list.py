@@ -1,0 +1,78 @@
+"""Lists of cameras: one per image, as Aachen's and hloc's, or one for all, as COLMAP's cameras.txt.
+
+A row is ``NAME MODEL WIDTH HEIGHT PARAMS...``, separated by blanks or commas.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.files import named, read_text
+from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera
+
+_MAX_BYTES = 1 << 28
+_ROW = re.compile(
+    rf"(?P<name>\S.*?)[\s,]+(?P<model>{'|'.join(CAMERA_MODEL_NUM_PARAMS)})[\s,]+(?P<numbers>.*)"
+)
+
+
+class CameraList:
+    """Cameras by the names of their images.
+
+    An image has the row of its name; without one that row whose name ends as its own, or as which
+    its own ends, by whole folders, where there is only one camera of the kind.
+    """
+
+    def __init__(self, cameras: Mapping[str, Camera]) -> None:
+        self._cameras = cameras
+        self._by_file: dict[str, list[str]] = {}
+        for name in cameras:
+            self._by_file.setdefault(PurePosixPath(name).name, []).append(name)
+
+    def of(self, image: str) -> Camera | None:
+        """The camera of an image; None where there is no row of it."""
+        if image in self._cameras:
+            return self._cameras[image]
+        names = self._by_file.get(PurePosixPath(image).name, ())
+        ending = {
+            self._cameras[name]
+            for name in names
+            if f"/{image}".endswith(f"/{name}") or f"/{name}".endswith(f"/{image}")
+        }
+        return ending.pop() if len(ending) == 1 else None
+
+
+def read_cameras(path: Path) -> Camera | CameraList:
+    """Read a list; a single row whose name is a number, as COLMAP's ids are, is of all images.
+
+    Raises DataError: no such list; names file and line.
+    """
+    cameras: dict[str, Camera] = {}
+    for number, line in enumerate(read_text(path, max_bytes=_MAX_BYTES).splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        with named(path, number):
+            row = _ROW.fullmatch(line.strip())
+            if row is None:
+                raise DataError("not a row of a list of cameras: NAME MODEL WIDTH HEIGHT PARAMS...")
+            if row["name"] in cameras:
+                raise DataError(f"{row['name']!r} is listed twice")
+            cameras[row["name"]] = _camera(row["model"], re.split(r"[\s,]+", row["numbers"]))
+    if not cameras:
+        raise DataError("no camera in this list", path=path)
+    if len(cameras) == 1 and next(iter(cameras)).isdigit():
+        return next(iter(cameras.values()))
+    return CameraList(cameras)
+
+
+def _camera(model: str, fields: list[str]) -> Camera:
+    try:
+        width, height, *params = map(float, fields)
+    except ValueError as error:
+        raise DataError(f"width, height and parameters are numbers, got {fields}") from error
+    if not (width.is_integer() and height.is_integer()):
+        raise DataError(f"image size {width:g}x{height:g} is not in whole pixels")
+    return Camera(model, int(width), int(height), tuple(params))
