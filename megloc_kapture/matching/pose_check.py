@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -89,14 +89,16 @@ def _split(pairs: Sequence[PairEvidence]) -> tuple[list[str], int]:
     """Return the images whose poses most of their pairs contradict, and the number of the others.
 
     A wrong pose spoils the pairs of right images too: the worst image is taken out with its pairs
-    before the next one is judged.
+    before the next one is judged. Images of a single pair are not judged.
     """
+    number = Counter(image for pair in pairs for image in (pair.image, pair.other))
     wrong, left = [], list(pairs)
     while True:
         contradict: dict[str, list[bool]] = defaultdict(list)
         for pair in left:
-            contradict[pair.image].append(not pair.agrees)
-            contradict[pair.other].append(not pair.agrees)
+            for image in (pair.image, pair.other):
+                if number[image] > 1:
+                    contradict[image].append(not pair.agrees)
         shares = [(np.mean(of_image), len(of_image), i) for i, of_image in contradict.items()]
         share, _, worst = max(shares, default=(0.0, 0, ""))
         if share <= _MOST:

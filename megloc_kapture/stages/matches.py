@@ -11,7 +11,7 @@ from collections import Counter, OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from functools import cache, cached_property, partial
-from itertools import groupby
+from itertools import combinations, groupby
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -61,8 +61,8 @@ _log = logging.getLogger(__name__)
 
 _CACHE_BYTES = 256 << 20  # descriptors kept per process: about a hundred images
 _PAIRS_PER_ITEM = 32  # of one image, whose features are read once for them
-# images, and pairs of each, that say whether the given poses contradict the matches
-_CHECKED_IMAGES, _CHECKED_PAIRS = 24, 4
+# groups of images whose pairs say whether the given poses contradict the matches
+_CHECKED_GROUPS, _GROUP_SIZE = 6, 6
 
 
 class NoVerification(Options):
@@ -204,20 +204,18 @@ def check_given_poses(
 
 
 def _sampled(pairs: Sequence[ImagePair]) -> list[_Job]:
-    """Images spread over the map, each with some of its pairs, near and far ones."""
-    others: dict[str, dict[str, None]] = {}
+    """Pairs within groups of images spread over the map: an image and some of those paired with
+    it, near and far ones."""
+    paired: dict[str, list[str]] = {}
     for pair in sorted(pairs, key=lambda pair: (-pair.score, pair.query, pair.map)):
-        others.setdefault(pair.query, {})[pair.map] = None
-        others.setdefault(pair.map, {})[pair.query] = None
-    jobs: dict[str, list[str]] = {}
-    seen = set()
-    for image in _spread(sorted(others), _CHECKED_IMAGES):
-        for other in _spread(list(others[image]), _CHECKED_PAIRS):
-            pair = min(image, other), max(image, other)
-            if pair not in seen:
-                seen.add(pair)
-                jobs.setdefault(image, []).append(other)
-    return list(jobs.items())
+        paired.setdefault(pair.query, []).append(pair.map)
+        paired.setdefault(pair.map, []).append(pair.query)
+    chosen: dict[str, set[str]] = {}
+    for image in _spread(sorted(paired), _CHECKED_GROUPS):
+        others = _spread(list(dict.fromkeys(paired[image])), _GROUP_SIZE - 1)
+        for a, b in combinations(sorted({image, *others}), 2):
+            chosen.setdefault(a, set()).add(b)
+    return [(image, sorted(others)) for image, others in chosen.items()]
 
 
 def _spread(items: Sequence[str], count: int) -> list[str]:

@@ -118,6 +118,8 @@ class CheckReport:
         counts = Counter(finding.severity for finding in self.findings)
         of = "" if self.expected is None else f" of {self.expected} queries"
         outcome = "no problem found"
+        if any(finding.kind == "undecided" for finding in self.findings):
+            outcome += ", but not every mistake is ruled out"
         if counts["error"]:
             outcome = f"{plural(counts['error'], 'problem')} found"
         also = f", {plural(counts['warning'], 'warning')}" if counts["warning"] else ""
