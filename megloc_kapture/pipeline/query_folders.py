@@ -442,7 +442,7 @@ class Photographs(Queries):
     ) -> None:
         camera = given if isinstance(given, Camera) else self._calibrated.get(name)
         if isinstance(given, CameraList):
-            camera = given.of(name)
+            camera = given.of(name, path)
         if camera is None:
             photo = read_photo(path)
             self._images[name] = _Image(
