@@ -266,9 +266,10 @@ def cameras_of_images(
             of_camera.setdefault(key, {}).setdefault(image_size(path), []).append(path)
     scaled, errors = {}, []
     for key, sizes in of_camera.items():
-        camera, size = cameras[key], next(iter(sizes))
-        if len(sizes) == 1 and size != (camera.width, camera.height) and is_scaled(camera, size):
-            scaled[key] = camera = scaled_camera(camera, *size)
+        camera = cameras[key]
+        fitting = [size for size in sizes if is_scaled(camera, size)]
+        if len(fitting) == 1 and fitting[0] != (camera.width, camera.height):
+            scaled[key] = camera = scaled_camera(camera, *fitting[0])
         errors += [
             _other_size(path, size, camera)
             for size, paths in sizes.items()

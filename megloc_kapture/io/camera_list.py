@@ -22,8 +22,8 @@ _ROW = re.compile(
 class CameraList:
     """Cameras by the names of their images.
 
-    An image has the row of its name; without one that row whose name ends as its own, or as which
-    its own ends, by whole folders, where there is only one camera of the kind.
+    An image has the row whose name its path ends as, by whole folders, the longest of several;
+    else the only row whose name ends as the image's.
     """
 
     def __init__(self, cameras: Mapping[str, Camera]) -> None:
@@ -32,17 +32,16 @@ class CameraList:
         for name in cameras:
             self._by_file.setdefault(PurePosixPath(name).name, []).append(name)
 
-    def of(self, image: str) -> Camera | None:
-        """The camera of an image; None where there is no row of it."""
-        if image in self._cameras:
-            return self._cameras[image]
-        names = self._by_file.get(PurePosixPath(image).name, ())
-        ending = {
-            self._cameras[name]
-            for name in names
-            if f"/{image}".endswith(f"/{name}") or f"/{name}".endswith(f"/{image}")
-        }
-        return ending.pop() if len(ending) == 1 else None
+    def of(self, image: str, path: Path) -> Camera | None:
+        """The camera of an image by its name and file; None where there is no row of it."""
+        names = self._by_file.get(PurePosixPath(image).name, [])
+        file = path.absolute().as_posix()
+        ending = [name for name in names if file.endswith(f"/{name}")]
+        if not ending:
+            ending = [name for name in names if name.endswith(f"/{image}")]
+            if len(ending) > 1:
+                return None
+        return self._cameras[max(ending, key=len)] if ending else None
 
 
 def read_cameras(path: Path) -> Camera | CameraList:

@@ -367,9 +367,8 @@ def is_image(path: Path) -> bool:
     try:
         if not path.is_file():  # reading a pipe might never end
             return False
-        with _quiet():
-            Image.open(path, formats=_FORMATS).close()
-        return True
+        with _quiet(), Image.open(path) as image:
+            return image.format in _FORMATS
     except Exception:  # pillow raises many kinds on broken headers
         return False
 
@@ -381,23 +380,25 @@ def read_photo(path: Path | str) -> Photo:
     """
     path = Path(path)
     check_image_file(path)
+    known = f"cannot be read; {', '.join(WRITABLE_SUFFIXES)} can"
     if path.suffix.lower() in UNREAD_SUFFIXES:
-        raise DataError(f"{path.suffix} cannot be read; JPEG, PNG, TIFF and WebP can", path=path)
+        raise DataError(f"{path.suffix} {known}", path=path)
     with _opened(path) as image:
-        if image.format not in _FORMATS:
-            raise DataError(
-                f"{image.format} cannot be read; JPEG, PNG, TIFF and WebP can", path=path
-            )
-        return photo_of(image)
+        photo = photo_of(image) if image.format in _FORMATS else None
+    if photo is None:
+        raise DataError(f"an image of this format {known}", path=path)
+    return photo
 
 
 def photo_of(image: Image.Image) -> Photo:
     """The header of an image that pillow has opened."""
+    import PIL.Image
+
     width, height = image.size
     with _quiet():
-        exif = _tried(image.getexif) or {}
-        orientation = _number(_tried(lambda: exif.get(_ORIENTATION)))
-        make, model = (_text(_tried(lambda tag=tag: exif.get(tag))) for tag in (_MAKE, _MODEL))
+        exif = _tried(image.getexif) or PIL.Image.Exif()
+        orientation = _number(_tried(lambda: exif[_ORIENTATION]))
+        make, model = _text(_tried(lambda: exif[_MAKE])), _text(_tried(lambda: exif[_MODEL]))
         gps = _tried(lambda: _position(exif.get_ifd(_GPS)))
         focal = _tried(lambda: focal_from_exif(_blank_with_exif(exif, make, model, image.size)))
     # pillow and OpenCV have turned TIFF files already
@@ -498,7 +499,7 @@ def _blank_with_exif(exif: Image.Exif, make: str, model: str, size: tuple[int, i
     kept[_MAKE], kept[_MODEL] = make, model
     stored = exif.get_ifd(_EXIF)
     for tag in _FOCAL_TAGS:
-        value = _number(_tried(lambda tag=tag: stored.get(tag)))
+        value = _number(stored.get(tag))
         if value is not None and 0 < value < 2**31:
             whole = value.is_integer()  # pillow takes the type of a tag from its value
             kept.get_ifd(_EXIF)[tag] = int(value) if whole else IFDRational(value)

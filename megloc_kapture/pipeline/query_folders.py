@@ -183,7 +183,7 @@ class KaptureQueries(Queries):
             raise errors[0]
 
     def units(self, *, rigs: bool) -> list[scene.Unit]:
-        units = []
+        units: list[scene.Unit] = []
         for unit in super().units(rigs=rigs):
             if any(self._is_unknown(name) for name, _ in unit):  # one is estimated by itself
                 units += [((name, RigidTransform.identity()),) for name, _ in unit]
@@ -442,7 +442,7 @@ class Photographs(Queries):
     ) -> None:
         camera = given if isinstance(given, Camera) else self._calibrated.get(name)
         if isinstance(given, CameraList):
-            camera = given.of(name)
+            camera = given.of(name, path)
         if camera is None:
             photo = read_photo(path)
             self._images[name] = _Image(

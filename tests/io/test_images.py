@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import struct
+from io import BytesIO
 from pathlib import Path
 
 import cv2
@@ -20,7 +22,9 @@ from megloc_kapture.io.images import (
     GUESS_DEVIATION,
     WRITABLE_SUFFIXES,
     image_size,
+    is_image,
     photo_of,
+    pillow_pixels,
     read_depth_map,
     read_image_rgb,
     read_photo,
@@ -57,6 +61,48 @@ def test_grey_deep_and_transparent_images_are_three_channels_of_8_bits(tmp_path:
     alpha = RNG.integers(0, 256, (40, 60, 1), dtype=np.uint8)
     Image.fromarray(np.concatenate([PIXELS, alpha], axis=2)).save(path)
     assert np.array_equal(read_image_rgb(path), PIXELS)
+
+
+def spread(low: float, high: float) -> np.ndarray:
+    """An image (40, 60) that uses this range evenly."""
+    return np.linspace(low, high, 2400).reshape(40, 60)
+
+
+@pytest.mark.parametrize(
+    ("name", "deep"),
+    [
+        ("12_bits.png", spread(0, 4080).astype(np.uint16)),
+        ("10_bits.png", spread(0, 1020).astype(np.uint16)),
+        ("thermal.png", spread(8000, 8765).astype(np.uint16)),
+        ("full.png", spread(0, 65535).astype(np.uint16)),
+        ("float.tif", spread(0, 1).astype(np.float32)),
+        ("kelvin.tif", spread(273.15, 301).astype(np.float32)),
+        ("long.tif", spread(-5000, 5000).astype(np.int32)),
+    ],
+)
+def test_what_is_used_of_the_range_becomes_8_bits(
+    name: str, deep: np.ndarray, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    Image.fromarray(deep).save(tmp_path / name)
+    expected = spread(0, 255)[:, :, None]
+    found = read_image_rgb(tmp_path / name)
+    assert found.dtype == np.uint8 and np.abs(found - expected).max() <= 1.01
+    with Image.open(tmp_path / name) as image:
+        assert np.array_equal(pillow_pixels(image), found)
+    assert capfd.readouterr().err == ""
+
+
+def test_dead_pixels_and_colours_do_not_change_the_range(tmp_path: Path) -> None:
+    deep = np.stack([spread(8000, 8765)] * 3, axis=2).astype(np.uint16)
+    deep[:, :, 2] //= 2  # BGR: red is half of the others
+    deep[0, 0], deep[20, 30] = 65535, 0
+    cv2.imwrite(str(tmp_path / "a.png"), deep)
+    red, green, blue = (read_image_rgb(tmp_path / "a.png")[30, 30, k].astype(int) for k in range(3))
+    assert green == blue > 230 and red < 20
+    # one value alone is scaled, not stretched: a mask of 16 bits
+    for value in (0, 257, 65535):
+        Image.fromarray(np.full((40, 60), value, np.uint16)).save(tmp_path / "b.png")
+        assert np.unique(read_image_rgb(tmp_path / "b.png")) == value // 257
 
 
 def test_exif_orientation_is_ignored(tmp_path: Path) -> None:
@@ -114,7 +160,6 @@ def test_things_that_are_no_images_are_refused(tmp_path: Path) -> None:
 def test_bad_arrays_and_places_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for name, image, match in (
-        ("a.gif", PIXELS, "suffix"),
         ("a.png", PIXELS.astype(np.float32), "uint8"),
         ("a.png", PIXELS[:, :, :2], "channels"),
     ):
@@ -220,13 +265,147 @@ def test_broken_exif_is_as_none(junk: bytes, at: int) -> None:
     assert photo.camera.width == 64 and photo.camera.params[0] > 0
 
 
+# --- EXIF written byte by byte, for pillow writes no damaged tags
+ASCII, SHORT, LONG, RATIONAL, BYTES, BYTE = 2, 3, 4, 5, 7, 1
+Tags = dict[int, tuple[int, bytes]]  # type and content
+GPS = 0x8825
+SIZE_OF = {ASCII: 1, SHORT: 2, LONG: 4, RATIONAL: 8, BYTES: 1, BYTE: 1, 99: 1}
+
+
+def rationals(*pairs: tuple[int, int]) -> tuple[int, bytes]:
+    return RATIONAL, b"".join(struct.pack("<II", *pair) for pair in pairs)
+
+
+def ifd(tags: Tags, at: int) -> bytes:
+    """A directory of EXIF, with the contents that do not fit into it behind it."""
+    rows, contents = struct.pack("<H", len(tags)), b""
+    behind = at + 2 + 12 * len(tags) + 4
+    for tag, (kind, content) in sorted(tags.items()):
+        rows += struct.pack("<HHI", tag, kind, len(content) // SIZE_OF[kind])
+        if len(content) > 4:
+            rows += struct.pack("<I", behind + len(contents))
+            contents += content
+        else:
+            rows += content.ljust(4, b"\0")
+    return rows + bytes(4) + contents
+
+
+def exif_bytes(main: Tags, inner: Tags, gps: Tags) -> bytes:
+    size = len(ifd({**main, EXIF: (LONG, bytes(4)), GPS: (LONG, bytes(4))}, 8))
+    places = [8 + size, 8 + size + len(ifd(inner, 0))]
+    pointers = {t: (LONG, struct.pack("<I", at)) for t, at in zip((EXIF, GPS), places, strict=True)}
+    parts = ifd({**main, **pointers}, 8) + ifd(inner, places[0]) + ifd(gps, places[1])
+    return b"Exif\0\0II*\0\x08\0\0\0" + parts
+
+
+MAIN: Tags = {ORIENTATION: (SHORT, b"\6\0"), MAKE: (ASCII, b"Acme\0"), MODEL: (ASCII, b"P1\0")}
+INNER: Tags = {FOCAL_35MM: (SHORT, b"\x20\0"), 0x927C: (BYTES, b"maker note" * 9)}
+POSITION: Tags = {
+    1: (ASCII, b"N\0"),
+    2: rationals((47, 1), (22, 1), (30, 1)),
+    3: (ASCII, b"W\0"),
+    4: rationals((8, 1), (32, 1), (30, 1)),
+    6: rationals((400, 1)),
+}
+WHOLE = (6, "Acme P1", 426.6, (47.375, -8.541667, 400.0))
+
+
+def header(exif: bytes) -> tuple[int, str, float, tuple[float, ...] | None]:
+    image = Image.new("RGB", (480, 320))
+    image.info["exif"] = exif
+    photo = photo_of(image)
+    gps = None if photo.gps is None else tuple(round(value, 6) for value in photo.gps)
+    return photo.orientation, photo.make, round(photo.camera.params[0], 1), gps
+
+
+@pytest.mark.parametrize(
+    ("part", "tag", "written", "expected"),
+    [
+        ("main", ORIENTATION, (SHORT, b"\6\0"), 6),
+        ("main", ORIENTATION, (ASCII, b"6\0"), 6),
+        ("main", ORIENTATION, (BYTE, b"\6"), 6),
+        ("main", ORIENTATION, (SHORT, b"\x09\0"), 1),
+        ("main", ORIENTATION, (SHORT, b""), 1),
+        ("main", ORIENTATION, (99, b"\6\0"), 1),
+        ("main", ORIENTATION, rationals((6, 0)), 1),
+        ("main", MAKE, (ASCII, b"Acme\0\0rest\0"), "Acme P1"),
+        ("main", MAKE, (BYTES, b"Acme\n"), "Acme P1"),
+        ("main", MAKE, (SHORT, b"\1\0"), "P1"),
+        ("inner", FOCAL_35MM, (ASCII, b"32 mm\0"), 426.6),
+        ("inner", FOCAL_35MM, rationals((64, 2)), 426.6),
+        ("inner", FOCAL_35MM, (SHORT, b"\0\0"), 576.0),
+        ("inner", FOCAL_35MM, rationals((32, 0)), 576.0),
+        ("inner", 0x927C, (99, b"broken" * 20), 426.6),
+        ("gps", 2, rationals((47, 1), (45, 2)), (47.375, -8.541667, 400.0)),
+        ("gps", 2, rationals((47375, 1000)), (47.375, -8.541667, 400.0)),
+        ("gps", 2, (ASCII, b"47 22 30\0"), (47.375, -8.541667, 400.0)),
+        ("gps", 2, rationals((47, 1), (22, 1), (0, 0)), (47.366667, -8.541667, 400.0)),
+        ("gps", 2, rationals((47, 0), (22, 1), (0, 0)), None),
+        ("gps", 2, (BYTES, b"\xff\xfe\xfd"), None),
+        ("gps", 3, (ASCII, b"\0"), None),
+        ("gps", 3, (BYTE, b"w"), (47.375, -8.541667, 400.0)),
+        ("gps", 6, rationals((1, 0)), (47.375, -8.541667, 0.0)),
+    ],
+)
+def test_a_damaged_tag_costs_no_other(
+    part: str, tag: int, written: tuple[int, bytes], expected: object
+) -> None:
+    parts = {"main": MAIN, "inner": INNER, "gps": POSITION}
+    parts[part] = {**parts[part], tag: written}
+    at = {"main": 1 if tag == MAKE else 0, "inner": 2, "gps": 3}[part]
+    found = header(exif_bytes(*parts.values()))
+    assert found == (*WHOLE[:at], expected, *WHOLE[at + 1 :])
+
+
+def test_of_truncated_exif_what_is_there_is_read() -> None:
+    whole = exif_bytes(MAIN, INNER, POSITION)
+    assert header(whole) == WHOLE
+    behind_main = 14 + len(ifd({**MAIN, EXIF: (LONG, bytes(4)), GPS: (LONG, bytes(4))}, 8))
+    for end in range(behind_main, len(whole), 9):
+        assert header(whole[:end])[:2] == (6, "Acme P1")
+        assert header(whole[:end] + bytes(len(whole) - end))[:2] == (6, "Acme P1")
+
+
+def test_images_are_told_by_their_content(tmp_path: Path) -> None:
+    for name, written in (
+        ("a.jfif", "JPEG"),
+        ("frame.000007", "JPEG"),
+        ("noname", "PNG"),
+        ("b.pgm", "PPM"),
+        ("c.jp2", "JPEG2000"),
+        ("d.gif", "GIF"),
+        ("e.txt", "WEBP"),
+    ):
+        noise().convert("L" if written == "PPM" else "RGB").save(tmp_path / name, written)
+        assert is_image(tmp_path / name)
+        assert read_photo(tmp_path / name).camera.width == 64
+        assert read_image_rgb(tmp_path / name).shape == (48, 64, 3)
+        write_image(tmp_path / name, SMOOTH)
+        lossy = name in ("a.jfif", "frame.000007", "noname", "e.txt")
+        assert np.abs(read_image_rgb(tmp_path / name).astype(int) - SMOOTH).mean() <= 4 * lossy
+    os.mkfifo(tmp_path / "pipe")  # opening it would wait for ever
+    for name, content in (("f.json", b"{}"), ("g", b""), ("h", ICON)):
+        (tmp_path / name).write_bytes(content)
+    assert not any(is_image(tmp_path / name) for name in ("f.json", "g", "h", "pipe", "nowhere"))
+
+
+def icon() -> bytes:
+    content = BytesIO()
+    Image.new("RGB", (16, 16)).save(content, "ICO")
+    return content.getvalue()
+
+
+ICON = icon()
+
+
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
         ("empty.jpg", b"", "not an image, or broken"),
         ("text.jpg", b"hello", "not an image, or broken"),
         ("phone.heic", b"x", r"\.heic cannot be read; .*\.jpg"),
-        ("noname", b"x", "such a file cannot be read"),
+        ("noname", b"x", "not an image, or broken"),
+        ("icon.jpg", ICON, r"format cannot be read; .*\.jpg"),
         ("nowhere.jpg", None, "no such image"),
     ],
 )

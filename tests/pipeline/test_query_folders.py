@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,14 +13,16 @@ from PIL import Image
 
 from megloc_kapture import KaptureMap, Localizer
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.images import image_size, read_image_rgb
-from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.camera_list import read_cameras
+from megloc_kapture.io.images import image_size, read_image_rgb, read_photo, write_image
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.output_folders import claim_folder
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.query_folders import KaptureQueries, Photographs
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.pipeline.workspace import Workspace
-from megloc_kapture.values import Camera
+from megloc_kapture.preprocessing.frames import resized, scaled_camera
+from megloc_kapture.values import Camera, RigidTransform
 from tests.pipeline.runs import evaluated
 
 
@@ -37,8 +40,11 @@ def test_names_are_paths_below_what_was_given(tmp_path: Path) -> None:
         write(tmp_path / "in" / name) if name != "raw.NEF" else (tmp_path / "in" / name).touch()
     (tmp_path / "in" / "notes.txt").write_text("no image")
     other = write(tmp_path / "e.jpg")
+    write(tmp_path / "in" / "f.jpg").rename(tmp_path / "in" / "frame_000007")
     photos = Photographs([tmp_path / "in", other])
-    assert photos.names == ["a dir/c.PNG", "b.jpg", "e.jpg"]
+    assert photos.names == ["a dir/c.PNG", "b.jpg", "e.jpg", "frame_000007"]
+    assert photos.passed_over == ["notes.txt"]
+    assert photos.describe() == ["1 files that are no images are left out: notes.txt"]
     assert list(photos.unreadable) == ["raw.NEF"]
     assert ".nef cannot be read" in photos.unreadable["raw.NEF"].lower()
 
@@ -117,19 +123,96 @@ def test_a_name_that_kapture_cannot_hold_is_refused(tmp_path: Path, name: str) -
 def test_refused(tmp_path: Path) -> None:
     one, two = write(tmp_path / "a" / "x.jpg"), write(tmp_path / "b" / "x.jpg")
     (tmp_path / "empty").mkdir()
-    (tmp_path / "k" / "sensors").mkdir(parents=True)
-    (tmp_path / "k" / "sensors" / "sensors.txt").touch()
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24")
     for paths, words in (
         ([one, two], "same name"),
         ([tmp_path / "nowhere"], "no such file"),
         ([tmp_path / "empty"], "no image or video"),
-        ([tmp_path / "k"], "--query"),
+        ([tmp_path / "cameras.txt"], "a list of cameras is given by --camera"),
     ):
         with pytest.raises(DataError, match=words):
             Photographs(paths)
     for every, words in ((3, "no video"), (0, "give 1 or more")):
         with pytest.raises(OptionError, match=words):
             Photographs([one], every=every)
+
+
+def test_a_list_gives_each_image_its_camera(tmp_path: Path) -> None:
+    for name in ("day/1.jpg", "day/2 b.jpg", "night/1.jpg", "other/3.jpg"):
+        write(tmp_path / "query" / name)
+    (tmp_path / "cameras.txt").write_text(
+        "# NAME MODEL WIDTH HEIGHT PARAMS\n"
+        "query/day/1.jpg PINHOLE 64 48 51 51 32 24\n"
+        "query/night/1.jpg PINHOLE 64 48 52 52 32 24\n"
+        "query/day/2 b.jpg, SIMPLE_RADIAL, 128, 96, 106, 64, 48, 0.1\n"
+    )
+    cameras = read_cameras(tmp_path / "cameras.txt")
+    photos = Photographs([tmp_path / "query"], cameras)
+    found = {name: photos.query(name).camera for name in photos.names}
+    assert found["day/1.jpg"] == Camera("PINHOLE", 64, 48, (51, 51, 32, 24))
+    assert found["night/1.jpg"].params[0] == 52
+    # the image is half as large as its camera
+    assert found["day/2 b.jpg"] == Camera("SIMPLE_RADIAL", 64, 48, (53, 32, 24, 0.1))
+    assert photos.without_row == ["other/3.jpg"] and found["other/3.jpg"].focal_deviation > 0
+    assert "1 images are not in the list of cameras" in photos.describe()[0]
+    assert not photos.known_cameras()
+    # the path of the file tells images of one name apart
+    assert Photographs([tmp_path / "query" / "day"], cameras).query("1.jpg").camera.params[0] == 51
+    (tmp_path / "query" / "day").rename(tmp_path / "moved")
+    assert Photographs([tmp_path / "moved"], cameras).without_row == ["1.jpg"]
+    with pytest.raises(OptionError, match=r"no row of any image, as of 3\.jpg"):
+        Photographs([tmp_path / "query" / "other"], cameras)
+    # COLMAP's cameras.txt with one camera
+    (tmp_path / "cameras.txt").write_text("# Camera list\n1 PINHOLE 64 48 50 50 32 24\n")
+    photos = Photographs([tmp_path / "query"], read_cameras(tmp_path / "cameras.txt"))
+    assert photos.known_cameras() and photos.query("night/1.jpg").camera.params[0] == 50
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "no camera"),
+        ("a.jpg 64 48 50 50 32 24", "1: not a row"),
+        ("a.jpg PINHOLE 64 48 50 50 32", "1: camera model PINHOLE takes 4"),
+        ("a.jpg PINHOLE 64 48 fifty 50 32 24", "1: width, height and parameters are numbers"),
+        ("a.jpg PINHOLE 6.5 48 50 50 32 24", "1: image size 6.5x48"),
+        ("a.jpg PINHOLE 64 48 50 50 32 24\n" * 2, "2: 'a.jpg' is listed twice"),
+    ],
+)
+def test_a_wrong_list_of_cameras_is_refused_with_its_line(
+    text: str, said: str, tmp_path: Path
+) -> None:
+    (tmp_path / "cameras.txt").write_text(text)
+    with pytest.raises(DataError, match=f"cameras.txt.*{said}"):
+        read_cameras(tmp_path / "cameras.txt")
+
+
+def kapture_of(root: Path, sensors: dict[str, Sensor], images: dict[str, str]) -> KaptureFolder:
+    """A kapture folder of images (name to sensor) without poses; the files are not written."""
+    data = KaptureData(sensors=sensors)
+    for timestamp, (name, sensor) in enumerate(images.items()):
+        data.records_camera[timestamp, sensor] = name
+    write_sensors(root, data)
+    return KaptureFolder(root)
+
+
+def test_images_of_a_kapture_folder_are_photographs_with_its_cameras(tmp_path: Path) -> None:
+    known = Camera.pinhole(64, 48, 51)
+    sensors = {
+        "a": Sensor.from_camera(known),
+        "b": Sensor("", "camera", ("UNKNOWN_CAMERA", "64", "48")),
+    }
+    folder = kapture_of(tmp_path, sensors, {"1.jpg": "a", "2.jpg": "b"})
+    for name in ("1.jpg", "2.jpg"):
+        write(folder.image_path(name), focal_35mm=28)
+    photos = Photographs([tmp_path])
+    assert photos.query("1.jpg").camera == known
+    assert photos.query("2.jpg").camera == read_photo(folder.image_path("2.jpg")).camera
+    write_sensors(
+        tmp_path, replace(folder.read(), trajectories={(0, "a"): RigidTransform.identity()})
+    )
+    with pytest.raises(DataError, match="with poses: `megloc triangulate`"):
+        Photographs([tmp_path])
 
 
 FEW = "local_features.rootsift.options.max_keypoints=300"
@@ -186,3 +269,79 @@ def test_of_both_the_fitting_type_is_read_and_an_image_without_either_is_named(
         found.unlink()
     queries = KaptureQueries(KaptureFolder(place.path("query"), features_dirs=[features]), opened)
     assert queries.lacking("rootsift") == name
+
+
+@pytest.fixture
+def queries(workspaces: dict[str, Workspace], tmp_path: Path) -> tuple[KaptureMap, KaptureFolder]:
+    """A map, and its queries without features in a folder that may be changed."""
+    place = workspaces["rootsift"]
+    query = Path(shutil.copytree(place.path("query"), tmp_path / "query"))
+    return KaptureMap.open(place.path("map")), KaptureFolder(query)
+
+
+@pytest.mark.parametrize("with_features", [False, True])
+def test_an_uncalibrated_camera_is_estimated(
+    queries: tuple[KaptureMap, KaptureFolder],
+    workspaces: dict[str, Workspace],
+    with_features: bool,
+) -> None:
+    opened, folder = queries
+    data = folder.read()
+    first = data.image_names()[0]
+    timestamp, sensor = data.record_of(first)
+    known = data.camera_of(first)
+    unknown = Sensor("", "camera", ("UNKNOWN_CAMERA", str(known.width), str(known.height)))
+    del data.records_camera[timestamp, sensor]
+    data.records_camera[timestamp, "unknown"] = first
+    write_sensors(folder.root, replace(data, sensors={**data.sensors, "unknown": unknown}))
+    features = [workspaces["rootsift"].root] if with_features else []
+    folder = KaptureFolder(folder.root, features_dirs=features)
+    results = Results(Localizer(opened, options=options_of_preset(assignments=[FEW])), folder)
+    found = results[first]
+    assert found and found.camera is not None
+    assert abs(found.camera.params[0] / known.params[0] - 1) < 0.05
+    others = [one for name, one in results.items() if name != first]
+    assert all(others) and all(one.camera is None for one in others)
+    counts = results.save(folder.root.parent / "out")
+    assert counts["localized"] == len(results)
+    saved = KaptureFolder(folder.root.parent / "out").read()
+    np.testing.assert_allclose(saved.camera_of(first).params, found.camera.params)
+
+
+def test_cameras_are_scaled_to_smaller_images(
+    queries: tuple[KaptureMap, KaptureFolder], caplog: pytest.LogCaptureFixture
+) -> None:
+    opened, folder = queries
+    names, known = folder.read().image_names(), {}
+    for name in names:
+        camera, path = folder.read().camera_of(name), folder.image_path(name)
+        known[name] = scaled_camera(camera, camera.width // 2, camera.height // 2)
+        write_image(
+            path.parent / "half.png",
+            resized(read_image_rgb(path), camera.width // 2, camera.height // 2),
+        )
+        (path.parent / "half.png").replace(path)
+    found = KaptureQueries(folder, opened)
+    found.check()
+    assert found.names == names and not found.unreadable
+    for name in names:
+        camera = found.query(name).camera
+        assert (camera.width, camera.height) == (known[name].width, known[name].height)
+        np.testing.assert_allclose(camera.params, opened.to_colmap(known[name]).params, atol=0.51)
+        assert found.data().camera_of(name) == known[name]
+    assert "scaled to their images" in caplog.text
+    # of another shape one fails by itself
+    write_image(folder.image_path(names[0]), np.zeros((50, 50, 3), np.uint8))
+    found = KaptureQueries(folder, opened)
+    found.check()
+    assert "50x50, its camera says" in found.unreadable[names[0]]
+
+
+def test_features_by_another_spelling_of_their_type_are_used(
+    queries: tuple[KaptureMap, KaptureFolder], workspaces: dict[str, Workspace], tmp_path: Path
+) -> None:
+    opened, folder = queries
+    source = workspaces["rootsift"].root / "local_features" / "rootsift"
+    shutil.copytree(source, tmp_path / "features" / "local_features" / "RootSIFT")
+    folder = KaptureFolder(folder.root, features_dirs=[tmp_path / "features"])
+    assert KaptureQueries(folder, opened).lacking("rootsift") is None
