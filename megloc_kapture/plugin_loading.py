@@ -47,7 +47,7 @@ def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) ->
         refuses its options; says which and why.
     """
     kind = plugin_class(group, name)
-    model = getattr(kind, "Options", None)
+    model: Any = getattr(kind, "Options", None)
     try:
         if model is None:
             if options:

@@ -246,7 +246,7 @@ def localize_in_clusters(
                 reflected = partial(_mirror_matches, views, ranked[best].images, sources, scene)
                 sources = replace(sources, displacements_rad=seen, mirror_matches=reflected)
             known = result.camera is None
-            misfit = focal_misfit(problem, result, options.max_error_px) if known else None
+            misfit = focal_misfit(problem, result, options) if known else None
             result = with_confidence(
                 problem, result, sources, options.max_error_px, min_confidence, misfit
             )

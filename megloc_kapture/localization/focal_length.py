@@ -5,7 +5,7 @@ still agree. What gives it away is perspective. With a pose at hand the focal le
 (Gauss-Newton on rays, Cauchy weights), and what comes of it depends on the camera:
 
 - one that is known stays as it is; where another focal length fits better by far more than its
-  uncertainty, a remark says so;
+  uncertainty (:func:`focal_misfit`), a remark says so, and the confidence is lower;
 - one whose focal length is not certain (``Camera.focal_deviation``) gets the most probable one, and
   principal point and radial distortion, where its model has one, with what was known before as a
   prior. The first estimate is by P4Pf where P3P with the given focal length has fewer inliers. The
@@ -66,6 +66,8 @@ _MAX_DEVIATIONS = 3.0
 _PRINCIPAL_POINT_DEVIATION, _DISTORTION_DEVIATION = 0.01, 0.1
 # a calibrated camera may be off by as much: the focal length, and the radial distortion
 _CALIBRATED, _CALIBRATED_DISTORTION = 0.01, 0.02
+# errors of neighbouring points are alike: they average out as those of so many matches would
+_INDEPENDENT = 30
 # matches were verified with the given focal length: another that they tell is off by such a share
 # of the difference
 _BIASED_BY = 0.1
@@ -128,26 +130,90 @@ class FocalMisfit:
     shift: float
 
 
-def focal_misfit(problem: PoseProblem, pose: Pose, max_error_px: float) -> FocalMisfit | None:
+def focal_misfit(
+    problem: PoseProblem, pose: Pose, options: AbsolutePoseOptions
+) -> FocalMisfit | None:
     """Find another focal length that fits better; None where the given one may be right, where the
-    matches do not tell, or of a rig.
-
-    The focal length is set free, and so are principal point and radial distortion as far as a
-    calibrated camera may be off. What agrees with the camera is decided again each time, for the
-    inliers of a wrong focal length are those that fit it.
-    """
+    matches do not tell, or of a rig."""
     if len(problem.views) != 1 or pose.inliers is None or pose.num_inliers < _MIN_INLIERS:
         return None
+    given = problem.views[0].camera
+    found = _freed(problem, pose.cam_from_world, pose.inliers, options.max_error_px)
+    if found is None or not found.contradicts(given):
+        return None
+    # the inliers of a focal length that is far off hide the right one
+    free = focal_from_matches(
+        problem.points_px, problem.points, given, options.max_error_px, options.seed
+    )
+    if free is not None:
+        other = _with_camera(problem, scale_focal(given, free / focal_px(given)))
+        estimate = estimate_pose(other, options)
+        if isinstance(estimate, PoseEstimate):
+            start = estimate.rig_from_world, estimate.inliers
+            second = _freed(other, *start, options.max_error_px)
+            if second is not None and second.cost < found.cost:
+                found = second
+    if not found.contradicts(given):
+        return None
+    deviation_px = found.focal_px * found.deviation_from(given)
+    shift = np.linalg.norm(found.rig_from_world.center() - pose.cam_from_world.center())
+    return FocalMisfit(
+        f"the focal length of {focal_px(given):.0f} px {_DOES_NOT_FIT}: {found.focal_px:.0f} +- "
+        f"{deviation_px:.0f} px would",
+        float(shift) / found.distance,
+    )
+
+
+@dataclass(frozen=True)
+class _Freed:
+    """A pose whose focal length was free.
+
+    Attributes
+    ----------
+    deviation : of the focal length, as a share of it.
+    cost : sum of the squared errors of all matches, each at most that of an outlier.
+    distance : median of the inliers'.
+    """
+
+    focal_px: float
+    deviation: float
+    rig_from_world: RigidTransform
+    cost: float
+    distance: float
+
+    def change_from(self, given: Camera) -> float:
+        """Logarithm of the factor to the given focal length."""
+        return math.log(self.focal_px / focal_px(given))
+
+    def deviation_from(self, given: Camera) -> float:
+        """Standard deviation of that, with the calibration's and what verification left out."""
+        return math.hypot(self.deviation, _CALIBRATED, _BIASED_BY * self.change_from(given))
+
+    def contradicts(self, given: Camera) -> bool:
+        """Whether the given focal length is off by more than can be explained."""
+        return abs(self.change_from(given)) >= _MIN_SIGMAS * self.deviation_from(given)
+
+
+def _freed(
+    problem: PoseProblem,
+    rig_from_world: RigidTransform,
+    inliers: NDArray[np.bool_],
+    max_error_px: float,
+) -> _Freed | None:
+    """Set the focal length free, and principal point and radial distortion as far as a calibrated
+    camera may be off; None where the matches do not determine it.
+
+    What agrees with the camera is decided again each time.
+    """
     (view,) = problem.views
     focal = focal_px(view.camera)
     rays, points = normalized_from_px(view.camera, problem.points_px), problem.points
     usable = np.isfinite(rays).all(axis=1) & np.isfinite(points).all(axis=1)
-    rays, points = rays[usable], points[usable] + problem.offset
+    rays, points, inliers = rays[usable], points[usable] + problem.offset, inliers[usable]
     larger = max(view.camera.width, view.camera.height) / focal
     principal_point = _PRINCIPAL_POINT_DEVIATION * larger
     deviations = np.array([1.0, principal_point, principal_point, _CALIBRATED_DISTORTION])
-    inliers, start = pose.inliers[usable], view.cam_from_rig @ pose.cam_from_world
-    moved, change, expected = start, np.zeros(4), np.zeros(4)
+    moved, change, expected = view.cam_from_rig @ rig_from_world, np.zeros(4), np.zeros(4)
     for _ in range(_ROUNDS):
         in_camera = moved.apply(points[inliers])
         solved = _free_camera(rays[inliers], in_camera, focal, change, expected, deviations, 1.0)
@@ -159,23 +225,18 @@ def focal_misfit(problem: PoseProblem, pose: Pose, max_error_px: float) -> Focal
         ahead = in_camera[:, 2] > 0
         residuals = np.full(rays.shape, np.inf)
         residuals[ahead], _ = _linearized(rays[ahead], in_camera[ahead], change)
-        again = np.linalg.norm(residuals, axis=1) * focal <= max_error_px
-        if again.sum() < _MIN_INLIERS:
+        errors_px = np.linalg.norm(residuals, axis=1) * focal
+        before, inliers = inliers, errors_px <= max_error_px
+        if inliers.sum() < _MIN_INLIERS:
             return None
-        if (again == inliers).all():
+        if (before == inliers).all():
             break
-        inliers = again
-    deviation = math.hypot(
-        _ALIKE * math.sqrt(covariance[6, 6]), _CALIBRATED, _BIASED_BY * change[0]
-    )
-    if abs(change[0]) < _MIN_SIGMAS * deviation:
-        return None
-    better = focal * math.exp(change[0])
-    distance = np.median(np.linalg.norm(in_camera[inliers], axis=1))
-    return FocalMisfit(
-        f"the focal length of {focal:.0f} px {_DOES_NOT_FIT}: {better:.0f} +- "
-        f"{better * deviation:.0f} px would",
-        float(np.linalg.norm(moved.center() - start.center()) / distance),
+    return _Freed(
+        focal_px=focal * math.exp(change[0]),
+        deviation=math.sqrt(covariance[6, 6] * (1 + inliers.sum() / _INDEPENDENT)),
+        rig_from_world=view.cam_from_rig.inverse() @ moved,
+        cost=float((np.minimum(errors_px, max_error_px) ** 2).sum()),
+        distance=float(np.median(np.linalg.norm(in_camera[inliers], axis=1))),
     )
 
 

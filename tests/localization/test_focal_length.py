@@ -52,7 +52,7 @@ def misfit(
     view = View(camera, ALONE, pixels, points)
     found = rig_pose([view])
     assert isinstance(found, Pose)
-    return focal_misfit(PoseProblem.of([view]), found, OPTIONS.max_error_px)
+    return focal_misfit(PoseProblem.of([view]), found, OPTIONS)
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.8, 0.95, 1.05, 1.2, 1.5])
@@ -93,14 +93,14 @@ def straight_on() -> tuple[Floats, Floats]:
 def test_nothing_is_said_of_a_wall_seen_straight_on() -> None:
     view = View(Camera.pinhole(1600, 1200, 1700.0), ALONE, *straight_on())
     pose = Pose(RigidTransform(ALONE.quat_wxyz, (0.0, 0.0, 2.14)), 200, 200, np.ones(200, bool))
-    assert focal_misfit(PoseProblem.of([view]), pose, OPTIONS.max_error_px) is None
+    assert focal_misfit(PoseProblem.of([view]), pose, OPTIONS) is None
 
 
 def test_few_inliers_and_rigs_say_nothing() -> None:
     view = View(Camera.pinhole(64, 48, 50), ALONE, np.zeros((5, 2)), np.ones((5, 3)))
     pose = Pose(ALONE, 5, 5, np.ones(5, bool))
-    assert focal_misfit(PoseProblem.of([view]), pose, OPTIONS.max_error_px) is None
-    assert focal_misfit(PoseProblem.of([view, view]), pose, OPTIONS.max_error_px) is None
+    assert focal_misfit(PoseProblem.of([view]), pose, OPTIONS) is None
+    assert focal_misfit(PoseProblem.of([view, view]), pose, OPTIONS) is None
 
 
 def solved(camera: Camera, pixels: Floats, points: Floats) -> Pose | Failure:
