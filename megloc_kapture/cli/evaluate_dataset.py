@@ -128,7 +128,7 @@ class Eval(Deciding, Working):
             doubtful = done["submission"].counts.get("doubtful", 0)
             if doubtful and run.source.adapter is not None:  # a challenge, which has a server
                 console.say(
-                    f"{doubtful:g} queries that the pose file lacks had a pose of too little "
+                    f"{doubtful:,} queries that the pose file lacks had a pose of too little "
                     "confidence; a server counts a missing pose as a wrong one: --set "
                     "localization.min_confidence=0 hands in every pose"
                 )

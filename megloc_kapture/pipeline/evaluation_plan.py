@@ -246,7 +246,10 @@ class Evaluate(_RunStage):
         evaluation = replace(evaluation, context=context)
         write_report(output, evaluation, map_poses=map_poses, provenance=provenance)
         row = evaluation.row()
-        recall = {f"recall at {at.threshold}": round(at.recall, 4) for at in row.recall}
+        recall = {
+            f"recall within {at.threshold} percent".replace(",", " and"): round(100 * at.recall, 2)
+            for at in row.recall
+        }
         return {"queries_with_truth": len(evaluation.queries), **recall}
 
 

@@ -27,7 +27,7 @@ from megloc_kapture.pipeline.workspace import (
     remember_files,
     written_files,
 )
-from megloc_kapture.stages.stage import CODE_OF, Stage, StageWork, is_below
+from megloc_kapture.stages.stage import CODE_OF, Stage, StageWork, count_text, is_below
 from megloc_kapture.stages.work import HERE, Digest, KeptItems, Work
 
 State = Literal["run", "kept", "pending", "skipped"]
@@ -306,8 +306,6 @@ def describe(report: StageReport) -> str:
         return f"{report.name}: taken as it is{f'; {report.why}' if report.why else ''}"
     if report.state == "pending":
         return f"{report.name}: would run ({report.why})"
-    counts = ", ".join(
-        f"{value:g} {name.replace('_', ' ')}" for name, value in report.counts.items()
-    )
-    kept = f"; {report.kept_items}" if report.kept_items else ""
-    return f"{report.name}: {counts}{kept}; {report.seconds:.1f} s"
+    counts = ", ".join(count_text(*count) for count in report.counts.items())
+    parts = filter(None, (counts, report.kept_items, f"{report.seconds:.1f} s"))
+    return f"{report.name}: {'; '.join(parts)}"

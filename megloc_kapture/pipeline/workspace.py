@@ -253,7 +253,7 @@ class Manifest(Options):
     fingerprint: str
     content: str = Field(default="", description="hash of the outputs; none where they are links")
     outputs: tuple[str, ...]
-    counts: dict[str, float] = Field(default_factory=dict)
+    counts: dict[str, int | float] = Field(default_factory=dict)
     seconds: float
     started: str
     versions: dict[str, str]

@@ -358,7 +358,8 @@ def refine_poses(
             if row.method == refiner.name
         )
     for row in tested:
-        counts[" ".join(filter(None, (row.method, "trusted", row.frame)))] = float(not row.reason)
+        name = f"frames_where_{row.method}_is_trusted"
+        counts[name] = counts.get(name, 0) + (not row.reason)
     return counts
 
 

@@ -342,3 +342,22 @@ def test_a_dry_run_only_tells(kitchen: Kitchen) -> None:
     assert kitchen.log == []
     kitchen.options["b"] = {}
     assert all_kept(kitchen.cook())
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("keypoints", 33_485_000, "33,485,000 keypoints"),
+        ("queries_with_truth", 1, "1 query with truth"),
+        ("pairs_with_matches", 1, "1 pair with matches"),
+        ("matches", 1, "1 match"),
+        ("max_size_px", 1600, "max size: 1,600 px"),
+        ("mean_reprojection_error_px", 0.74219, "mean reprojection error: 0.7422 px"),
+        ("mean_track_length", 4.0, "mean track length: 4"),
+        ("metres_per_unit", 33_485.21, "metres per unit: 33,485"),
+        ("recall within 0.25 m and 2 deg percent", 87.5, "recall within 0.25 m and 2 deg: 87.5 %"),
+    ],
+)
+def test_counts_read_as_english(name: str, value: float, text: str) -> None:
+    assert describe(StageReport("a", "run", 0.04, {name: value}, "")) == f"a: {text}; 0.0 s"
+    assert describe(StageReport("a", "run", 0.04, {}, "")) == "a: 0.0 s"

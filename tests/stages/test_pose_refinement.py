@@ -192,7 +192,7 @@ def test_each_coordinate_frame_is_judged_by_itself(folders: Any, tmp_path: Path)
     options = Chosen(refiners=(Sure(),))
     counts = refine_poses(*folders, out, options, restrictions=RESTRICTIONS)
     assert counts == {
-        "queries": 2, "accepted_by_sure": 1, "sure trusted bad": 0, "sure trusted good": 1,
+        "queries": 2, "accepted_by_sure": 1, "frames_where_sure_is_trusted": 1,
     }  # fmt: skip
     statuses, rows = read_status(out / "status.csv"), read_refinement(out / "refinement.csv")
     assert statuses["a.png"].refinement == "sure: accepted"
