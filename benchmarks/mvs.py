@@ -364,7 +364,7 @@ def densified_map(
     seconds = _cpu_seconds() - started
     row = {
         "seconds_per_image": seconds / counts["images"],
-        "fill": counts["share_of_pixels_with_depth"],
+        "fill": counts["share_with_depth"],
     }
     return KaptureFolder(target), row
 

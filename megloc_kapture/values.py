@@ -6,11 +6,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from megloc_kapture.errors import DataError
 
@@ -42,6 +42,23 @@ class Options(BaseModel):
     """Base of all option models: frozen, validated, unknown keys refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _none_by_name(cls, values: Any) -> Any:
+        """Read ``none`` as None, as texts and TOML have it, unless the option has such a choice."""
+        if not isinstance(values, dict):
+            return values
+        named = [
+            name for name, value in values.items() if isinstance(value, str) and value == "none"
+        ]
+        nullable = [name for name in named if cls._is_nullable(name)]
+        return {**values, **dict.fromkeys(nullable)} if nullable else values
+
+    @classmethod
+    def _is_nullable(cls, name: str) -> bool:
+        kinds = get_args(cls.model_fields[name].annotation) if name in cls.model_fields else ()
+        return type(None) in kinds and not any("none" in get_args(kind) for kind in kinds)
 
     def idle(self) -> dict[str, str]:
         """Options that change nothing while the others are as they are: name to the reason.

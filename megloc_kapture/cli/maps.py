@@ -168,7 +168,7 @@ class Densify(Reading, StageCommand):
             )
             console.say(
                 f"depth of {counts['images_with_depth']} of {counts['images']} images, on "
-                f"{100 * counts['share_of_pixels_with_depth']:.0f} % of their pixels"
+                f"{100 * counts['share_with_depth']:.0f} % of their pixels"
                 + (f"; {counts['points_lifted']} keypoints lifted" if self.points else "")
             )
             if self.fuse is not None:
