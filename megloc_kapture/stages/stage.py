@@ -173,6 +173,7 @@ class StageWork(Work):
 
 
 CODE_OF = "code of "
+ROOT = "root"  # name of that folder among what an import has read
 
 
 def is_below(path: str, folder: str) -> bool:
@@ -188,8 +189,11 @@ class Stage(ABC):
     name : of its manifest, as ``--from`` and ``--until`` take it.
     version : to be raised when the output changes for the same options and inputs.
     reads, writes : paths in the workspace; a path stands for all that is below it.
+    root : folder of the user's data that it imports; None where it imports none. A workspace holds
+        the data of one root.
     """
 
+    root: Path | None = None
     name: str
     version: ClassVar[int] = 1
     reads: Sequence[str] = ()

@@ -297,6 +297,33 @@ def test_a_workspace_that_is_deleted_while_a_stage_runs_is_an_error(
     assert not kitchen.workspace.root.exists()
 
 
+def test_data_of_another_root_do_not_replace_those_of_a_workspace(tmp_path: Path) -> None:
+    roots = [tmp_path / name / "scene" for name in "ab"]
+
+    def import_from(root: Path, *, force: bool = False) -> str:
+        workspace = Workspace(tmp_path / "workspace", force=force)
+
+        def do(out: Path) -> Mapping[str, float]:
+            (out / "a.txt").write_text(str(root))
+            return {}
+
+        stage = Step("import", (), ("a.txt",), do, outside={"root": str(root.resolve())})
+        stage.root = root
+        with workspace.lock():
+            run_plan([stage], workspace)
+        return workspace.path("a.txt").read_text()
+
+    for root in roots:
+        root.mkdir(parents=True)
+    one, other = roots
+    assert import_from(one) == import_from(one) == str(one)
+    with pytest.raises(OptionError, match=f"is the workspace of {one}; give another --workspace"):
+        import_from(other)
+    assert import_from(other, force=True) == str(other)
+    other.rename(tmp_path / "moved")  # nothing else than these data can be meant
+    assert import_from(tmp_path / "moved") == str(tmp_path / "moved")
+
+
 def test_first_and_last(kitchen: Kitchen) -> None:
     with pytest.raises(OptionError, match="--from b needs stage a, which has not run"):
         kitchen.cook(first="b")
