@@ -340,7 +340,7 @@ class LocalizeQueries(PipelineStage):
     """Estimate the poses of the queries from their matches with the map."""
 
     name = "localization"
-    version = 9
+    version = 10
     uses = ("localization", "guided_pyramid.mode", *LOCAL_TYPES)
     inputs = (
         MAPPING,
