@@ -24,7 +24,10 @@ TORCH_INDEX ?=
 VENV ?= .venv
 BIN := $(VENV)/bin
 # named by content, not by date: a checkout alone installs nothing again
-STAMP := $(VENV)/.installed-$(shell cat pyproject.toml $(wildcard twins/pyproject.toml) constraints.txt | cksum | cut -d ' ' -f 1)
+CHECKSUM := $(shell cat pyproject.toml $(wildcard twins/pyproject.toml) constraints.txt | cksum | cut -d ' ' -f 1)
+# the requirements alone, and with networks and all tools
+BASE := $(VENV)/.base-$(CHECKSUM)
+STAMP := $(VENV)/.installed-$(CHECKSUM)
 INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check
 
 help:
@@ -44,7 +47,8 @@ help:
 
 venv: $(STAMP)
 
-eval: $(STAMP)
+# the preset classic has no networks
+eval: $(or $(wildcard $(STAMP)),$(if $(filter-out classic,$(PRESET)),$(STAMP),$(BASE)))
 	@$(BIN)/megloc eval '$(DATASET)' $(if $(ROOT),--root '$(ROOT)') $(if $(PRESET),--preset '$(PRESET)') \
 		$(if $(WORKSPACE),--workspace '$(WORKSPACE)') --submissions submissions $(ARGS)
 
@@ -102,12 +106,17 @@ clean:
 	@rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache build dist
 	@find megloc_kapture $(wildcard twins) tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# torch first: the other packages then take the one that is there. kapture-localization is the
-# tests' oracle; its own requirements (opencv-python, cvxpy) would break the environment.
-$(STAMP):
+$(BASE):
 	@python=$$(PYTHON='$(PYTHON)' sh scripts/find_python.sh) && \
 		{ test -x $(BIN)/python || "$$python" -m venv $(VENV); }
-	@echo 'Setting up $(VENV), once: about 3 GB of packages, a few minutes.'
+	@echo 'Setting up $(VENV), once: about 0.9 GB of packages, a few minutes.'
+	@$(INSTALL) -c constraints.txt -e . $(addprefix -e ,$(wildcard twins))
+	@rm -f $(VENV)/.base-* && touch $@
+
+# torch first: the other packages then take the one that is there. kapture-localization is the
+# tests' oracle; its own requirements (opencv-python, cvxpy) would break the environment.
+$(STAMP): | $(BASE)
+	@echo 'Adding networks and tools to $(VENV), once: about 2 GB of packages, a few minutes.'
 	@$(INSTALL) $(if $(TORCH_INDEX),--index-url '$(TORCH_INDEX)') -c constraints.txt torch
 	@$(INSTALL) -c constraints.txt -e '.[cluster,dev,docs,serve]' $(addprefix -e ,$(wildcard twins))
 	@$(INSTALL) -c constraints.txt --no-deps kapture-localization

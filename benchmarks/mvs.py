@@ -362,7 +362,10 @@ def densified_map(
     started = _cpu_seconds()
     counts = densify_map(KaptureFolder(out / "map" / "map"), target, options, estimator=estimator)
     seconds = _cpu_seconds() - started
-    row = {"seconds_per_image": seconds / counts["images"], "fill": counts["fill"]}
+    row = {
+        "seconds_per_image": seconds / counts["images"],
+        "fill": counts["share_with_depth"],
+    }
     return KaptureFolder(target), row
 
 

@@ -417,7 +417,8 @@ def run(
     root : the dataset as it is published; looked for below MEGLOC_DATA unless given.
     preset : that of the dataset's benchmark file unless given.
     set : options, ``{"localization.rank.name": "perceptual"}``.
-    workspace : ``runs/DATASET-PRESET`` unless given.
+    workspace : ``runs/DATASET-PRESET`` unless given; of kapture folders
+        ``runs/kapture-ROOT-PRESET``.
     workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
     scheduler : address of a dask scheduler, whose workers do the work instead.
 
@@ -428,7 +429,7 @@ def run(
     chosen = choose_run(
         dataset, None if root is None else Path(root), preset=preset, assignments=set or {}
     )
-    place = workspace or Path("runs") / f"{dataset}-{chosen.preset}"
+    place = workspace or chosen.default_workspace
     made = _run(plan_evaluation(chosen), place, workers, scheduler)
     pose_file = chosen.submission_below(made.root, made.path(SIDE_TABLES))
     return FinishedRun(made.root, pose_file, chosen.options)

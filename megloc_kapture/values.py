@@ -48,6 +48,12 @@ def _is_list(annotation: Any) -> bool:
     return any(get_origin(one) is tuple and get_args(one)[-1] is Ellipsis for one in kinds)
 
 
+def _may_be_none(annotation: Any) -> bool:
+    """True where None is a value of the type, and no choice of it is called ``none``."""
+    kinds = get_args(annotation)
+    return type(None) in kinds and not any("none" in get_args(kind) for kind in kinds)
+
+
 def listed(value: Any) -> Any:
     """A list that is given as one name, as names between commas, or as one table."""
     if isinstance(value, str):
@@ -62,11 +68,19 @@ class Options(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _one_is_a_list(cls, values: Any) -> Any:
+    def _as_typed(cls, values: Any) -> Any:
+        """Read ``none`` as None where an option may be None, and one name as a list of one."""
         if not isinstance(values, dict):
             return values
-        lists = {name for name, one in cls.model_fields.items() if _is_list(one.annotation)}
-        return {key: listed(one) if key in lists else one for key, one in values.items()}
+        read = {}
+        for key, value in values.items():
+            field = cls.model_fields.get(key)
+            annotation = None if field is None else field.annotation
+            if isinstance(value, str) and value == "none" and _may_be_none(annotation):
+                read[key] = None
+            else:
+                read[key] = listed(value) if _is_list(annotation) else value
+        return read
 
     def idle(self) -> dict[str, str]:
         """Options that change nothing while the others are as they are: name to the reason.

@@ -10,6 +10,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -55,6 +56,42 @@ def test_the_twins_need_what_the_package_has() -> None:
     assert {str(other) for other in others} <= set(PROJECT["dependencies"])
     for key in ("requires-python", "license", "authors"):
         assert TWINS[key] == PROJECT[key]
+
+
+@pytest.mark.skipif(not (REPOSITORY / ".git").exists(), reason="an unpacked distribution")
+def test_the_source_distribution_has_all_that_a_clone_has() -> None:
+    targets = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["hatch"]["build"]
+    listed = subprocess.run(["git", "ls-files"], cwd=REPOSITORY, capture_output=True, text=True)
+    names = {name.partition("/")[0] for name in listed.stdout.splitlines()}
+    visible = {f"/{name}" for name in names if not name.startswith(".")}
+    # which is always in it
+    assert {*targets["targets"]["sdist"]["include"], "/pyproject.toml"} == visible
+
+
+@pytest.mark.parametrize(
+    ("arguments", "networks"),
+    [
+        (["eval"], False),
+        (["eval", "PRESET=classic"], False),
+        (["eval", "PRESET=modern"], True),
+        (["test"], True),
+        (["venv"], True),
+    ],
+)
+def test_make_eval_sets_up_no_more_than_its_preset_needs(
+    arguments: list[str], networks: bool, tmp_path: Path
+) -> None:
+    def commands() -> str:
+        make = ["make", "-n", f"VENV={tmp_path}", *arguments]
+        return subprocess.run(make, cwd=REPOSITORY, capture_output=True, text=True).stdout
+
+    assert "pip install" in commands() and ("[cluster,dev,docs,serve]" in commands()) == networks
+    stamps = re.findall(rf"touch {tmp_path}/(\S+)", commands())
+    assert len(stamps) == 1 + networks
+    # what has both needs nothing
+    (tmp_path / stamps[-1].replace(".base", ".installed")).touch()
+    (tmp_path / stamps[0]).touch()
+    assert "pip install" not in commands()
 
 
 def test_registered_plugins_and_command_exist() -> None:

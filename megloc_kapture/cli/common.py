@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from functools import partial
+from itertools import starmap
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -27,6 +28,7 @@ from megloc_kapture.pipeline.executors import (
     open_executor,
     single_threaded,
 )
+from megloc_kapture.stages.stage import count_label
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera
 
@@ -68,8 +70,8 @@ class Console:
 
     def counts(self, counts: Mapping[str, float]) -> None:
         """A line of the result for each count."""
-        for what, value in counts.items():
-            self.result(f"{what.replace('_', ' '):44s}{value:>8g}")
+        for words, figure in starmap(count_label, counts.items()):
+            self.result(f"{words:44s}{figure:>8}")
 
     def track(self, items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
         """Yield the items and show how far it is."""

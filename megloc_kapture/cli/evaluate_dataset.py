@@ -49,7 +49,8 @@ class Eval(Deciding, Working):
     allow_missing: bool = False
     """Go on with what is there of a partial download."""
     workspace: Annotated[Path | None, tyro.conf.arg(aliases=["-w"])] = None
-    """Where everything is kept; runs/DATASET-PRESET unless given."""
+    """Where everything is kept; runs/DATASET-PRESET unless given, of kapture folders
+    runs/kapture-ROOT-PRESET."""
     submissions: Path | None = None
     """Folder that gets a copy of the pose file and its provenance, and overwrites none of another
     result; submissions/ unless --workspace is given."""
@@ -78,8 +79,8 @@ class Eval(Deciding, Working):
     fail_below: float | None = None
     """Exit with 3 when the share of queries at the last threshold is lower (0 to 1)."""
     force: Overwrite = False
-    """Use a workspace folder that has other things in it, and map poses that contradict the
-    matches of their images."""
+    """Use a workspace folder that has other things in it, or was made of another root; and map
+    poses that contradict the matches of their images."""
 
     def run(self, console: Console) -> int:
         """Run it; returns the exit status."""
@@ -103,7 +104,7 @@ class Eval(Deciding, Working):
             benchmark = run.benchmark.model_copy(update={"thresholds": pairs})
             run = replace(run, benchmark=benchmark)
         self._check_truth(run.source)
-        place = self.workspace or Path("runs") / f"{self.dataset}-{run.preset}"
+        place = self.workspace or run.default_workspace
         submissions = self.submissions or (None if self.workspace else Path(FOLDER))
         workspace = Workspace(place, force=self.force)
         with self.working_in(workspace) as work:
@@ -136,7 +137,7 @@ class Eval(Deciding, Working):
             doubtful = done["submission"].counts.get("doubtful", 0)
             if doubtful and run.source.adapter is not None:  # a challenge, which has a server
                 console.say(
-                    f"{doubtful:g} queries that the pose file lacks had a pose of too little "
+                    f"{doubtful:,} queries that the pose file lacks had a pose of too little "
                     "confidence; a server counts a missing pose as a wrong one: --set "
                     "localization.min_confidence=0 hands in every pose"
                 )

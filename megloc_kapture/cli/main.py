@@ -297,7 +297,7 @@ def examples_text(arguments: Sequence[str]) -> str:
     words = [word for word in arguments if not word.startswith("-")]
     found = [one for one in EXAMPLES if one.split()[1] in (words[:1] or ("localize", "eval"))]
     if not found:  # the command of a stage of another package
-        found = [f"megloc {words[0]} -w runs/kapture-classic"]
+        found = [f"megloc {words[0]} -w runs/kapture-my_scene-classic"]
     narrower = [one for one in found if one.split()[2:3] == words[1:2]]  # of megloc weights fetch
     return "\n".join(["examples:", *(f"  {one}" for one in (narrower or found)[:3])])
 

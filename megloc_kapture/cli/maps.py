@@ -171,7 +171,7 @@ class Densify(Reading, StageCommand):
             )
             console.say(
                 f"depth of {counts['images_with_depth']} of {counts['images']} images, on "
-                f"{100 * counts['fill']:.0f} % of their pixels"
+                f"{100 * counts['share_with_depth']:.0f} % of their pixels"
                 + (f"; {counts['points_lifted']} keypoints lifted" if self.points else "")
             )
             if self.fuse is not None:
@@ -218,12 +218,12 @@ class RefinePoses(Linked, StageCommand):
                 work=work,
             )
         accepted = ", ".join(
-            f"{count:g} accepted by {name.removeprefix('accepted_by_')}"
+            f"{count:,} accepted by {name.removeprefix('accepted_by_')}"
             for name, count in counts.items()
             if name.startswith("accepted_by_")
         )
         console.result(
-            f"{counts['queries']:g} poses, {accepted}; status.csv and refinement.csv in "
+            f"{counts['queries']:,} poses, {accepted}; status.csv and refinement.csv in "
             f"{self.output}"
         )
         if (table := self.output / CONSISTENCY_FILE).is_file():

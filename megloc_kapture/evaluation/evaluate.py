@@ -157,6 +157,7 @@ def evaluate_results(
                 label=found.label,
                 nowhere=nowhere,
                 confidences=found.confidences,
+                covariances=found.covariances,
             )
         known_by = benchmark.protocol.truth
         evaluations.append(replace(evaluation, truth_known_by=known_by, context=found.context))

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from megloc_kapture.errors import DataError
@@ -38,6 +39,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import (
     CLUSTERS_FILE,
     CONSISTENCY_FILE,
+    COVARIANCE_FILE,
     REFINEMENT_FILE,
     STATUS_FILE,
     ClusterRow,
@@ -45,6 +47,7 @@ from megloc_kapture.io.tables import (
     QueryStatus,
     read_clusters,
     read_consistency,
+    read_covariances,
     read_refinement,
     read_status,
 )
@@ -229,6 +232,7 @@ class Result:
     statuses : rows of ``status.csv``; None without one.
     confidences : image -> probability that its pose is right, where the provenance beside a pose
         file says it; ``statuses`` have their own.
+    covariances : image -> covariance (6, 6) of its pose, as of ``Pose``, where there is one.
     by_pair : of MLAD's pose files, the query's ``cam_from_world`` of each row; None of others.
     context : what a report of it can show.
     """
@@ -238,6 +242,7 @@ class Result:
     images: tuple[str, ...]
     statuses: Mapping[str, QueryStatus] | None = None
     confidences: Mapping[str, float] = field(default_factory=dict)
+    covariances: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     by_pair: Mapping[RelocalizationPair, RigidTransform] | None = None
     context: ResultContext = field(default_factory=ResultContext)
 
@@ -281,7 +286,9 @@ def read_result(
         data = KaptureFolder(path).read()
         found = _in_frame_of(benchmark.world, data.poses(), path)
         rows = _if_there(read_status, path / STATUS_FILE)
-        return Result(label, found, tuple(sorted(data.image_names())), rows)
+        covariances = _if_there(read_covariances, path / COVARIANCE_FILE) or {}
+        images = tuple(sorted(data.image_names()))
+        return Result(label, found, images, rows, covariances=covariances)
     poses = poses_by_image(read_pose_file(path), images, benchmark.names)
     if benchmark.world != World():
         poses = {image: benchmark.world.pose_in_local(pose) for image, pose in poses.items()}
@@ -297,6 +304,7 @@ def result_in_memory(
     """
     poses: dict[str, RigidTransform] = {}
     statuses: dict[str, QueryStatus] = {}
+    covariances = {}
     for image, found in estimated.items():
         if isinstance(found, RigidTransform):
             poses[image] = checked_pose(found.quat_wxyz, found.translation, repr(image))
@@ -304,7 +312,10 @@ def result_in_memory(
         statuses[image] = query_status(image, found)
         if isinstance(found, Pose):
             poses[image] = found.cam_from_world
-    return Result(label, poses, tuple(sorted(estimated)), statuses or None)
+            if found.covariance is not None:
+                covariances[image] = found.covariance
+    images = tuple(sorted(estimated))
+    return Result(label, poses, images, statuses or None, covariances=covariances)
 
 
 def distinct_labels(sources: Sequence[Path]) -> list[str]:

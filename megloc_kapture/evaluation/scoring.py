@@ -34,6 +34,7 @@ from megloc_kapture.geometry.poses import compose, invert, stack_poses
 from megloc_kapture.io.dataset_tables import RelocalizationPair
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.tables import Fallback, QueryStatus
+from megloc_kapture.refinement.acceptance import squared_distance
 from megloc_kapture.values import RigidTransform
 
 if TYPE_CHECKING:
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
     from megloc_kapture.evaluation.report.reports import AnyReported
     from megloc_kapture.evaluation.statistics import Comparison
     from megloc_kapture.evaluation.without_truth import NearCandidates
+
+_CHI2_95 = 12.592  # quantile of six degrees of freedom
 
 Outcome = Literal["localized", "fallback", "missing"]
 # column of a table of queries -> attribute
@@ -123,6 +126,14 @@ class Reported(ABC):
         return pd.DataFrame(columns).set_index("image")
 
 
+@dataclass(frozen=True, slots=True)
+class CovarianceCheck:
+    """Errors of poses against what their covariances claim."""
+
+    num_poses: int
+    num_within: int
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Evaluation(Reported):
     """Everything known about one result.
@@ -141,6 +152,8 @@ class Evaluation(Reported):
     not_scored : images with a true pose that the benchmark does not count; sorted.
     truth_known_by : who knows the true poses that are not published; empty: said nowhere.
     pairs : of MLAD's challenges, what a query is called in ``queries`` -> its pair; else empty.
+    covariance : how many poses come with a covariance, and of how many the error lies within the
+        region that it claims to hold 95 % of the errors; None where none has one.
     nowhere : queries that show nothing of the map, sorted by name; they are right without a pose,
         and stand in no row.
     by_center : of MLAD's pairs, the same queries' evaluation by the distance of the camera centres;
@@ -160,6 +173,7 @@ class Evaluation(Reported):
     truth_known_by: str = ""
     pairs: Mapping[str, RelocalizationPair] = field(default_factory=dict)
     nowhere: tuple[QueryResult, ...] = ()
+    covariance: CovarianceCheck | None = None
     by_center: Evaluation | None = None
     context: ResultContext = field(default_factory=ResultContext)
 
@@ -231,6 +245,7 @@ def evaluate_poses(
     label: str = "",
     nowhere: Collection[str] = (),
     confidences: Mapping[str, float] | None = None,
+    covariances: Mapping[str, NDArray[np.float64]] | None = None,
 ) -> Evaluation:
     """Errors, recall and outcomes of ``estimated``.
 
@@ -247,6 +262,7 @@ def evaluate_poses(
     label : what to call this result.
     nowhere : images that are known to show nothing of the map.
     confidences : of poses, where ``statuses`` do not say them.
+    covariances : of poses, float64 (6, 6) as of ``Pose``.
 
     Raises
     ------
@@ -289,10 +305,25 @@ def evaluate_poses(
         errors=errors,
         truth={name: truth[name] for name in counted},
         estimated={name: estimated[name] for name in counted if name in estimated},
+        covariance=_check_covariances(queries, estimated, truth, covariances or {}),
         nowhere=tuple(result(name, np.inf, np.inf) for name in sorted(nowhere)),
         without_truth=tuple(sorted(wanted - set(truth) - set(nowhere))),
         not_scored=tuple(sorted(set(truth) - set(counted))),
     )
+
+
+def _check_covariances(
+    queries: Sequence[QueryResult],
+    estimated: Poses,
+    truth: Poses,
+    covariances: Mapping[str, NDArray[np.float64]],
+) -> CovarianceCheck | None:
+    names = [q.image for q in queries if q.outcome == "localized" and q.image in covariances]
+    within = sum(
+        squared_distance(truth[name], estimated[name], covariances[name]) <= _CHI2_95
+        for name in names
+    )
+    return CovarianceCheck(len(names), within) if names else None
 
 
 def _rows(

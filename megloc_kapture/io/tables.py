@@ -3,6 +3,7 @@
 ==================== =============================================================================
 status.csv           the outcome of every query, beside the localized poses
 clusters.csv         the clusters of candidates that every query was tried in
+covariance.csv       how uncertain every localized pose is, beside the poses
 refinement.csv       the outcome of refining each query's pose, step by step
 map_consistency.csv  how far a map's own images would move, by coordinate frame
 depth.csv            depth of the map's images by stereo
@@ -23,14 +24,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.csv_table import POSE, TEXT, Table, flag, list_of, number, or_empty
-from megloc_kapture.io.files import check_relative
-from megloc_kapture.values import ClusterPose, Options, RefinementRow, RigidTransform
+from megloc_kapture.io.csv_table import (
+    POSE,
+    TEXT,
+    Table,
+    flag,
+    list_of,
+    number,
+    or_empty,
+    read_csv_table,
+    write_csv_table,
+)
+from megloc_kapture.io.files import check_relative, named
+from megloc_kapture.values import ClusterPose, Options, Pose, RefinementRow, RigidTransform
 
 STATUS_FILE = "status.csv"
+COVARIANCE_FILE = "covariance.csv"
 CLUSTERS_FILE = "clusters.csv"
 REFINEMENT_FILE = "refinement.csv"
 CONSISTENCY_FILE = "map_consistency.csv"
@@ -100,6 +114,41 @@ def read_status(path: Path | str) -> dict[str, QueryStatus]:
 def write_status(path: Path | str, statuses: Iterable[QueryStatus]) -> None:
     """Write ``status.csv`` (the file itself), sorted by image."""
     _STATUS.write(path, sorted(statuses, key=lambda status: status.image))
+
+
+_UPPER = np.triu_indices(6)
+_AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
+_COVARIANCE_COLUMNS = ("image", *(f"{_AXES[i]}_{_AXES[j]}" for i, j in zip(*_UPPER, strict=True)))
+
+
+def read_covariances(path: Path | str) -> dict[str, NDArray[np.float64]]:
+    """Read ``covariance.csv`` (the file itself): image -> covariance (6, 6), as ``Pose`` has it.
+
+    A row has the upper triangle: ``rx_rx, rx_ry, ... tz_tz``.
+    """
+    found = {}
+    for line, row in read_csv_table(path, _COVARIANCE_COLUMNS):
+        with named(path, line):
+            image, *texts = (row[name] for name in _COVARIANCE_COLUMNS)
+            covariance = np.empty((6, 6))
+            try:
+                covariance[_UPPER] = covariance.T[_UPPER] = [float(text) for text in texts]
+                if not np.isfinite(np.linalg.cholesky(covariance)).all():
+                    raise ValueError
+            except ValueError as error:  # LinAlgError is one
+                raise DataError(f"{image!r} has no positive definite covariance") from error
+            found[image] = covariance
+    return found
+
+
+def write_covariances(path: Path, poses: Mapping[str, Pose]) -> None:
+    """Write ``covariance.csv`` (the file itself) of the poses that have a covariance, by image."""
+    rows = [
+        (image, *map(repr, pose.covariance[_UPPER].tolist()))
+        for image, pose in sorted(poses.items())
+        if pose.covariance is not None
+    ]
+    write_csv_table(path, _COVARIANCE_COLUMNS, rows)
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,7 @@ from megloc_kapture.stages.stage import (
     QUERY,
     QUERY_GT,
     REFERENCE,
+    ROOT,
     SUBMISSIONS,
     Hashes,
     PipelineStage,
@@ -159,6 +160,10 @@ class Import(_RunStage):
     version = 4
     writes = (MAPPING, QUERY, QUERY_GT, SIDE_TABLES, REFERENCE)
 
+    def __init__(self, run: Run) -> None:
+        super().__init__(run)
+        self.root = run.source.root
+
     @property
     def reads(self) -> Sequence[str]:  # type: ignore[override]
         return (WORLD,) if self._run.source.twin is not None else ()
@@ -171,12 +176,11 @@ class Import(_RunStage):
         return [one for one in (self._run.source.adapter,) if one is not None]
 
     def external(self, hashes: Hashes) -> Mapping[str, str]:
-        source = self._run.source
-        if source.root is None:
+        if self.root is None:
             return {}
-        root = source.root.resolve()
-        content = hashes.of_files(root, source.input_files(root))
-        return {"dataset files": content, "dataset root": str(root)}
+        root = self.root.resolve()
+        content = hashes.of_files(root, self._run.source.input_files(root))
+        return {"dataset files": content, ROOT: str(root)}
 
     def check(self) -> None:
         self._run.source.rehearse()
@@ -229,7 +233,6 @@ class Evaluate(_RunStage):
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         localized, truth, tables = map(work.path, (LOCALIZED, QUERY_GT, SIDE_TABLES))
-        label = f"{self._run.dataset}, {self._run.preset}"
         map_poses = work.folder(MAPPING).read().poses()
         provenance = self.settings() | {"versions": package_versions()}
         output = work.out / EVALUATION
@@ -237,18 +240,21 @@ class Evaluate(_RunStage):
         context = replace(context_of(localized), seconds={})
         if not truth.is_dir():
             found = results_without_truth(
-                [localized], benchmark_of(tables), map_poses=map_poses, labels=[label]
+                [localized], benchmark_of(tables), map_poses=map_poses, labels=[self._run.label]
             )
             found = replace(found, results=(replace(found.results[0], context=context),))
             write_report(output, found, map_poses=map_poses, provenance=provenance)
             return {"queries_with_truth": 0}
         evaluation = evaluate(
-            localized, truth, side_tables=tables, label=label, mapping=work.path(MAPPING)
+            localized, truth, side_tables=tables, label=self._run.label, mapping=work.path(MAPPING)
         )
         evaluation = replace(evaluation, context=context)
         write_report(output, evaluation, map_poses=map_poses, provenance=provenance)
         row = evaluation.row()
-        recall = {f"recall at {at.threshold}": round(at.recall, 4) for at in row.recall}
+        recall = {
+            f"recall within {at.threshold} percent".replace(",", " and"): round(100 * at.recall, 2)
+            for at in row.recall
+        }
         return {"queries_with_truth": len(evaluation.queries), **recall}
 
 

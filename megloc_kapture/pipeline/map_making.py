@@ -82,6 +82,7 @@ from megloc_kapture.stages.stage import (
     MAP,
     MAPPING,
     QUERY,
+    ROOT,
     Hashes,
     PipelineStage,
     Stage,
@@ -146,11 +147,11 @@ class ImportMapping(Stage):
 
     def __init__(self, mapping: KaptureFolder) -> None:
         super().__init__(Options())
-        self._mapping = mapping
+        self._mapping, self.root = mapping, mapping.root
 
     def external(self, hashes: Hashes) -> Mapping[str, str]:
         root = self._mapping.root.resolve()
-        return {"images": hashes.of_files(root, mapping_files(self._mapping)), "root": str(root)}
+        return {"images": hashes.of_files(root, mapping_files(self._mapping)), ROOT: str(root)}
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         return import_mapping(self._mapping, work.out)

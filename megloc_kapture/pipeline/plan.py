@@ -27,7 +27,7 @@ from megloc_kapture.pipeline.workspace import (
     remember_files,
     written_files,
 )
-from megloc_kapture.stages.stage import CODE_OF, Stage, StageWork, is_below
+from megloc_kapture.stages.stage import CODE_OF, ROOT, Stage, StageWork, count_text, is_below
 from megloc_kapture.stages.work import HERE, Digest, KeptItems, Work
 
 State = Literal["run", "kept", "pending", "skipped"]
@@ -73,7 +73,8 @@ def run_plan(
 
     Raises
     ------
-    OptionError : ``first`` or ``last`` is no stage, or ``first`` needs a stage that has not run.
+    OptionError : ``first`` or ``last`` is no stage, or ``first`` needs a stage that has not run; or
+        the workspace holds data of another root, and was opened without ``force``.
     """
     names = [stage.name for stage in stages]
     for name in (first, last):
@@ -89,6 +90,8 @@ def run_plan(
             raise OptionError(
                 f"--from {first} needs stage {name}, which has not run; leave --from out"
             )
+    for stage in stages:
+        _check_root(stage, workspace)
     external = _external(stages, workspace)
     if not dry_run:
         # whatever stops this run, the next one has to do what was asked for
@@ -209,6 +212,19 @@ def _external(stages: Sequence[Stage], workspace: Workspace) -> dict[str, dict[s
     return found
 
 
+def _check_root(stage: Stage, workspace: Workspace) -> None:
+    """Refuse to replace what was made of another root, unless that is gone, e.g. was renamed."""
+    made = workspace.manifest(stage.name)
+    held = "" if made is None else made.inputs.get(ROOT, "")
+    if workspace.force or not held or not Path(held).is_dir():
+        return
+    if stage.root is None or str(stage.root.resolve()) != held:
+        raise OptionError(
+            f"{workspace.root} is the workspace of {held}; give another --workspace for "
+            f"{stage.root or 'other data'}, or --force to replace its content"
+        )
+
+
 def _with_followers(stages: Sequence[Stage], first: str) -> dict[str, str]:
     """A stage and those that read its output, directly or not, each with why it is run again."""
     found = {first: "asked for"}
@@ -307,8 +323,6 @@ def describe(report: StageReport) -> str:
         return f"{report.name}: taken as it is{f'; {report.why}' if report.why else ''}"
     if report.state == "pending":
         return f"{report.name}: would run ({report.why})"
-    counts = ", ".join(
-        f"{value:g} {name.replace('_', ' ')}" for name, value in report.counts.items()
-    )
-    kept = f"; {report.kept_items}" if report.kept_items else ""
-    return f"{report.name}: {counts}{kept}; {report.seconds:.1f} s"
+    counts = ", ".join(count_text(*count) for count in report.counts.items())
+    parts = filter(None, (counts, report.kept_items, f"{report.seconds:.1f} s"))
+    return f"{report.name}: {'; '.join(parts)}"

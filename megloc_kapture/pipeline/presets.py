@@ -184,7 +184,7 @@ def _typed(assignment: str, flag: str) -> tuple[str, Any]:
     if not equals or not key:
         raise OptionError(f"{flag} takes key=value, got {assignment!r}")
     key, text = key.strip(), text.strip()
-    if text.lower() in ("none", "null") and text != "none":  # which is a choice of some options
+    if text in ("None", "null"):  # Options reads "none", which is a choice of some options
         return key, None
     try:
         return key, tomllib.loads(f"value = {text}")["value"]

@@ -6,6 +6,7 @@ Peng et al., MegLoc, arXiv 2111.13063; docs/paper.md has the same steps with the
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,31 +75,61 @@ class Run:
         """The dataset's name."""
         return self.source.name
 
+    @property
+    def default_workspace(self) -> Path:
+        """``runs/DATASET-PRESET``; of kapture folders, ``runs/kapture-ROOT-PRESET``."""
+        source, folder = self.source, ""
+        if source.root is not None and source.adapter is None:
+            folder = Path(os.path.abspath(source.root)).name
+        return Path("runs") / "-".join(filter(None, (self.dataset, folder, self.preset)))
+
+    @property
+    def label(self) -> str:
+        """What its result is called: ``kapture, classic with local_features=aliked``."""
+        changed = " and ".join(f"{key}={names}" for key, names in self._changed_features().items())
+        return f"{self.dataset}, {self.preset}{' with ' if changed else ''}{changed}"
+
+    def _changed_features(self) -> dict[str, str]:
+        """Types of features, by option, that the user has chosen instead of the usual ones."""
+        usual, changed = self._options_of_file(), {}
+        for key in ("local_features", "global_features"):
+            names = [one.name for one in getattr(self.options, key)]
+            if names != [one.name for one in getattr(usual, key)]:
+                changed[key] = "+".join(names)
+        return changed
+
+    def _options_of_file(self) -> PipelineOptions:
+        """The preset's options with what the dataset's file changes."""
+        facts = self.facts or DatasetFacts(map_depth=False, query_depth=False, model=False)
+        changes = self.benchmark.changes(
+            self.preset, map_depth=facts.map_depth, query_depth=facts.query_depth
+        )
+        return options_of_preset(self.preset, changes=changes)
+
     def steps(self) -> list[PaperStep]:
         """The steps of the paper in its order, and whether the run does them; nothing is loaded."""
         if self.facts is None:
             return []
-        changes = self.benchmark.changes(
-            self.preset, map_depth=self.facts.map_depth, query_depth=self.facts.query_depth
-        )
         of_preset = options_of_preset(self.preset, changes=[EVERY_POSE])
-        of_file = options_of_preset(self.preset, changes=changes)
-        wanted = (self.options, *(_permitted(one, self.facts) for one in (of_file, of_preset)))
+        usual = (self._options_of_file(), of_preset)
+        wanted = (self.options, *(_permitted(one, self.facts) for one in usual))
         layers = (_steps_of(one, self.facts) for one in wanted)
         return [_explained(self.preset, *each) for each in zip(*layers, strict=True)]
 
     def submission_below(self, folder: Path, tables: Path) -> Path:
         """Where, below ``folder``, the pose file stands; a folder where it is several files.
 
-        Its name is the server's, ``Aachen_v1_1_eval_METHOD.txt``. That of a rendered twin begins
-        with ``synthetic-``: there is no server for it. ``tables`` : the dataset's side tables.
+        Its name is the server's, ``Aachen_v1_1_eval_METHOD.txt``; METHOD names the preset, and the
+        features that were chosen instead of its own. That of a rendered twin begins with
+        ``synthetic-``: there is no server for it. ``tables`` : the dataset's side tables.
         """
         protocol = read_protocol(tables)
         stem = self.dataset
         if protocol.pose_file_stem and not stem.startswith(TWIN_PREFIX):
             stem = protocol.pose_file_stem
         end = "" if protocol.pose_file == "mlad" else ".txt"
-        return folder / SUBMISSIONS / f"{stem}_eval_megloc-{self.preset}{end}"
+        method = "-".join(("megloc", self.preset, *self._changed_features().values()))
+        return folder / SUBMISSIONS / f"{stem}_eval_{method}{end}"
 
     def provenance(self) -> dict[str, Any]:
         """What a result is of, as plain JSON values."""

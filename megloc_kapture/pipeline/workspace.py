@@ -59,7 +59,7 @@ class Workspace:
     """Paths of a workspace (docs/architecture.md); raises OutputError for a folder of others."""
 
     def __init__(self, root: Path, *, force: bool = False) -> None:
-        self.root = Path(root).absolute()
+        self.root, self.force = Path(root).absolute(), force
         self._claim = claim_folder(self.root, kind="workspace", force=force)
         self._published = False
         # open files, so that no other file gets their numbers
@@ -253,7 +253,7 @@ class Manifest(Options):
     fingerprint: str
     content: str = Field(default="", description="hash of the outputs; none where they are links")
     outputs: tuple[str, ...]
-    counts: dict[str, float] = Field(default_factory=dict)
+    counts: dict[str, int | float] = Field(default_factory=dict)
     seconds: float
     started: str
     versions: dict[str, str]

@@ -170,7 +170,7 @@ def densify_map(
     return {
         "images": len(rows),
         "images_with_depth": len(done),
-        "fill": round(float(np.mean(list(fills.values()))), 4) if fills else 0.0,
+        "share_with_depth": round(float(np.mean(list(fills.values()))), 4) if fills else 0.0,
         "points_lifted": num_lifted,
         "max_size_px": options.max_size_px,
         "map_error_px": round(error_px, 4),

@@ -98,7 +98,7 @@ def given_map(reference: KaptureFolder, mapping: KaptureFolder, output: Path) ->
 
     Returns
     -------
-    Counts for the log; ``found_again`` is the share of the observations whose keypoints were.
+    Counts for the log; ``share_found_again`` is the share of the observations whose keypoints were.
 
     Raises
     ------
@@ -135,7 +135,7 @@ def given_map(reference: KaptureFolder, mapping: KaptureFolder, output: Path) ->
         "images": len(_observing(seen)),
         "points": int(kept.sum()),
         "observations": len(seen),
-        "found_again": round(found_again, 4),
+        "share_found_again": round(found_again, 4),
     }
 
 

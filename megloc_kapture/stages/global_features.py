@@ -409,5 +409,5 @@ class ExtractGlobalFeatures(PipelineStage):
             else:
                 folders = [work.folder(self.layout.mapping()), *queries]
                 found = extract_global_features(folders, chosen.make(), work.out, work=work)
-            counts[chosen.name] = found["images"]
+            counts[f"images_with_{chosen.name}"] = found["images"]
         return counts

@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import TypeAdapter
 
 from megloc_kapture.errors import DataError
@@ -22,12 +23,14 @@ from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.tables import (
     CLUSTERS_FILE,
+    COVARIANCE_FILE,
     REFINEMENT_FILE,
     STATUS_FILE,
     Fallback,
     QueryStatus,
     refinement_text,
     write_clusters,
+    write_covariances,
     write_refinement,
     write_status,
 )
@@ -48,8 +51,9 @@ def write_localized(
 ) -> dict[str, int]:
     """Write the localized queries as kapture, with ``status.csv`` and ``clusters.csv`` beside it.
 
-    Where pose refiners were at work, ``refinement.csv`` says what each made of a pose. A query
-    whose focal length was estimated gets a camera of its own.
+    ``covariance.csv`` has the covariances of the localized poses. Where pose refiners were at work,
+    ``refinement.csv`` says what each made of a pose. A query whose focal length was estimated gets
+    a camera of its own.
 
     Parameters
     ----------
@@ -88,6 +92,7 @@ def write_localized(
     if isinstance(query, KaptureFolder):
         link_images(query.root, output)
     write_status(output / STATUS_FILE, statuses)
+    write_covariances(output / COVARIANCE_FILE, found)
     write_clusters(
         output / CLUSTERS_FILE,
         (
@@ -130,10 +135,11 @@ _PARTS: dict[str, TypeAdapter[Any]] = {
 
 
 def plain_result(found: Pose | Failure) -> dict[str, Any]:
-    """A result as JSON values: all that is written of it; no arrays."""
-    if isinstance(found, Pose):
-        found = replace(found, covariance=None, evidence={})
-    return asdict(found)
+    """A result as JSON values: all that is written of it."""
+    if isinstance(found, Failure):
+        return asdict(found)
+    covariance = None if found.covariance is None else found.covariance.tolist()
+    return asdict(replace(found, covariance=None, evidence={})) | {"covariance": covariance}
 
 
 def result_of(plain: Mapping[str, Any]) -> Pose | Failure:
@@ -146,7 +152,8 @@ def result_of(plain: Mapping[str, Any]) -> Pose | Failure:
 def pose_of(plain: Mapping[str, Any]) -> Pose:
     """The pose that :func:`plain_result` made JSON values of."""
     parts = {name: kind.validate_python(plain[name]) for name, kind in _PARTS.items()}
-    return Pose(**{**plain, **parts})
+    covariance = None if plain["covariance"] is None else np.array(plain["covariance"])
+    return Pose(**{**plain, **parts, "covariance": covariance})
 
 
 def query_status(image: str, result: Pose | Failure, fallback: Fallback = "none") -> QueryStatus:

@@ -8,7 +8,7 @@ import shutil
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, astuple, fields, replace
+from dataclasses import astuple, fields, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Literal
@@ -23,13 +23,16 @@ from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.tables import (
     CLUSTERS_FILE,
     CONSISTENCY_FILE,
+    COVARIANCE_FILE,
     REFINEMENT_FILE,
     STATUS_FILE,
     ConsistencyRow,
     QueryStatus,
+    read_covariances,
     read_status,
     refinement_text,
     write_consistency,
+    write_covariances,
     write_refinement,
     write_status,
 )
@@ -330,8 +333,17 @@ def refine_poses(
     refiners = MapRefiners(map_folder, restrictions, options)
     statuses = read_status(localized.root / STATUS_FILE)
     data = localized.read()
+    covariances = {}
+    if (table := localized.root / COVARIANCE_FILE).is_file():
+        covariances = read_covariances(table)
     poses = {
-        image: Pose(pose, row.num_matches, row.num_inliers, candidates=row.candidates)
+        image: Pose(
+            pose,
+            row.num_matches,
+            row.num_inliers,
+            candidates=row.candidates,
+            covariance=covariances.get(image),
+        )
         for image, row in statuses.items()
         if row.status == "localized" and (pose := data.cam_from_world(image)) is not None
     }
@@ -341,7 +353,7 @@ def refine_poses(
 
     def inputs(image: str, digest: Digest) -> object:
         camera = query.read().camera_of(image)
-        own = (asdict(poses[image]), astuple(camera), of_query(image, digest), uses[image])
+        own = (plain_result(poses[image]), astuple(camera), of_query(image, digest), uses[image])
         return [refiners.map_content(digest), *own]
 
     items = work.items("refined", list(poses), inputs)
@@ -368,7 +380,8 @@ def refine_poses(
             if row.method == refiner.name
         )
     for row in tested:
-        counts[" ".join(filter(None, (row.method, "trusted", row.frame)))] = float(not row.reason)
+        name = f"frames_where_{row.method}_is_trusted"
+        counts[name] = counts.get(name, 0) + (not row.reason)
     return counts
 
 
@@ -388,6 +401,7 @@ def _write(
         told = {"refinement": refinement_text(refined.refinements)}
         statuses[image] = statuses[image].model_copy(update=told)
     write_status(output / STATUS_FILE, statuses.values())
+    write_covariances(output / COVARIANCE_FILE, found)
     clusters = localized.root / CLUSTERS_FILE
     if clusters.is_file():
         shutil.copyfile(clusters, output / CLUSTERS_FILE)
@@ -411,7 +425,7 @@ class RefinePoses(PipelineStage):
     """Refine the poses of localized queries by ICP or by rendering."""
 
     name = "refine_poses"
-    version = 3
+    version = 4
     uses = ("pose_refinement",)
     inputs = (SIDE_TABLES, Layout.query, MAP, UNREFINED_POSES)
     outputs = (LOCALIZED, REFINEMENT_TIMING)

@@ -8,6 +8,7 @@ stage of another package, its command. ``docs/plugins.md`` has an example.
 from __future__ import annotations
 
 import json
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,31 @@ from megloc_kapture.values import Options
 
 if TYPE_CHECKING:
     from megloc_kapture.stages.options import PipelineOptions
+
+
+_UNITS = {"px": "px", "m": "m", "percent": "%"}  # last words of a count's name
+
+
+def count_label(name: str, value: float) -> tuple[str, str]:
+    """A count of a stage as words and figure, e.g. ``keypoints``, ``33,485,000``."""
+    words, _, last = name.replace("_", " ").rpartition(" ")
+    unit = f" {_UNITS[last]}" if words and last in _UNITS else ""
+    words = words if unit else f"{words} {last}".lstrip()
+    if isinstance(value, int):
+        if value == 1 and not unit:  # queries, matches, images
+            words = re.sub(
+                r"(ie|(?<=ch)e|)s\b", lambda end: "y" if end[1] == "ie" else "", words, count=1
+            )
+        return words, f"{value:,}{unit}"
+    figure = f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    return words, f"{figure}{unit}"
+
+
+def count_text(name: str, value: float) -> str:
+    """A count of a stage in a sentence: ``12 images``, ``mean reprojection error: 0.74 px``."""
+    words, figure = count_label(name, value)
+    is_number = isinstance(value, int) and figure[-1].isdigit()
+    return f"{figure} {words}" if is_number else f"{words}: {figure}"
 
 
 # as imported; kapture folders
@@ -147,6 +173,7 @@ class StageWork(Work):
 
 
 CODE_OF = "code of "
+ROOT = "root"  # name of that folder among what an import has read
 
 
 def is_below(path: str, folder: str) -> bool:
@@ -162,8 +189,11 @@ class Stage(ABC):
     name : of its manifest, as ``--from`` and ``--until`` take it.
     version : to be raised when the output changes for the same options and inputs.
     reads, writes : paths in the workspace; a path stands for all that is below it.
+    root : folder of the user's data that it imports; None where it imports none. A workspace holds
+        the data of one root.
     """
 
+    root: Path | None = None
     name: str
     version: ClassVar[int] = 1
     reads: Sequence[str] = ()
@@ -200,7 +230,7 @@ class Stage(ABC):
 
     @abstractmethod
     def run(self, work: StageWork) -> Mapping[str, float]:
-        """Write the outputs; returns counts for the log.
+        """Write the outputs; returns counts for the log, see :func:`count_text`.
 
         Raises MeglocError: the data or the options cannot be used; the workspace stays as it was.
         """

@@ -198,8 +198,8 @@ def _scaled(model: Model, structure: StructureOptions) -> tuple[World, Model, di
     centers = {name: pose.center() for name, pose in model.poses.items()}
     found = align_to_earth(centers, structure.gps)
     counts = {
-        "gps_positions": found.num_positions,
-        "gps_residual_m": round(found.residual_m, 3),
+        "positions_from_GPS": found.num_positions,
+        "GPS_residual_m": round(found.residual_m, 3),
         "metres_per_unit": found.scale,
     }
     world = World(unit=METRES, geo_origin=found.origin)

@@ -91,7 +91,7 @@ def test_the_pose_file_of_each_result_is_among_the_submissions(
     megloc: Any, scene: Path, workspace: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (workspace.parent / "runs").mkdir()
-    run = workspace.rename(workspace.parent / "runs" / "kapture-classic")
+    run = workspace.rename(workspace.parent / "runs" / f"kapture-{scene.name}-classic")
     monkeypatch.chdir(workspace.parent)
     command = ("eval", "kapture", "--root", scene, "--executor", "inline")
     same = ("--set", "local_features.options.max_keypoints=800")

@@ -144,7 +144,7 @@ def test_queries_are_localized(
             rows = database.execute("SELECT SUM(rows) FROM keypoints").fetchone()[0]
         assert counts["keypoints"] == rows
     else:
-        assert counts["found_again"] > 0.99
+        assert counts["share_found_again"] > 0.99
     assert folder.descriptors("sift").names == folder.read().image_names()
     assert sorted(p.name for p in (tmp_path / "map").iterdir()) == ["reconstruction", "sensors"]
     link = tmp_path / "map" / "sensors" / "records_data"

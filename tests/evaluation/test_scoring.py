@@ -15,7 +15,12 @@ from megloc_kapture.evaluation.evaluate import evaluate_results
 from megloc_kapture.evaluation.metrics import thresholds_from_pairs
 from megloc_kapture.evaluation.pose_files import RelativePose, format_mlad_file, relative_pose
 from megloc_kapture.evaluation.protocols import benchmark_of, protocol_of
-from megloc_kapture.evaluation.report.reports import render_report, report_text, write_report
+from megloc_kapture.evaluation.report.reports import (
+    render_report,
+    report_data,
+    report_text,
+    write_report,
+)
 from megloc_kapture.evaluation.scoring import (
     evaluate_pairs,
     evaluate_poses,
@@ -53,6 +58,34 @@ def test_every_true_query_is_counted_once(world: Any) -> None:
     backwards = (dict(reversed(each.items())) for each in (world.estimated, world.truth))
     second = evaluate_poses(*backwards)
     assert (first.rows, first.queries) == (second.rows, second.queries)
+
+
+@pytest.mark.parametrize(("times", "low", "high"), [(1.0, 0.93, 0.97), (2.0, 0.1, 0.3)])
+def test_errors_are_as_large_as_their_covariances_claim_or_not(
+    times: float, low: float, high: float
+) -> None:
+    """Errors drawn from the covariances lie within the 95 % region in 95 % of all cases."""
+    rng = np.random.default_rng(0)
+    estimated, truth, covariances = {}, {}, {}
+    for number in range(1000):
+        half = rng.normal(size=(6, 6)) * np.array([1e-3] * 3 + [0.1] * 3)[:, None]
+        step = times * half @ rng.normal(size=6)
+        x, y, z, w = Rotation.from_rotvec(step[:3]).as_quat().tolist()
+        error = RigidTransform((w, x, y, z), tuple(step[3:].tolist()))
+        x, y, z, w = Rotation.random(rng=rng).as_quat().tolist()
+        pose = RigidTransform((w, x, y, z), tuple((100 * rng.normal(size=3)).tolist()))
+        name = f"{number}.jpg"
+        estimated[name], truth[name], covariances[name] = pose, error @ pose, half @ half.T
+    estimated["guess.jpg"] = truth["guess.jpg"] = HERE  # it has none
+    evaluation = evaluate_poses(estimated, truth, covariances=covariances)
+    check = evaluation.covariance
+    assert check is not None and check.num_poses == 1000
+    assert low < check.num_within / 1000 < high
+    line = f"Covariance: {check.num_within} of 1000 errors lie within the claimed 95 % region."
+    assert line in report_text(evaluation)
+    said = {"num_poses": 1000, "num_within": check.num_within}
+    assert report_data(evaluation)["covariance"] == said
+    assert "Covariance" not in report_text(evaluate_poses(estimated, truth))
 
 
 def test_images_without_truth_or_not_scored_are_reported_and_not_counted() -> None:

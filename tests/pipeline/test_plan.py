@@ -297,6 +297,33 @@ def test_a_workspace_that_is_deleted_while_a_stage_runs_is_an_error(
     assert not kitchen.workspace.root.exists()
 
 
+def test_data_of_another_root_do_not_replace_those_of_a_workspace(tmp_path: Path) -> None:
+    roots = [tmp_path / name / "scene" for name in "ab"]
+
+    def import_from(root: Path, *, force: bool = False) -> str:
+        workspace = Workspace(tmp_path / "workspace", force=force)
+
+        def do(out: Path) -> Mapping[str, float]:
+            (out / "a.txt").write_text(str(root))
+            return {}
+
+        stage = Step("import", (), ("a.txt",), do, outside={"root": str(root.resolve())})
+        stage.root = root
+        with workspace.lock():
+            run_plan([stage], workspace)
+        return workspace.path("a.txt").read_text()
+
+    for root in roots:
+        root.mkdir(parents=True)
+    one, other = roots
+    assert import_from(one) == import_from(one) == str(one)
+    with pytest.raises(OptionError, match=f"is the workspace of {one}; give another --workspace"):
+        import_from(other)
+    assert import_from(other, force=True) == str(other)
+    other.rename(tmp_path / "moved")  # nothing else than these data can be meant
+    assert import_from(tmp_path / "moved") == str(tmp_path / "moved")
+
+
 def test_first_and_last(kitchen: Kitchen) -> None:
     with pytest.raises(OptionError, match="--from b needs stage a, which has not run"):
         kitchen.cook(first="b")
@@ -342,3 +369,22 @@ def test_a_dry_run_only_tells(kitchen: Kitchen) -> None:
     assert kitchen.log == []
     kitchen.options["b"] = {}
     assert all_kept(kitchen.cook())
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("keypoints", 33_485_000, "33,485,000 keypoints"),
+        ("queries_with_truth", 1, "1 query with truth"),
+        ("pairs_with_matches", 1, "1 pair with matches"),
+        ("matches", 1, "1 match"),
+        ("max_size_px", 1600, "max size: 1,600 px"),
+        ("mean_reprojection_error_px", 0.74219, "mean reprojection error: 0.7422 px"),
+        ("mean_track_length", 4.0, "mean track length: 4"),
+        ("metres_per_unit", 33_485.21, "metres per unit: 33,485"),
+        ("recall within 0.25 m and 2 deg percent", 87.5, "recall within 0.25 m and 2 deg: 87.5 %"),
+    ],
+)
+def test_counts_read_as_english(name: str, value: float, text: str) -> None:
+    assert describe(StageReport("a", "run", 0.04, {name: value}, "")) == f"a: {text}; 0.0 s"
+    assert describe(StageReport("a", "run", 0.04, {}, "")) == "a: 0.0 s"

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
+
 import pytest
 
 from megloc_kapture.errors import DataError, OptionError, PluginError
-from megloc_kapture.pipeline.presets import PRESETS, PipelineOptions, options_of_preset
+from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
+from megloc_kapture.pipeline.presets import (
+    PRESETS,
+    PipelineOptions,
+    assigned,
+    options_of,
+    options_of_preset,
+)
 
 
 def test_assignments_and_tables_build_the_same_and_the_last_counts() -> None:
@@ -42,6 +51,22 @@ def test_values(text: str, value: object) -> None:
     options = options_of_preset(assignments=[f"matching.options.x={text}"])
     found = options.matching.options["x"]
     assert found == value and type(found) is type(value)
+
+
+def test_none_turns_off_what_may_be_off_and_is_a_choice_of_other_options() -> None:
+    off, chosen = set(), set()
+    for option in options_of(PipelineOptions()):
+        if "None" in option.kind or "'none'" in option.kind:
+            options = options_of_preset(changes=[assigned([f"{option.key}=none"])])
+            found = attrgetter(option.key)(options)
+            (off if "None" in option.kind else chosen).add(option.key)
+            assert found == (None if "None" in option.kind else "none"), option.key
+    assert {"refinement.depth.max_sigmas", "preprocessing.masks.segmenter"} <= off
+    assert {"reranking.by", "localization.fallback", "localization.clusters.by"} <= chosen
+    with pytest.raises(OptionError, match="option query_pairs.top_k: .*integer"):
+        options_of_preset(assignments=["query_pairs.top_k=none"])
+    # those of plugins, which they check themselves
+    assert NearestNeighbours.Options(max_ratio="none").max_ratio is None
 
 
 SEVERAL = 'local_features=["sift", "rootsift"]'

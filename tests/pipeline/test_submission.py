@@ -35,6 +35,7 @@ from megloc_kapture.io.files import write_json_model
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.tables import QueryStatus, write_status
 from megloc_kapture.pipeline.datasets import DatasetChoice
+from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.submission import (
     check_dataset,
@@ -483,6 +484,42 @@ def test_a_run_calls_its_pose_file_as_the_server_does(name: str, stem: str, tmp_
     end = "" if rules.pose_file == "mlad" else ".txt"
     expected = tmp_path / "submissions" / f"{stem}_eval_megloc-classic{end}"
     assert run.submission_below(tmp_path, tmp_path / "megloc") == expected
+
+
+def test_label_and_pose_file_name_other_features_than_the_presets(
+    tmp_path: Path,
+) -> None:
+    write_protocol(tmp_path / "megloc", Protocol())
+    source = DatasetChoice("kapture", tmp_path / "scene")
+
+    def names(*assignments: str) -> tuple[str, str]:
+        options = options_of_preset(assignments=assignments)
+        run = Run(source, "classic", options)
+        return run.label, run.submission_below(tmp_path, tmp_path / "megloc").stem
+
+    usual = ("kapture, classic", "kapture_eval_megloc-classic")
+    assert names() == names("local_features.options.max_keypoints=800") == usual
+    assert names("local_features=aliked") == (
+        "kapture, classic with local_features=aliked",
+        "kapture_eval_megloc-classic-aliked",
+    )
+    both = ('local_features=["sift", "xfeat"]', "global_features=netvlad")
+    assert names(*both) == (
+        "kapture, classic with local_features=sift+xfeat and global_features=netvlad",
+        "kapture_eval_megloc-classic-sift+xfeat-netvlad",
+    )
+
+
+def test_a_dataset_of_kapture_folders_has_a_workspace_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    options = PipelineOptions()
+    for root in (Path("house"), tmp_path / "house", Path("house/../house/")):
+        place = Run(DatasetChoice("kapture", root), "modern", options).default_workspace
+        assert place == Path("runs/kapture-house-modern")
+    rendered = Run(DatasetChoice("synthetic-aachen", None), "classic", options)
+    assert rendered.default_workspace == Path("runs/synthetic-aachen-classic")
 
 
 @pytest.mark.parametrize("stem", ["../x", "a/b", ".x", "a b", "a\n"])

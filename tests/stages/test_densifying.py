@@ -48,7 +48,7 @@ def densified(world: Any, tmp_path_factory: pytest.TempPathFactory) -> KaptureFo
     root = tmp_path_factory.mktemp("densified") / "map"
     counts = densify_map(world.map(), root, OPTIONS)
     assert counts["images"] == counts["images_with_depth"] == 5
-    assert counts["fill"] > 0.5 and counts["points_lifted"] > 300
+    assert counts["share_with_depth"] > 0.5 and counts["points_lifted"] > 300
     return KaptureFolder(root, features_dirs=[world.features_dir])
 
 

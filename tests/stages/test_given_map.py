@@ -98,7 +98,7 @@ def test_a_map_with_descriptors_is_taken_as_it_is(world, tmp_path: Path, folder_
         "images": 5,
         "points": len(reference.points3d()),
         "observations": len(seen),
-        "found_again": 1.0,
+        "share_found_again": 1.0,
     }
     # nothing differs: sensors, points, observations, local and global features
     for part in ("sensors", "reconstruction"):
@@ -120,7 +120,7 @@ def test_without_descriptors_the_observations_move_to_the_features_extracted_ane
     reference = published(truth, tmp_path / "reference")
     assert not has_descriptors(reference)
     counts = given_map(reference, world.mapping(), tmp_path / "map")
-    assert counts["found_again"] == 1.0
+    assert counts["share_found_again"] == 1.0
     made = KaptureFolder(tmp_path / "map")
     made.validate()
     assert has_descriptors(made)
@@ -158,7 +158,7 @@ def test_another_implementation_may_find_them_some_tenths_of_a_pixel_away(
 ) -> None:
     truth = world.map()
     reference = published(truth, tmp_path / "reference", shift_px=0.3)
-    assert given_map(reference, world.mapping(), tmp_path / "map")["found_again"] == 1.0
+    assert given_map(reference, world.mapping(), tmp_path / "map")["share_found_again"] == 1.0
     expected, found = (
         {
             (point, image, place(folder, image, keypoint))
@@ -187,8 +187,8 @@ def test_what_is_not_found_again_is_left_out(world: Any, tmp_path: Path) -> None
     kept = {name: set(map(tuple, keypoints.read(name).tolist())) for name in keypoints.names}
     seen = triples(truth)
     there = [(p, image) for p, image, k in seen if place(truth, image, k) in kept[image]]
-    assert 0.5 < counts["found_again"] < 1
-    assert counts["found_again"] == pytest.approx(len(there) / len(seen), abs=0.02)
+    assert 0.5 < counts["share_found_again"] < 1
+    assert counts["share_found_again"] == pytest.approx(len(there) / len(seen), abs=0.02)
     # points are numbered anew, without those that nothing sees any more
     points = made.points3d()
     assert counts["points"] == len(points) < len(truth.points3d())

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import kapture.io.csv
+import numpy as np
 import pytest
 
+from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.io.tables import CLUSTERS_FILE, STATUS_FILE, read_clusters, read_status
-from megloc_kapture.stages.localized_folder import write_localized
+from megloc_kapture.io.tables import (
+    CLUSTERS_FILE,
+    COVARIANCE_FILE,
+    STATUS_FILE,
+    read_clusters,
+    read_covariances,
+    read_status,
+)
+from megloc_kapture.stages.localized_folder import plain_result, result_of, write_localized
 from megloc_kapture.values import Failure, Pose
 
 
@@ -31,9 +41,34 @@ def test_localized_queries_are_a_kapture(world: Any, tmp_path: Path) -> None:
         (chosen,) = (row for row in clusters[image] if row.chosen == "yes")
         assert row.cluster == chosen.cluster and chosen.images == result.candidates
         assert chosen.score is not None and chosen.score > 100
+    covariances = read_covariances(tmp_path / COVARIANCE_FILE)
+    assert {image: c.tolist() for image, c in covariances.items()} == {
+        image: found.covariance.tolist() for image, found in results
+    }
     lines = (tmp_path / "timing.csv").read_text().splitlines()
     assert lines[0] == "image,step,seconds"
     assert {line.split(",")[1] for line in lines[1:]} >= {"reading", "estimation", "refinement"}
+
+
+def test_a_covariance_that_is_none_is_refused_by_its_line(world: Any, tmp_path: Path) -> None:
+    write_localized(tmp_path, world.query(), half_failed(world))
+    path = tmp_path / COVARIANCE_FILE
+    header, row = path.read_text().splitlines()
+    assert header.startswith("image,rx_rx,rx_ry,rx_rz,rx_tx") and row.startswith("query/b.png,")
+    for wrong in ("-1", "x", "nan"):
+        image, _, rest = row.split(",", 2)
+        path.write_text(f"{header}\n{image},{wrong},{rest}\n")
+        with pytest.raises(DataError, match="covariance.csv:2: 'query/b.png' has no positive def"):
+            read_covariances(path)
+
+
+def test_a_result_in_a_journal_keeps_its_covariance(world: Any) -> None:
+    for _, found in world.localized():
+        again = result_of(json.loads(json.dumps(plain_result(found))))
+        assert isinstance(again, Pose) and again.cam_from_world == found.cam_from_world
+        np.testing.assert_array_equal(again.covariance, found.covariance)
+    failed = Failure("dark")
+    assert result_of(json.loads(json.dumps(plain_result(failed)))) == failed
 
 
 def half_failed(world: Any) -> list[tuple[str, Pose | Failure]]:

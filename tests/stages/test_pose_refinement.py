@@ -19,6 +19,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import (
     CONSISTENCY_FILE,
     read_consistency,
+    read_covariances,
     read_refinement,
     read_status,
 )
@@ -31,6 +32,7 @@ from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
+COVARIANCE = np.diag([1e-6, 2e-6, 3e-6, 1e-4, 2e-4, 1 / 3])
 SHIFT = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.25))
 
 
@@ -88,7 +90,9 @@ class Chosen(PoseRefinementOptions):
 def localized(world: Any, tmp_path: Path) -> KaptureFolder:
     """One query at its true pose, from the map's first image; the other failed."""
     first, second = sorted(world.query_poses)
-    found = Pose(world.query_poses[first], 50, 40, candidates=(sorted(world.map_poses)[0],))
+    image = min(world.map_poses)
+    pose = world.query_poses[first]
+    found = Pose(pose, 50, 40, candidates=(image,), covariance=COVARIANCE)
     folder = tmp_path / "localized"
     write_localized(folder, world.query(), [(first, found), (second, Failure("too dark"))])
     return KaptureFolder(folder)
@@ -119,6 +123,19 @@ def test_poses_move_by_each_refiner_in_turn_and_failures_stay(
     with ThreadPoolExecutor(2) as executor:
         refine_poses(*arguments, tmp_path / "threads", options, work=Work(executor))
     assert folder_bytes(tmp_path / "out") == folder_bytes(tmp_path / "threads")
+
+
+def test_a_pose_that_stays_keeps_its_covariance(
+    world: Any, localized: KaptureFolder, tmp_path: Path
+) -> None:
+    first = min(world.query_poses)
+    kept = {}
+    for name, stays in (("stays", first), ("moved", "")):
+        options = Chosen(refiners=(Shift(stays=stays),))
+        refine_poses(world.mapping(), world.query(), localized, tmp_path / name, options)
+        kept[name] = read_covariances(tmp_path / name / "covariance.csv")
+    np.testing.assert_array_equal(kept["stays"][first], COVARIANCE)
+    assert kept["moved"] == {}  # this refiner does not know that of its poses
 
 
 def test_references_look_the_same_way_and_are_of_one_frame(
@@ -207,7 +224,7 @@ def test_each_coordinate_frame_is_judged_by_itself(folders: Any, tmp_path: Path)
     options = Chosen(refiners=(Sure(),))
     counts = refine_poses(*folders, out, options, restrictions=RESTRICTIONS)
     assert counts == {
-        "queries": 2, "accepted_by_sure": 1, "sure trusted bad": 0, "sure trusted good": 1,
+        "queries": 2, "accepted_by_sure": 1, "frames_where_sure_is_trusted": 1,
     }  # fmt: skip
     statuses, rows = read_status(out / "status.csv"), read_refinement(out / "refinement.csv")
     assert statuses["a.png"].refinement == "sure: accepted"

@@ -43,6 +43,7 @@ from megloc_kapture.evaluation.report.wording import (
     agreement_sentence,
     comparison_sentences,
     confidence_sentences,
+    covariance_sentence,
     criterion,
     format_degrees,
     format_interval,
@@ -270,12 +271,15 @@ def _pictured(
 
 
 def _confidence(evaluation: Evaluation) -> list[Block]:
-    """The worth of a result's confidences; empty where it brings none."""
-    confidence = evaluation.confidence
-    if confidence is None:
-        return []
-    said = confidence_sentences(confidence, evaluation.thresholds[-1])
+    """The worth of a result's confidences and covariances; empty where it brings none."""
+    confidence, said = evaluation.confidence, []
+    if confidence is not None:
+        said += confidence_sentences(confidence, evaluation.thresholds[-1])
+    if evaluation.covariance is not None:
+        said.append(covariance_sentence(evaluation.covariance))
     blocks: list[Block] = [Paragraph(_as_sentence(one)) for one in said]
+    if confidence is None:
+        return blocks
     if (confident := tables.confident_table(evaluation)) is not None:
         blocks += [Paragraph(f"{CONFIDENT}:"), confident]
     if confidence.num_poses < FEW:

@@ -31,6 +31,7 @@ from megloc_kapture.evaluation.report.wording import (
     bounds,
     comparison_sentences,
     confidence_sentences,
+    covariance_sentence,
     criterion,
     method_sentence,
     notes,
@@ -189,12 +190,15 @@ def _text_sections(reported: AnyReported) -> list[Section]:
         sections.append(_lines(_line(evaluations[0].label)))
     sections += _recall_sections(evaluations)
     for evaluation in evaluations:
+        whose = f" of {evaluation.label}" if several else ""
         if (confident := tables.confident_table(evaluation)) is not None:
             sections.append(_lines(_line(f"{CONFIDENT} (%)"), confident))
         if (confidence := evaluation.confidence) is not None:
-            whose = f" of {evaluation.label}" if several else ""
             said = "; ".join(confidence_sentences(confidence, evaluation.thresholds[-1]))
             sections.append(_lines(Paragraph(f"Confidence{whose}: {said}.")))
+        if evaluation.covariance is not None:
+            said = covariance_sentence(evaluation.covariance)
+            sections.append(_lines(Paragraph(f"Covariance{whose}: {said}.")))
     if isinstance(reported, Comparison):
         sections.append(_lines(Items(tuple(comparison_sentences(reported)))))
         sections.append(_lines(Paragraph(method_sentence(reported))))
@@ -265,6 +269,7 @@ def _line(text: str) -> Paragraph:
 
 def _recall_data(evaluation: Evaluation) -> dict[str, Any]:
     confidence, by_center = evaluation.confidence, evaluation.by_center
+    covariance = evaluation.covariance
     return {
         "label": evaluation.label,
         "criterion": criterion(evaluation),
@@ -273,6 +278,7 @@ def _recall_data(evaluation: Evaluation) -> dict[str, Any]:
         "notes": notes(evaluation),
         **({} if confidence is None else {"confidence": asdict(confidence)}),
         "rows_above_min_confidence": evaluation.rows_above(MIN_CONFIDENCE),
+        **({} if covariance is None else {"covariance": asdict(covariance)}),
         "without_truth": evaluation.without_truth,
         "not_scored": evaluation.not_scored,
         **({} if by_center is None else {"rows_by_center": by_center.rows}),

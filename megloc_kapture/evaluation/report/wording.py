@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from megloc_kapture.evaluation.confidence import Confidence
 from megloc_kapture.evaluation.metrics import ALL, RecallAt, Threshold
-from megloc_kapture.evaluation.scoring import Evaluation
+from megloc_kapture.evaluation.scoring import CovarianceCheck, Evaluation
 from megloc_kapture.evaluation.statistics import (
     NUM_RESAMPLES,
     SIGNIFICANCE,
@@ -180,6 +180,14 @@ def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[st
             f"{confidence.num_nowhere - confidence.num_nowhere_refused} given a pose"
         )
     return said
+
+
+def covariance_sentence(check: CovarianceCheck) -> str:
+    """How many errors are as small as the covariances claim, without a full stop."""
+    return (
+        f"{check.num_within} of {counted(check.num_poses, 'error lies', 'errors lie')} within the "
+        "claimed 95 % region"
+    )
 
 
 def no_retrieval(result: ResultWithoutTruth) -> str:
