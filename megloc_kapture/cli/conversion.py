@@ -177,6 +177,9 @@ class Export(Common):
     geo_origin: str | None = None
     """Of geojson: latitude,longitude[,height] of the world's origin, whose axes are East, North
     and Up there."""
+    undistort: bool = False
+    """Of colmap: also write images/, undistorted, and the model of these in sparse/0, with PINHOLE
+    cameras, as programs for Gaussian splatting read them."""
     force: Overwrite = False
     """Overwrite, or write into a folder that has other things in it."""
 
@@ -188,6 +191,7 @@ class Export(Common):
             query=self.query,
             sensor=self.sensor,
             origin=None if self.geo_origin is None else _origin(self.geo_origin),
+            undistort=self.undistort,
             force=self.force,
         )
         console.result(f"{number} images exported: {self.output}")

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from shutil import disk_usage
+from shutil import disk_usage, rmtree
 from typing import Any
 
 import numpy as np
@@ -433,3 +433,29 @@ def write_model(
         model.write(str(output))
     except (OSError, RuntimeError, ValueError) as error:
         raise OutputError(f"{output}: COLMAP cannot write its model: {error}") from error
+
+
+def undistort_model(model: Path, images: Path, output: Path) -> None:
+    """Write ``images/`` and ``sparse/0`` without distortion, keypoints included.
+
+    Raises
+    ------
+    DataError : COLMAP cannot read an image of the model.
+    OutputError : the folder cannot be written to.
+    """
+    pycolmap = load_pycolmap()
+    try:
+        with quiet_stderr():
+            pycolmap.undistort_images(str(output), str(model), str(images))
+        # only for COLMAP's own stereo
+        rmtree(output / "stereo")
+        for script in output.glob("run-colmap-*.sh"):
+            script.unlink()
+        (output / "sparse").rename(output / "0")
+        (output / "sparse").mkdir()
+        (output / "0").rename(output / "sparse" / "0")
+    except (OSError, RuntimeError, ValueError) as error:
+        raise OutputError(f"{output}: COLMAP cannot undistort the images: {error}") from error
+    for image in images.iterdir():
+        if not (output / "images" / image.name).is_file():
+            raise DataError("COLMAP cannot read the image", path=image.resolve())
