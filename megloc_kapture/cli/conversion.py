@@ -215,9 +215,9 @@ class View(Linked, Common):
     map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
     """Kapture folder: a map with points, or images with poses; or a COLMAP model."""
     result: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="RESULT")] = None
-    """Localized kapture folder, or pose file."""
+    """Localized kapture folder, pose file or COLMAP model."""
     gt: Path | None = None
-    """Kapture folder with the true poses: queries are coloured by their error, and joined to it."""
+    """The true poses, likewise: queries are coloured by their error, and joined to it."""
     rendered: Path | None = None
     """Kapture folder of `megloc render --along RESULT`: shown beside the queries' photographs."""
     output: Output = Path("view.html")

@@ -29,13 +29,14 @@ EVALUATION = "evaluation"
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(Common):
-    """Compare localized queries (kapture folders or pose files) with their true poses, and two or
-    more results with each other."""
+    """Compare localized queries (kapture folders, pose files, COLMAP models) with their true poses,
+    and two or more results with each other."""
 
     input: Inputs = ()
-    """Localized kapture folder, or pose file; may be repeated to compare results."""
+    """Localized kapture folder, pose file or COLMAP model; may be repeated to compare results."""
     gt: Path | None = None
-    """Kapture folder with the true poses; without it, says what can be known without truth."""
+    """The true poses: kapture folder, pose file or COLMAP model; without it, says what can be known
+    without truth."""
     dataset: str | None = None
     """Dataset whose thresholds, conditions and pools hold: aachen, robotcar, 4seasons, inloc, ...;
     the workspace's protocol unless given."""

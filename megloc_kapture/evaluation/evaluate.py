@@ -11,6 +11,7 @@ import numpy as np
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.metrics import Threshold
+from megloc_kapture.evaluation.pose_files import poses_by_image
 from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of
 from megloc_kapture.evaluation.results import (
     Poses,
@@ -19,6 +20,7 @@ from megloc_kapture.evaluation.results import (
     context_of,
     distinct_labels,
     first_map_poses,
+    read_poses,
     read_result,
     result_in_memory,
     side_tables_near,
@@ -52,10 +54,11 @@ def evaluate(
 
     Parameters
     ----------
-    estimated : a kapture folder with trajectories (and perhaps ``status.csv``), a pose file, or
-        image -> pose; poses in memory are ``cam_from_world`` in the frame of the truth, metres.
-    truth : a kapture folder, or image -> ``cam_from_world``. Queries that show nothing of the map
-        stand in the folder's ``nowhere.txt``, one a line: they are right without a pose.
+    estimated : a kapture folder with trajectories (and perhaps ``status.csv``), a pose file, a
+        COLMAP model, or image -> pose; poses in memory are ``cam_from_world`` in the frame of the truth, metres.
+    truth : a kapture folder, a pose file, a COLMAP model, or image -> ``cam_from_world``. Queries
+        that show nothing of the map are in the kapture folder's ``nowhere.txt``, one a line: they
+        are right without a pose.
     dataset : whose thresholds, conditions and pools hold; by default those of the side tables.
     side_tables : the workspace's ``megloc/`` folder: conditions, which images are scored, the
         protocol, and the world a pose file has to be brought back from; found beside truth or
@@ -116,7 +119,7 @@ def evaluate_results(
     if isinstance(truth, Mapping):
         true_poses: Poses = result_in_memory(truth).poses
     else:
-        true_poses = KaptureFolder(Path(truth)).read().poses()
+        true_poses = read_poses(Path(truth))
     nowhere = () if isinstance(truth, Mapping) else read_nowhere(truth)
     contexts = [_context(source, mapping) for source in results]
     _check_metres(contexts)
@@ -132,6 +135,8 @@ def evaluate_results(
     read = _read(results, benchmark, contexts, labels, true_poses, references)
     if not isinstance(truth, Mapping) and side_tables_near(truth) is None:
         true_poses = _in_local_frame(true_poses, read, benchmark.world, truth)
+    if not relative:
+        true_poses = _by_names_of_results(true_poses, read, {*nowhere, *benchmark.names})
     for found in read:
         if relative:
             evaluation = evaluate_pairs(
@@ -227,6 +232,26 @@ def _read(
             )
         found.append(replace(result, context=context))
     return found
+
+
+def _by_names_of_results(
+    true_poses: Poses, results: Sequence[Result], known: Collection[str]
+) -> Poses:
+    """True poses by the images' names in the results, where these have other folders.
+
+    Raises DataError: a result with poses has no name in common with the truth.
+    """
+    images = {image for result in results for image in result.images}
+    if not images & true_poses.keys():
+        true_poses = poses_by_image(true_poses, images)
+    for result in results:
+        if result.poses and not (true_poses.keys() | known) & set(result.images):
+            raise DataError(
+                f"no name fits: the result has {min(result.images)!r}, the truth "
+                f"{min(true_poses, default='nothing')!r}"
+                + (f" ({result.label})" if result.label else "")
+            )
+    return true_poses
 
 
 def _in_local_frame(

@@ -31,6 +31,7 @@ from megloc_kapture.io.files import check_relative
 from megloc_kapture.values import ClusterPose, Options, RefinementRow, RigidTransform
 
 STATUS_FILE = "status.csv"
+POSES_FILE = "poses.csv"
 CLUSTERS_FILE = "clusters.csv"
 REFINEMENT_FILE = "refinement.csv"
 CONSISTENCY_FILE = "map_consistency.csv"

@@ -118,7 +118,7 @@ def export_colmap(scene: Scene, output: Path) -> None:
 
 
 def export_undistorted(scene: Scene, output: Path) -> None:
-    """Write what programs for Gaussian splatting read: PINHOLE cameras, ``images/`` and ``sparse/0``.
+    """Write PINHOLE cameras, ``images/`` and ``sparse/0``, as Gaussian splatting reads them.
 
     The original program ignores the folders in images' names, so ``/`` becomes ``_``.
 

@@ -350,6 +350,7 @@ def colmap_maps_folder() -> Path:
 def import_colmap(source: ColmapFolders, output: Path, *, work: Work = HERE) -> dict[str, float]:
     """Write a COLMAP reconstruction as a kapture map; ``output`` is empty.
 
+    A model of poses alone, without points, images and database, becomes a kapture folder of poses.
     Where the model's features cannot be had (no points; no database, and no SIFT), its images are
     mapped anew with its poses, by the default preset, and a warning is logged.
 
@@ -362,6 +363,14 @@ def import_colmap(source: ColmapFolders, output: Path, *, work: Work = HERE) -> 
     DataError : see :class:`~megloc_kapture.datasets.colmap_map.ColmapReconstruction`.
     """
     read = ColmapReconstruction.read(source)
+    if source.images is None and source.database is None and not len(read.model.points):
+        _log.warning(
+            "%s has no points, no images and no database: it becomes a kapture folder of poses, "
+            "not a map (`megloc import colmap --images` or `--database` give it features)",
+            source.model,
+        )
+        read.write_images(output)
+        return {"images": len(read.names), "points": 0}
     try:
         return read.write_map(output, work=work)
     except OtherFeaturesError as error:

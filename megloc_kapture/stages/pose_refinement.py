@@ -22,6 +22,7 @@ from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.tables import (
     CLUSTERS_FILE,
     CONSISTENCY_FILE,
+    POSES_FILE,
     REFINEMENT_FILE,
     STATUS_FILE,
     ConsistencyRow,
@@ -50,7 +51,7 @@ from megloc_kapture.refinement.references import (
     spread_names,
 )
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.localized_folder import plain_result, pose_of, write_timing
+from megloc_kapture.stages.localized_folder import plain_result, pose_of, write_poses, write_timing
 from megloc_kapture.stages.scene import KaptureScene, image_inputs
 from megloc_kapture.stages.stage import (
     LOCALIZED,
@@ -372,7 +373,9 @@ def _write(
     poses = dict(data.trajectories)
     for image, refined in found.items():
         poses[data.record_of(image)] = refined.cam_from_world
-    write_sensors(output, replace(data, trajectories=poses))
+    refined_data = replace(data, trajectories=poses)
+    write_sensors(output, refined_data)
+    write_poses(output / POSES_FILE, refined_data.poses())
     link_images(localized.root, output)
     for image, refined in found.items():
         told = {"refinement": refinement_text(refined.refinements)}
