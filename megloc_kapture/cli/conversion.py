@@ -23,7 +23,7 @@ from megloc_kapture.datasets.colmap_map import find_colmap
 from megloc_kapture.datasets.kapture_folders import QUERY
 from megloc_kapture.datasets.megadepth import MegaDepthOptions, import_megadepth
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.dataset_tables import METRES, SIDE_TABLES, write_unit
+from megloc_kapture.io.dataset_tables import NO_METRES, SIDE_TABLES
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,
@@ -62,9 +62,8 @@ class Import(Common):
     """Of colmap: folder of the images; images/ beside the model or around it unless given."""
     database: Path | None = None
     """Of colmap: the features; database.db beside the model or around it unless given."""
-    unit: Literal["m", "units"] = "m"
-    """Of colmap: units says that nobody knows the model's scale, so that nothing takes it for
-    metres."""
+    unit: Literal["m", "units"] = "units"
+    """Of colmap: m says that the model is in metres; its scale is unknown unless given."""
     allow_missing: bool = False
     """Import what is there of a partial download."""
     set: Texts = ()
@@ -83,7 +82,7 @@ class Import(Common):
             return
         if self.images or self.database:
             raise OptionError(f"--images and --database are of colmap, not of {self.dataset}")
-        if self.unit != METRES:
+        if self.unit != NO_METRES:
             raise OptionError(f"--unit is of colmap, not of {self.dataset}")
         choice = choose_dataset(
             KAPTURE if name == SYNTHETIC else name,
@@ -112,12 +111,12 @@ class Import(Common):
             staged_output(self.output, kind=MAP, force=self.force) as out,
             open_executor("processes") as executor,
         ):
-            counts = import_colmap(source, out, work=Work(executor, console.track))
-            if self.unit != METRES:
-                write_unit(out, self.unit)
+            counts = import_colmap(source, out, unit=self.unit, work=Work(executor, console.track))
         for what, found in (("images", source.images), ("database", source.database)):
             console.say(f"{what}: {found or 'none'}")
         console.counts(counts)
+        if self.unit == NO_METRES:
+            console.say("unit: units of the map, whose scale is not known; --unit m if in metres")
 
     def _import_megadepth(self, console: Console) -> None:
         self._refuse_unused("MegaDepth", {"--images": self.images, "--database": self.database})

@@ -114,7 +114,7 @@ class Localize(Reading, Deciding, Common):
         for remark in sorted(remarks.keys() - focal):
             console.say(f"left out of {remarks[remark]} queries: {remark}")
         if kapture_map.unit != METRES:
-            console.say(f"positions are in {kapture_map.unit} of the map, whose scale is not known")
+            console.say("positions are in units of the map, whose scale is not known")
         if focal:
             number = sum(remarks[remark] for remark in focal)
             console.say(f"focal length: {number} remarks in {STATUS_FILE}")

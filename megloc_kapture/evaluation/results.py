@@ -264,8 +264,8 @@ def read_result(
 
     Parameters
     ----------
-    source : a localized kapture folder, a pose file, a COLMAP model, or (where the benchmark has MLAD's pairs) a
-        pose file of the MLAD challenges or a folder with several.
+    source : a localized kapture folder, a pose file, a COLMAP model, or (where the benchmark has
+        MLAD's pairs) a pose file of the MLAD challenges or a folder with several.
     images : those that the short names of a pose file may stand for.
     references : ``cam_from_world`` of the map's images, for MLAD's pose files.
 

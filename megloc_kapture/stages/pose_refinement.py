@@ -128,10 +128,11 @@ class MapRefiners:
     def __init__(
         self, mapping: KaptureFolder, restrictions: Restrictions, options: PoseRefinementOptions
     ) -> None:
-        if options.refines() and (unit := unit_of(mapping.root)) != METRES:
+        if options.refines() and unit_of(mapping.root) != METRES:
             raise OptionError(
-                f"pose_refinement.by {options.by[0].name}: its limits are in metres, the map is in "
-                f"{unit} of its own; `megloc map --scale` makes a map in metres"
+                f"pose_refinement.by {options.by[0].name}: its limits are in metres, and the map's "
+                "scale is not known; `megloc map --scale` makes a map in metres, `megloc import "
+                "colmap --unit m` says that a COLMAP model is in metres"
             )
         self.refiners = tuple(options.make_refiners())
         self.map = FolderSpec(mapping)
