@@ -23,7 +23,7 @@ from megloc_kapture.datasets.colmap_map import find_colmap
 from megloc_kapture.datasets.kapture_folders import QUERY
 from megloc_kapture.datasets.megadepth import MegaDepthOptions, import_megadepth
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.dataset_tables import METRES, SIDE_TABLES, write_unit
+from megloc_kapture.io.dataset_tables import NO_METRES, SIDE_TABLES
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,
@@ -62,9 +62,8 @@ class Import(Common):
     """Of colmap: folder of the images; images/ beside the model or around it unless given."""
     database: Path | None = None
     """Of colmap: the features; database.db beside the model or around it unless given."""
-    unit: Literal["m", "units"] = "m"
-    """Of colmap: units says that nobody knows the model's scale, so that nothing takes it for
-    metres."""
+    unit: Literal["m", "units"] = "units"
+    """Of colmap: m says that the model is in metres; its scale is unknown unless given."""
     allow_missing: bool = False
     """Import what is there of a partial download."""
     set: Texts = ()
@@ -85,7 +84,7 @@ class Import(Common):
             return
         if self.images or self.database:
             raise OptionError(f"--images and --database are of colmap, not of {self.dataset}")
-        if self.unit != METRES:
+        if self.unit != NO_METRES:
             raise OptionError(f"--unit is of colmap, not of {self.dataset}")
         choice = choose_dataset(
             KAPTURE if name == SYNTHETIC else name,
@@ -115,12 +114,12 @@ class Import(Common):
             open_executor("processes") as executor,
         ):
             work = Work(executor, console.track, force=self.force)
-            counts = import_colmap(source, out, work=work)
-            if self.unit != METRES:
-                write_unit(out, self.unit)
+            counts = import_colmap(source, out, unit=self.unit, work=work)
         for what, found in (("images", source.images), ("database", source.database)):
             console.say(f"{what}: {found or 'none'}")
         console.counts(counts)
+        if self.unit == NO_METRES:
+            console.say("unit: units of the map, whose scale is not known; --unit m if in metres")
 
     def _import_megadepth(self, console: Console) -> None:
         self._refuse_unused("MegaDepth", {"--images": self.images, "--database": self.database})
@@ -180,6 +179,9 @@ class Export(Common):
     geo_origin: str | None = None
     """Of geojson: latitude,longitude[,height] of the world's origin, whose axes are East, North
     and Up there."""
+    undistort: bool = False
+    """Of colmap: also write images/, undistorted, and the model of these in sparse/0, with PINHOLE
+    cameras, as programs for Gaussian splatting read them."""
     force: Overwrite = False
     """Overwrite, or write into a folder that has other things in it."""
 
@@ -191,6 +193,7 @@ class Export(Common):
             query=self.query,
             sensor=self.sensor,
             origin=None if self.geo_origin is None else _origin(self.geo_origin),
+            undistort=self.undistort,
             force=self.force,
         )
         console.result(f"{number} images exported: {self.output}")
@@ -214,9 +217,9 @@ class View(Linked, Common):
     map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
     """Kapture folder: a map with points, or images with poses; or a COLMAP model."""
     result: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="RESULT")] = None
-    """Localized kapture folder, or pose file."""
+    """Localized kapture folder, pose file or COLMAP model."""
     gt: Path | None = None
-    """Kapture folder with the true poses: queries are coloured by their error, and joined to it."""
+    """The true poses, likewise: queries are coloured by their error, and joined to it."""
     rendered: Path | None = None
     """Kapture folder of `megloc render --along RESULT`: shown beside the queries' photographs."""
     output: Output = Path("view.html")

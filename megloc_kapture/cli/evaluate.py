@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -29,13 +29,14 @@ EVALUATION = "evaluation"
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(Common):
-    """Compare localized queries (kapture folders or pose files) with their true poses, and two or
-    more results with each other."""
+    """Compare localized queries (kapture folders, pose files, COLMAP models) with their true poses,
+    and two or more results with each other."""
 
     input: Inputs = ()
-    """Localized kapture folder, or pose file; may be repeated to compare results."""
+    """Localized kapture folder, pose file or COLMAP model; may be repeated to compare results."""
     gt: Path | None = None
-    """Kapture folder with the true poses; without it, says what can be known without truth."""
+    """The true poses: kapture folder, pose file or COLMAP model; without it, says what can be known
+    without truth."""
     dataset: str | None = None
     """Dataset whose thresholds, conditions and pools hold: aachen, robotcar, 4seasons, inloc, ...;
     the workspace's protocol unless given."""
@@ -43,6 +44,9 @@ class Evaluate(Common):
     """Folder for tables (text, JSON, CSV) and report.html."""
     thresholds: tuple[str, ...] = ()
     """Recall thresholds, metres and degrees: 0.25,2 0.5,5."""
+    align: Literal["none", "se3", "sim3"] = "none"
+    """Align the poses with the truth first, as evo does: sim3 with scale, for maps in a frame and
+    scale of their own; se3 without. Robust: the poses that agree determine it."""
     seeds: bool = False
     """The results are runs of one method with different seeds: report mean and spread."""
     side_tables: Path | None = None
@@ -75,7 +79,12 @@ class Evaluate(Common):
             )
         else:
             evaluations = evaluate_results(
-                self.input, self.gt, benchmark, thresholds=thresholds, mapping=self.map
+                self.input,
+                self.gt,
+                benchmark,
+                thresholds=thresholds,
+                mapping=self.map,
+                align=self.align,
             )
             found = evaluations[0]
             if self.seeds:
@@ -98,6 +107,8 @@ class Evaluate(Common):
             raise OptionError("--seeds needs at least two results (-i)")
         if self.seeds and self.gt is None:
             raise OptionError("--seeds needs true poses (--gt)")
+        if self.align != "none" and self.gt is None:
+            raise OptionError("--align needs true poses (--gt)")
         existing([path for path in (self.side_tables, self.map) if path is not None])
 
 

@@ -83,7 +83,7 @@ class Info(Reading, Common):
         except MeglocError as error:
             line(console, "localizing", f"not possible: {error}")
             return
-        unknown = f"none: {opened.unit} of its own, no scale known"
+        unknown = "units of the map: its scale is not known"
         line(console, "unit", "metres" if opened.unit == METRES else unknown)
         if fault := opened.fault():
             line(console, "FAULT", fault)

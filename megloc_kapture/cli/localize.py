@@ -118,7 +118,7 @@ class Localize(Reading, Deciding, Common):
         for remark in sorted(remarks.keys() - focal):
             console.say(f"left out of {remarks[remark]} queries: {remark}")
         if kapture_map.unit != METRES:
-            console.say(f"positions are in {kapture_map.unit} of the map, whose scale is not known")
+            console.say("positions are in units of the map, whose scale is not known")
         if misfits := misfits_text(("; ".join(r.remarks) for _, r in named), STATUS_FILE):
             console.say(misfits)
         console.result(

@@ -6,11 +6,13 @@ import logging
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.metrics import Threshold
+from megloc_kapture.evaluation.pose_files import poses_by_image
 from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of
 from megloc_kapture.evaluation.results import (
     Poses,
@@ -19,17 +21,29 @@ from megloc_kapture.evaluation.results import (
     context_of,
     distinct_labels,
     first_map_poses,
+    read_poses,
     read_result,
     result_in_memory,
     side_tables_near,
 )
 from megloc_kapture.evaluation.scoring import Evaluation, evaluate_pairs, evaluate_poses
 from megloc_kapture.evaluation.without_truth import WithoutTruth, evaluate_without_truth
-from megloc_kapture.io.dataset_tables import METRES, World, read_nowhere, unit_of
+from megloc_kapture.geometry.poses import align_poses, stack_poses
+from megloc_kapture.io.dataset_tables import (
+    METRES,
+    SimilarityTransform,
+    World,
+    read_nowhere,
+    unit_of,
+)
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
 _log = logging.getLogger(__name__)
+
+Align = Literal["none", "se3", "sim3"]
+# a similarity agrees with two poses' centres by construction
+_MIN_AGREEING = 4
 
 Localized = Path | str | Mapping[str, Pose | Failure] | Mapping[str, RigidTransform]
 
@@ -43,6 +57,7 @@ def evaluate(
     thresholds: Sequence[Threshold] | None = None,
     mapping: Path | str | None = None,
     label: str | None = None,
+    align: Align = "none",
 ) -> Evaluation:
     """Evaluate poses against true ones, by a benchmark's rules.
 
@@ -52,10 +67,12 @@ def evaluate(
 
     Parameters
     ----------
-    estimated : a kapture folder with trajectories (and perhaps ``status.csv``), a pose file, or
-        image -> pose; poses in memory are ``cam_from_world`` in the frame of the truth, metres.
-    truth : a kapture folder, or image -> ``cam_from_world``. Queries that show nothing of the map
-        stand in the folder's ``nowhere.txt``, one a line: they are right without a pose.
+    estimated : a kapture folder with trajectories (and perhaps ``status.csv``), a pose file, a
+        COLMAP model, or image -> pose; poses in memory are ``cam_from_world`` in the frame of the
+        truth, metres.
+    truth : a kapture folder, a pose file, a COLMAP model, or image -> ``cam_from_world``. Queries
+        that show nothing of the map are in the kapture folder's ``nowhere.txt``, one a line: they
+        are right without a pose.
     dataset : whose thresholds, conditions and pools hold; by default those of the side tables.
     side_tables : the workspace's ``megloc/`` folder: conditions, which images are scored, the
         protocol, and the world a pose file has to be brought back from; found beside truth or
@@ -64,6 +81,7 @@ def evaluate(
     mapping : kapture folder of the map, for MLAD's pairs and for the report's pictures; found in
         the workspace of ``estimated`` by itself.
     label : what the result is called in tables; by default its path.
+    align : sim3 and se3: align the poses with the truth first, robustly, with and without scale.
 
     Raises
     ------
@@ -73,7 +91,13 @@ def evaluate(
     benchmark = benchmark_beside([truth, estimated], side_tables=side_tables, dataset=dataset)
     labels = None if label is None else [label]
     return evaluate_results(
-        [estimated], truth, benchmark, thresholds=thresholds, mapping=mapping, labels=labels
+        [estimated],
+        truth,
+        benchmark,
+        thresholds=thresholds,
+        mapping=mapping,
+        labels=labels,
+        align=align,
     )[0]
 
 
@@ -99,6 +123,7 @@ def evaluate_results(
     thresholds: Sequence[Threshold] | None = None,
     mapping: Path | str | None = None,
     labels: Sequence[str] | None = None,
+    align: Align = "none",
 ) -> list[Evaluation]:
     """Evaluate several results against one truth, by one benchmark; in their order.
 
@@ -106,7 +131,7 @@ def evaluate_results(
 
     Parameters
     ----------
-    results, truth, thresholds, mapping : as in :func:`evaluate`.
+    results, truth, thresholds, mapping, align : as in :func:`evaluate`.
     labels : what the results are called; by default their paths, cut to what tells them apart.
 
     Raises
@@ -116,11 +141,14 @@ def evaluate_results(
     if isinstance(truth, Mapping):
         true_poses: Poses = result_in_memory(truth).poses
     else:
-        true_poses = KaptureFolder(Path(truth)).read().poses()
+        true_poses = read_poses(Path(truth))
     nowhere = () if isinstance(truth, Mapping) else read_nowhere(truth)
     contexts = [_context(source, mapping) for source in results]
-    _check_metres(contexts)
     relative = benchmark.protocol.pose_file == "mlad" and bool(benchmark.pairs)
+    if align == "none":
+        _warn_of_unit(contexts)
+    elif relative:
+        raise OptionError("--align: the challenge compares relative poses, which need none")
     references = first_map_poses(contexts) if relative else {}
     if relative and not references:
         raise DataError(
@@ -132,7 +160,10 @@ def evaluate_results(
     read = _read(results, benchmark, contexts, labels, true_poses, references)
     if not isinstance(truth, Mapping) and side_tables_near(truth) is None:
         true_poses = _in_local_frame(true_poses, read, benchmark.world, truth)
-    for found in read:
+    if not relative:
+        true_poses = _by_names_of_results(true_poses, read, {*nowhere, *benchmark.names})
+    for result in read:
+        found, alignment = (result, "") if relative else _aligned(result, true_poses, align)
         if relative:
             evaluation = evaluate_pairs(
                 found.poses_of_pairs(benchmark.pairs),
@@ -160,7 +191,8 @@ def evaluate_results(
                 covariances=found.covariances,
             )
         known_by = benchmark.protocol.truth
-        evaluations.append(replace(evaluation, truth_known_by=known_by, context=found.context))
+        evaluation = replace(evaluation, truth_known_by=known_by, context=found.context)
+        evaluations.append(replace(evaluation, alignment=alignment))
     return evaluations
 
 
@@ -189,7 +221,7 @@ def results_without_truth(
     """
     contexts = [_context(source, mapping) for source in results]
     if len(contexts) > 1:
-        _check_metres(contexts)
+        _warn_of_unit(contexts)
     if map_poses is None:
         map_poses = first_map_poses(contexts)
     known = {image for context in contexts for image in context.query_images()}
@@ -230,6 +262,26 @@ def _read(
     return found
 
 
+def _by_names_of_results(
+    true_poses: Poses, results: Sequence[Result], known: Collection[str]
+) -> Poses:
+    """True poses by the images' names in the results, where these have other folders.
+
+    Raises DataError: a result with poses has no name in common with the truth.
+    """
+    images = {image for result in results for image in result.images}
+    if not images & true_poses.keys():
+        true_poses = poses_by_image(true_poses, images)
+    for result in results:
+        if result.poses and not (true_poses.keys() | known) & set(result.images):
+            raise DataError(
+                f"no name fits: the result has {min(result.images)!r}, the truth "
+                f"{min(true_poses, default='nothing')!r}"
+                + (f" ({result.label})" if result.label else "")
+            )
+    return true_poses
+
+
 def _in_local_frame(
     true_poses: Poses, results: Sequence[Result], world: World, truth: Path | str
 ) -> Poses:
@@ -264,14 +316,40 @@ def _context(source: Localized, mapping: Path | str | None) -> ResultContext:
     )
 
 
-def _check_metres(contexts: Sequence[ResultContext]) -> None:
-    """Raise DataError where poses are of a map without metres: no threshold applies to them."""
-    for context in contexts:
-        if context.unit != METRES:
-            raise DataError(
-                f"the poses are in {context.unit} of a map whose scale is not known, thresholds "
-                "are in metres; `megloc map --scale` makes a map in metres"
-            )
+def _warn_of_unit(contexts: Sequence[ResultContext]) -> None:
+    if any(context.unit != METRES for context in contexts):
+        _log.warning("the poses are in units of a map of unknown scale, which count as metres")
+
+
+def _aligned(result: Result, true_poses: Poses, align: Align) -> tuple[Result, str]:
+    """The result, aligned if asked for, and a sentence on the alignment, which may be empty."""
+    images = sorted(result.poses.keys() & true_poses.keys())
+    estimated = stack_poses(result.poses[image] for image in images)
+    true = stack_poses(true_poses[image] for image in images)
+    try:
+        found = align_poses(estimated, true, with_scale=align != "se3")
+    except DataError:
+        if align == "none":
+            return result, ""
+        raise
+    number = int(found.agrees.sum())
+    kind = "a rigid transform" if align == "se3" else f"a similarity of scale {found.scale:.6g}"
+    if align == "none":
+        fits = number >= _MIN_AGREEING and 2 * number > len(images)
+        if not fits or 2 * found.agreed_before.sum() > number:
+            return result, ""
+        agree = f"{number} of {len(images)} poses agree"
+        return result, f"the results fit the truth after {kind} ({agree}): --align sim3"
+    target_from_source = found.target_from_source
+    similarity = SimilarityTransform(
+        quat_wxyz=target_from_source.quat_wxyz,
+        translation=target_from_source.translation,
+        scale=found.scale,
+    )
+    world = World(official_from_local=similarity)
+    moved = {image: world.pose_in_official(pose) for image, pose in result.poses.items()}
+    told = f"aligned with the truth by {kind}, with which {number} of {len(images)} poses agree"
+    return replace(result, poses=moved), told
 
 
 def _labels(results: Sequence[Localized]) -> list[str]:

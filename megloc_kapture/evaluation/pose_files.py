@@ -19,10 +19,11 @@ import hashlib
 import logging
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
+from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
 
@@ -121,39 +122,61 @@ def write_pose_file(path: Path | str, poses: Poses, *, names: Names = "full") ->
 
 
 def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
-    """Read a pose file, ours or foreign: name -> ``cam_from_world``, in the file's order.
+    """Read a pose file or COLMAP's ``images.txt``: name -> ``cam_from_world``, in the file's order.
 
-    Runs of spaces, tabs and CRLF line ends are taken; empty lines are passed over.
+    Runs of spaces, tabs and CRLF line ends are taken; empty lines and comments are passed over. A
+    row of nan, or with a quaternion of zeros, is how other tools write a query that failed: it is
+    left out, and a warning is logged.
 
     Raises
     ------
-    DataError : not eight columns, a number that is none or not finite, a quaternion off unit
-        length by 1e-3 or more (below, it is normalised), a name given twice, or a last line
-        that is not ended: it may be cut short. Names file and line.
+    DataError : not eight columns, a number that is none, a quaternion off unit length by 1e-3 or
+        more (below, it is normalised), or a name given twice. Names file and line.
     """
-    lines = read_text(path).split("\n")
-    if lines.pop() != "":
-        raise DataError(
-            "the last line is not ended, so the file may be cut short; add a newline if it is not",
-            path=path,
-            line=len(lines) + 1,
-        )
-    poses: dict[str, RigidTransform] = {}
-    for number, line in enumerate(lines, start=1):
-        fields = line.split()
-        if not fields:
-            continue
+    text = read_text(path)
+    rows = (_colmap_rows if is_colmap_images(text) else _rows)(text)
+    poses: dict[str, RigidTransform | None] = {}
+    for number, fields in rows:
         name = fields[0]
         try:
             if len(fields) != 8:
                 raise DataError(f"{len(fields)} columns instead of 8 ({COLUMNS})")
             if name in poses:
                 raise DataError(f"{name!r} is given twice")
-            qw, qx, qy, qz, tx, ty, tz = (parse_number(field) for field in fields[1:])
-            poses[name] = checked_pose((qw, qx, qy, qz), (tx, ty, tz), repr(name))
+            qw, qx, qy, qz, tx, ty, tz = values = [parse_number(field) for field in fields[1:]]
+            failed = not np.isfinite(values).all() or not any(values[:4])
+            poses[name] = (
+                None if failed else checked_pose((qw, qx, qy, qz), (tx, ty, tz), repr(name))
+            )
         except DataError as error:
             raise DataError(error.message, path=path, line=number) from error
-    return poses
+    if failures := [name for name, pose in poses.items() if pose is None]:
+        message = "%s: rows of nan or zeros are queries without a pose: %d, the first is %s"
+        _log.warning(message, path, len(failures), failures[0])
+    return {name: pose for name, pose in poses.items() if pose is not None}
+
+
+def is_colmap_images(text: str) -> bool:
+    """Whether a text is COLMAP's ``images.txt``: ID QW QX QY QZ TX TY TZ CAMERA_ID NAME."""
+    _, fields = next(_rows(text), (0, []))
+    return len(fields) >= 10 and fields[0].isdecimal() and fields[8].isdecimal()
+
+
+def _rows(text: str) -> Iterator[tuple[int, list[str]]]:
+    """Line numbers and columns, without empty lines and comments."""
+    for number, line in enumerate(text.split("\n"), start=1):
+        if (fields := line.split()) and not fields[0].startswith("#"):
+            yield number, fields
+
+
+def _colmap_rows(text: str) -> Iterator[tuple[int, list[str]]]:
+    """The rows of ``images.txt`` in the order of a pose file's columns."""
+    lines = iter(enumerate(text.split("\n"), start=1))
+    for number, line in lines:
+        if (fields := line.split(maxsplit=9)) and not fields[0].startswith("#"):
+            next(lines, None)  # the image's keypoints
+            name = fields.pop().strip() if len(fields) == 10 else ""
+            yield number, [name, *fields[1:8]]
 
 
 def poses_by_image(
@@ -164,9 +187,9 @@ def poses_by_image(
     """Give the poses of a pose file the names that ``images`` bear in kapture.
 
     A name of the challenge's list becomes its image. Of the others, one that is an image stays;
-    one that ends exactly one image's path becomes that image, where none fits also with another
-    ending (``.jpg`` for ``.png``, as servers take it); any other stays as it is, unknown, for the
-    evaluation to report.
+    one that ends exactly one image's path becomes that image, and so does one that ends with an
+    image's path; where none fits also with another ending (``.jpg`` for ``.png``, as servers take
+    it); any other stays as it is, unknown, for the evaluation to report.
 
     Parameters
     ----------
@@ -190,6 +213,9 @@ def poses_by_image(
         fitting = [name] if name in known else by_end.get(name, [])
         if name in listed:
             fitting = [listed[name]]
+        if not fitting:
+            longer = (end for end in _ends(name)[1:] if end in known and end not in poses)
+            fitting = list(islice(longer, 1))
         if not fitting:
             alike = by_stem.get(_stem(name), {name})
             fitting = list(alike) if len(alike) == 1 else [name]

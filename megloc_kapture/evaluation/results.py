@@ -24,6 +24,7 @@ from megloc_kapture.evaluation.pose_files import (
     timestamp_of,
 )
 from megloc_kapture.evaluation.protocols import Benchmark
+from megloc_kapture.io.colmap import read_model_poses
 from megloc_kapture.io.dataset_tables import (
     METRES,
     PROTOCOL_FILE,
@@ -64,6 +65,7 @@ _MANIFESTS = "stages"
 _QUERY, _QUERY_MATCHES = "query", "matches/query"
 _QUERY_PYRAMID, _MAPPING_PYRAMID = "pyramid/query", "pyramid/mapping"
 _SENSORS = "sensors/sensors.txt"
+_MODELS = ("images.bin", "images.txt")
 # images that were prepared for features, with masks; keypoints stand in their pixels
 _PREPARED, _ROLES, _MASKS = "preprocessed", ("mapping", "query"), "sensors/masks"
 
@@ -267,8 +269,8 @@ def read_result(
 
     Parameters
     ----------
-    source : a localized kapture folder, a pose file, or (where the benchmark has MLAD's pairs) a
-        pose file of the MLAD challenges or a folder with several.
+    source : a localized kapture folder, a pose file, a COLMAP model, or (where the benchmark has
+        MLAD's pairs) a pose file of the MLAD challenges or a folder with several.
     images : those that the short names of a pose file may stand for.
     references : ``cam_from_world`` of the map's images, for MLAD's pose files.
 
@@ -282,17 +284,40 @@ def read_result(
         by_pair = _read_mlad(path, benchmark.pairs, references or {}, benchmark.world)
         poses = {pair.query: pose for pair, pose in by_pair.items()}
         return Result(label, poses, tuple(sorted(poses)), by_pair=by_pair)
-    if path.is_dir():
+    if path.is_dir() and model_of(path) is None:
         data = KaptureFolder(path).read()
         found = _in_frame_of(benchmark.world, data.poses(), path)
         rows = _if_there(read_status, path / STATUS_FILE)
         covariances = _if_there(read_covariances, path / COVARIANCE_FILE) or {}
         images = tuple(sorted(data.image_names()))
         return Result(label, found, images, rows, covariances=covariances)
-    poses = poses_by_image(read_pose_file(path), images, benchmark.names)
+    poses = poses_by_image(read_poses(path), images, benchmark.names)
     if benchmark.world != World():
         poses = {image: benchmark.world.pose_in_local(pose) for image, pose in poses.items()}
     return Result(label, poses, tuple(sorted(poses)), confidences=read_confidences(path))
+
+
+def read_poses(source: Path) -> dict[str, RigidTransform]:
+    """Read ``cam_from_world`` by name of a kapture folder, a COLMAP model or a pose file.
+
+    Raises
+    ------
+    DataError : missing or broken.
+    """
+    if not source.exists():
+        raise DataError("no such file or folder", path=source)
+    if (model := model_of(source)) is not None:
+        images = model / "images.txt"
+        return read_model_poses(model) if not images.is_file() else read_pose_file(images)
+    return KaptureFolder(source).read().poses() if source.is_dir() else read_pose_file(source)
+
+
+def model_of(folder: Path) -> Path | None:
+    """The folder of the COLMAP model in a folder; None where there is none, and of kapture's."""
+    if (folder / _SENSORS).is_file():
+        return None
+    places = (folder, folder / "sparse", folder / "sparse" / "0")
+    return next((p for p in places for n in _MODELS if (p / n).is_file()), None)
 
 
 def result_in_memory(

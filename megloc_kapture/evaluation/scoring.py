@@ -158,6 +158,7 @@ class Evaluation(Reported):
         and stand in no row.
     by_center : of MLAD's pairs, the same queries' evaluation by the distance of the camera centres;
         None where that is the position error anyway.
+    alignment : how the poses were aligned with the truth, or that they could be.
     """
 
     label: str
@@ -176,6 +177,7 @@ class Evaluation(Reported):
     covariance: CovarianceCheck | None = None
     by_center: Evaluation | None = None
     context: ResultContext = field(default_factory=ResultContext)
+    alignment: str = ""
 
     @property
     def confidence(self) -> Confidence | None:

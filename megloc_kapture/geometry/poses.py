@@ -30,6 +30,10 @@ _FLATTENING = 1 / 298.257223563
 _ECCENTRICITY_SQUARED = _FLATTENING * (2 - _FLATTENING)
 _LATITUDE_ROUNDS = 8  # each gains more than two digits
 _ALIGNING_ROUNDS = 50
+_ALIGNING_PAIRS = 200  # with half of the poses right, every fourth pair is
+# of a pose with an alignment; by chance one of 30,000 rotations is as near
+_AGREEMENT_DEG = 5.0
+_AGREEMENT_OF_SPREAD = 0.1  # of the centres' median distance from their median
 # how far the positions have to spread in two directions, in residuals, to tell scale and axes
 _MIN_SPREAD = 3.0
 # receivers of phones claim no better; residuals of three positions may be smaller by chance
@@ -246,15 +250,103 @@ def align_to_earth(
     )
 
 
-def _similarity(source: Floats, target: Floats, weights: Floats) -> tuple[float, Floats, Floats]:
-    """``target = scale * rotation @ source + translation`` in weighted least squares."""
+@dataclass(frozen=True, eq=False)
+class PoseAlignment:
+    """Similarity between two estimates of the same cameras: ``target = R(scale * source) + t``.
+
+    ``agrees`` and ``agreed_before`` (N,) mark the poses that agree with and without it.
+    """
+
+    scale: float
+    target_from_source: RigidTransform
+    agrees: NDArray[np.bool_]
+    agreed_before: NDArray[np.bool_]
+
+
+def align_poses(
+    source: tuple[Floats, Floats], target: tuple[Floats, Floats], *, with_scale: bool = True
+) -> PoseAlignment:
+    """Align ``cam_from_source`` with ``cam_from_target``, robustly.
+
+    The similarity (without scale: the rigid transform) through a pair of poses that most poses
+    agree with, in rotation as well as in position, is fitted again to these poses.
+
+    Parameters
+    ----------
+    source, target : quaternions (N, 4) and translations (N, 3) of the same cameras.
+
+    Raises
+    ------
+    DataError : fewer than three poses, or all of them at one place.
+    """
+    number = len(source[0])
+    if number < 3:
+        raise DataError(f"{number} poses have a true pose; an alignment takes 3 or more")
+    centers = camera_centers(*source), camera_centers(*target)
+    axes = rotation_matrices(source[0]), rotation_matrices(target[0])
+    spread = np.median(np.linalg.norm(centers[1] - np.median(centers[1], axis=0), axis=1))
+
+    def fit(rows: NDArray[np.integer[Any]]) -> tuple[float, Floats, Floats]:
+        directions = tuple(one[rows].reshape(-1, 3) for one in axes)
+        a, b = (one[rows] for one in centers)
+        found = _similarity(a, b, np.ones(len(a)), directions)
+        if with_scale:
+            return found
+        return 1.0, found[1], b.mean(axis=0) - found[1] @ a.mean(axis=0)
+
+    def agreeing(scale: float, rotation: Floats, translation: Floats) -> NDArray[np.bool_]:
+        apart = np.linalg.norm(scale * centers[0] @ rotation.T + translation - centers[1], axis=1)
+        # the trace of rotation^T target_from_cam cam_from_source
+        cosines = (np.einsum("nij,jk,nik->n", axes[1], rotation, axes[0]) - 1) / 2
+        turned = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+        near = apart <= _AGREEMENT_OF_SPREAD * spread
+        return near & (turned <= _AGREEMENT_DEG) & (scale > 0)
+
+    rows = np.stack(np.triu_indices(number, 1), axis=1)
+    if len(rows) > _ALIGNING_PAIRS:
+        rows = np.random.default_rng(0).choice(rows, _ALIGNING_PAIRS, replace=False)
+    agrees = np.zeros(number, np.bool_)
+    for pair in rows:
+        if np.any(centers[0][pair[0]] != centers[0][pair[1]]):
+            more = agreeing(*fit(pair))
+            agrees = more if more.sum() > agrees.sum() else agrees
+    best = fit(np.flatnonzero(agrees) if agrees.sum() > 1 else np.arange(number))
+    for _ in range(_ALIGNING_ROUNDS):
+        more = agreeing(*best)
+        if more.sum() <= agrees.sum():
+            break
+        agrees, best = more, fit(np.flatnonzero(more))
+    scale, rotation, translation = best
+    return PoseAlignment(
+        scale,
+        RigidTransform.from_matrix(rotation, translation),
+        agreeing(*best),
+        agreeing(1.0, np.eye(3), np.zeros(3)),
+    )
+
+
+def _similarity(
+    source: Floats,
+    target: Floats,
+    weights: Floats,
+    directions: tuple[Floats, ...] = (np.zeros((0, 3)), np.zeros((0, 3))),
+) -> tuple[float, Floats, Floats]:
+    """``target = scale * rotation @ source + translation`` in weighted least squares.
+
+    ``directions`` (K, 3) in both frames also determine the rotation.
+    """
     from scipy.spatial.transform import Rotation
 
     means = [np.average(points, axis=0, weights=weights) for points in (source, target)]
     a, b = source - means[0], target - means[1]
-    rotation = Rotation.align_vectors(b, a, weights=weights)[0].as_matrix()
     spread = float((weights * (a**2).sum(axis=1)).sum())
     if spread == 0:
         raise DataError("the photographs were all taken at one place: there is no scale to tell")
+    sizes = [np.sqrt((points**2).sum() / len(points)) or 1.0 for points in (a, b)]
+    rotation = Rotation.align_vectors(
+        np.concatenate([b / sizes[1], directions[1]]),
+        np.concatenate([a / sizes[0], directions[0]]),
+        weights=np.concatenate([weights, np.ones(len(directions[0]))]),
+    )[0].as_matrix()
     scale = float((weights[:, None] * b * (a @ rotation.T)).sum()) / spread
     return scale, rotation, means[1] - scale * rotation @ means[0]

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from shutil import disk_usage
+from shutil import disk_usage, rmtree
 from typing import Any
 
 import numpy as np
@@ -433,3 +433,55 @@ def write_model(
         model.write(str(output))
     except (OSError, RuntimeError, ValueError) as error:
         raise OutputError(f"{output}: COLMAP cannot write its model: {error}") from error
+
+
+def read_model_poses(model: Path) -> dict[str, RigidTransform]:
+    """Read ``cam_from_world`` by image name of a binary model, whose points need not be there.
+
+    Raises
+    ------
+    DataError : the model is broken.
+    """
+    with tempfile.TemporaryDirectory(prefix=f".{owned_name()}") as folder:
+        for file in model.glob("*.bin"):
+            if file.name != "points3D.bin":
+                (Path(folder) / file.name).symlink_to(file.resolve())
+        (Path(folder) / "points3D.bin").write_bytes(bytes(8))  # of no point
+        try:
+            images = load_pycolmap().Reconstruction(folder).images.values()
+        except (OSError, RuntimeError, ValueError, IndexError) as error:
+            raise DataError(f"COLMAP cannot read the model: {error}", path=model) from error
+    poses = {}
+    for image in images:
+        if image.has_pose:
+            pose = image.cam_from_world()
+            x, y, z, w = pose.rotation.quat.tolist()
+            tx, ty, tz = pose.translation.tolist()
+            poses[image.name] = RigidTransform((w, x, y, z), (tx, ty, tz))
+    return poses
+
+
+def undistort_model(model: Path, images: Path, output: Path) -> None:
+    """Write ``images/`` and ``sparse/0`` without distortion, keypoints included.
+
+    Raises
+    ------
+    DataError : COLMAP cannot read an image of the model.
+    OutputError : the folder cannot be written to.
+    """
+    pycolmap = load_pycolmap()
+    try:
+        with quiet_stderr():
+            pycolmap.undistort_images(str(output), str(model), str(images))
+        # only for COLMAP's own stereo
+        rmtree(output / "stereo")
+        for script in output.glob("run-colmap-*.sh"):
+            script.unlink()
+        (output / "sparse").rename(output / "0")
+        (output / "sparse").mkdir()
+        (output / "0").rename(output / "sparse" / "0")
+    except (OSError, RuntimeError, ValueError) as error:
+        raise OutputError(f"{output}: COLMAP cannot undistort the images: {error}") from error
+    for image in images.iterdir():
+        if not (output / "images" / image.name).is_file():
+            raise DataError("COLMAP cannot read the image", path=image.resolve())

@@ -45,6 +45,7 @@ from megloc_kapture.values import ClusterPose, Options, Pose, RefinementRow, Rig
 
 STATUS_FILE = "status.csv"
 COVARIANCE_FILE = "covariance.csv"
+POSES_FILE = "poses.csv"
 CLUSTERS_FILE = "clusters.csv"
 REFINEMENT_FILE = "refinement.csv"
 CONSISTENCY_FILE = "map_consistency.csv"

@@ -2,7 +2,7 @@
 
 colmap      a model, as COLMAP writes it
 nerfstudio  ``transforms.json`` and ``sparse_pc.ply``
-tum         ``timestamp tx ty tz qx qy qz qw``, as evo reads it
+tum         ``seconds tx ty tz qx qy qz qw``, as evo reads it
 kitti       twelve numbers, ``world_from_cam`` row by row, as evo reads it
 ply         points and camera frusta, which every viewer of meshes opens
 geojson     camera centres as points of WGS84 (RFC 7946)
@@ -14,10 +14,13 @@ ahead. nerfstudio's are OpenGL's: x right, y up, z back.
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
+import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -29,17 +32,20 @@ from megloc_kapture.errors import DataError, OptionError, OutputError, suggestio
 from megloc_kapture.evaluation.report.scene import corner_rays
 from megloc_kapture.geometry.cameras import principal_point_px
 from megloc_kapture.geometry.poses import earth_from_enu, geodetic
-from megloc_kapture.io.colmap import MapImage, write_model
+from megloc_kapture.io.colmap import MapImage, undistort_model, write_model
 from megloc_kapture.io.dataset_tables import read_world, tables_of
 from megloc_kapture.io.files import write_bytes
+from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.kapture.points import write_ply
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.map_making import kapture_of
 from megloc_kapture.preprocessing.frames import scaled_camera
+from megloc_kapture.stages.local_features import check_size
 from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
 
+_log = logging.getLogger(__name__)
 _MAP_COLOUR, _QUERY_COLOUR = (120, 120, 120), (220, 50, 32)
 # fx fy cx cy and distortion, by COLMAP's order of parameters
 _NERFSTUDIO: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -113,6 +119,29 @@ def export_colmap(scene: Scene, output: Path) -> None:
     write_model(output, images, observed, scene.points[:, :3], scene.points[:, 3:])
 
 
+def export_undistorted(scene: Scene, output: Path) -> None:
+    """Write PINHOLE cameras, ``images/`` and ``sparse/0``, as Gaussian splatting reads them.
+
+    The original program ignores the folders in images' names, so ``/`` becomes ``_``.
+
+    Raises
+    ------
+    DataError : an image is missing or has another size than its camera, or two would have one name.
+    """
+    images = [replace(image, name=image.name.replace("/", "_")) for image in scene.images]
+    for image in images:
+        if image.path is None or not image.path.is_file():
+            raise DataError(f"undistorting needs the file of {image.name!r}", path=image.path)
+        check_size(image_size(image.path), image.camera, image.path)
+    with tempfile.TemporaryDirectory(prefix=".megloc-", dir=output) as scratch:
+        model, links = Path(scratch) / "model", Path(scratch) / "images"
+        export_colmap(Scene(images, scene.points), model)
+        links.mkdir()
+        for image in images:
+            (links / image.name).symlink_to(Path(image.path or "").resolve())
+        undistort_model(model, links, output)
+
+
 def export_nerfstudio(scene: Scene, output: Path, *, beside: Path | None = None) -> None:
     """Write ``transforms.json``, with intrinsics per frame, and ``sparse_pc.ply``.
 
@@ -145,7 +174,7 @@ def export_nerfstudio(scene: Scene, output: Path, *, beside: Path | None = None)
 
 
 def export_tum(scene: Scene, output: Path) -> None:
-    """Write a TUM trajectory, timestamps as kapture has them.
+    """Write a TUM trajectory.
 
     Raises
     ------
@@ -163,7 +192,19 @@ def export_tum(scene: Scene, output: Path) -> None:
             "several images have one timestamp; choose one camera with --sensor: "
             f"{', '.join(sorted({image.sensor for image in scene.images}))}"
         )
-    write_bytes(output, "".join(f"{stamp} {row}\n" for stamp, row in rows).encode())
+    exponent = _exponent_of_seconds(max(stamps))
+    text = "".join(f"{Decimal(stamp).scaleb(exponent):f} {row}\n" for stamp, row in rows)
+    write_bytes(output, text.encode())
+
+
+def _exponent_of_seconds(timestamp: int) -> int:
+    """Return the power of ten that converts a timestamp to seconds.
+
+    Nanoseconds, microseconds and milliseconds since 1970 are recognised by their magnitude (each
+    limit is between 1973 and 5138); smaller numbers are seconds or frame numbers.
+    """
+    limits = ((10**17, -9), (10**14, -6), (10**11, -3))
+    return next((exponent for limit, exponent in limits if timestamp >= limit), 0)
 
 
 def export_kitti(scene: Scene, output: Path) -> None:
@@ -243,8 +284,8 @@ def frustum(camera: Camera, cam_from_world: RigidTransform, depth: float) -> NDA
 def _nerfstudio_camera(camera: Camera) -> Mapping[str, Any]:
     if camera.model not in _NERFSTUDIO:
         raise DataError(
-            f"nerfstudio has no camera model {camera.model}; undistort first "
-            "(`megloc preprocess --set undistort=true`)"
+            f"nerfstudio has no camera model {camera.model}; undistort first: it also reads what "
+            "`megloc export colmap --undistort` writes"
         )
     model, names = _NERFSTUDIO[camera.model]
     cx, cy = principal_point_px(camera)
@@ -277,6 +318,7 @@ def export(
     query: Path | str | None = None,
     sensor: str | None = None,
     origin: GeoOrigin | None = None,
+    undistort: bool = False,
     force: bool = False,
 ) -> int:
     """Write a map, localized queries, or both in the format of another tool.
@@ -290,6 +332,8 @@ def export(
     sensor : images of this camera only.
     origin : of geojson, where the world's origin lies on earth; a map of photographs whose
         positions were known brings it.
+    undistort : of colmap: write undistorted images and their model, as programs for Gaussian
+        splatting read them: ``images/`` and ``sparse/0`` with PINHOLE cameras.
 
     Returns
     -------
@@ -305,6 +349,8 @@ def export(
         raise OptionError(f"unknown format {name!r}; {suggestion(name, get_args(ExportFormat))}")
     if map is None and query is None:
         raise OptionError("nothing to export: give a map, or localized queries")
+    if undistort and name != "colmap":
+        raise OptionError(f"--undistort is of colmap, not of {name}")
     if name == "geojson" and origin is None:
         origin = _origin_of(map)
     if (name == "geojson") != (origin is not None):
@@ -319,7 +365,10 @@ def export(
     output = Path(output)
     if name in ("colmap", "nerfstudio"):
         with staged_output(output, kind=_KIND, force=force) as out:
-            if name == "colmap":
+            if undistort:
+                export_undistorted(scene, out)
+            elif name == "colmap":
+                _hint_at_undistort(scene)
                 export_colmap(scene, out)
             else:
                 export_nerfstudio(scene, out, beside=output)
@@ -335,6 +384,16 @@ def export(
     else:
         export_ply(scene, output)
     return len(scene.images)
+
+
+def _hint_at_undistort(scene: Scene) -> None:
+    models = {image.camera.model for image in scene.images}
+    if distorted := sorted(models - {"PINHOLE", "SIMPLE_PINHOLE"}):
+        _log.warning(
+            "programs for Gaussian splatting refuse %s cameras; --undistort writes PINHOLE "
+            "cameras and images/ for them",
+            distorted[0],
+        )
 
 
 def _origin_of(given: KaptureMap | Path | str | None) -> GeoOrigin | None:

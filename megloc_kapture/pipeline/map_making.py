@@ -37,6 +37,7 @@ from megloc_kapture.datasets.kapture_folders import import_mapping, mapping_file
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.colmap_mapping import MIN_IMAGES, Mapper
 from megloc_kapture.io.dataset_tables import (
+    METRES,
     NO_METRES,
     SIDE_TABLES,
     UNREGISTERED_FILE,
@@ -44,6 +45,7 @@ from megloc_kapture.io.dataset_tables import (
     read_unreadable,
     read_world,
     write_protocol,
+    write_unit,
     write_unreadable,
 )
 from megloc_kapture.io.files import (
@@ -331,7 +333,7 @@ def _too_few(number: int, unreadable: Mapping[str, str]) -> DataError:
 
 
 _STAMP = "colmap.json"
-_VERSION = 1  # of the import: another one makes all maps anew
+_VERSION = 2  # of the import: another one makes all maps anew
 
 
 class _Stamp(BaseModel):
@@ -347,9 +349,14 @@ def colmap_maps_folder() -> Path:
     return user_cache() / "maps"
 
 
-def import_colmap(source: ColmapFolders, output: Path, *, work: Work = HERE) -> dict[str, float]:
+def import_colmap(
+    source: ColmapFolders, output: Path, *, unit: str = NO_METRES, work: Work = HERE
+) -> dict[str, float]:
     """Write a COLMAP reconstruction as a kapture map; ``output`` is empty.
 
+    A model does not say its scale, so its unit is unknown unless given.
+
+    A model of poses alone, without points, images and database, becomes a kapture folder of poses.
     Where the model's features cannot be had (no points; no database, and no SIFT), its images are
     mapped anew with its poses, by the default preset, and a warning is logged.
 
@@ -362,6 +369,16 @@ def import_colmap(source: ColmapFolders, output: Path, *, work: Work = HERE) -> 
     DataError : see :class:`~megloc_kapture.datasets.colmap_map.ColmapReconstruction`.
     """
     read = ColmapReconstruction.read(source)
+    if unit != METRES:
+        write_unit(output, unit)
+    if source.images is None and source.database is None and not len(read.model.points):
+        _log.warning(
+            "%s has no points, no images and no database: it becomes a kapture folder of poses, "
+            "not a map (`megloc import colmap --images` or `--database` give it features)",
+            source.model,
+        )
+        read.write_images(output)
+        return {"images": len(read.names), "points": 0}
     try:
         return read.write_map(output, work=work)
     except OtherFeaturesError as error:

@@ -24,6 +24,7 @@ from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_
 from megloc_kapture.io.tables import (
     CLUSTERS_FILE,
     COVARIANCE_FILE,
+    POSES_FILE,
     REFINEMENT_FILE,
     STATUS_FILE,
     Fallback,
@@ -49,7 +50,8 @@ def write_localized(
     first_candidates: dict[str, tuple[str, RigidTransform]] | None = None,
     timing: Path | None = None,
 ) -> dict[str, int]:
-    """Write the localized queries as kapture, with ``status.csv`` and ``clusters.csv`` beside it.
+    """Write the localized queries as kapture, with ``status.csv``, ``poses.csv`` and
+    ``clusters.csv`` next to them.
 
     ``covariance.csv`` has the covariances of the localized poses. Where pose refiners were at work,
     ``refinement.csv`` says what each made of a pose. A query whose focal length was estimated gets
@@ -88,7 +90,9 @@ def write_localized(
             poses[record] = result.cam_from_world
         elif guess is not None:
             poses[data.record_of(image)] = guess[1]
-    write_sensors(output, KaptureData(sensors=sensors, trajectories=poses, records_camera=records))
+    localized = KaptureData(sensors=sensors, trajectories=poses, records_camera=records)
+    write_sensors(output, localized)
+    write_poses(output / POSES_FILE, localized.poses())
     if isinstance(query, KaptureFolder):
         link_images(query.root, output)
     write_status(output / STATUS_FILE, statuses)
@@ -111,6 +115,16 @@ def write_localized(
         "failed": len(named) - len(found),
         "fallbacks": len(poses) - len(found),
     }
+
+
+def write_poses(path: Path, poses: Mapping[str, RigidTransform]) -> None:
+    """Write ``poses.csv``: ``cam_from_world`` and the camera's centre in the world by image."""
+    columns = ("image", "qw", "qx", "qy", "qz", "tx", "ty", "tz")
+    rows = (
+        (image, *map(repr, (*pose.quat_wxyz, *pose.translation, *pose.center().tolist())))
+        for image, pose in sorted(poses.items())
+    )
+    write_csv_table(path, (*columns, "center_x", "center_y", "center_z"), rows)
 
 
 def write_timing(path: Path, results: Iterable[tuple[str, Pose | Failure]]) -> None:

@@ -24,6 +24,7 @@ from megloc_kapture.io.tables import (
     CLUSTERS_FILE,
     CONSISTENCY_FILE,
     COVARIANCE_FILE,
+    POSES_FILE,
     REFINEMENT_FILE,
     STATUS_FILE,
     ConsistencyRow,
@@ -54,7 +55,7 @@ from megloc_kapture.refinement.references import (
     spread_names,
 )
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.localized_folder import plain_result, pose_of, write_timing
+from megloc_kapture.stages.localized_folder import plain_result, pose_of, write_poses, write_timing
 from megloc_kapture.stages.scene import KaptureScene, image_inputs
 from megloc_kapture.stages.stage import (
     LOCALIZED,
@@ -137,10 +138,11 @@ class MapRefiners:
     def __init__(
         self, mapping: KaptureFolder, restrictions: Restrictions, options: PoseRefinementOptions
     ) -> None:
-        if options.refines() and (unit := unit_of(mapping.root)) != METRES:
+        if options.refines() and unit_of(mapping.root) != METRES:
             raise OptionError(
-                f"pose_refinement.by {options.by[0].name}: its limits are in metres, the map is in "
-                f"{unit} of its own; `megloc map --scale` makes a map in metres"
+                f"pose_refinement.by {options.by[0].name}: its limits are in metres, and the map's "
+                "scale is not known; `megloc map --scale` makes a map in metres, `megloc import "
+                "colmap --unit m` says that a COLMAP model is in metres"
             )
         self.refiners = tuple(options.make_refiners())
         self.map = FolderSpec(mapping)
@@ -395,7 +397,9 @@ def _write(
     poses = dict(data.trajectories)
     for image, refined in found.items():
         poses[data.record_of(image)] = refined.cam_from_world
-    write_sensors(output, replace(data, trajectories=poses))
+    refined_data = replace(data, trajectories=poses)
+    write_sensors(output, refined_data)
+    write_poses(output / POSES_FILE, refined_data.poses())
     link_images(localized.root, output)
     for image, refined in found.items():
         told = {"refinement": refinement_text(refined.refinements)}

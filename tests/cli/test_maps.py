@@ -58,27 +58,28 @@ def test_a_workspace_stands_for_its_map(megloc: Any, unposed: Path, tmp_path: Pa
 
 def test_every_command_says_units(megloc: Any, unposed: Path, scene: Path, tmp_path: Path) -> None:
     workspace, localized = unposed / "map", tmp_path / "localized"
-    assert "unit              none: units of its own" in megloc("info", workspace).out
+    assert "unit              units of the map" in megloc("info", workspace).out
     query = scene / "query" / "sensors" / "records_data"
     done = megloc("localize", "-i", workspace, "--images", query, "-o", localized)
     assert done.status == 0 and "4 of 4 queries" in done.out
     assert "positions are in units of the map" in done.err
     done = megloc("evaluate", "-i", localized, "-o", tmp_path / "report")
-    assert "the map is in units of its own" in done.out and " m\n" not in done.out
+    assert "the map's scale is not known" in done.out and " m\n" not in done.out
     page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
-    assert "The map is in units of its own" in page and "of the first candidate" not in page
+    assert "The map's scale is not known" in page and "of the first candidate" not in page
     truth = ("--gt", scene / "query_gt")
-    megloc("evaluate", "-i", localized, *truth).refused("thresholds are in metres")
-    shutil.copytree(localized, tmp_path / "copy", symlinks=True)
-    both = ("-i", localized, "-i", tmp_path / "copy")
-    megloc("evaluate", *both).refused("thresholds are in metres")
+    done = megloc("evaluate", "-i", localized, *truth)
+    assert "0.0 / 0.0" in done.out and "after a similarity of scale" in done.out
+    assert "units of a map of unknown scale" in done.err
+    done = megloc("evaluate", "-i", localized, *truth, "--align", "sim3")
+    assert "4 of 4 poses agree" in done.out and "100.0" in done.out
     assert json.loads(map_overview(KaptureMap.open(workspace / "map")))["unit"] == "units"
 
 
 def test_a_model_of_unknown_scale(megloc: Any, colmap_room: Path, tmp_path: Path) -> None:
-    for unit, told in (("units", "none: units of its own"), ("m", "metres")):
-        folder = tmp_path / unit
-        assert megloc("import", "colmap", colmap_room, "-o", folder, "--unit", unit).status == 0
+    for unit, told in (((), "units of the map"), (("--unit", "m"), "metres")):
+        folder = tmp_path / told
+        assert megloc("import", "colmap", colmap_room, "-o", folder, *unit).status == 0
         assert f"unit              {told}" in megloc("info", folder).out
 
 

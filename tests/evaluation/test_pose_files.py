@@ -147,8 +147,15 @@ def test_a_pose_that_must_not_be_handed_in(
         "\ufeffa.jpg 1 0 0 0 1.5 -0.2 3\n",
         "\n\na.jpg 1e0 0 0 0 1.5 -.2 +3\n\n",
         "a.jpg 1.0009 0 0 0 1.5 -0.2 3\n",
+        "a.jpg 1 0 0 0 1.5 -0.2 3",
+        "# name qw qx qy qz tx ty tz\na.jpg 1 0 0 0 1.5 -0.2 3\n",
+        "7 1 0 0 0 1.5 -0.2 3 4 a.jpg\n1.5 2.5 -1 3.5 4.5 17\n",
+        "# IMAGE_ID, QW, ...\n7 1 0 0 0 1.5 -0.2 3 4 a.jpg\n\n8 nan 0 0 0 0 0 0 4 b c.jpg\n",
     ],
-    ids=["tabs and crlf", "byte order mark", "empty lines", "slightly off unit length"],
+    ids=[
+        *("tabs and crlf", "byte order mark", "empty lines", "slightly off unit length"),
+        *("no newline at the end", "comment", "COLMAP's images.txt", "its header, a failure"),
+    ],
 )
 def test_foreign_habits_are_taken(tmp_path: Path, text: str) -> None:
     path = tmp_path / "poses.txt"
@@ -156,20 +163,24 @@ def test_foreign_habits_are_taken(tmp_path: Path, text: str) -> None:
     assert read_pose_file(path) == {"a.jpg": RigidTransform((1.0, 0.0, 0.0, 0.0), (1.5, -0.2, 3.0))}
 
 
+@pytest.mark.parametrize("row", ["nan nan nan nan nan nan nan", "0 0 0 0 0 0 0", "1 0 0 0 inf 0 0"])
+def test_rows_without_a_pose_are_misses(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, row: str
+) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text(f"{GOOD}b.jpg {row}\n")
+    assert list(read_pose_file(path)) == ["a.jpg"]
+    assert "rows of nan or zeros are queries without a pose: 1, the first is b.jpg" in caplog.text
+
+
 BROKEN = [
     ("b.jpg 1 0 0 0 1.5 -0.2", "7 columns instead of 8"),
     ("b.jpg 1 0 0 0 1.5 -0.2 3 4", "9 columns instead of 8"),
-    ("# name qw qx qy qz tx ty tz", "9 columns"),
     ("b.jpg, 1, 0, 0, 0, 1.5, -0.2, 3", "is not a number"),
     ("b.jpg 1 0 0 0 1.5 -0.2 x", "is not a number"),
     ("b.jpg 1 0 0 0 1_5 -0.2 3", "is not a number"),
     ("b.jpg 1 0 0 0 ١ -0.2 3", "'١' is not a number"),
-    ("b.jpg 1 0 0 0 nan -0.2 3", "not finite"),
-    ("b.jpg 1 0 0 0 1e999 -0.2 3", "not finite"),
-    ("b.jpg 1 0 0 0 inf -0.2 3", "not finite"),
-    ("b.jpg nan 0 0 0 1 -0.2 3", "not finite"),
     ("b.jpg 1 1 0 0 1 -0.2 3", "length 1.414"),
-    ("b.jpg 0 0 0 0 1 -0.2 3", "length 0"),
     ("b.jpg 1.0011 0 0 0 1 -0.2 3", "length 1.0011"),
     ("a.jpg 1 0 0 0 1 -0.2 3", "given twice"),
 ]
@@ -206,12 +217,8 @@ def test_broken_lines_are_named(
     assert caught.value.line == 3 and str(caught.value).startswith(f"{path}:3: ")
 
 
-def test_a_file_that_is_cut_short_or_no_text(tmp_path: Path) -> None:
+def test_a_file_that_is_no_text(tmp_path: Path) -> None:
     path = tmp_path / "poses.txt"
-    path.write_text(GOOD + "b.jpg 1 0 0 0 1.5 -0.2 3.14")
-    with pytest.raises(DataError, match="cut short") as caught:
-        read_pose_file(path)
-    assert caught.value.line == 2
     path.write_bytes(GOOD.encode() + b"\xff\xfe\n")
     with pytest.raises(DataError, match="UTF-8") as caught:
         read_pose_file(path)
@@ -281,6 +288,14 @@ def test_names_that_end_a_path_or_have_another_ending() -> None:
     assert list(poses_by_image(dict.fromkeys(strange, HERE), images)) == strange
     listed = {"v2/dawn/rear/1.jpg": "rear/1.png"}
     assert list(poses_by_image({"rear/1.jpeg": HERE}, images, listed)) == images[:1]
+
+
+def test_names_longer_than_the_queries() -> None:
+    longer = {"db/x/1.jpg": HERE, "/data/q/2.jpg": HERE, "x/q/3.jpg": HERE, "q/3.jpg": HERE}
+    found = poses_by_image(longer, ["1.jpg", "q/2.jpg", "q/3.jpg"])
+    assert list(found) == ["1.jpg", "q/2.jpg", "x/q/3.jpg", "q/3.jpg"]
+    with pytest.raises(DataError, match="in two ways"):
+        poses_by_image({"db/1.jpg": HERE, "query/1.jpg": HERE}, ["1.jpg"])
 
 
 def test_relative_poses_are_query_from_reference() -> None:

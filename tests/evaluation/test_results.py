@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial.transform import Rotation
 
 import megloc_kapture as megloc
 from megloc_kapture.errors import DataError, OptionError
@@ -314,3 +315,53 @@ def test_nothing_heavy_is_loaded_before_it_is_needed() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("kind", ["binary", "text", "images.txt", "without points"])
+def test_colmap_models_are_truth_and_result(
+    world: Any, truth: Path, tmp_path: Path, kind: str
+) -> None:
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model="PINHOLE", width=8, height=6, params=[5, 5, 4, 3], camera_id=1)
+    model.add_camera_with_trivial_rig(camera)
+    for number, (name, pose) in enumerate(world.truth.items(), start=1):
+        w, x, y, z = pose.quat_wxyz
+        rigid = pycolmap.Rigid3d(pycolmap.Rotation3d([x, y, z, w]), np.array(pose.translation))
+        image = pycolmap.Image(image_id=number, name=f"above/{name}", camera_id=1)
+        model.add_image_with_trivial_frame(image, rigid)
+    (folder := tmp_path / "sparse" / "0").mkdir(parents=True)
+    (model.write_binary if kind in ("binary", "without points") else model.write_text)(str(folder))
+    if kind == "without points":
+        (folder / "points3D.bin").unlink()
+    source = folder / "images.txt" if kind == "images.txt" else tmp_path
+    for row in (evaluate(source, truth).row(), evaluate(truth, source).row()):
+        assert row.num_localized == row.num_queries == len(world.truth)
+        assert row.median_position_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_names_that_do_not_fit_are_an_error(world: Any, truth: Path, tmp_path: Path) -> None:
+    write_pose_file(tmp_path / "poses.txt", {"other.jpg": RigidTransform.identity()})
+    with pytest.raises(DataError, match="no name fits: the result has 'other.jpg', the truth"):
+        evaluate(tmp_path / "poses.txt", truth)
+
+
+def test_alignment_is_reported_and_done() -> None:
+    rng = np.random.default_rng(0)
+    turns = Rotation.random(10, random_state=0).as_matrix()
+    true = {
+        f"{n}.jpg": RigidTransform.from_matrix(turn, rng.normal(size=3))
+        for n, turn in enumerate(turns)
+    }
+    world = World(official_from_local=SimilarityTransform(scale=3.7, translation=(9.0, -5.0, 2.0)))
+    moved = {name: world.pose_in_official(pose) for name, pose in true.items()}
+    found = evaluate(moved, true)
+    assert found.row().recall[-1].num_within == 0
+    assert "fit the truth after a similarity of scale 0.27027 (10 of 10" in str(found)
+    assert evaluate(moved, true, align="sim3").row().recall[0].num_within == 10
+    assert evaluate(moved, true, align="se3").row().recall[0].num_within < 10
+    by_chance = dict(zip(true, list(true.values())[::-1], strict=True))
+    assert not evaluate(by_chance, true).alignment
+    assert evaluate(by_chance, true, align="sim3").row().recall[0].num_within < 5
+    assert not evaluate(true, true).alignment

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.poses import (
     GeoPosition,
+    align_poses,
     align_to_earth,
     camera_centers,
     compose,
@@ -231,3 +232,32 @@ def test_positions_that_tell_no_scale(enu: NDArray[np.float64], known: int, reas
     positions = dict(list(on_earth(enu).items())[:known])
     with pytest.raises(DataError, match=reason):
         align_to_earth(in_map(enu), positions)
+
+
+@pytest.mark.parametrize("on_a_line", [False, True])
+def test_an_alignment_ignores_wrong_poses(on_a_line: bool) -> None:
+    """Of similarities, half of the poses right; a line of centres alone would not fix the roll."""
+    scale, turn, offset = 0.2, Rotation.random(random_state=1), np.array([100.0, -50.0, 7.0])
+    rng = np.random.default_rng(0)
+    centers = rng.normal(size=(40, 3)) * ([10.0, 0.0, 0.0] if on_a_line else 10.0)
+    rotations = Rotation.random(40, random_state=2)
+    target = scale * turn.apply(centers) + offset
+    target[20:] = rng.normal(size=(20, 3))
+
+    def poses(rotations: Rotation, centers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return rotations.as_quat()[:, [3, 0, 1, 2]], -rotations.apply(centers)
+
+    found = align_poses(poses(rotations, centers), poses(rotations * turn.inv(), target))
+    assert found.scale == pytest.approx(scale)
+    np.testing.assert_allclose(
+        found.target_from_source.matrix()[:3],
+        np.column_stack([turn.as_matrix(), offset]),
+        atol=1e-9,
+    )
+    assert found.agrees[:20].all() and found.agrees.sum() < 25 and not found.agreed_before.any()
+
+
+def test_an_alignment_takes_three_poses() -> None:
+    two = random_poses(0, 2)
+    with pytest.raises(DataError, match="takes 3 or more"):
+        align_poses(two, two)

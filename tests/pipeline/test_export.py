@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project
+from megloc_kapture.io.images import image_size, write_image
 from megloc_kapture.pipeline.export import (
     GeoOrigin,
     PosedImage,
@@ -20,6 +22,7 @@ from megloc_kapture.pipeline.export import (
     export_geojson,
     export_nerfstudio,
     export_tum,
+    export_undistorted,
     frustum,
 )
 from megloc_kapture.values import Camera, RigidTransform
@@ -120,6 +123,60 @@ def test_cameras_of_nerfstudio(camera: Camera, tmp_path: Path) -> None:
     np.testing.assert_allclose(pixels.reshape(-1, 2), expected, atol=1e-8)
 
 
+@pytest.mark.parametrize(
+    ("timestamp", "column"),
+    [
+        (1602074877390449152, "1602074877.390449152"),
+        (1602074877390449, "1602074877.390449"),
+        (1602074877390, "1602074877.390"),
+        (1602074877, "1602074877"),
+        (17, "17"),
+    ],
+    ids=["ns", "us", "ms", "s", "frame number"],
+)
+def test_tum_has_seconds(timestamp: int, column: str, tmp_path: Path) -> None:
+    export_tum(
+        scene(image(Camera.pinhole(6, 4, 5), RigidTransform.identity(), timestamp=timestamp)),
+        tmp_path / "a.tum",
+    )
+    assert (tmp_path / "a.tum").read_text().split()[0] == column
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        Camera("SIMPLE_RADIAL", 640, 480, (500, 320, 240, -0.1)),
+        Camera("OPENCV_FISHEYE", 640, 480, (400, 410, 320, 240, 0.1, 0.01, 0.0, 0.0)),
+        Camera("PINHOLE", 640, 480, (500, 510, 320, 240)),
+    ],
+    ids=lambda camera: camera.model,
+)
+def test_undistorted_model_for_gaussian_splatting(camera: Camera, tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    rng, pose = np.random.default_rng(0), RigidTransform.identity()
+    points = np.concatenate([rng.uniform((-1, -1, 3), (1, 1, 5), (20, 3)), np.ones((20, 3))], 1)
+    rows = np.arange(20)
+    images = []
+    for name in ("left/a.png", "right/a.png"):
+        (tmp_path / name).parent.mkdir()
+        write_image(tmp_path / name, rng.integers(0, 255, (480, 640, 3), np.uint8))
+        pixels = project(camera, pose, points[:, :3])
+        posed = image(camera, pose, path=tmp_path / name)
+        images.append(replace(posed, name=name, keypoints_px=pixels, rows=rows, points=rows))
+    (out := tmp_path / "out").mkdir()
+    export_undistorted(Scene(images, points), out)
+
+    model = pycolmap.Reconstruction(str(out / "sparse" / "0"))
+    model.update_point_3d_errors()
+    assert {found.model.name for found in model.cameras.values()} == {"PINHOLE"}
+    assert model.num_points3D() == 20 and model.compute_num_observations() == 40
+    assert model.compute_mean_reprojection_error() < 1e-4
+    for found in model.images.values():
+        assert found.name in ("left_a.png", "right_a.png")
+        assert image_size(out / "images" / found.name) == (found.camera.width, found.camera.height)
+    assert sorted(path.name for path in out.iterdir()) == ["images", "sparse"]
+
+
 def test_what_a_format_cannot_say_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").touch()
     odd = Camera("THIN_PRISM_FISHEYE", 640, 480, (500, 500, 320, 240, *[0.0] * 8))
@@ -128,6 +185,8 @@ def test_what_a_format_cannot_say_is_refused(tmp_path: Path) -> None:
         export_nerfstudio(scene(image(odd, pose, path=tmp_path / "a.jpg")), tmp_path)
     with pytest.raises(DataError, match="needs the file"):
         export_nerfstudio(scene(image(Camera.pinhole(6, 4, 5), pose)), tmp_path)
+    with pytest.raises(DataError, match="needs the file"):
+        export_undistorted(scene(image(Camera.pinhole(6, 4, 5), pose)), tmp_path)
     two = image(Camera.pinhole(6, 4, 5), pose), image(Camera.pinhole(6, 4, 5), pose)
     with pytest.raises(DataError, match="one timestamp"):
         export_tum(scene(*two), tmp_path / "a.tum")

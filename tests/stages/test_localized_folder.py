@@ -8,13 +8,16 @@ from typing import Any
 
 import kapture.io.csv
 import numpy as np
+import pandas
 import pytest
+from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import (
     CLUSTERS_FILE,
     COVARIANCE_FILE,
+    POSES_FILE,
     STATUS_FILE,
     read_clusters,
     read_covariances,
@@ -30,6 +33,17 @@ def test_localized_queries_are_a_kapture(world: Any, tmp_path: Path) -> None:
     folder = KaptureFolder(tmp_path)
     folder.validate(deep=True)  # the images are there too
     assert folder.read().poses() == {image: found.cam_from_world for image, found in results}
+    table = pandas.read_csv(tmp_path / POSES_FILE, index_col="image")
+    for image, found in results:
+        rotation = Rotation.from_quat(
+            table.loc[image, ["qx", "qy", "qz", "qw"]].to_numpy(copy=True)
+        )
+        expected = found.cam_from_world.rotation_matrix()
+        np.testing.assert_allclose(rotation.as_matrix(), expected, atol=1e-12)
+        moved = rotation.apply(
+            table.loc[image, ["center_x", "center_y", "center_z"]].to_numpy(copy=True)
+        )
+        np.testing.assert_allclose(-moved, table.loc[image, ["tx", "ty", "tz"]], atol=1e-9)
     theirs = kapture.io.csv.kapture_from_dir(str(tmp_path))
     assert len(theirs.trajectories) == 2 and len(list(theirs.records_camera.key_pairs())) == 2
     status = read_status(tmp_path / STATUS_FILE)

@@ -186,7 +186,14 @@ class Rows:
 def read_rows(path: Path, kind: PoseFileFormat) -> Rows:
     """Read what can be read of a pose file; DataError: nothing can, or it is no text in UTF-8."""
     _, columns, at = _FORMATS[kind]
-    poses, named, findings = _scan(read_text(path).split("\n"), kind)
+    text = read_text(path)
+    if pose_files.is_colmap_images(text):
+        raise DataError(
+            "this is COLMAP's images.txt, not a pose file; `megloc import colmap` of its folder "
+            "and `megloc submit` make one",
+            path=path,
+        )
+    poses, named, findings = _scan(text.split("\n"), kind)
     if read_content(path).startswith(BYTE_ORDER_MARK):
         message = "a byte order mark stands before the first name: a server may not find that query"
         findings.append(Finding("warning", "byte-order-mark", message, line=1))

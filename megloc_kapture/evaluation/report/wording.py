@@ -122,7 +122,7 @@ def criterion(evaluation: Evaluation) -> str:
 def notes(evaluation: Evaluation) -> list[str]:
     """Sentences a reader needs beside the table: fallbacks, images without truth, no overlap."""
     row = evaluation.row()
-    said = []
+    said = [evaluation.alignment] if evaluation.alignment else []
     if row.num_queries < FEW:
         said.append(
             f"too few queries ({row.num_queries}) to compare recall by: the intervals say how "
@@ -193,7 +193,7 @@ def covariance_sentence(check: CovarianceCheck) -> str:
 def no_retrieval(result: ResultWithoutTruth) -> str:
     """The reason why nothing is said about agreement with retrieval; empty where it is said."""
     if result.context.unit != METRES:
-        return f"the map is in {result.context.unit} of its own, so nothing is said about distances"
+        return "the map's scale is not known, so nothing is said about distances"
     if result.rows[-1].first_candidate is None:
         return (
             "no map or no ranked candidates are known, so nothing is said about agreement with "

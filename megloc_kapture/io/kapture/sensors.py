@@ -58,8 +58,14 @@ def read_kapture_data(root: Path, *, allow_links_below: Sequence[Path] = ()) -> 
     ------
     DataError : names file and line.
     """
-    if not root.is_dir():
+    if not root.exists():
         raise DataError("no such kapture folder", path=root)
+    if not (root / "sensors").is_dir():
+        raise DataError(
+            "no kapture folder: sensors/sensors.txt is missing. Photographs? `megloc localize "
+            "--images` localizes them, `megloc map` makes a map of them",
+            path=root,
+        )
     roots = (root, *allow_links_below)
 
     def read(name: str, reader: Callable[..., dict[Any, Any]], *known: Any) -> dict[Any, Any]:

@@ -172,7 +172,7 @@ def test_a_table_that_may_be_cut_short_is_told_once(
 def test_missing_and_unreadable_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="nothing: no such kapture folder"):
         read_kapture_data(tmp_path / "nothing")
-    with pytest.raises(DataError, match="sensors.txt: cannot read: the file is missing"):
+    with pytest.raises(DataError, match="no kapture folder.*Photographs.*--images.*megloc map"):
         read_kapture_data(tmp_path)
     make(tmp_path)
     os.mkfifo(tmp_path / "sensors" / "rigs.txt")  # opening it would wait for ever
