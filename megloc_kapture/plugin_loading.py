@@ -61,7 +61,7 @@ def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) ->
         option = ".".join(str(part) for part in first["loc"])
         reason = first["msg"]
         if model is not None and first["type"] == "extra_forbidden" and len(first["loc"]) == 1:
-            reason = f"unknown option; {suggestion(option, model.model_fields)}"
+            reason = f"{reason}; {suggestion(option, model.model_fields)}"
         raise PluginError(f"plugin {name!r} refuses its options: {option}: {reason}") from error
     except Exception as error:  # whatever a foreign constructor raises
         reason = " ".join(str(error).split())
