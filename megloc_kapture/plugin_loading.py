@@ -59,10 +59,9 @@ def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) ->
     except ValidationError as error:
         first = error.errors()[0]
         option = ".".join(str(part) for part in first["loc"])
-        reason = first["msg"]
-        if model is not None and first["type"] == "extra_forbidden" and len(first["loc"]) == 1:
-            reason = f"{reason}; {suggestion(option, model.model_fields)}"
-        raise PluginError(f"plugin {name!r} refuses its options: {option}: {reason}") from error
+        raise PluginError(
+            f"plugin {name!r} refuses its options: {option}: {first['msg']}"
+        ) from error
     except Exception as error:  # whatever a foreign constructor raises
         reason = " ".join(str(error).split())
         raise PluginError(f"plugin {name!r} refuses its options: {reason}") from error
