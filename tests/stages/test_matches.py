@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import Executor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +12,19 @@ import pytest
 
 from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.geometry.cameras import bearing_rays
-from megloc_kapture.io.kapture import ImagePair, KaptureFolder
+from megloc_kapture.io.kapture import ImagePair, KaptureFolder, write_sensors
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours, match_nearest
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import single_threaded
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import LOCAL_FEATURES
+from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import (
     FeatureCache,
     Features,
     NoVerification,
+    check_given_poses,
     iterate_candidates,
     match_all,
     match_pairs,
@@ -221,3 +226,35 @@ def test_candidates_come_best_first_and_ties_by_name() -> None:
         ImagePair("q1", "m1", 0.5),
     ]
     assert list(iterate_candidates(pairs)) == [("q1", ["m2", "m1", "m3"]), ("q2", ["m1"])]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("wrong", "told"), [(0, ""), (2, "matches: 0000.jpg, 0002.jpg"), (5, "No usual")]
+)
+def test_given_poses_of_photographs(
+    shared_data: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, wrong: int, told: str
+) -> None:
+    """Surveyed poses, and some replaced by chance ones: a warning up to half of the images."""
+    source = KaptureFolder(shared_data / "scenes" / "fountain_p11" / "mapping")
+    data, rng = source.read(), np.random.default_rng(0)
+    poses = dict(data.trajectories)
+    for key in list(poses)[:wrong]:
+        x, y, z, w = rng.normal(size=4)
+        quat = np.array([w, x, y, z]) / np.linalg.norm([w, x, y, z])
+        poses[key] = replace(poses[key], quat_wxyz=tuple(quat.tolist()))
+    write_sensors(tmp_path / "map", replace(data, trajectories=poses))
+    extractor = load_plugin(LOCAL_FEATURES, "rootsift", {"max_keypoints": 2000})
+    extract_local_features([source], extractor, tmp_path / "features")
+    mapping = KaptureFolder(tmp_path / "map", features_dirs=[tmp_path / "features"])
+    names = sorted(data.image_names())
+
+    def check(force: bool) -> None:
+        pairs, work = all_pairs(names, names), Work(force=force)
+        check_given_poses(mapping, pairs, "rootsift", NearestNeighbours(), work)
+
+    if wrong > 3:
+        with pytest.raises(DataError, match=told):
+            check(force=False)
+    check(force=wrong > 3)
+    assert told in caplog.text and bool(caplog.text) == (wrong > 0)
