@@ -208,11 +208,7 @@ class Photographs:
         self.folder, self._options = Path(folder), options
         if not self.folder.is_dir():
             raise DataError("no such folder", path=self.folder)
-        self._paths = [
-            path
-            for path in sorted(self.folder.rglob("*"))
-            if is_image(path)
-        ]
+        self._paths = [path for path in sorted(self.folder.rglob("*")) if is_image(path)]
         if not self._paths:
             raise DataError("no image in this folder", path=self.folder)
 
