@@ -13,6 +13,7 @@ import kapture.io.csv
 import numpy as np
 import pytest
 from kapture.converter.colmap.database import COLMAPDatabase
+from PIL import Image
 
 from megloc_kapture.datasets.colmap_map import (
     ColmapFolders,
@@ -327,6 +328,30 @@ def test_of_images_that_are_not_there_the_database_has_the_features(
     assert "1 of the model's 7 images are not here, the first is 0003.jpg" in caplog.text
     kept = found.descriptors("sift").read("0003.jpg")
     assert np.array_equal(kept, before.descriptors("sift").read("0003.jpg"))
+
+
+def test_the_map_is_as_large_as_its_images(
+    own: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole, _ = imported(find_colmap(own), tmp_path / "whole")
+    for path in [path for path in (own / "images").rglob("*") if path.is_file()]:
+        with Image.open(path) as image:
+            half = image.resize((image.width // 2, image.height // 2))
+        path.unlink()  # a link into the shared scene, perhaps
+        half.save(path)
+    found, _ = imported(find_colmap(own), tmp_path / "half")
+    assert f"{own / 'images'}: 1 cameras are scaled to their images" in caplog.text
+    name = found.read().image_names()[0]
+    large, small = whole.read().camera_of(name), found.read().camera_of(name)
+    assert (small.width, small.height) == (large.width // 2, large.height // 2)
+    np.testing.assert_allclose(small.params, np.array(large.params) / 2)
+    np.testing.assert_allclose(
+        found.keypoints("sift").read(name), whole.keypoints("sift").read(name) / 2
+    )
+    found.validate(deep=True)
+    Image.new("RGB", (50, 50)).save(own / "images" / name)
+    with pytest.raises(DataError, match=f"{own}.*{name}.*50x50, its camera says.*--images"):
+        imported(find_colmap(own), tmp_path / "third")
 
 
 def test_models_of_other_features_or_without_points_are_refused(own: Path, tmp_path: Path) -> None:

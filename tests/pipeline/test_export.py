@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from megloc_kapture.cli.info import describe_sizes
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.images import image_size, write_image
@@ -19,13 +20,17 @@ from megloc_kapture.pipeline.export import (
     GeoOrigin,
     PosedImage,
     Scene,
+    export,
     export_geojson,
     export_nerfstudio,
     export_tum,
     export_undistorted,
     frustum,
 )
+from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.values import Camera, RigidTransform
+
+import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
 NO_ROWS = np.zeros(0, np.int64)
 
@@ -200,3 +205,31 @@ def test_a_frustum_is_what_the_camera_sees() -> None:
     np.testing.assert_allclose(pose.apply(corners[1:])[:, 2], 2.0)
     expected = [(0, 0), (640, 0), (640, 480), (0, 480)]
     np.testing.assert_allclose(project(camera, pose, corners[1:]), expected, atol=1e-6)
+
+
+def test_cameras_and_keypoints_are_of_the_images_as_they_are(
+    map_copy: Path, tmp_path: Path
+) -> None:
+    opened = KaptureMap.open(map_copy)
+    name = opened.images[0]
+    camera, keypoints = opened.camera(name), opened.keypoints["rootsift"].keypoints_px(name)
+    records = map_copy / "sensors" / "records_data"
+    if records.is_symlink():
+        records.unlink()
+    for image in opened.folder.read().image_names():
+        write_image(records / image, np.zeros((camera.height // 2, camera.width // 2, 3), np.uint8))
+    scaled = KaptureMap.open(map_copy)
+    assert export("nerfstudio", tmp_path / "nerf", map=scaled) == len(opened.images)
+    frame = json.loads((tmp_path / "nerf" / "transforms.json").read_text())["frames"][0]
+    assert (frame["w"], frame["h"]) == (camera.width // 2, camera.height // 2)
+    assert frame["fl_x"] == pytest.approx(camera.params[0] / 2)
+    export("colmap", tmp_path / "colmap", map=scaled)
+    model = pycolmap.Reconstruction(str(tmp_path / "colmap"))
+    found = next(one for one in model.images.values() if one.name == name)
+    assert model.cameras[found.camera_id].width == camera.width // 2
+    xy = np.array([point.xy for point in found.points2D])
+    np.testing.assert_allclose(xy, keypoints[:, :2] / 2, atol=1e-3)
+    assert any("200x150, scaled from the 400x300" in text for text in describe_sizes(scaled.folder))
+    write_image(records / name, np.zeros((50, 50, 3), np.uint8))
+    with pytest.raises(DataError, match=f"{name}: the image is 50x50, its camera says"):
+        export("colmap", tmp_path / "refused", map=KaptureMap.open(map_copy))
