@@ -338,8 +338,8 @@ def _aligned(result: Result, true_poses: Poses, align: Align) -> tuple[Result, s
         fits = number >= _MIN_AGREEING and 2 * number > len(images)
         if not fits or 2 * found.agreed_before.sum() > number:
             return result, ""
-        agree = f"{number} of {len(images)} poses agree"
-        return result, f"the results fit the truth after {kind} ({agree}): --align sim3"
+        told = f"the results fit the truth after {kind}: --align sim3"
+        return result, f"{told} ({number} of {len(images)} poses agree)"
     target_from_source = found.target_from_source
     similarity = SimilarityTransform(
         quat_wxyz=target_from_source.quat_wxyz,

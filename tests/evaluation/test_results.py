@@ -358,7 +358,7 @@ def test_alignment_is_reported_and_done() -> None:
     moved = {name: world.pose_in_official(pose) for name, pose in true.items()}
     found = evaluate(moved, true)
     assert found.row().recall[-1].num_within == 0
-    assert "fit the truth after a similarity of scale 0.27027 (10 of 10" in str(found)
+    assert "fit the truth after a similarity of scale 0.27027: --align sim3" in str(found)
     assert evaluate(moved, true, align="sim3").row().recall[0].num_within == 10
     assert evaluate(moved, true, align="se3").row().recall[0].num_within < 10
     by_chance = dict(zip(true, list(true.values())[::-1], strict=True))

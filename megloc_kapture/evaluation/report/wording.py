@@ -193,7 +193,7 @@ def covariance_sentence(check: CovarianceCheck) -> str:
 def no_retrieval(result: ResultWithoutTruth) -> str:
     """The reason why nothing is said about agreement with retrieval; empty where it is said."""
     if result.context.unit != METRES:
-        return "the map's scale is not known, so nothing is said about distances"
+        return "the scale of the map is not known, so nothing is said about distances"
     if result.rows[-1].first_candidate is None:
         return (
             "no map or no ranked candidates are known, so nothing is said about agreement with "
