@@ -79,6 +79,11 @@ class RenderingOptions(Options):
         default=True,
         description="refine only where the map's own images, held out, would stay where they are",
     )
+    accept_always: bool = Field(
+        default=False,
+        description="take every pose that is found, without the tests of this pose; "
+        "require_consistent_map tests the map",
+    )
     min_significance: float = Field(
         default=2.5,
         ge=0,
@@ -143,6 +148,8 @@ def accept_or_keep(
         measures["claimed_m"] = float(np.sqrt(np.trace(uncertainty[3:, 3:])))
         measures["claimed_deg"] = float(np.degrees(np.sqrt(np.trace(uncertainty[:3, :3]))))
         measures["squared_distance"] = squared_distance(start, pose, uncertainty)
+    if options.accept_always:
+        return PoseRefinement(pose, "", measures, uncertainty)
     reason = _too_far(moved_m, turned_deg, options) or _no_better(comparison, overlaps, options)
     if reason:
         return PoseRefinement(start, reason, measures)

@@ -82,6 +82,11 @@ class IcpOptions(Options):
         gt=0,
         description="depth maps of the map, those that overlap most, one of views that are alike",
     )
+    accept_always: bool = Field(
+        default=False,
+        description="take every pose that is found, without a test of overlap, residual, movement "
+        "and condition",
+    )
     min_points: int = Field(
         default=1000, ge=NORMAL_NEIGHBOURS, description="in either cloud, of the finest voxels"
     )
@@ -145,7 +150,7 @@ def refine_by_icp(
     the map's planes, of points that have map within the coarsest distance), ``overlap_before`` and
     ``overlap_after`` (share of points that have map within the finest), ``moved_m``, ``moved_deg``
     and ``condition``, as far as it came; accepted only if residual and overlap improve and every
-    limit of the options holds. Its covariance is that of
+    limit of the options holds, or if ``accept_always`` is set. Its covariance is that of
     :func:`~megloc_kapture.refinement.icp_surface.fit_covariance`.
     """
     options = options or IcpOptions()
@@ -197,6 +202,8 @@ def _reason_to_skip(
     levels: Sequence[_Level], local_from_cam: RigidTransform, options: IcpOptions
 ) -> str:
     """Reason why fitting need not be tried; empty where it should be."""
+    if options.accept_always:
+        return ""
     spacing, limit = levels[-1].surface.spacing(), options.max_distances_m[-1]
     if spacing > limit:
         return (
@@ -245,6 +252,8 @@ def _movement(start: RigidTransform, end: RigidTransform) -> tuple[float, float]
 
 
 def _reason_too_far(start: RigidTransform, end: RigidTransform, options: IcpOptions) -> str:
+    if options.accept_always:
+        return ""
     moved_m, moved_deg = _movement(start, end)
     if moved_m > options.max_moved_m:
         return f"the pose moved by {moved_m:.3f} m, at most {options.max_moved_m:g} m is allowed"
@@ -260,6 +269,8 @@ def _reason_to_refuse(
     before: SurfaceFit, after: SurfaceFit, num_points: int, condition: float, options: IcpOptions
 ) -> str:
     """Reason why a refined pose is not taken; empty where it is."""
+    if options.accept_always and math.isfinite(condition):
+        return ""
     if after.overlap < options.min_overlap:
         return (
             f"{100 * after.overlap:.0f} % of the query's points are on the map, "

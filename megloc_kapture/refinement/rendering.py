@@ -300,7 +300,8 @@ class Rendering:
         self, image: str, images: ReferenceImages, scene: RankingScene
     ) -> Displacement | None:
         """Displacement of a map image; see :func:`~.references.refine_held_out`."""
-        displace = partial(displacement_by_rendering, options=self.options, features=self.features)
+        options = self.options.model_copy(update={"accept_always": False})
+        displace = partial(displacement_by_rendering, options=options, features=self.features)
         return refine_held_out(
             image, images, scene, displace, max_references=self.options.max_references
         )

@@ -242,6 +242,15 @@ def test_bounds_of_movement_and_overlap(furnished: Any) -> None:
     assert distance_m < 0.003 and angle_deg < 0.1
 
 
+def test_every_pose_that_is_found_may_be_taken(furnished: Any) -> None:
+    start = disturbed(0, 0.05, 3.0)
+    refused = IcpOptions(max_moved_m=0.04, min_overlap=1.0, max_condition=1.1)
+    assert not refine(furnished, start, refused).accepted
+    always = refused.model_copy(update={"accept_always": True})
+    expected = refine(furnished, start)
+    assert refine(furnished, start, always).cam_from_world == expected.cam_from_world != start
+
+
 def test_an_overlap_that_falls_by_the_noise_of_counting_is_as_good() -> None:
     def reason(overlap: float, residual_m: float, num_points: int) -> str:
         before: Any = SimpleNamespace(overlap=0.98, residual_m=0.004)

@@ -260,6 +260,8 @@ def test_each_bound_keeps_the_old_pose(case: Case) -> None:
     ):
         refined = run(case, start, **options)
         assert reason in refined.reason and refined.cam_from_world is start
+    refined = run(case, start, min_correlation=0.99, accept_always=True)
+    assert refined.accepted and refined.cam_from_world != start
     away = start_from(case.truth, 0, deg=180.0)
     assert "cover" in run(case, away).reason
 
