@@ -72,7 +72,7 @@ class Options(BaseModel):
         """Read ``none`` as None where an option may be None, and one name as a list of one."""
         if not isinstance(values, dict):
             return values
-        read = {}
+        read: dict[str, Any] = {}
         for key, value in values.items():
             field = cls.model_fields.get(key)
             annotation = None if field is None else field.annotation

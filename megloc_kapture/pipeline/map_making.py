@@ -177,7 +177,7 @@ class ImportPhotographs(Stage):
 
     def __init__(self, photographs: Photographs) -> None:
         super().__init__(Options())
-        self._photographs = photographs
+        self._photographs, self.root = photographs, photographs.root
 
     def external(self, hashes: Hashes) -> Mapping[str, str]:
         data, files = self._photographs.data(), self._photographs.files()
@@ -188,7 +188,8 @@ class ImportPhotographs(Stage):
             "unreadable": self._photographs.unreadable,
         }
         text = json.dumps(content, sort_keys=True, default=str)
-        return {"photographs": hashlib.sha256(text.encode()).hexdigest()}
+        fingerprint = hashlib.sha256(text.encode()).hexdigest()
+        return {"photographs": fingerprint, ROOT: str(self._photographs.root.resolve())}
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         write_sensors(work.out / MAPPING, self._photographs.data())

@@ -220,7 +220,7 @@ def _check_root(stage: Stage, workspace: Workspace) -> None:
         return
     if stage.root is None or str(stage.root.resolve()) != held:
         raise OptionError(
-            f"{workspace.root} is the workspace of {held}; give another --workspace for "
+            f"{workspace.root} was made of {held}; give another folder for "
             f"{stage.root or 'other data'}, or --force to replace its content"
         )
 

@@ -333,6 +333,7 @@ class Photographs(Queries):
 
     Attributes
     ----------
+    root : the first folder, or that of the first file.
     passed_over : files of the folders that are no images.
     without_row : images that the list of cameras does not have.
 
@@ -355,6 +356,7 @@ class Photographs(Queries):
             raise OptionError(f"every {every}th frame cannot be taken; give 1 or more")
         roots = [Path(path) for path in paths]
         files, self.passed_over = _named_files(roots)
+        self.root = roots[0] if roots[0].is_dir() else roots[0].parent
         self.without_row: list[str] = []
         self._calibrated = {k: v for root in roots for k, v in _calibrated(root).items()}
         self._scaled: list[tuple[Camera, Camera]] = []

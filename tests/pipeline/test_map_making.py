@@ -313,6 +313,14 @@ def test_two_scenes_are_two_models(
     assert all(reason.startswith("model 2, of 5 photographs") for reason in reasons.values())
 
 
+def test_a_map_of_other_photographs_is_not_replaced(
+    room: Path, made: megloc.Map, tmp_path: Path
+) -> None:
+    others = put(tmp_path / "others", images_of(room)[:4])
+    with pytest.raises(OptionError, match="was made of .*photos; give another folder"):
+        megloc.map_photographs(others, workspace=room / "workspace", **FEW)
+
+
 def test_what_makes_no_map_is_refused_with_the_reason(room: Path, tmp_path: Path) -> None:
     photos = sorted((room / "photos").iterdir())
     put(tmp_path / "few", photos[:2])

@@ -317,7 +317,7 @@ def test_data_of_another_root_do_not_replace_those_of_a_workspace(tmp_path: Path
         root.mkdir(parents=True)
     one, other = roots
     assert import_from(one) == import_from(one) == str(one)
-    with pytest.raises(OptionError, match=f"is the workspace of {one}; give another --workspace"):
+    with pytest.raises(OptionError, match=f"was made of {one}; give another folder"):
         import_from(other)
     assert import_from(other, force=True) == str(other)
     other.rename(tmp_path / "moved")  # nothing else than these data can be meant
