@@ -125,7 +125,7 @@ def test_files_of_the_repository_that_are_named_exist(page: Path) -> None:
 
 def paper_rows() -> list[list[str]]:
     """Cells of the rows of docs/paper.md that quote the paper."""
-    text = (REPOSITORY / "docs" / "paper.md").read_text().split("## What we added")[0]
+    text = (REPOSITORY / "docs" / "paper.md").read_text().split("## The paper's rules")[0]
     rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| ")]
     return [row for row in rows if row[0] != "step"]
 
