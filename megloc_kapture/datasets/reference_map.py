@@ -269,7 +269,7 @@ def _write_features(
         rows = order[ends[position] : ends[position + 1]]
         keypoints, numbers_of_image = features(name, rows)
         if name in scales:
-            keypoints = keypoints * np.float32(scales[name])
+            keypoints = keypoints * np.array(scales[name], np.float32)
         num_keypoints += len(keypoints)
         if len(keypoints) or with_empty:
             writer.write(name, keypoints)

@@ -22,7 +22,7 @@ from megloc_kapture.pipeline.query_folders import KaptureQueries, Photographs
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.preprocessing.frames import resized, scaled_camera
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import Camera, Pose, RigidTransform
 from tests.pipeline.runs import evaluated
 
 
@@ -298,10 +298,10 @@ def test_an_uncalibrated_camera_is_estimated(
     folder = KaptureFolder(folder.root, features_dirs=features)
     results = Results(Localizer(opened, options=options_of_preset(assignments=[FEW])), folder)
     found = results[first]
-    assert found and found.camera is not None
+    assert isinstance(found, Pose) and found.camera is not None
     assert abs(found.camera.params[0] / known.params[0] - 1) < 0.05
     others = [one for name, one in results.items() if name != first]
-    assert all(others) and all(one.camera is None for one in others)
+    assert all(isinstance(one, Pose) and one.camera is None for one in others)
     counts = results.save(folder.root.parent / "out")
     assert counts["localized"] == len(results)
     saved = KaptureFolder(folder.root.parent / "out").read()
