@@ -80,7 +80,7 @@ class Localize(Reading, Deciding, Common):
     def run(self, console: Console) -> None:
         self._check_queries()
         workers = available_cores() if self.workers is None else self.workers
-        path = opened_map(self.input, console)
+        path = opened_map(self.input, console, force=self.force)
         kapture_map = self.opening(path, self.keypoints_type, self.pixel_origin)()
         _check_consistent(kapture_map, self.input, force=self.force)
         options = _options_of(self)
@@ -169,7 +169,7 @@ class Serve(Reading, Deciding, Common):
         token = None if self.token_file is None else _read_token(self.token_file)
         options = _options_of(self)
         with bind(self.host, self.port) as bound:
-            path = opened_map(self.map, console)
+            path = opened_map(self.map, console, force=self.force)
             opening = self.opening(path, self.keypoints_type, self.pixel_origin)
             kapture_map = opening()
             _check_consistent(kapture_map, self.map, force=self.force)

@@ -92,7 +92,8 @@ def _split(pairs: Sequence[PairEvidence]) -> tuple[list[str], int]:
     before the next one is judged. Images of a single pair are not judged.
     """
     number = Counter(image for pair in pairs for image in (pair.image, pair.other))
-    wrong, left = [], list(pairs)
+    wrong: list[str] = []
+    left = list(pairs)
     while True:
         contradict: dict[str, list[bool]] = defaultdict(list)
         for pair in left:
