@@ -125,7 +125,7 @@ def refuse_given(of: str, **flags: object) -> None:
             raise OptionError(f"--{name.replace('_', '-')} changes nothing: it is of {of}")
 
 
-def opened_map(path: Path, console: Console) -> Path:
+def opened_map(path: Path, console: Console, *, force: bool = False) -> Path:
     """The kapture folder of a map, or of a workspace; a COLMAP model's is made in the user's cache,
     and said."""
     # commands that open no map do not wait for all stages
@@ -135,7 +135,7 @@ def opened_map(path: Path, console: Console) -> Path:
     if not is_colmap(path):
         return kapture_of(path)
     with open_executor("processes") as executor:
-        folder = kapture_of(path, work=Work(executor, console.track))
+        folder = kapture_of(path, work=Work(executor, console.track, force=force))
     console.say(f"{path}: a COLMAP model, as kapture in {folder}")
     return folder
 

@@ -90,7 +90,7 @@ class Localize(Reading, Deciding, Common):
                 console.say(text)
         else:
             folder = self.kapture(self.query)
-        path = opened_map(self.input, console)
+        path = opened_map(self.input, console, force=self.force)
         kapture_map = self.opening(path, self.keypoints_type, self.pixel_origin)()
         _check_consistent(kapture_map, self.input, force=self.force)
         options = _options_of(self)
@@ -180,7 +180,7 @@ class Serve(Reading, Deciding, Common):
         token = None if self.token_file is None else _read_token(self.token_file)
         options = _options_of(self)
         with bind(self.host, self.port) as bound:
-            path = opened_map(self.map, console)
+            path = opened_map(self.map, console, force=self.force)
             opening = self.opening(path, self.keypoints_type, self.pixel_origin)
             kapture_map = opening()
             _check_consistent(kapture_map, self.map, force=self.force)

@@ -58,17 +58,21 @@ def transform(matrix: Matrix) -> RigidTransform:
 
 
 def turned(pose: Matrix) -> RigidTransform:
-    (w, *xyz), t = transform(pose).quat_wxyz, transform(pose).translation
-    return RigidTransform((*xyz, w), t)
+    (w, x, y, z), t = transform(pose).quat_wxyz, transform(pose).translation
+    return RigidTransform((x, y, z, w), t)
+
+
+def inverse(pose: Matrix) -> Matrix:
+    return np.asarray(np.linalg.inv(pose), np.float64)
 
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 GIVEN: dict[str, Callable[[Matrix], RigidTransform]] = {
-    "poses inverted (camera-to-world": lambda pose: transform(np.linalg.inv(pose)),
+    "poses inverted (camera-to-world": lambda pose: transform(inverse(pose)),
     "read with OpenGL's axes (y up, z back)": lambda pose: transform(OPENGL @ pose),
-    "inverted and with OpenGL's axes": lambda pose: transform(np.linalg.inv(OPENGL @ pose)),
+    "inverted and with OpenGL's axes": lambda pose: transform(inverse(OPENGL @ pose)),
     "translations read as camera centres": lambda pose: RigidTransform(
-        transform(pose).quat_wxyz, tuple(np.linalg.inv(pose)[:3, 3].tolist())
+        transform(pose).quat_wxyz, tuple(inverse(pose)[:3, 3].tolist())
     ),
     "quaternions read as x, y, z, w": turned,
 }
