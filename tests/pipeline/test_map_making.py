@@ -102,7 +102,9 @@ def test_a_model_of_poses_alone_is_mapped_anew(
     folder = KaptureFolder(tmp_path / "map")
     folder.validate(deep=True)
     assert counts["points"] == len(folder.points3d()) > 100
-    assert sorted(path.name for path in folder.root.iterdir()) == ["reconstruction", "sensors"]
+    assert sorted(path.name for path in folder.root.iterdir()) == [
+        *("megloc", "reconstruction", "sensors")
+    ]
     results = megloc.open_map(folder.root).localize(scene / "query")
     found = megloc.evaluate(results, truth=scene / "query_gt").row()
     assert found.num_localized == 4 and (found.median_position_m or 1) < 0.01
