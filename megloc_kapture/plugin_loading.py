@@ -47,24 +47,31 @@ def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) ->
         refuses its options; says which and why.
     """
     kind = plugin_class(group, name)
-    model = getattr(kind, "Options", None)
+    model: Any = getattr(kind, "Options", None)
     try:
         if model is None:
             if options:
-                raise ValueError(f"it takes no options, got {sorted(options)}")
+                raise ValueError(f"it takes no options, got {', '.join(sorted(options))}")
             return kind()
         return kind(model(**(options or {})))
     except MeglocError:
         raise
     except ValidationError as error:
-        first = error.errors()[0]
-        option = ".".join(str(part) for part in first["loc"])
-        raise PluginError(
-            f"plugin {name!r} refuses its options: {option}: {first['msg']}"
-        ) from error
+        fault = option_fault(error, model)
+        raise PluginError(f"plugin {name!r} refuses its options: {fault}") from error
     except Exception as error:  # whatever a foreign constructor raises
         reason = " ".join(str(error).split())
         raise PluginError(f"plugin {name!r} refuses its options: {reason}") from error
+
+
+def option_fault(error: ValidationError, model: type[Options]) -> str:
+    """Say which option cannot be used and why; of one that is unknown, the ones it may mean."""
+    first = error.errors()[0]
+    option = ".".join(map(str, first["loc"]))
+    if first["type"] == "extra_forbidden":
+        return f"unknown option {option!r}; {suggestion(option, sorted(model.model_fields))}"
+    message = first["msg"].removeprefix("Value error, ").replace("Input should", "it should")
+    return f"{option}: {message}" if option else message
 
 
 def plugin_class(group: str, name: str) -> Any:
