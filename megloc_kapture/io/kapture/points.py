@@ -1,9 +1,9 @@
 """``reconstruction/points3d.txt``, the 3D points of a map, how uncertain they are, and PLY files.
 
-pandas reads the plain form of the grammar, each number as Python's ``float`` does (from version
-3.1 on; before, the last bit could differ). It also takes what the grammar does not know (missing
-fields, words, quotes): whatever might be such is read by the strict parser, which says what is
-wrong, or that nothing is. Python's ``repr`` is the format that is written.
+pandas reads the plain form of the grammar, each number as Python's ``float`` does. It also takes
+what the grammar does not know (missing fields, words, quotes): whatever might be such is read by
+the strict parser, which says what is wrong, or that nothing is. Python's ``repr`` is the format
+that is written.
 """
 
 from __future__ import annotations
@@ -79,12 +79,20 @@ def _read_plain(path: Path) -> NDArray[np.float64] | None:
             dtype=np.float64,
             lineterminator="\n",
             low_memory=False,
+            **({} if _reads_exactly(pd.__version__) else {"float_precision": "round_trip"}),
         )
     except (ValueError, OverflowError, OSError):  # pandas' own errors are ValueErrors
         return None
     values = np.ascontiguousarray(table.to_numpy(dtype=np.float64))
     # NaN: fewer fields, or none
     return values if values.shape[1] in POINTS_HEADERS and np.isfinite(values).all() else None
+
+
+def _reads_exactly(pandas_version: str) -> bool:
+    """Whether pandas reads floats exactly by default, for which older versions need an option that
+    this one deprecates."""
+    major, minor = map(int, pandas_version.split(".")[:2])
+    return (major, minor) >= (3, 1)
 
 
 def read_points3d_strictly(path: Path) -> NDArray[np.float64]:
