@@ -13,11 +13,11 @@ from megloc_kapture.geometry.conventions import CONVENTIONS, better_conventions
 from megloc_kapture.matching.verification import Floats, KnownPoseOptions, verify_with_poses
 from megloc_kapture.values import RigidTransform
 
-# poses of depth sensors are off by centimetres, wrong ones by more than this, also in pixels of
-# the larger side
-_MIN_ERROR_PX, _MAX_ERROR_SHARE = 8.0, 0.01
+# share of the larger side, more than a degree: poses of depth sensors are off by nearly as much
+_MAX_ERROR_SHARE = 0.02
 _AGREEING = 0.5  # share of a pair's matches that have to fit its poses
 _MOST = 0.5
+_FEW = 3  # compared images, too few to refuse a map for
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,7 @@ def count_fitting(
     Of matched rays and slopes as in :func:`verify_with_poses`; ``side_px`` is the images' larger
     side.
     """
-    error_px = max(_MIN_ERROR_PX, _MAX_ERROR_SHARE * side_px)
-    options = KnownPoseOptions(max_error_px=error_px, min_matches=0)
+    options = KnownPoseOptions(max_error_px=_MAX_ERROR_SHARE * side_px, min_matches=0)
     counts = []
     for read in (lambda pose: pose, *CONVENTIONS.values()):
         a, b = map(read, poses)
@@ -80,16 +79,17 @@ def pose_contradiction(pairs: Sequence[PairEvidence]) -> tuple[str, bool] | None
         f"the given poses of {len(wrong)} of {len(wrong) + right} compared images contradict their "
         f"matches: {shown}"
     )
-    if len(wrong) <= _MOST * (len(wrong) + right):
+    if len(wrong) + right < _FEW or len(wrong) <= _MOST * (len(wrong) + right):
         return message, False
     return f"{message}. No usual convention explains it: check poses, names and cameras", True
 
 
 def _split(pairs: Sequence[PairEvidence]) -> tuple[list[str], int]:
-    """Return the images whose poses most of their pairs contradict, and the number of the others.
+    """Return the images whose poses most of their pairs contradict, and the number of those with a
+    pair that agrees.
 
     A wrong pose spoils the pairs of right images too: the worst image is taken out with its pairs
-    before the next one is judged. Images of a single pair are not judged.
+    before the next one is judged. A single pair says nothing against an image.
     """
     number = Counter(image for pair in pairs for image in (pair.image, pair.other))
     wrong: list[str] = []
@@ -103,6 +103,7 @@ def _split(pairs: Sequence[PairEvidence]) -> tuple[list[str], int]:
         shares = [(np.mean(of_image), len(of_image), i) for i, of_image in contradict.items()]
         share, _, worst = max(shares, default=(0.0, 0, ""))
         if share <= _MOST:
-            return sorted(wrong), len(contradict)
+            agreeing = {i for pair in left if pair.agrees for i in (pair.image, pair.other)}
+            return sorted(wrong), len(agreeing)
         wrong.append(worst)
         left = [pair for pair in left if worst not in (pair.image, pair.other)]

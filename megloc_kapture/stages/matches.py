@@ -6,6 +6,7 @@ Mapping pairs are verified with their known poses, query pairs by a two-view mod
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
@@ -62,7 +63,8 @@ _log = logging.getLogger(__name__)
 _CACHE_BYTES = 256 << 20  # descriptors kept per process: about a hundred images
 _PAIRS_PER_ITEM = 32  # of one image, whose features are read once for them
 # groups of images whose pairs say whether the given poses contradict the matches
-_CHECKED_GROUPS, _GROUP_SIZE = 6, 6
+_CHECKED_GROUPS = 6
+_RANKS = (0, 1, 3, 7, 15)  # of the others in a group among the images paired with its first one
 
 
 class NoVerification(Options):
@@ -205,22 +207,19 @@ def check_given_poses(
 
 def _sampled(pairs: Sequence[ImagePair]) -> list[_Job]:
     """Pairs within groups of images spread over the map: an image and some of those paired with
-    it, near and far ones."""
+    it, mostly the most similar ones, which overlap."""
     paired: dict[str, list[str]] = {}
     for pair in sorted(pairs, key=lambda pair: (-pair.score, pair.query, pair.map)):
         paired.setdefault(pair.query, []).append(pair.map)
         paired.setdefault(pair.map, []).append(pair.query)
     chosen: dict[str, set[str]] = {}
-    for image in _spread(sorted(paired), _CHECKED_GROUPS):
-        others = _spread(list(dict.fromkeys(paired[image])), _GROUP_SIZE - 1)
+    images = sorted(paired)
+    for image in images[:: max(1, math.ceil(len(images) / _CHECKED_GROUPS))]:
+        ranked = list(dict.fromkeys(paired[image]))
+        others = {ranked[rank] for rank in _RANKS if rank < len(ranked)}
         for a, b in combinations(sorted({image, *others}), 2):
             chosen.setdefault(a, set()).add(b)
     return [(image, sorted(others)) for image, others in chosen.items()]
-
-
-def _spread(items: Sequence[str], count: int) -> list[str]:
-    every = max(1.0, len(items) / count)
-    return [items[int(number * every)] for number in range(min(count, len(items)))]
 
 
 def _evidence(

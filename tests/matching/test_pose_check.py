@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -125,3 +126,24 @@ def test_noise_is_no_contradiction() -> None:
         given.append(transform(off @ pose))
     assert pose_contradiction(evidence(right, given)) is None
     assert pose_contradiction([]) is None
+
+
+def test_repeated_structure_is_no_contradiction() -> None:
+    """Images of two ends of a facade that look alike match well, with a wrong two-view model."""
+    right = poses_around(9)
+    pairs = evidence(right, list(map(transform, right)))
+    alike = [
+        replace(pair, fitting=(0, *pair.fitting[1:]))
+        if {pair.image, pair.other} in ({"0.jpg", "7.jpg"}, {"0.jpg", "8.jpg"}, {"1.jpg", "8.jpg"})
+        else pair
+        for pair in pairs
+    ]
+    assert alike != pairs and pose_contradiction(alike) is None
+
+
+def test_two_images_are_too_few_to_refuse_a_map() -> None:
+    """Where no convention explains it; a convention that does is named all the same."""
+    right = poses_around(2)
+    for given, most in ((by_chance(right), None), ([*map(transform, map(inverse, right))], True)):
+        contradiction = pose_contradiction(evidence(right, given))
+        assert (contradiction and contradiction[1]) == most
