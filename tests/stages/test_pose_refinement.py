@@ -28,7 +28,7 @@ from megloc_kapture.refinement.references import Displacement
 from megloc_kapture.stages.candidates import Restrictions
 from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_poses
-from megloc_kapture.stages.work import Work
+from megloc_kapture.stages.work import KeptItems, Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 SHIFT = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.25))
@@ -121,6 +121,23 @@ def test_poses_move_by_each_refiner_in_turn_and_failures_stay(
     assert folder_bytes(tmp_path / "out") == folder_bytes(tmp_path / "threads")
 
 
+def test_queries_of_an_interrupted_run_are_counted_too(
+    world: Any, localized: KaptureFolder, tmp_path: Path
+) -> None:
+    sources: list[tuple[Path, Path]] = []
+    asked = []
+    for name in ("first", "again"):
+        out, journal = tmp_path / name, tmp_path / f"{name}.items"
+        work = Work(kept=KeptItems("", out, journal, tuple(sources), lambda path: ""))
+        refiner = Shift()
+        options = Chosen(refiners=(refiner,))
+        counts = refine_poses(world.mapping(), world.query(), localized, out, options, work=work)
+        assert counts["queries"] == counts["accepted_by_shift"] == 1
+        asked.append(len(refiner.asked))
+        sources.append((out, journal))
+    assert asked == [1, 0]
+
+
 def test_references_look_the_same_way_and_are_of_one_frame(
     world: Any, localized: KaptureFolder, tmp_path: Path
 ) -> None:
@@ -129,7 +146,8 @@ def test_references_look_the_same_way_and_are_of_one_frame(
     groups = {image: ImageGroup(frame="a" if k < 3 else "b") for k, image in enumerate(images)}
     refiner = Shift()
     refine_poses(
-        world.mapping(), world.query(), localized, tmp_path / "out", Chosen(refiners=(refiner,)),
+        world.mapping(), world.query(), localized, tmp_path / "out",
+        Chosen(refiners=(refiner,), references="frame"),
         restrictions=Restrictions(groups=groups),
     )  # fmt: skip
     assert set(refiner.asked[first]) <= set(images[:3])
