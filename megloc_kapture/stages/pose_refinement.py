@@ -80,7 +80,7 @@ class PoseRefinementOptions(Options):
         default=(), description="pose refiners, one after another; none: poses stay"
     )
     references: Literal["cluster", "frame"] = Field(
-        default="frame",
+        default="cluster",
         description="map images a refiner may choose from: those of the cluster that the pose "
         "comes from, or others of its coordinate frame as well",
     )

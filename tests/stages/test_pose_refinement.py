@@ -29,7 +29,7 @@ from megloc_kapture.refinement.references import Displacement
 from megloc_kapture.stages.candidates import Restrictions
 from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_poses
-from megloc_kapture.stages.work import Work
+from megloc_kapture.stages.work import KeptItems, Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 COVARIANCE = np.diag([1e-6, 2e-6, 3e-6, 1e-4, 2e-4, 1 / 3])
@@ -138,6 +138,23 @@ def test_a_pose_that_stays_keeps_its_covariance(
     assert kept["moved"] == {}  # this refiner does not know that of its poses
 
 
+def test_queries_of_an_interrupted_run_are_counted_too(
+    world: Any, localized: KaptureFolder, tmp_path: Path
+) -> None:
+    sources: list[tuple[Path, Path]] = []
+    asked = []
+    for name in ("first", "again"):
+        out, journal = tmp_path / name, tmp_path / f"{name}.items"
+        work = Work(kept=KeptItems("", out, journal, tuple(sources), lambda path: ""))
+        refiner = Shift()
+        options = Chosen(refiners=(refiner,))
+        counts = refine_poses(world.mapping(), world.query(), localized, out, options, work=work)
+        assert counts["queries"] == counts["accepted_by_shift"] == 1
+        asked.append(len(refiner.asked))
+        sources.append((out, journal))
+    assert asked == [1, 0]
+
+
 def test_references_look_the_same_way_and_are_of_one_frame(
     world: Any, localized: KaptureFolder, tmp_path: Path
 ) -> None:
@@ -146,7 +163,8 @@ def test_references_look_the_same_way_and_are_of_one_frame(
     groups = {image: ImageGroup(frame="a" if k < 3 else "b") for k, image in enumerate(images)}
     refiner = Shift()
     refine_poses(
-        world.mapping(), world.query(), localized, tmp_path / "out", Chosen(refiners=(refiner,)),
+        world.mapping(), world.query(), localized, tmp_path / "out",
+        Chosen(refiners=(refiner,), references="frame"),
         restrictions=Restrictions(groups=groups),
     )  # fmt: skip
     assert set(refiner.asked[first]) <= set(images[:3])
