@@ -96,8 +96,8 @@ submit evaluate:Submit Write the pose file of a localized kapture folder, and it
 beside it.
 check evaluate:Check Check a pose file, ours or foreign, against the rules of its challenge and \
 the map.
-evaluate evaluate:Evaluate Compare localized queries (kapture folders or pose files) with their \
-true poses, and two or more results with each other.
+evaluate evaluate:Evaluate Compare localized queries (kapture folders, pose files, COLMAP models) \
+with their true poses, and two or more results with each other.
 export conversion:Export Write a map, localized queries or both for COLMAP, nerfstudio, evo and \
 viewers.
 view conversion:View Write a page that shows a map in 3D, and the queries of a result in it; it \

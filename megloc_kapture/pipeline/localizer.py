@@ -98,7 +98,9 @@ class Localizer:
             kapture_map.folder, kapture_map.restrictions, self.options.pose_refinement
         )
         self.types = local_types_of(kapture_map, self.options, FeatureCache())
-        self._counted = self.options.reranking.counted_types([one.name for one in self.types])
+        names = [one.name for one in self.types]
+        # a map of another tool may lack the type that a preset counts
+        self._counted = self.options.reranking.types_named(names) or names
         for local in self.types:
             local.prepare()
         self._retrieval = MapRetrieval(kapture_map, self.options, self.types, self._preprocessor)

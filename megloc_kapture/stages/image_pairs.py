@@ -328,21 +328,22 @@ class RerankingOptions(Options):
         """Whether anything is done."""
         return self.by != "none"
 
-    def counted_types(self, local_types: Sequence[str]) -> list[str]:
-        """Those of the types whose matches count.
-
-        Raises OptionError: ``local_type`` names none of them.
-        """
+    def types_named(self, local_types: Sequence[str]) -> list[str]:
+        """Those of the types that ``local_type`` names; all where it names no type."""
         name = self.local_type
         if name is None or not self.reranks():
             return list(local_types)
         # a type may be named after its weights, which begin with the plugin's name
         found = [one for one in local_types if base_type(one) == name]
-        found = found or [one for one in local_types if one.startswith(name)]
+        return found or [one for one in local_types if one.startswith(name)]
+
+    def counted_types(self, local_types: Sequence[str]) -> list[str]:
+        """The types whose matches count; raises OptionError where ``local_type`` names none."""
+        found = self.types_named(local_types)
         if not found:
             raise OptionError(
-                f"reranking.local_type: no local features of type {name!r}; "
-                f"{suggestion(name, map(base_type, local_types))}"
+                f"reranking.local_type: no local features of type {self.local_type!r}; "
+                f"{suggestion(str(self.local_type), map(base_type, local_types))}"
             )
         return found
 

@@ -107,7 +107,7 @@ def test_a_scene_with_its_undistorted_model(tmp_path: Path, capsys: Any) -> None
         main(["import", "megadepth", str(tmp_path / "root"), "-o", str(tmp_path / "out")])
     assert end.value.code == 0, capsys.readouterr().err
     printed = " ".join(capsys.readouterr().out.split())
-    assert printed == "scenes 1 images 4 without depth 1"
+    assert printed == "scene 1 images 4 without depth 1"
     check(tmp_path / "out" / "0015")
 
 

@@ -160,13 +160,12 @@ def test_a_fallback_is_the_pose_of_the_first_candidate_after_reranking(
     map_poses = workspace.folder("map").read().poses()
     assert found == {name: map_poses[image] for name, image in first[1].items()}
     assert found == workspace.folder("localized").read().poses()
-    # a type of features that the map lacks is refused by both
+    # a type that the run does not extract is refused; a map of another tool may lack it
     wrong = options_of_preset(assignments=[*sets, "reranking.local_type=superpoint"])
     message = "no local features of type 'superpoint'; known: rootsift"
     with pytest.raises(OptionError, match=message):
         evaluated(tmp_path / "wrong", scene, wrong)
-    with pytest.raises(OptionError, match=message):
-        Localizer(localizer.map, options=wrong)
+    Localizer(localizer.map, options=wrong)
 
 
 @pytest.mark.slow

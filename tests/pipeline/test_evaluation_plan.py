@@ -31,8 +31,7 @@ STEPS = {
     "map refinement": {"refinement"},
     "reranking": {"reranking", "query_pairs"},
     "guided pyramid": {"guided_pyramid"},
-    "clusters": {"localization"},
-    "pose ranking": {"localization"},
+    "clusters": {"localization"},  # ranked by inliers: there is no other ranking to leave out
 }
 
 
