@@ -196,7 +196,9 @@ def test_both_refiners_work_on_displaced_poses(workspace: Path) -> None:
     assert any(row.accepted for row in rows if row.method == "icp")
 
 
-def test_nothing_breaks_where_nothing_matches(workspace: Path, tmp_path: Path) -> None:
+def test_a_map_where_nothing_matches_ends_the_run(
+    workspace: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     place = tmp_path / "whole"
     for part in ("scene", "workspace"):
         shutil.copytree(workspace.parent / part, place / part, symlinks=True)
@@ -205,12 +207,13 @@ def test_nothing_breaks_where_nothing_matches(workspace: Path, tmp_path: Path) -
         "local_features.superpoint.matching.options.match_threshold=0.9999999",
         "local_features.aslfeat.matching.options.max_ratio=0.0001",
     )
-    empty = run(wiring, place, megloc, changed(*nothing))
-    assert len(KaptureFolder(empty / "map").points3d()) == 0
-    statuses = read_status(empty / "localized" / "status.csv")
-    assert {status.status for status in statuses.values()} == {"failed"}
-    assert all(status.reason for status in statuses.values())
-    assert [one.stage for one in artefacts(empty) if one.path == "map"] == ["map"]
-    (empty / "localized" / "clusters.csv").unlink()
-    with pytest.raises(FileNotFoundError, match=r"localization|refine_poses: .*clusters\.csv"):
-        artefacts(empty)
+
+    def refused(_: str, arguments: Sequence[str]) -> float:
+        with pytest.raises(SystemExit) as end:
+            main([*arguments, "--quiet"])
+        assert end.value.code == 2
+        return 0.0
+
+    # the copied workspace is of another root
+    run(wiring, place, lambda name, own: refused(name, [*own, "--force"]), changed(*nothing))
+    assert "no point could be triangulated" in capsys.readouterr().err
