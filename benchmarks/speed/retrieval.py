@@ -24,6 +24,7 @@ import resource
 import runpy
 import subprocess
 import sys
+import tarfile
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -49,6 +50,7 @@ from megloc_kapture.io.kapture import (
     write_pairs,
     write_sensors,
 )
+from megloc_kapture.io.kapture.features import feature_folder
 from megloc_kapture.io.kapture.vectors import KaptureVectors
 from megloc_kapture.retrieval.fusion import FusionOptions
 from megloc_kapture.retrieval.search import (
@@ -94,11 +96,21 @@ def generate(
         data.trajectories[timestamp, "camera"] = HERE
     write_sensors(folder, data)
     config = FeatureConfig(TYPE, np.dtype("float32"), dimension, None, "L2")
-    with FeatureWriter(folder, "global_features", TYPE, config, tar=tar) as writer:
+    with FeatureWriter(folder, "global_features", TYPE, config) as writer:
         for name, vector in zip(names, vectors, strict=True):
             if name not in writer:
                 writer.write(name, vector)
+    if tar:
+        pack(feature_folder(folder, "global_features", TYPE, orphan=False))
     (folder / "complete").touch()
+
+
+def pack(folder: Path) -> None:
+    """Move the global features of a type's folder into a tar, as kapture keeps large sets."""
+    with tarfile.open(folder / "global_features.tar", "w") as tar:
+        for path in sorted(folder.rglob("*.gfeat")):
+            tar.add(path, path.relative_to(folder))
+            path.unlink()
 
 
 # ------------------------------------------------------------------------------------------ ours

@@ -215,7 +215,7 @@ class Serve(Reading, Deciding, Common):
 
 def _read_token(path: Path) -> str:
     """The token in a file: one line of printable ASCII; raises DataError."""
-    token = read_text(path, max_bytes=10_000).strip()
+    token = read_text(path).strip()
     if len(token) < _MIN_TOKEN_LENGTH or not token.isascii() or not token.isprintable():
         raise DataError(
             f"a token is one line of {_MIN_TOKEN_LENGTH} or more printable characters", path=path

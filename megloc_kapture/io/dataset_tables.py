@@ -16,8 +16,7 @@ protocol.json       thresholds, the pose file's format and names, conditions and
 
 Written by datasets, read by stages and evaluation. A file that is absent stands for its default:
 no groups, no priors, names by the protocol's rule, no pairs, one metric frame without offset, the
-default protocol. Readers raise DataError, which names the file and the line or field; writers raise
-it for an image name that is no plain relative path, and OutputError where they cannot write.
+default protocol.
 """
 
 from __future__ import annotations
@@ -35,8 +34,6 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import Column, ImageName, Table, flag
 from megloc_kapture.io.files import (
     ModelT,
-    check_no_escape,
-    check_plain,
     check_relative,
     named,
     read_json_model,
@@ -57,7 +54,6 @@ UNREADABLE_FILE = "unreadable.csv"
 UNREGISTERED_FILE = "unregistered.csv"
 # in the folder of the true poses
 NOWHERE_FILE = "nowhere.txt"
-_MAX_BYTES = 1 << 28
 # units of the local frame: a map that nobody knows the scale of has units of its own
 METRES, NO_METRES = "m", "units"
 
@@ -293,13 +289,8 @@ def write_side_tables(folder: Path, tables: SideTables) -> None:
 
 
 def table_path(folder: Path | str, name: str) -> Path:
-    """The path of a table, which need not exist.
-
-    Raises DataError: a link that leaves the dataset, no plain file, or larger than any such table.
-    """
-    path = check_no_escape(Path(folder).parent, Path(folder) / name)
-    check_plain(path, _MAX_BYTES)
-    return path
+    """The path of a table, which need not exist."""
+    return Path(folder) / name
 
 
 def read_groups(folder: Path | str) -> dict[str, ImageGroup]:
@@ -307,7 +298,7 @@ def read_groups(folder: Path | str) -> dict[str, ImageGroup]:
     names = tuple(ImageGroup.model_fields)
     return {
         row.image: ImageGroup(**{name: getattr(row, name) for name in names})
-        for row in sorted(_GROUPS.read_if_there(table_path(folder, GROUPS_FILE)))
+        for row in sorted(_GROUPS.read_if_there(Path(folder) / GROUPS_FILE))
     }
 
 
@@ -323,7 +314,7 @@ def read_priors(folder: Path | str) -> dict[str, tuple[str, ...]]:
     A query that is not in the table is not restricted.
     """
     permitted: dict[str, tuple[str, ...]] = {}
-    for query, group in sorted(_PRIORS.read_if_there(table_path(folder, PRIORS_FILE))):
+    for query, group in sorted(_PRIORS.read_if_there(Path(folder) / PRIORS_FILE)):
         permitted[query] = (*permitted.get(query, ()), group)
     return permitted
 
@@ -331,7 +322,7 @@ def read_priors(folder: Path | str) -> dict[str, tuple[str, ...]]:
 def write_priors(folder: Path | str, priors: Mapping[str, Sequence[str]]) -> None:
     """Write ``priors.csv``, sorted by query and permitted name.
 
-    Raises DataError for a query with nothing (or "") permitted: an absent row is "everything".
+    A query with nothing permitted is refused: without a row everything is permitted.
     """
     for query, groups in priors.items():
         if not groups or not all(groups):
@@ -342,7 +333,7 @@ def write_priors(folder: Path | str, priors: Mapping[str, Sequence[str]]) -> Non
 
 def read_names(folder: Path | str) -> dict[str, str]:
     """Read ``names.csv``: image -> its name in the pose file, in the table's order."""
-    return dict(_NAMES.read_if_there(table_path(folder, NAMES_FILE)))
+    return dict(_NAMES.read_if_there(Path(folder) / NAMES_FILE))
 
 
 def write_names(folder: Path | str, names: Mapping[str, str]) -> None:
@@ -352,7 +343,7 @@ def write_names(folder: Path | str, names: Mapping[str, str]) -> None:
 
 def read_unreadable(folder: Path | str, name: str = UNREADABLE_FILE) -> dict[str, str]:
     """Read ``unreadable.csv``, or another such table: image -> reason, sorted by image."""
-    return dict(sorted(_UNREADABLE.read_if_there(table_path(folder, name))))
+    return dict(sorted(_UNREADABLE.read_if_there(Path(folder) / name)))
 
 
 def write_unreadable(
@@ -379,14 +370,14 @@ def write_unit(root: Path, unit: str) -> None:
 
 
 def unit_of(root: Path | str) -> str:
-    """The unit of a map, or of results in it: m, or :data:`NO_METRES`; raises DataError."""
+    """The unit of a map, or of results in it: m, or :data:`NO_METRES`."""
     tables = tables_of(root)
     return METRES if tables is None else read_world(tables).unit
 
 
 def read_relocalization(folder: Path | str) -> list[RelocalizationPair]:
     """Read ``relocalization.csv`` in its order."""
-    return _RELOCALIZATION.read_if_there(table_path(folder, RELOCALIZATION_FILE))
+    return _RELOCALIZATION.read_if_there(Path(folder) / RELOCALIZATION_FILE)
 
 
 def write_relocalization(folder: Path | str, pairs: Iterable[RelocalizationPair]) -> None:
@@ -410,7 +401,7 @@ def read_protocol(folder: Path | str) -> Protocol:
 
 
 def _read_model(folder: Path | str, name: str, model: type[ModelT]) -> ModelT:
-    path = table_path(folder, name)
+    path = Path(folder) / name
     return read_json_model(path, model) if path.exists() else model()
 
 
@@ -420,25 +411,19 @@ def write_protocol(folder: Path | str, protocol: Protocol) -> None:
 
 
 def read_nowhere(truth: Path | str) -> tuple[str, ...]:
-    """Queries that show nothing of the map, one a line in ``nowhere.txt`` beside the true poses.
-
-    Raises DataError: the file cannot be read, or a name stands in it twice; names file and line.
-    """
-    path = table_path(truth, NOWHERE_FILE)
+    """Queries that show nothing of the map, one a line in ``nowhere.txt`` beside the true poses."""
+    path = Path(truth) / NOWHERE_FILE
     if not path.is_file():
         return ()
-    names: dict[str, int] = {}
+    names: set[str] = set()
     for line, text in enumerate(read_text(path).splitlines(), start=1):
         name = text.strip()
-        if not name or name.startswith("#"):
-            continue
-        with named(path, line):
-            if check_relative(name) in names:
-                raise DataError(f"{name!r} stands on line {names[name]} as well")
-        names[name] = line
+        if name and not name.startswith("#"):
+            with named(path, line):
+                names.add(check_relative(name))
     return tuple(sorted(names))
 
 
 def write_nowhere(truth: Path, names: Iterable[str]) -> None:
-    """Write ``nowhere.txt`` of a folder of true poses; raises OutputError."""
+    """Write ``nowhere.txt`` of a folder of true poses."""
     write_bytes(truth / NOWHERE_FILE, "".join(f"{name}\n" for name in names).encode("utf-8"))

@@ -1,7 +1,7 @@
 """Files: their paths checked, read whole, written atomically, linked, kept as JSON.
 
-Paths that data names (image names, type names and the like) come from files that somebody else
-wrote, and may only ever lead to something below the folder they belong to.
+Paths that data names (image names, type names) come from files that somebody else wrote, and may
+only lead to something below the folder they belong to.
 
 A file is written beside its final path under a name that no reader lists and then renamed over it:
 a killed run or a full disk leaves the old state or the new one. There is no fsync: after a power
@@ -23,57 +23,30 @@ import socket
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, BinaryIO, NoReturn, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from megloc_kapture.errors import DataError, OutputError
 
-_MAX_JSON_BYTES = 1 << 28
-_MAX_FOLDERS = 250  # Python makes a folder's parents one within the other
-
 ModelT = TypeVar("ModelT", bound=BaseModel)
-# the folder that something was found in, and others that links in it may lead to
-Roots = Path | tuple[Path, ...]
 
 
 # ------------------------------------------------------------------------------------ reading
 
 
-def read_content(path: Path | str, max_bytes: int | None = None) -> bytes:
-    """All bytes of a plain file.
-
-    Raises DataError: missing, not readable, larger than ``max_bytes``, or no plain file: reading a
-    pipe or a device might never end.
-    """
-    path = Path(path)
+def read_content(path: Path | str) -> bytes:
+    """Return all bytes of a file; DataError where it is missing or cannot be read."""
     with reading(path):
-        try:
-            check_plain(path, max_bytes)
-            return path.read_bytes()
-        except FileNotFoundError as error:
-            raise DataError("cannot read: the file is missing", path=path) from error
+        return Path(path).read_bytes()
 
 
-def check_plain(path: Path, max_bytes: int | None = None) -> None:
-    """Raise DataError for what is there and is no plain file, or larger than ``max_bytes``."""
-    if not path.exists():
-        return
-    if not path.is_file():
-        raise DataError("not a plain file", path=path)
-    if max_bytes is not None and path.stat().st_size > max_bytes:
-        raise DataError(f"larger than {max_bytes >> 20} MB, which no such file is", path=path)
+def read_text(path: Path | str) -> str:
+    """Return the text of a UTF-8 file without its byte order mark; line ends stay as they are.
 
-
-def read_text(path: Path | str, max_bytes: int | None = None) -> str:
-    """The text of a UTF-8 file (ASCII included); a byte order mark is dropped.
-
-    Line ends are left as they are.
-
-    Raises DataError: see :func:`read_content`; or it is not UTF-8 or holds a NUL; names the file
-    and the line where the text breaks.
+    Raises DataError: missing, not UTF-8 (names the line), or with a NUL character.
     """
-    content = read_content(path, max_bytes)
+    content = read_content(path)
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -87,9 +60,11 @@ def read_text(path: Path | str, max_bytes: int | None = None) -> str:
 
 @contextlib.contextmanager
 def reading(path: Path | str) -> Iterator[None]:
-    """An OSError of the block becomes a DataError that names this file or folder."""
+    """Turn an OSError of the block into a DataError that names this file or folder."""
     try:
         yield
+    except FileNotFoundError as error:
+        raise DataError("cannot read: the file is missing", path=path) from error
     except OSError as error:
         raise DataError(f"cannot read: {error.strerror or error}", path=path) from error
 
@@ -98,7 +73,7 @@ def reading(path: Path | str) -> Iterator[None]:
 def named(
     path: Path | str | None = None, line: int | None = None, *, about: str = ""
 ) -> Iterator[None]:
-    """A DataError of the block that names no file gets this one, the line, and what it is about."""
+    """Add the file, the line and what it is about to a DataError that names no file yet."""
     try:
         yield
     except DataError as error:
@@ -120,11 +95,10 @@ def has_control_characters(text: str) -> bool:
 
 @lru_cache(maxsize=1 << 12)  # the text alone decides, and the same names come in a row
 def check_relative(text: str) -> str:
-    """Return ``text`` if it is a plain relative path (``a/b.jpg``), else raise.
+    """Return ``text`` if it is a plain relative path (``a/b.jpg``), else raise DataError.
 
-    Raises DataError: empty, absolute, deeper than 250 folders, ``.`` or ``..`` or an empty
-    component, a backslash, or a control character (NUL included) in it. A ``.`` or empty component
-    is harmless, but would give one file two names, and names are identities in kapture.
+    A ``.`` or an empty component is refused too: harmless, but it would give one file two names,
+    and names are identities in kapture.
     """
     if not text:
         raise DataError("empty path")
@@ -132,8 +106,6 @@ def check_relative(text: str) -> str:
         raise DataError(f"backslash in path {text!r}")
     if has_control_characters(text):
         raise DataError(f"control character in path {text!r}")
-    if text.count("/") > _MAX_FOLDERS:
-        raise DataError(f"path of {text.count('/')} folders: {text[:20]!r}...")
     if text.startswith("/"):
         raise DataError(f"absolute path {text!r}; it must be relative to its folder")
     for component in text.split("/"):
@@ -145,10 +117,7 @@ def check_relative(text: str) -> str:
 
 
 def check_component(text: str) -> str:
-    """Return ``text`` if it can be the name of one folder and one CSV field, as types have it.
-
-    Raises DataError: what :func:`check_relative` refuses, a slash, a comma, or a space at an end.
-    """
+    """Return ``text`` if it can be the name of one folder and one CSV field, as types have it."""
     check_relative(text)
     if "/" in text or "," in text or text != text.strip():
         raise DataError(f"{text!r} cannot be a type name (slash, comma or space at the end)")
@@ -160,28 +129,17 @@ def safe_join(root: Path, relative_text: str) -> Path:
     return Path(root) / check_relative(relative_text)
 
 
-def check_no_escape(roots: Roots, path: Path) -> Path:
+def check_no_escape(roots: Sequence[Path], path: Path) -> Path:
     """Return ``path`` if it lies in one of the ``roots`` with all links followed, or DataError."""
-    roots = (roots,) if isinstance(roots, Path) else roots
-    real = os.path.realpath(path)
-    for root in roots:
-        real_root = os.path.realpath(root)
-        if real == real_root or real.startswith(real_root.rstrip(os.sep) + os.sep):
-            return path
-    raise DataError(
-        f"is or lies behind a link that leaves {roots[0]}, to {real}; images may be links to "
-        "anywhere, anything else only to below a folder that --allow-links-below names, of "
-        "commands that have it",
-        path=path,
-    )
-
-
-def check_output(root: Path, path: Path) -> Path:
-    """Return ``path`` if no link on the way leads out of ``root``, else raise OutputError."""
-    try:
-        return check_no_escape(root, path)
-    except DataError as error:
-        raise OutputError(f"{path}: not written: lies behind a link that leaves {root}") from error
+    real = Path(os.path.realpath(path))
+    if not any(real.is_relative_to(os.path.realpath(root)) for root in roots):
+        raise DataError(
+            f"is or lies behind a link that leaves {roots[0]}, to {real}; images may be links to "
+            "anywhere, anything else only to below a folder that --allow-links-below names, of "
+            "commands that have it",
+            path=path,
+        )
+    return path
 
 
 # -------------------------------------------------------------------------------- temporary names
@@ -257,9 +215,7 @@ def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
     """Open a binary file that replaces ``path`` when the block ends well.
 
     Missing parent folders are made. When the block raises, the temporary file is removed and
-    ``path`` is as it was.
-
-    Raises OutputError: the file cannot be written (disk full, permission, ...); names ``path``.
+    ``path`` is as it was; OutputError where the file cannot be written.
     """
     # plain text: a stage writes a file for each of its pairs, and a Path takes as long as writing
     folder = os.path.dirname(path)
@@ -368,24 +324,10 @@ def _new_link(link: Path) -> Iterator[None]:
 
 
 def read_json_model(path: Path | str, model: type[ModelT]) -> ModelT:
-    """Read one JSON file as ``model``.
-
-    Raises DataError: the file cannot be read, is not JSON (names the line; NaN and infinity are not
-    JSON), or does not fit the model (names the field).
-    """
-
-    def refuse(name: str) -> NoReturn:
-        raise ValueError(f"{name} is not a number in JSON")
-
-    text = read_text(path, _MAX_JSON_BYTES)
+    """Read one JSON file as ``model``; DataError names the file and the line or the field."""
+    text = read_text(path)
     try:
-        content = json.loads(text, parse_constant=refuse)
-    except json.JSONDecodeError as error:
-        raise DataError(f"not JSON: {error.msg}", path=path, line=error.lineno) from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"not JSON: {error}", path=path) from error
-    try:
-        return model.model_validate(content)
+        return model.model_validate_json(text)
     except ValidationError as error:
         raise DataError(first_problem(error), path=path) from error
 
@@ -396,13 +338,7 @@ def write_json_model(path: Path | str, model: BaseModel) -> None:
 
 
 def write_json(path: Path | str, content: Any) -> None:
-    """Write plain JSON data, indented and atomically.
-
-    Raises
-    ------
-    ValueError : ``content`` holds NaN or infinity, which JSON does not know.
-    OutputError : the file cannot be written.
-    """
+    """Write plain JSON data, indented and atomically; ValueError for NaN and infinity."""
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
     write_bytes(path, f"{text}\n".encode())
 

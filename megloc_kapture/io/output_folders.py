@@ -1,29 +1,25 @@
 """Folders that a command writes: whose they are, and output that comes only when all went well.
 
 A folder is ours when it is new, empty, or carries our mark; nothing that a user owns is written
-over unasked. The mark names the kind of the folder, in its first line, and what we have written
-into it, so that nothing of an earlier run is taken for the last one's. What replaces a folder does
-so in one step. The state of a written file is remembered, so that one changed, cut or gone is
-noticed.
+over unasked. The mark names the kind of the folder in its first line and the files of the last
+command behind it, which the next command replaces.
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import errno
 import hashlib
 import os
 import shutil
-import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from stat import S_ISLNK, S_ISREG
 from typing import NamedTuple
 
-from megloc_kapture.errors import OutputError
+from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.io.files import (
+    check_relative,
     clear_leftovers,
     clear_temporary,
     output_error,
@@ -41,7 +37,7 @@ class Claim:
     Attributes
     ----------
     made : the folders that had to be made for it, innermost first.
-    old_mark : content of the mark that stood there; None: there was none.
+    old_mark : content of the mark that stood there; None without a mark.
     """
 
     folder: Path
@@ -49,7 +45,7 @@ class Claim:
     old_mark: bytes | None
 
     def undo(self) -> None:
-        """Take back the mark and the folders that were made; what has been written stays."""
+        """Restore the mark and remove the folders that were made; written files stay."""
         mark = self.folder / MARKER
         with contextlib.suppress(OSError, OutputError):
             if self.old_mark is None:
@@ -62,18 +58,10 @@ class Claim:
 
 
 def claim_folder(folder: Path, *, kind: str, force: bool = False) -> Claim:
-    """Make a folder ours, or refuse it.
+    """Make a folder ours, or refuse it with an OutputError.
 
-    A folder is ours when it is new, empty, or carries our mark with the same kind. With
-    ``force`` any folder will do; what stands in it and is not written anew stays.
-
-    Parameters
-    ----------
-    kind : what the folder is for, one word; written into the mark.
-
-    Raises
-    ------
-    OutputError : the folder is somebody else's, or cannot be made; it is as it was.
+    A folder is ours when it is new, empty, or carries our mark with the same ``kind`` (one word).
+    With ``force`` any folder will do; what it holds and is not written anew stays.
     """
     folder = Path(folder)
     mark = folder / MARKER
@@ -109,27 +97,18 @@ def _kind(mark: bytes) -> str:
 
 
 def _mark_of(kind: str, names: Iterable[str] = ()) -> bytes:
-    # no tool's file has a line break in its name, and a name cut in two would be another's
-    lines = (kind, *sorted(name for name in names if "\n" not in name))
-    return b"".join(os.fsencode(line) + b"\n" for line in lines)
+    return b"".join(os.fsencode(line) + b"\n" for line in (kind, *sorted(names)))
 
 
 @contextlib.contextmanager
 def staged_output(
     folder: Path, *, kind: str, force: bool = False, adds: bool = False
 ) -> Iterator[Path]:
-    """A folder to write a command's output to; it gets to ``folder`` only when the block ends well.
+    """A folder to write a command's output to, which is moved to ``folder`` when the block ends.
 
-    Files that are written anew replace old ones, one by one. Those of an earlier run with the same
-    kind that are not written anew go, what else stands in the folder stays. When the
-    block raises, ``folder`` is as it was, and gone if it was not there. What killed runs have left
-    in it is cleared.
-
-    Parameters
-    ----------
-    adds : runs add to each other; what earlier ones have written stays.
-
-    Raises OutputError: see :func:`claim_folder`; or something of the user's is in the way.
+    Files of the last command of the same kind are removed, unless commands of this kind add to
+    each other (``adds``); what else stands in the folder stays. When the block raises, ``folder``
+    is as it was. Raises OutputError: see :func:`claim_folder`.
     """
     folder = Path(folder)
     claim = claim_folder(folder, kind=kind, force=force)
@@ -140,16 +119,11 @@ def staged_output(
             staging.mkdir()
             yield staging
             clear_temporary(staging)
-            new = _names_below(staging)
-            before = set() if adds else _listed(claim.old_mark, kind)
-            stale = {name for name in before - new if not _through_link(folder, name)}
-            _check_ways(folder, new, stale)
             if not adds:
-                write_bytes(folder / MARKER, _mark_of(kind, before | new))
-            _remove_files(folder, stale)
-            _merge(staging, folder)
-            if before - new:
+                new = _files_below(staging)
+                _remove_old_files(folder, _listed(claim.old_mark, kind) - new)
                 write_bytes(folder / MARKER, _mark_of(kind, new))
+            _merge(staging, folder)
         finally:
             shutil.rmtree(staging, ignore_errors=True)
     except OSError as error:
@@ -163,7 +137,7 @@ def staged_output(
         raise
 
 
-def _names_below(folder: Path) -> set[str]:
+def _files_below(folder: Path) -> set[str]:
     """Files and links below a folder, as paths from it."""
     found = set()
     for place, folders, files in os.walk(folder):
@@ -173,50 +147,23 @@ def _names_below(folder: Path) -> set[str]:
 
 
 def _listed(mark: bytes | None, kind: str) -> set[str]:
-    """What a mark says was written; names that leave the folder are not ours."""
+    """The files that a mark of this kind lists."""
     if mark is None or _kind(mark) != kind:
         return set()
-    names = {os.fsdecode(line) for line in mark.split(b"\n")[1:] if line}
-    return {
-        name
-        for name in names
-        if not os.path.isabs(name)
-        and os.path.normpath(name) == name
-        and ".." not in Path(name).parts
-    } - {MARKER, "."}
+    return {os.fsdecode(line) for line in mark.split(b"\n")[1:] if line}
 
 
-def _through_link(folder: Path, name: str) -> bool:
-    return any((folder / one).is_symlink() for one in _parents({name}))
-
-
-def _check_ways(folder: Path, new: set[str], stale: set[str]) -> None:
-    """Raises OutputError where a folder stands in a file's way or the reverse, and stays."""
-    for name in sorted(new):
-        path = folder / name
-        if not path.is_dir() or path.is_symlink():
-            continue
-        if any(os.path.join(name, one) not in stale for one in _names_below(path)):
-            raise OutputError(f"{path}: a folder stands where a file is to be written")
-    for name in sorted(_parents(new) - stale):
-        path = folder / name
-        if path.is_file() and not path.is_symlink():
-            raise OutputError(f"{path}: a file stands where a folder is to be written")
-
-
-def _parents(names: set[str]) -> set[str]:
-    return {str(one) for name in names for one in list(Path(name).parents)[:-1]}
-
-
-def _remove_files(folder: Path, names: set[str]) -> None:
-    """Remove files and links below a folder, and the folders that this leaves empty."""
+def _remove_old_files(folder: Path, names: Iterable[str]) -> None:
+    """Remove files and links below a folder, never through a link, and folders left empty."""
     for name in names:
-        path = folder / name
-        if path.is_symlink() or not path.is_dir():
-            path.unlink(missing_ok=True)
-    for name in sorted(_parents(names), key=len, reverse=True):
-        with contextlib.suppress(OSError):
-            (folder / name).rmdir()
+        with contextlib.suppress(DataError, OSError):
+            path = folder / check_relative(name)
+            parents = list(path.parents)[: name.count("/")]
+            if any(parent.is_symlink() for parent in parents):
+                continue
+            path.unlink()
+            for parent in parents:
+                parent.rmdir()
 
 
 def _lies_in(name: str | bytes | int, folder: Path) -> bool:
@@ -237,52 +184,25 @@ def _merge(source: Path, target: Path) -> None:
 
 
 def replace_directory(new: Path, path: Path) -> None:
-    """Replace folder ``path``, which need not exist, by folder ``new``.
+    """Replace folder ``path``, which need not exist, by folder ``new`` on the same file system.
 
-    Both must be on one file system. On Linux the two are exchanged in one step, so that a run
-    killed here leaves either the old or the new folder at ``path``; what was there before is
-    then removed. A run killed during that removal leaves a rest at ``new``'s old name.
+    A run killed in between leaves the old folder under a temporary name and none at ``path``.
 
     Raises OutputError: ``path`` is a file or a link (a user's link is not ours to replace), or the
-    file system refuses; names ``path``.
+    file system refuses.
     """
     new, path = Path(new), Path(path)
     if path.is_symlink() or (path.exists() and not path.is_dir()):
         raise OutputError(f"{path}: is a link or a file, not a folder; move it away first")
+    old = path.with_name(temporary_name())
     try:
-        if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            os.rename(new, path)
-            return
-        if _exchange(new, path):
-            shutil.rmtree(new)
-            return
-        old = path.with_name(temporary_name())
-        os.rename(path, old)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists():
+            os.rename(path, old)
         os.rename(new, path)
-        shutil.rmtree(old)
+        shutil.rmtree(old, ignore_errors=True)
     except OSError as error:
         raise output_error(path, error) from error
-
-
-def _exchange(first: Path, second: Path) -> bool:
-    """Swap two paths in one step; False where the system has no such call."""
-    if not sys.platform.startswith("linux"):
-        return False
-    try:
-        renameat2 = ctypes.CDLL(None, use_errno=True).renameat2
-    except (OSError, AttributeError):
-        return False
-    at_fdcwd, rename_exchange = -100, 2
-    done = renameat2(
-        at_fdcwd, os.fsencode(first), at_fdcwd, os.fsencode(second), ctypes.c_uint(rename_exchange)
-    )
-    if done == 0:
-        return True
-    code = ctypes.get_errno()
-    if code in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP):
-        return False
-    raise OSError(code, os.strerror(code), os.fspath(second))
 
 
 # ------------------------------------------------------------------------------ states of files

@@ -11,9 +11,7 @@ match_counts.csv     matches of each pair, found and verified, beside the matche
 masked.csv           keypoints that masks removed, by image, beside the features of a type
 ==================== =============================================================================
 
-Readers raise DataError, which names file, line and column (see :meth:`.csv_table.Table.read`);
-writers OutputError where the file cannot be written. All take the file itself and keep its order,
-where nothing else is said.
+Readers and writers take the file itself and keep its order, unless they say otherwise.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +28,6 @@ from pydantic import Field, model_validator
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import (
-    POSE,
-    TEXT,
     Table,
     flag,
     list_of,
@@ -61,18 +57,15 @@ class QueryStatus(Options):
     image : the query.
     status : ``localized``: the pose was estimated from the image; ``failed``: it was not.
     reason : why it failed; empty for a localized query.
-    num_matches : 2D-3D matches the solver was given.
-    num_inliers : those that agree with the pose.
-    confidence : probability that the pose is right; of a failed query that of the pose that was
-        not trusted; None where there was none, or nobody asked.
+    num_matches, num_inliers : 2D-3D matches of the solver, and those that agree with the pose.
+    confidence : probability that the pose is right, or that the rejected pose of a failed query
+        was; None without one.
     cluster : index of the candidate cluster the pose comes from; None without clusters.
     fallback : ``retrieval``: a failed query was given the pose of the best retrieved map image, a
-        guess; ``rig``: it was given its pose through the rig, by another camera of its moment.
-        Everything that counts poses says how many of them are fallbacks.
+        guess; ``rig``: its pose comes through the rig from another camera.
     candidates : the map images the pose comes from, best first.
-    refinement : by method, whether a refined pose was accepted or why the one before it stays;
-        empty where nothing was refined.
-    remarks : steps that were left out because the query, or the map, lacks what they need.
+    refinement : by method, whether a refined pose was accepted or why not; may be empty.
+    remarks : steps that were skipped because the query or the map lacks what they need.
     """
 
     image: str
@@ -108,12 +101,12 @@ _STATUS = Table(QueryStatus, keys=[("image",)], later=("confidence", "remarks"))
 
 
 def read_status(path: Path | str) -> dict[str, QueryStatus]:
-    """Read ``status.csv`` (the file itself): image -> status, sorted by image."""
+    """Read ``status.csv``: image -> status, sorted by image."""
     return {row.image: row for row in sorted(_STATUS.read(path), key=lambda row: row.image)}
 
 
 def write_status(path: Path | str, statuses: Iterable[QueryStatus]) -> None:
-    """Write ``status.csv`` (the file itself), sorted by image."""
+    """Write ``status.csv``, sorted by image."""
     _STATUS.write(path, sorted(statuses, key=lambda status: status.image))
 
 
@@ -123,7 +116,7 @@ _COVARIANCE_COLUMNS = ("image", *(f"{_AXES[i]}_{_AXES[j]}" for i, j in zip(*_UPP
 
 
 def read_covariances(path: Path | str) -> dict[str, NDArray[np.float64]]:
-    """Read ``covariance.csv`` (the file itself): image -> covariance (6, 6), as ``Pose`` has it.
+    """Read ``covariance.csv``: image -> covariance (6, 6), as ``Pose`` has it.
 
     A row has the upper triangle: ``rx_rx, rx_ry, ... tz_tz``.
     """
@@ -143,7 +136,7 @@ def read_covariances(path: Path | str) -> dict[str, NDArray[np.float64]]:
 
 
 def write_covariances(path: Path, poses: Mapping[str, Pose]) -> None:
-    """Write ``covariance.csv`` (the file itself) of the poses that have a covariance, by image."""
+    """Write ``covariance.csv`` of the poses that have a covariance, by image."""
     rows = [
         (image, *map(repr, pose.covariance[_UPPER].tolist()))
         for image, pose in sorted(poses.items())
@@ -181,7 +174,7 @@ _CLUSTERS = Table(ClusterRow)
 
 
 def read_clusters(path: Path | str) -> dict[str, list[ClusterRow]]:
-    """Read ``clusters.csv`` (the file itself): query -> its clusters."""
+    """Read ``clusters.csv``: query -> its clusters."""
     clusters: dict[str, list[ClusterRow]] = {}
     for row in _CLUSTERS.read(path):
         clusters.setdefault(row.image, []).append(row)
@@ -200,26 +193,19 @@ def write_clusters(
     _CLUSTERS.write(path, records)
 
 
-def _refinement_row(accepted: bool, **values: Any) -> RefinementRow:
-    row = RefinementRow(**values)
-    if accepted != row.accepted:
-        raise DataError(f"accepted and reason {row.reason!r} contradict each other")
-    return row
+@dataclass(frozen=True)
+class _RefinementRecord:
+    image: str
+    method: str
+    accepted: Annotated[bool, flag("yes", "no")]
+    reason: str
+    moved_m: Annotated[float, number(".6f")]
+    turned_deg: Annotated[float, number(".6f")]
+    measures: Annotated[tuple[str, ...], list_of(";")]
+    before: RigidTransform
 
 
-_REFINEMENT = Table(
-    _refinement_row,
-    {
-        "image": TEXT,
-        "method": TEXT,
-        "accepted": flag("yes", "no"),
-        "reason": TEXT,
-        "moved_m": number(".6f"),
-        "turned_deg": number(".6f"),
-        "measures": list_of(";"),
-        "before": POSE,
-    },
-)
+_REFINEMENT = Table(_RefinementRecord)
 
 
 def refinement_text(rows: Sequence[RefinementRow]) -> str:
@@ -227,11 +213,16 @@ def refinement_text(rows: Sequence[RefinementRow]) -> str:
     return "; ".join(f"{row.method}: {'accepted' if row.accepted else row.reason}" for row in rows)
 
 
-read_refinement = _REFINEMENT.read
+def read_refinement(path: Path | str) -> list[RefinementRow]:
+    """Read ``refinement.csv``; a row is accepted if it has no reason."""
+    return [
+        RefinementRow(r.image, r.method, r.reason, r.moved_m, r.turned_deg, r.measures, r.before)
+        for r in _REFINEMENT.read(path)
+    ]
 
 
 def write_refinement(path: Path, rows: Iterable[RefinementRow]) -> None:
-    """Write ``refinement.csv`` (the file itself) by image; the steps of one stay in order."""
+    """Write ``refinement.csv`` by image; the steps of one stay in order."""
     _REFINEMENT.write(path, sorted(rows, key=lambda row: row.image))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -142,11 +141,11 @@ def test_world_and_protocol_read_back_to_the_last_digit(tmp_path: Path) -> None:
         ("world", '{"official_from_local": {"quat_wxyz": [1, 1, 0, 0]}}', "quaternion of length"),
         ("world", '{"official_from_local": {"quat_wxyz": [1, 0, 0]}}', "quat_wxyz"),
         ("world", '{"official_from_local": {"scale": 0}}', "scale"),
-        ("world", '{"official_from_local": {"scale": NaN}}', "NaN"),
+        ("world", '{"official_from_local": {"scale": NaN}}', "scale"),
         ("world", '{"official_from_local": {"translation": [1e999, 0, 0]}}', "finite"),
         ("world", '{"origin": 1}', "origin"),
-        ("world", '{"unit": "m",\n  "unit', r"json:2: not JSON"),
-        ("world", "[]", "dict"),
+        ("world", '{"unit": "m",\n  "unit', r"Invalid JSON.* line 2"),
+        ("world", "[]", "should be an object"),
         ("protocol", '{"thresholds": []}', "at least one"),
         ("protocol", '{"thresholds": [[-1.0, 2.0]]}', "threshold"),
         ("protocol", '{"thresholds": [[0.25, -2.0]]}', "threshold"),
@@ -181,23 +180,3 @@ def test_official_poses_see_the_same_and_come_back(seed: int, scale: float) -> N
     np.testing.assert_allclose(seen, scale * pose.apply(local), atol=1e-8)
     back = world.pose_in_local(in_official)
     np.testing.assert_allclose(back.apply(local), pose.apply(local), atol=1e-8)
-
-
-@pytest.mark.parametrize("name", READERS)
-def test_what_is_no_plain_table_of_the_dataset_is_refused(name: str, tmp_path: Path) -> None:
-    place = tmp_path / "dataset" / "megloc" / name
-    place.parent.mkdir(parents=True)
-    os.mkfifo(place)
-    with pytest.raises(DataError, match=f"{name}: not a plain file"):
-        READERS[name](place.parent)
-    place.unlink()
-    with open(place, "wb") as file:
-        file.truncate(1 << 34)  # takes no room on the disk
-    with pytest.raises(DataError, match=f"{name}: larger than 256 MB"):
-        READERS[name](place.parent)
-    for target in ("/dev/zero", tmp_path / "elsewhere"):
-        place.unlink()
-        place.symlink_to(target)
-        (tmp_path / "elsewhere").write_text("{}")
-        with pytest.raises(DataError, match=f"{name}: is or lies behind a link that leaves"):
-            READERS[name](place.parent)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tarfile
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ from megloc_kapture.io.kapture import (
     Sensor,
     write_sensors,
 )
-from megloc_kapture.io.kapture.features import ArrayKind
+from megloc_kapture.io.kapture.features import SUFFIX, ArrayKind, feature_folder
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
@@ -164,9 +165,16 @@ def write_features() -> Callable[..., None]:
         keypoints_type = name if kind == "descriptors" else None
         metric = None if kind == "keypoints" else "L2"
         config = FeatureConfig(name, like.dtype, like.shape[-1], keypoints_type, metric)
-        with FeatureWriter(root, kind, name, config, orphan=orphan, tar=tar) as writer:
+        with FeatureWriter(root, kind, name, config, orphan=orphan) as writer:
             for image, array in arrays.items():
                 writer.write(image, array)
+        if tar:
+            folder = feature_folder(root, kind, name, orphan=orphan)
+            with tarfile.open(folder / f"{kind}.tar", "w") as file:
+                for image in arrays:
+                    path = folder / (image + SUFFIX[kind])
+                    file.add(path, path.relative_to(folder))
+                    path.unlink()
 
     return write
 

@@ -1,8 +1,6 @@
-"""The kapture store: all that other rooms use of it, under one name.
+"""kapture folders: what other subpackages use of them, under one name.
 
-The format is parsed and written by the modules of this package, strictly and fast. kapture itself
-is needed only by who wants its objects (:func:`to_kapture`), and imported there alone: that takes a
-second.
+kapture itself is imported by :func:`to_kapture` alone: that takes a second.
 """
 
 from megloc_kapture.io.kapture.features import (

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import Roots, check_no_escape, safe_join
+from megloc_kapture.io.files import check_no_escape, safe_join
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture.features import (
     ArrayKind,
@@ -22,11 +22,7 @@ from megloc_kapture.io.kapture.features import (
 )
 from megloc_kapture.io.kapture.format import KaptureData
 from megloc_kapture.io.kapture.matches import MatchesReader
-from megloc_kapture.io.kapture.observations import (
-    Observations,
-    find_observation,
-    read_observations,
-)
+from megloc_kapture.io.kapture.observations import Observations, read_observations
 from megloc_kapture.io.kapture.points import read_points3d
 from megloc_kapture.io.kapture.sensors import read_kapture_data
 from megloc_kapture.values import RigidTransform
@@ -97,16 +93,15 @@ class KaptureFolder:
                         )
 
     def read(self) -> KaptureData:
-        """Sensors, rigs, trajectories and records; parsed once. DataError names file and line."""
+        """Sensors, rigs, trajectories and records; parsed once."""
         if self._data is None:
-            self._data = read_kapture_data(self.root, allow_links_below=self._roots()[1:])
+            self._data = read_kapture_data(
+                self.root, allow_links_below=(*self.features_dirs, *self.allow_links_below)
+            )
         return self._data
 
     def image_path(self, image: str) -> Path:
-        """Path of an image; the file need not exist and may be a link.
-
-        Raises DataError: the name leads out of ``records_data``.
-        """
+        """Path of an image; the file need not exist and may be a link."""
         return safe_join(self.root / "sensors" / "records_data", image)
 
     def depth_path(self, name: str) -> Path:
@@ -121,19 +116,19 @@ class KaptureFolder:
         return sorted(found)
 
     def keypoints(self, type_name: str) -> FeatureReader:
-        """Keypoints of a type. Raises DataError: no such type, or a broken configuration."""
+        """Keypoints of a type."""
         return self._features("keypoints", type_name)
 
     def descriptors(self, type_name: str) -> FeatureReader:
-        """Descriptors of a type; see :meth:`keypoints`."""
+        """Descriptors of a type."""
         return self._features("descriptors", type_name)
 
     def global_features(self, type_name: str) -> FeatureReader:
-        """Global features of a type; see :meth:`keypoints`."""
+        """Global features of a type."""
         return self._features("global_features", type_name)
 
     def matches(self, type_name: str) -> MatchesReader:
-        """Matches of a keypoints type; see :meth:`keypoints`."""
+        """Matches of a keypoints type."""
         return MatchesReader(type_name, self._folders("matches", type_name))
 
     def has_points(self) -> bool:
@@ -144,11 +139,9 @@ class KaptureFolder:
         """3D points, float64 (N, 6): X Y Z R G B; colours 0 where there are none.
 
         Read once; the array is shared and cannot be written to.
-
-        Raises DataError: missing or broken; names file and line.
         """
         if self._points is None:
-            points = read_points3d(check_no_escape(self._roots(), self._points_path))
+            points = read_points3d(self._inside(self._points_path))
             points.setflags(write=False)
             self._points = points
         return self._points
@@ -158,12 +151,10 @@ class KaptureFolder:
 
         Read once; the arrays are shared and cannot be written to. Point ids are checked against
         the points, keypoint ids against the keypoints of every image that has some (an image
-        without is kapture's way to say that it was taken out of the map).
-
-        Raises DataError: missing or broken, or ids out of range; names file and line.
+        without any was taken out of the map).
         """
         if self._observations is None:
-            path = check_no_escape(self._roots(), self._observations_path)
+            path = self._inside(self._observations_path)
             found = read_observations(path)
             num_points = len(self.points3d())
             for observations in found.values():
@@ -184,7 +175,7 @@ class KaptureFolder:
         observations against points and keypoints. With ``deep`` also every image is decoded and
         compared with its camera's size, and every match checked against the keypoints.
 
-        Raises DataError: the first thing found wrong.
+        Raises DataError for the first fault.
         """
         self.read()
         readers = {
@@ -212,14 +203,15 @@ class KaptureFolder:
     def _features(self, kind: ArrayKind, type_name: str) -> FeatureReader:
         return FeatureReader(kind, type_name, self._folders(kind, type_name))
 
-    def _roots(self, first: Path | None = None) -> tuple[Path, ...]:
-        """Folders that links may lead to; the one they are found in comes first, for messages."""
-        return (first or self.root, self.root, *self.features_dirs, *self.allow_links_below)
+    def _inside(self, path: Path, root: Path | None = None) -> Path:
+        """Return a path if no link on its way leads elsewhere than below the folders given here."""
+        folders = (root or self.root, self.root, *self.features_dirs, *self.allow_links_below)
+        return check_no_escape(folders, path)
 
-    def _folders(self, kind: FeatureKind, type_name: str) -> list[tuple[Roots, Path]]:
+    def _folders(self, kind: FeatureKind, type_name: str) -> list[Path]:
         candidates = [(self.root, False), *((folder, True) for folder in self.features_dirs)]
-        found: list[tuple[Roots, Path]] = [
-            (self._roots(root), feature_folder(root, kind, type_name, orphan=orphan))
+        found = [
+            self._inside(feature_folder(root, kind, type_name, orphan=orphan), root)
             for root, orphan in candidates
             if type_name in list_types(root, kind, orphan=orphan)
         ]
@@ -284,13 +276,11 @@ class KaptureFolder:
         image = observations.image_names[index]
         keypoint = int(observations.keypoint_ids[first])
         problem = (
-            f"point id {point}, but there are {num_points} points"
+            f"there are {num_points} points"
             if past_points[first]
-            else f"keypoint id {keypoint}, but {image!r} has {limit[index]} keypoints of type "
-            f"{keypoints_type!r}"
+            else f"keypoint {keypoint}, but there are {limit[index]} of type {keypoints_type!r}"
         )
-        line = find_observation(path, keypoints_type, point, image, keypoint)
-        raise DataError(problem, path=path, line=line)
+        raise DataError(f"point {point} of {image!r}: {problem}", path=path)
 
     def _check_images(self) -> None:
         data = self.read()

@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import Roots, check_output, check_relative, output_error, write_bytes
-from megloc_kapture.io.kapture.blobs import BlobSource
-from megloc_kapture.io.kapture.features import (
-    SUFFIX,
-    BlobWriter,
-    blob_sources,
+from megloc_kapture.io.files import check_relative, output_error, write_bytes
+from megloc_kapture.io.kapture.blobs import BlobSource, BlobWriter
+from megloc_kapture.io.kapture.features import SUFFIX, blob_sources, feature_folder
+from megloc_kapture.io.kapture.format import (
+    check_columns,
     check_field,
-    feature_folder,
+    format_table,
+    parse_float,
+    read_rows,
 )
-from megloc_kapture.io.kapture.format import check_columns, format_table, parse_float, read_rows
 
 _BETWEEN = ".overlapping/"
 _ROW_BYTES = 3 * 8
@@ -35,20 +35,14 @@ _MAX_INDEX = 2**53
 class MatchesReader:
     """The matches of one keypoints type, from one or several folders; the first one counts."""
 
-    def __init__(self, type_name: str, folders: Sequence[tuple[Roots, Path]]) -> None:
-        """``folders``: (roots that links may not leave, folder of the type), in order."""
+    def __init__(self, type_name: str, folders: Sequence[Path]) -> None:
         self.type_name = type_name
-        self._sources: list[BlobSource] = []
-        for roots, folder in folders:
-            self._sources += blob_sources(roots, folder, "matches")
+        self._sources = [s for folder in folders for s in blob_sources(folder, "matches")]
         self._pairs: list[tuple[str, str]] | None = None
 
     @property
     def pairs(self) -> list[tuple[str, str]]:
-        """Matched pairs ``(a, b)`` with ``a < b``, sorted.
-
-        Raises DataError: a file that names no pair, or an image with itself.
-        """
+        """Matched pairs ``(a, b)`` with ``a < b``, sorted."""
         if self._pairs is None:
             found = set()
             for source in self._sources:
@@ -60,8 +54,8 @@ class MatchesReader:
             self._pairs = sorted(found)
         return list(self._pairs)
 
-    def __contains__(self, pair: object) -> bool:
-        return isinstance(pair, tuple) and len(pair) == 2 and self._find(*pair) is not None
+    def __contains__(self, pair: tuple[str, str]) -> bool:
+        return self._find(*pair) is not None
 
     def length(self, a: str, b: str) -> int:
         """Number of matches of a pair, from the size of its file alone; 0 where there is none."""
@@ -75,10 +69,6 @@ class MatchesReader:
         -------
         indices : int64 (M, 2), the first column into ``a``'s keypoints, the second into ``b``'s.
         scores : float64 (M,).
-
-        Raises
-        ------
-        DataError : no such pair, a truncated file, or indices that are not whole and >= 0.
         """
         found = self._find(a, b)
         if found is None:
@@ -118,34 +108,21 @@ class MatchesWriter(BlobWriter):
     ``(a, b) in writer`` tells what is written already. Use as a context manager.
     """
 
-    def __init__(
-        self, root: Path, type_name: str, *, tar: bool = False, orphan: bool = False
-    ) -> None:
-        """Raises DataError: the type name cannot be the name of a folder; OutputError: cannot be
-        written.
-        """
+    def __init__(self, root: Path, type_name: str, *, orphan: bool = False) -> None:
         self.type_name = type_name
         folder = feature_folder(Path(root), "matches", type_name, orphan=orphan)
-        check_output(Path(root), folder)
         try:
-            # kapture lists a type by its folder; with no pair at all there must still be one
+            # kapture lists a type by its folder, so there must be one even without a pair
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise output_error(folder, error) from error
-        super().__init__(folder, "matches", tar=tar)
+        super().__init__(folder)
 
     def __contains__(self, pair: tuple[str, str]) -> bool:
         return self.has(_name(min(pair), max(pair)))
 
     def write(self, a: str, b: str, indices: ArrayLike, scores: ArrayLike) -> Path:
-        """Write a pair: integer indices (M, 2) in the order ``a``, ``b``, scores (M,); its file.
-
-        Raises
-        ------
-        ValueError : other shapes, indices that are not integers or negative, or ``a == b``.
-        DataError : a name that is no plain relative path.
-        OutputError : cannot be written.
-        """
+        """Write a pair: integer indices (M, 2) in the order ``a``, ``b``, scores (M,); its file."""
         if a == b:
             raise ValueError(f"image {a!r} matched with itself")
         pairs = np.asarray(indices)
@@ -182,14 +159,11 @@ class ImagePair:
 
 
 def read_pairs(path: Path | str) -> list[ImagePair]:
-    """Read a pairs file, in the order of the file; a repeated pair counts once, where it is first.
-
-    Raises DataError: names file and line.
-    """
+    """Read a pairs file in its order; a repeated pair counts once, where it is first."""
     pairs: list[ImagePair] = []
     seen: set[tuple[str, str]] = set()
     with read_rows(Path(path)) as rows:
-        for _, fields in rows:
+        for fields in rows:
             check_columns(fields, 3)
             pair = check_relative(fields[0]), check_relative(fields[1])
             score = parse_float(fields[2], "score")
@@ -200,13 +174,7 @@ def read_pairs(path: Path | str) -> list[ImagePair]:
 
 
 def write_pairs(path: Path | str, pairs: Iterable[ImagePair]) -> None:
-    """Write a pairs file in the given order, atomically.
-
-    Raises
-    ------
-    DataError : a name that is no plain relative path, or a score that is not finite.
-    OutputError : cannot be written.
-    """
+    """Write a pairs file in the given order, atomically."""
     rows = []
     for pair in pairs:
         score = float(pair.score)

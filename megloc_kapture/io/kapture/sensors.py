@@ -1,7 +1,6 @@
 """The tables below a kapture's ``sensors/``: sensors, rigs, trajectories and records.
 
-Read strictly, written sorted. Floats are written with as many digits as bring back the same
-float64 (up to 17).
+Floats are written with as many digits as bring back the same float64 (up to 17).
 
 Poses: kapture allows partial ones (blank fields). A row whose rotation or whose translation is
 entirely blank is no pose, and is skipped; a row with only some of them blank is an error.
@@ -10,21 +9,13 @@ entirely blank is no pose, and is skipped; a row with only some of them blank is
 from __future__ import annotations
 
 import math
+import os
 import re
-from collections.abc import Callable, Iterable, Sequence
-from graphlib import CycleError, TopologicalSorter
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import (
-    check_no_escape,
-    check_output,
-    check_relative,
-    named,
-    output_error,
-    write_bytes,
-)
+from megloc_kapture.io.files import check_no_escape, check_relative, named, remove, write_bytes
 from megloc_kapture.io.kapture.format import (
     CAMERA_SENSOR_TYPES,
     UNKNOWN_CAMERA,
@@ -43,60 +34,62 @@ MAX_QUATERNION_ERROR = 1e-3
 # below this |q| is one up to rounding: normalising again would only change the last bits
 _QUATERNION_ROUNDING = 1e-14
 
+_POSE_COLUMNS = "qw, qx, qy, qz, tx, ty, tz"
+_HEADERS = {
+    "sensors": "# sensor_id, name, sensor_type, [sensor_params]+",
+    "rigs": f"# rig_id, sensor_id, {_POSE_COLUMNS}",
+    "trajectories": f"# timestamp, device_id, {_POSE_COLUMNS}",
+    "records_camera": "# timestamp, device_id, image_path",
+    "records_depth": "# timestamp, device_id, depth_map_path",
+}
+
 
 # ------------------------------------------------------------------------------------ reading
 
 
 def read_kapture_data(root: Path, *, allow_links_below: Sequence[Path] = ()) -> KaptureData:
-    """Read and validate ``sensors/`` of the kapture at ``root``; only sensors.txt must exist.
+    """Read and check ``sensors/`` of the kapture at ``root``; only sensors.txt must exist.
 
     Parameters
     ----------
     allow_links_below : folders beside ``root`` that links may lead to.
-
-    Raises
-    ------
-    DataError : names file and line.
     """
+    folder = root / "sensors"
     if not root.exists():
         raise DataError("no such kapture folder", path=root)
-    if not (root / "sensors").is_dir():
+    if not folder.is_dir():
         raise DataError(
             "no kapture folder: sensors/sensors.txt is missing. Photographs? `megloc localize "
             "--images` localizes them, `megloc map` makes a map of them",
             path=root,
         )
-    roots = (root, *allow_links_below)
-
-    def read(name: str, reader: Callable[..., dict[Any, Any]], *known: Any) -> dict[Any, Any]:
-        path = root / "sensors" / name
-        if not (path.exists() or path.is_symlink() or name == "sensors.txt"):
-            return {}
-        return reader(check_no_escape(roots, path), *known)
-
-    sensors = read("sensors.txt", read_sensors)
-    rigs = read("rigs.txt", read_rigs, sensors)
-    return KaptureData(
-        sensors,
-        rigs,
-        read("trajectories.txt", read_trajectories, {*sensors, *rigs}),
-        read("records_camera.txt", read_records, sensors, "camera"),
-        read("records_depth.txt", read_records, sensors, "depth"),
-    )
+    paths = {
+        name: check_no_escape((root, *allow_links_below), folder / f"{name}.txt")
+        for name in _HEADERS
+        if name == "sensors" or os.path.lexists(folder / f"{name}.txt")
+    }
+    data = KaptureData(read_sensors(paths["sensors"]))
+    if "rigs" in paths:
+        data.rigs = read_rigs(paths["rigs"], data.sensors)
+    if "trajectories" in paths:
+        data.trajectories = read_trajectories(paths["trajectories"], {*data.sensors, *data.rigs})
+    if "records_camera" in paths:
+        data.records_camera = read_records(paths["records_camera"], data.sensors, "camera")
+    if "records_depth" in paths:
+        data.records_depth = read_records(paths["records_depth"], data.sensors, "depth")
+    return data
 
 
 def read_sensors(path: Path) -> dict[str, Sensor]:
     """Read ``sensors.txt``; cameras' models and parameters are checked."""
     sensors: dict[str, Sensor] = {}
     with read_rows(path, version_required=True) as rows:
-        for _, fields in rows:
+        for fields in rows:
             if len(fields) < 3:
                 raise DataError(f"expected at least 3 columns, got {len(fields)}")
             sensor_id, name, sensor_type, *params = fields
-            if not sensor_id:
-                raise DataError("empty sensor id")
-            if sensor_id in sensors:
-                raise DataError(f"sensor {sensor_id!r} is listed twice")
+            if not sensor_id or sensor_id in sensors:
+                raise DataError(f"sensor id {sensor_id!r} is empty or listed twice")
             sensors[sensor_id] = Sensor(name, sensor_type, tuple(params))
             check_sensor(sensors[sensor_id])
     return sensors
@@ -112,48 +105,40 @@ def check_sensor(sensor: Sensor) -> None:
         raise DataError(f"{UNKNOWN_CAMERA} takes a width and a height in whole pixels")
 
 
-def read_rigs(path: Path, sensors: Iterable[str]) -> dict[str, dict[str, RigidTransform]]:
+def read_rigs(path: Path, sensors: Collection[str]) -> dict[str, dict[str, RigidTransform]]:
     """Read ``rigs.txt``: rig id -> sensor or rig id -> ``sensor_from_rig``.
 
-    Rows of sensors that ``sensors.txt`` does not know are left out, as kapture does: who takes
-    some cameras of a rig out of a dataset leaves rigs.txt as it was. A rig that contains itself is
-    refused.
+    Rows of sensors that ``sensors.txt`` does not list are left out, as kapture does: someone took
+    these cameras out of the dataset.
     """
-    known = set(sensors)
     rigs: dict[str, dict[str, RigidTransform]] = {}
-    lines: dict[tuple[str, str], int] = {}
     with read_rows(path) as rows:
-        for line, fields in rows:
+        for fields in rows:
             check_columns(fields, 9)
             rig_id, sensor_id = fields[:2]
-            if not rig_id or not sensor_id:
-                raise DataError("empty rig or sensor id")
-            if rig_id in known:
-                raise DataError(f"rig id {rig_id!r} is also a sensor id")
-            if (rig_id, sensor_id) in lines:
-                raise DataError(f"sensor {sensor_id!r} is in rig {rig_id!r} twice")
-            lines[rig_id, sensor_id] = line
-            pose = _pose(fields[2:])
+            if not rig_id or rig_id in sensors:
+                raise DataError(f"rig id {rig_id!r} is empty or also a sensor id")
             rig = rigs.setdefault(rig_id, {})
+            if sensor_id in rig:
+                raise DataError(f"sensor {sensor_id!r} is in rig {rig_id!r} twice")
+            pose = _pose(fields[2:])
             if pose is not None:
                 rig[sensor_id] = pose
-    for members in rigs.values():
-        for sensor_id in [s for s in members if s not in known and s not in rigs]:
-            del members[sensor_id]
-    _check_no_cycle(rigs, lines, path)
-    return rigs
+    return {
+        rig_id: {s: pose for s, pose in members.items() if s in sensors or s in rigs}
+        for rig_id, members in rigs.items()
+    }
 
 
-def read_trajectories(path: Path, devices: Iterable[str]) -> dict[tuple[int, str], RigidTransform]:
+def read_trajectories(
+    path: Path, devices: Collection[str]
+) -> dict[tuple[int, str], RigidTransform]:
     """Read ``trajectories.txt``: (timestamp, device id) -> ``device_from_world``."""
-    known = set(devices)
     poses: dict[tuple[int, str], RigidTransform] = {}
-    lines: dict[tuple[int, str], int] = {}
     with read_rows(path) as rows:
-        for line, fields in rows:
+        for fields in rows:
             check_columns(fields, 9)
-            key = _record_key(fields, known, lines)
-            lines[key] = line
+            key = _record_key(fields, devices, poses)
             pose = _pose(fields[2:])
             if pose is not None:
                 poses[key] = pose
@@ -165,40 +150,33 @@ def read_records(
 ) -> dict[tuple[int, str], str]:
     """Read ``records_camera.txt`` or ``records_depth.txt``.
 
-    A path that is listed twice is refused (an image name is the identity of its features), and so
-    is a sensor of another type.
+    A path that is listed twice is refused: an image name is the identity of its features.
     """
-    known = set(sensors)
     records: dict[tuple[int, str], str] = {}
-    lines: dict[tuple[int, str], int] = {}
-    lines_of_names: dict[str, int] = {}
+    names: set[str] = set()
     with read_rows(path) as rows:
-        for line, fields in rows:
+        for fields in rows:
             check_columns(fields, 3)
-            key = _record_key(fields, known, lines)
-            lines[key] = line
+            key = _record_key(fields, sensors, records)
             found_type = sensors[key[1]].sensor_type
             if found_type != sensor_type:
                 raise DataError(f"sensor {key[1]!r} is of type {found_type!r}, not {sensor_type!r}")
             name = check_relative(fields[2])
-            if name in lines_of_names:
-                raise DataError(f"{name!r} is listed twice, first in line {lines_of_names[name]}")
-            lines_of_names[name] = line
+            if name in names:
+                raise DataError(f"{name!r} is listed twice")
+            names.add(name)
             records[key] = name
     return records
 
 
 def _record_key(
-    fields: Sequence[str], known: set[str], lines: dict[tuple[int, str], int]
+    fields: Sequence[str], devices: Collection[str], known: Collection[tuple[int, str]]
 ) -> tuple[int, str]:
-    """Timestamp and device of a row, of which there is none in ``lines``."""
     key = (parse_integer(fields[0], "timestamp"), fields[1])
-    if key[1] not in known:
+    if key[1] not in devices:
         raise DataError(f"unknown sensor or rig {key[1]!r}")
-    if key in lines:
-        raise DataError(
-            f"timestamp {key[0]} of {key[1]!r} is listed twice, first in line {lines[key]}"
-        )
+    if key in known:
+        raise DataError(f"timestamp {key[0]} of {key[1]!r} is listed twice")
     return key
 
 
@@ -216,9 +194,9 @@ def _pose(fields: Sequence[str]) -> RigidTransform | None:
 def unit_quaternion(
     quat_wxyz: tuple[float, float, float, float],
 ) -> tuple[float, float, float, float]:
-    """The quaternion with length one; unchanged where it is one up to rounding.
+    """Return the quaternion with length one; DataError where its length is off by 1e-3 or more.
 
-    Raises DataError: its length is off by 1e-3 or more.
+    One of length one up to rounding is returned unchanged.
     """
     norm = math.hypot(*quat_wxyz)
     if not abs(norm - 1.0) < MAX_QUATERNION_ERROR:
@@ -229,21 +207,6 @@ def unit_quaternion(
     return (w / norm, x / norm, y / norm, z / norm)
 
 
-def _check_no_cycle(
-    rigs: dict[str, dict[str, RigidTransform]], lines: dict[tuple[str, str], int], path: Path
-) -> None:
-    members: dict[str, list[str]] = {rig: [] for rig in rigs}
-    for rig, sensor_id in lines:
-        if sensor_id in rigs:
-            members[rig].append(sensor_id)
-    try:
-        TopologicalSorter(members).prepare()
-    except CycleError as error:
-        member, rig = error.args[1][:2]
-        line = lines[rig, member]
-        raise DataError(f"rig {member!r} contains itself", path=path, line=line) from None
-
-
 # ------------------------------------------------------------------------------------ writing
 
 
@@ -252,38 +215,26 @@ def write_sensors(root: Path, data: KaptureData) -> None:
 
     Rows are sorted; a table without rows has no file, and an older file of it is removed.
 
-    Raises
-    ------
-    DataError : the data is not valid kapture (ids, names, poses).
-    OutputError : a file cannot be written.
+    Raises DataError: the data is not valid kapture (ids, names, poses).
     """
-    root = Path(root)
-    folder = check_output(root, root / "sensors")
-    pose = "qw, qx, qy, qz, tx, ty, tz"
     tables = {
-        "sensors": ("sensor_id, name, sensor_type, [sensor_params]+", _sensor_rows(data)),
-        "rigs": (f"rig_id, sensor_id, {pose}", _rig_rows(data)),
-        "trajectories": (f"timestamp, device_id, {pose}", _trajectory_rows(data)),
-        "records_camera": ("timestamp, device_id, image_path", _record_rows(data, "camera")),
-        "records_depth": ("timestamp, device_id, depth_map_path", _record_rows(data, "depth")),
+        "sensors": _sensor_rows(data),
+        "rigs": _rig_rows(data),
+        "trajectories": _trajectory_rows(data),
+        "records_camera": _record_rows(data, data.records_camera, "camera"),
+        "records_depth": _record_rows(data, data.records_depth, "depth"),
     }
-    for name, (header, rows) in tables.items():
-        path = folder / f"{name}.txt"
+    for name, rows in tables.items():
+        path = Path(root) / "sensors" / f"{name}.txt"
         if rows or name == "sensors":
-            write_bytes(path, format_table(f"# {header}", rows))
+            write_bytes(path, format_table(_HEADERS[name], rows))
         else:
-            try:
-                path.unlink(missing_ok=True)
-            except OSError as error:
-                raise output_error(path, error) from error
+            remove(path)
 
 
 def _sensor_rows(data: KaptureData) -> list[list[str]]:
     rows = []
-    for sensor_id in sorted(data.sensors):
-        sensor = data.sensors[sensor_id]
-        if not sensor_id:
-            raise DataError("empty sensor id")
+    for sensor_id, sensor in sorted(data.sensors.items()):
         with named(about=f"sensor {sensor_id!r}"):
             check_sensor(sensor)
         rows.append([sensor_id, sensor.name, sensor.sensor_type, *sensor.params])
@@ -292,42 +243,36 @@ def _sensor_rows(data: KaptureData) -> list[list[str]]:
 
 def _rig_rows(data: KaptureData) -> list[list[str]]:
     rows = []
-    for rig_id in sorted(data.rigs):
-        if rig_id in data.sensors or not rig_id:
-            raise DataError(f"rig id {rig_id!r} is empty or also a sensor id")
-        for sensor_id in sorted(data.rigs[rig_id]):
+    for rig_id, members in sorted(data.rigs.items()):
+        for sensor_id, pose in sorted(members.items()):
             if sensor_id not in data.sensors and sensor_id not in data.rigs:
                 raise DataError(f"rig {rig_id!r} holds the unknown sensor {sensor_id!r}")
-            pose = data.rigs[rig_id][sensor_id]
             rows.append([rig_id, sensor_id, *_pose_fields(pose, f"rig {rig_id!r}")])
     return rows
 
 
 def _trajectory_rows(data: KaptureData) -> list[list[str]]:
     rows = []
-    for timestamp, device_id in sorted(data.trajectories):
+    for (timestamp, device_id), pose in sorted(data.trajectories.items()):
         # a rig without sensors has no row in rigs.txt, and so would be unknown to readers
         if device_id not in data.sensors and not data.rigs.get(device_id):
             raise DataError(f"trajectories name the unknown device {device_id!r}")
-        pose = data.trajectories[timestamp, device_id]
         where = f"trajectory of {device_id!r} at {timestamp}"
         rows.append([str(int(timestamp)), device_id, *_pose_fields(pose, where)])
     return rows
 
 
-def _record_rows(data: KaptureData, sensor_type: str) -> list[list[str]]:
-    records = data.records_camera if sensor_type == "camera" else data.records_depth
+def _record_rows(
+    data: KaptureData, records: dict[tuple[int, str], str], sensor_type: str
+) -> list[list[str]]:
+    if len(set(records.values())) < len(records):
+        raise DataError(f"two {sensor_type} records have the same path")
     rows = []
-    names: set[str] = set()
-    for timestamp, sensor_id in sorted(records):
-        name = records[timestamp, sensor_id]
+    for (timestamp, sensor_id), name in sorted(records.items()):
         sensor = data.sensors.get(sensor_id)
         if sensor is None or sensor.sensor_type != sensor_type:
             raise DataError(f"{name!r} is recorded by {sensor_id!r}, not a {sensor_type} sensor")
-        if check_relative(name) in names:
-            raise DataError(f"{name!r} is recorded twice")
-        names.add(name)
-        rows.append([str(int(timestamp)), sensor_id, name])
+        rows.append([str(int(timestamp)), sensor_id, check_relative(name)])
     return rows
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture.format import KaptureData, Sensor, read_rows
+from megloc_kapture.io.kapture.format import KaptureData, Sensor
 from megloc_kapture.io.kapture.sensors import read_kapture_data, write_sensors
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -79,22 +78,20 @@ REFUSED = {
     "records_camera": {
         "1, cam": "expected 3 columns, got 2",
         "1.0, cam, a.jpg": "timestamp '1.0' is not an integer",
-        "1_0, cam, a.jpg": "not an integer",
         "9, nocam, a.jpg": "unknown sensor or rig 'nocam'",
         "9, deep, a.jpg": "of type 'depth', not 'camera'",
-        "0, cam, b.jpg": "timestamp 0 of 'cam' is listed twice, first in line 2",
-        "9, cam, ok.jpg": "'ok.jpg' is listed twice, first in line 2",
+        "0, cam, b.jpg": "timestamp 0 of 'cam' is listed twice",
+        "9, cam, ok.jpg": "'ok.jpg' is listed twice",
         "9, cam, a/../../b.jpg": "leads out",
     },
     "trajectories": {
         **{f"1, cam, {pose}": match for pose, match in POSES.items()},
         f"0, rig, {IDENTITY}": "unknown sensor or rig 'rig'",
-        "0, cam, , , , , , ,": "listed twice",  # although it is no pose
     },
     "sensors": {
         "x, ": "at least 3 columns",
-        ", n, camera, PINHOLE, 640, 480, 500, 500, 320, 240": "empty sensor id",
-        "cam, n, gnss": "'cam' is listed twice",
+        ", n, camera, PINHOLE, 640, 480, 500, 500, 320, 240": "is empty or listed twice",
+        "cam, n, gnss": "'cam' is empty or listed twice",
         "x, n, camera": "without a model",
         "x, n, camera, PINHOLLOW, 640, 480, 1, 1, 1, 1": "unknown camera model 'PINHOLLOW'",
         "x, n, camera, PINHOLE, 640, 480, 500, 320, 240": "takes 6 parameters .* got 5",
@@ -109,8 +106,6 @@ REFUSED = {
         f"cam2, cam, {IDENTITY}": "also a sensor id",
         f"rig, cam, {IDENTITY}": "twice",
         f", cam, {IDENTITY}": "empty",
-        f"rig, rig, {IDENTITY}": "contains itself",
-        f"a, b, {IDENTITY}\nb, c, {IDENTITY}\nc, a, {IDENTITY}": "contains itself",
         f"rig, deep, {IDENTITY[:-3]}": "expected 9 columns",
     },
 }
@@ -133,16 +128,21 @@ def test_what_is_wrong_is_named_with_file_and_line(
 @pytest.mark.parametrize(
     ("head", "match"),
     [
-        ("# kapture format: 1.0\n", "1.0 is not supported"),
+        ("# kapture format: 1.2\n", "1.2 is not supported"),
         ("# kapture format: 11.1\n", "11.1 is not supported"),
         ("", "first line must be"),
         ("# sensors\n", "first line must be"),
     ],
 )
-def test_only_version_1_1_is_read(tmp_path: Path, head: str, match: str) -> None:
+def test_newer_versions_are_refused(tmp_path: Path, head: str, match: str) -> None:
     root = make(tmp_path, sensors=SENSORS.replace(VERSION, head))
     with pytest.raises(DataError, match=rf"sensors\.txt:1: .*{match}"):
         read_kapture_data(root)
+
+
+def test_sensors_of_version_1_0_are_read(tmp_path: Path) -> None:
+    root = make(tmp_path, sensors=SENSORS.replace("1.1", "1.0"))
+    assert set(read_kapture_data(root).sensors) == {"cam", "cam2", "deep", "gps"}
 
 
 @pytest.mark.parametrize("pose", [", , , , 1, 2, 3", "1, 0, 0, 0, , ,", " , , , , , , "])
@@ -158,25 +158,13 @@ def test_almost_unit_quaternions_are_normalised(tmp_path: Path) -> None:
     assert abs(np.linalg.norm(poses[1, "cam"].quat_wxyz) - 1) < 1e-15
 
 
-def test_a_table_that_may_be_cut_short_is_told_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = tmp_path / "rows.txt"
-    for end, told in (("\n", 0), ("", 1), ("", 1)):
-        path.write_text(f"# kapture format: 1.1\n0, cam, 7842{end}")
-        with read_rows(path) as rows:
-            assert list(rows) == [(2, ["0", "cam", "7842"])]
-        assert caplog.text.count("rows.txt:2: the last line is not ended") == told
-
-
 def test_missing_and_unreadable_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="nothing: no such kapture folder"):
         read_kapture_data(tmp_path / "nothing")
     with pytest.raises(DataError, match="no kapture folder.*Photographs.*--images.*megloc map"):
         read_kapture_data(tmp_path)
-    make(tmp_path)
-    os.mkfifo(tmp_path / "sensors" / "rigs.txt")  # opening it would wait for ever
-    with pytest.raises(DataError, match="rigs.txt: not a plain file"):
+    (make(tmp_path) / "sensors" / "rigs.txt").mkdir()
+    with pytest.raises(DataError, match="rigs.txt: cannot read: Is a directory"):
         read_kapture_data(tmp_path)
 
 
