@@ -182,12 +182,11 @@ class _DatabaseFeatures:
         return keypoints, numbers
 
     def close(self) -> None:
-        """Write empty descriptors where there are no keypoints, and close what was opened."""
+        """Write empty descriptors where there are no keypoints."""
         if self._writer is not None:
             for name in self._without:
                 empty = np.empty((0, self._writer.config.dsize), self._writer.config.dtype)
                 self._writer.write(name, empty)
-            self._writer.close()
 
     def _name_there(self, name: str) -> str | None:
         name = self._names.get(name, name)

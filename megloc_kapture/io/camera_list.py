@@ -13,7 +13,6 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import named, read_text
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera
 
-_MAX_BYTES = 1 << 28
 _ROW = re.compile(
     rf"(?P<name>\S.*?)[\s,]+(?P<model>{'|'.join(CAMERA_MODEL_NUM_PARAMS)})[\s,]+(?P<numbers>.*)"
 )
@@ -45,12 +44,9 @@ class CameraList:
 
 
 def read_cameras(path: Path) -> Camera | CameraList:
-    """Read a list; a single row whose name is a number, as COLMAP's ids are, is of all images.
-
-    Raises DataError: no such list; names file and line.
-    """
+    """Read a list; a single row whose name is a number, as COLMAP's ids are, is of all images."""
     cameras: dict[str, Camera] = {}
-    for number, line in enumerate(read_text(path, max_bytes=_MAX_BYTES).splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         with named(path, number):

@@ -1,12 +1,11 @@
 """Images, depth maps, frames of videos and headers of photographs, read the same way everywhere.
 
-kapture and COLMAP know pixels as they are stored, and so do the cameras here. Who wants a
-photograph the right way up turns pixels and camera by its EXIF orientation:
-:func:`turned_upright`.
+kapture and COLMAP know pixels as they are stored, and so do the cameras here;
+:func:`turned_upright` rotates pixels by the EXIF orientation.
 
 The focal length is COLMAP's reading of the EXIF (35 mm equivalent, COLMAP's database of sensors,
-resolution of the focal plane, in this order). It is rarely exact: digital zoom, stabilisation and
-rounded millimetres are in it, so a camera that comes from here is not certain of it.
+resolution of the focal plane, in this order). Digital zoom, stabilisation and rounding make it
+uncertain.
 """
 
 from __future__ import annotations
@@ -63,8 +62,6 @@ def read_image_rgb(path: Path | str) -> NDArray[np.uint8]:
 
     Grey images are repeated over three channels, transparency is dropped, and more than 8 bits
     become 8, see :func:`with_8_bits`.
-
-    Raises DataError: missing, not an image, or truncated.
     """
     check_image_file(Path(path))
     content = read_content(path)
@@ -74,16 +71,7 @@ def read_image_rgb(path: Path | str) -> NDArray[np.uint8]:
 
 
 def decode_image_rgb(content: bytes, path: Path | str | None = None) -> NDArray[np.uint8]:
-    """Decode the bytes of an image file; see :func:`read_image_rgb`.
-
-    Parameters
-    ----------
-    path : what an error names; nothing is read there.
-
-    Raises
-    ------
-    DataError : not an image, or truncated.
-    """
+    """Decode the bytes of an image file; errors name the ``path``."""
     image = _decoded_by_opencv(content)
     if image is None:
         try:
@@ -142,17 +130,14 @@ def with_8_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def image_size(path: Path | str) -> tuple[int, int]:
-    """``(width, height)`` in pixels as stored, from the header only.
-
-    Raises DataError: missing, or not an image.
-    """
+    """``(width, height)`` in pixels as stored, from the header only."""
     with _opened(Path(path)) as image:
         return int(image.width), int(image.height)
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """No warnings: pillow has them for whatever is broken in EXIF."""
+    """Silence pillow's warnings about broken EXIF."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -174,13 +159,8 @@ def _opened(path: Path) -> Iterator[Image.Image]:
 def write_image(path: Path | str, image: NDArray[np.uint8], *, jpeg_quality: int = 95) -> None:
     """Write uint8 (H, W, 3) RGB or (H, W) grey as its suffix says, atomically.
 
-    The same pixels give the same bytes: no dates, no metadata. A suffix that is none of
-    WRITABLE_SUFFIXES becomes JPEG, or PNG where its format is without loss.
-
-    Raises
-    ------
-    ValueError : the array is not such an image.
-    OutputError : the file cannot be written.
+    The same pixels give the same bytes: no dates, no metadata. Other suffixes than
+    WRITABLE_SUFFIXES become JPEG, or PNG where their format is lossless.
     """
     path = Path(path)
     write_bytes(path, _encoded(path, image, jpeg_quality))
@@ -189,12 +169,7 @@ def write_image(path: Path | str, image: NDArray[np.uint8], *, jpeg_quality: int
 def image_as_read_back(
     image: NDArray[np.uint8], name: str, *, jpeg_quality: int = 95
 ) -> NDArray[np.uint8]:
-    """The image that reading gives after :func:`write_image`: uint8 (H, W, 3) RGB.
-
-    Parameters
-    ----------
-    name : of the file that it would be; only its suffix counts.
-    """
+    """The image that reading gives after :func:`write_image` to a file of this name."""
     if _format_suffix(name) not in _JPEG:
         return image
     import cv2
@@ -233,7 +208,7 @@ def _encoded(path: Path, image: NDArray[np.uint8], jpeg_quality: int) -> bytes:
 
 
 def check_image_file(path: Path) -> None:
-    """Raise DataError where there is no plain file; its content is not looked at."""
+    """Raise DataError unless this is a file; its content is not looked at."""
     try:
         if path.is_file():
             return
@@ -268,10 +243,7 @@ def _check_complete(path: Path | str | None, content: bytes) -> None:
 
 
 def read_depth_map(path: Path | str, *, width: int, height: int) -> NDArray[np.float32]:
-    """Read a depth map as float32 (H, W) in metres; the size is its depth sensor's.
-
-    Raises DataError: missing, or of another size (truncated).
-    """
+    """Read a depth map as float32 (H, W) in metres; the size is its depth sensor's."""
     path = Path(path)
     content = read_content(path)
     expected = 4 * width * height
@@ -283,10 +255,7 @@ def read_depth_map(path: Path | str, *, width: int, height: int) -> NDArray[np.f
 
 
 def write_depth_map(path: Path | str, depth_m: ArrayLike) -> None:
-    """Write a depth map (H, W) in metres, atomically.
-
-    Raises ValueError: not a two-dimensional array; OutputError: cannot be written.
-    """
+    """Write a depth map (H, W) in metres, atomically."""
     pixels = np.asarray(depth_m, dtype="<f4")
     if pixels.ndim != 2:
         raise ValueError(f"expected a depth map of shape (H, W), got {pixels.shape}")
@@ -294,14 +263,9 @@ def write_depth_map(path: Path | str, depth_m: ArrayLike) -> None:
 
 
 def extract_frames(video: Path, folder: Path, every: int) -> Iterator[str]:
-    """Write every n-th frame of a video, the first included, as a JPEG file; yields their names.
+    """Write every n-th frame of a video, the first included, as a JPEG file; yield their names.
 
-    The names are the frames' numbers from 0: ``000120.jpg``. OpenCV turns frames as the file says.
-
-    Raises
-    ------
-    DataError : missing, or OpenCV finds no frame in it.
-    OutputError : a frame cannot be written.
+    The names are the frames' numbers from 0: ``000120.jpg``. OpenCV applies the rotation in the file.
     """
     import cv2
 
@@ -334,10 +298,9 @@ class Photo:
     Attributes
     ----------
     camera : of the pixels as they are stored; its focal length is uncertain.
-    orientation : EXIF's, 1 to 8: how the stored pixels are turned or mirrored; 1: not at all.
-    make : of the camera, with its model; may be empty.
-    gps : latitude and longitude in degrees, height in metres (0 where it is not said); None
-        without.
+    orientation : EXIF's, 1 to 8: how the stored pixels are rotated or mirrored; 1: not at all.
+    make : make and model of the camera; may be empty.
+    gps : latitude and longitude in degrees, height in metres (0 if unknown).
     """
 
     camera: Camera
@@ -356,7 +319,7 @@ class Photo:
 
 
 def guessed_camera(width: int, height: int) -> Camera:
-    """A camera of which nothing but its image size is known: COLMAP's guess, very uncertain."""
+    """COLMAP's guess for a camera of which only the image size is known."""
     return _centred(width, height, _GUESS * max(width, height), GUESS_DEVIATION)
 
 
@@ -374,10 +337,7 @@ def is_image(path: Path) -> bool:
 
 
 def read_photo(path: Path | str) -> Photo:
-    """Read the header of a photograph.
-
-    Raises DataError: missing, empty, or of a format that is not read.
-    """
+    """Read the header of a photograph; DataError for a format that is not read."""
     path = Path(path)
     check_image_file(path)
     known = f"cannot be read; {', '.join(WRITABLE_SUFFIXES)} can"
@@ -412,10 +372,9 @@ def photo_of(image: Image.Image) -> Photo:
 
 
 def _tried(read: Callable[[], T]) -> T | None:
-    """What is read, None where that fails: a damaged part of EXIF is as one that is missing."""
     try:
         return read()
-    except Exception:  # pillow raises many kinds
+    except Exception:  # pillow raises many kinds; a damaged part of EXIF counts as missing
         return None
 
 
@@ -437,7 +396,6 @@ def _numbers(value: Any) -> list[float]:
 
 
 def _number(value: Any) -> float | None:
-    """The first number in an EXIF tag; None where there is none."""
     return next(iter(_tried(lambda: _numbers(value)) or ()), None)
 
 
@@ -489,8 +447,8 @@ def _position(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
 def _blank_with_exif(exif: Image.Exif, make: str, model: str, size: tuple[int, int]) -> bytes:
     """A JPEG of that size that has nothing but what the EXIF says of the camera.
 
-    COLMAP reads EXIF from files only, and decodes them; a blank one takes a tenth of the time, and
-    may come from formats that COLMAP does not read.
+    COLMAP reads EXIF from files only, and decodes them; a blank file takes a tenth of the time and
+    serves formats that COLMAP does not read.
     """
     from PIL import Image
     from PIL.TiffImagePlugin import IFDRational

@@ -225,7 +225,7 @@ def test_a_file_that_is_no_text(tmp_path: Path) -> None:
     assert caught.value.line == 2
     with pytest.raises(DataError, match="cannot read"):
         read_pose_file(tmp_path / "absent.txt")
-    with pytest.raises(DataError, match="not a plain file"):
+    with pytest.raises(DataError, match="Is a directory"):
         read_pose_file(tmp_path)
 
 

@@ -1,7 +1,4 @@
-"""kapture folders: what other subpackages use of them, under one name.
-
-kapture itself is imported by :func:`to_kapture` alone: that takes a second.
-"""
+"""kapture folders: what other subpackages use of them, under one name."""
 
 from megloc_kapture.io.kapture.features import (
     FeatureConfig,
@@ -10,7 +7,7 @@ from megloc_kapture.io.kapture.features import (
     FeatureWriter,
     feature_folder,
 )
-from megloc_kapture.io.kapture.folder import KaptureFolder, to_kapture
+from megloc_kapture.io.kapture.folder import KaptureFolder
 from megloc_kapture.io.kapture.format import KaptureData, Sensor, writable_name
 from megloc_kapture.io.kapture.matches import (
     ImagePair,
@@ -45,7 +42,6 @@ __all__ = [
     "feature_folder",
     "read_pairs",
     "read_point_covariances",
-    "to_kapture",
     "unit_quaternion",
     "write_observations",
     "write_pairs",

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import filecmp
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +25,6 @@ from megloc_kapture.io.kapture.matches import MatchesReader
 from megloc_kapture.io.kapture.observations import Observations, read_observations
 from megloc_kapture.io.kapture.points import read_points3d
 from megloc_kapture.io.kapture.sensors import read_kapture_data
-from megloc_kapture.values import RigidTransform
-
-if TYPE_CHECKING:
-    import kapture
 
 _ARRAY_KINDS: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_features")
 
@@ -309,32 +305,3 @@ def _same_array(first: FeatureReader, second: FeatureReader, image: str) -> bool
     except DataError:
         return False
     return a.size > 0 and a.shape == b.shape and a.tobytes() == b.tobytes()
-
-
-def to_kapture(source: KaptureData | KaptureFolder | Path | str) -> kapture.Kapture:
-    """The sensors, rigs, trajectories and records as kapture's own object, for its tools."""
-    import kapture
-
-    if isinstance(source, Path | str):
-        source = KaptureFolder(source)
-    data = source.read() if isinstance(source, KaptureFolder) else source
-    sensors = kapture.Sensors()
-    for sensor_id, sensor in sorted(data.sensors.items()):
-        sensors[sensor_id] = kapture.create_sensor(
-            sensor.sensor_type, list(sensor.params), sensor.name or None
-        )
-    rigs = {(rig, sensor): p for rig, members in data.rigs.items() for sensor, p in members.items()}
-    parts: dict[str, tuple[Any, Mapping[Any, Any]]] = {
-        "rigs": (kapture.Rigs(), rigs),
-        "trajectories": (kapture.Trajectories(), data.trajectories),
-        "records_camera": (kapture.RecordsCamera(), data.records_camera),
-        "records_depth": (kapture.RecordsDepth(), data.records_depth),
-    }
-    for container, values in parts.values():
-        for key, value in sorted(values.items()):
-            if isinstance(value, RigidTransform):
-                value = kapture.PoseTransform(list(value.quat_wxyz), list(value.translation))
-            container[key] = value
-    return kapture.Kapture(
-        sensors=sensors, **{name: container or None for name, (container, _) in parts.items()}
-    )

@@ -53,8 +53,13 @@ class Observations:
         if not (np.diff(self.point_ids) < 0).any():
             return self
         order = np.argsort(self.point_ids, kind="stable")
-        arrays = (ids[order] for ids in (self.point_ids, self.image_ids, self.keypoint_ids))
-        return Observations(self.keypoints_type, self.image_names, *arrays)
+        return Observations(
+            self.keypoints_type,
+            self.image_names,
+            self.point_ids[order],
+            self.image_ids[order],
+            self.keypoint_ids[order],
+        )
 
 
 # ------------------------------------------------------------------------------------ reading
