@@ -10,7 +10,6 @@ the script fails if anything differs, or with ``--fail-below`` if the ratio is t
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
 import tempfile
 import time
@@ -70,25 +69,6 @@ def read_ours(folder: Path) -> tuple[float, float, np.ndarray[Any, Any], Observa
     return points_s, observations_s, points, observations[KEYPOINTS_TYPE]
 
 
-COMPILE = """
-import sys
-from pathlib import Path
-from megloc_kapture.io.kapture.observations import read_observations
-from megloc_kapture.io.kapture.points import read_points3d
-root = Path(sys.argv[1]) / "reconstruction"
-read_points3d(root / "points3d.txt", large_bytes=0)
-read_observations(root / "observations.txt", large_bytes=0)
-"""
-
-
-def compile_loops() -> float:
-    """Seconds of a process that reads a tiny map: most of it compiling, the first time."""
-    with tempfile.TemporaryDirectory() as folder:
-        generate(Path(folder), 10, 20)
-        command = [sys.executable, "-c", COMPILE, folder]
-        return timed(lambda: subprocess.run(command, check=True))[0]
-
-
 def equal(
     points: np.ndarray[Any, Any], observations: Observations, theirs: tuple[Any, Any]
 ) -> bool:
@@ -128,7 +108,6 @@ def main() -> int:
     for file in files:
         file.read_bytes()  # into the page cache
 
-    compile_s = compile_loops()
     first = read_ours(folder)
     again = min((read_ours(folder) for _ in range(3)), key=lambda read: read[0] + read[1])
 
@@ -153,7 +132,6 @@ def main() -> int:
         both = points_s + observations_s
         ratio = theirs_s / both
         print(f"{name:28}{points_s:8.2f} s{observations_s:12.2f} s{both:8.2f} s{ratio:7.1f}x")
-    print(f"a process that reads a tiny map, compiling our loops if need be: {compile_s:.1f} s")
     print("content equal" if same else "CONTENT DIFFERS")
     ratio = theirs_s / (first[0] + first[1])
     return 0 if same and ratio >= options.fail_below else 1

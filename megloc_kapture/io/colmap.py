@@ -211,11 +211,6 @@ def triangulate(
     images : the mapping images.
     matches : (M, 2) keypoint rows for pairs (i, j) of indices into ``images``.
     scratch : folder for COLMAP's database meanwhile, the system's unless given.
-
-    Raises
-    ------
-    DataError : a match refers past the keypoints of its image.
-    OutputError : no room for the database.
     """
     options = options or TriangulationOptions()
     empty = np.zeros(0, dtype=np.int64)
@@ -270,8 +265,6 @@ def database_folder(
     matches: Mapping[tuple[int, int], NDArray[np.integer[Any]]],
 ) -> Iterator[str]:
     """A folder for a database; with too little room COLMAP would end the process, so it is asked.
-
-    Raises OutputError: too little room, or COLMAP could not write.
     """
     place = tempfile.gettempdir() if scratch is None else scratch
     # matches are written twice, keypoints as float32; the rest is what SQLite and its journal take
@@ -413,10 +406,6 @@ def write_model(
     ----------
     observed : of each image rows of its keypoints and of the points that they observe.
     xyz, colours : (N, 3), the latter from 0 to 255. A point that no image observes is written too.
-
-    Raises
-    ------
-    OutputError : the folder cannot be written to.
     """
     pycolmap = load_pycolmap()
     model = _posed_reconstruction(images, *_cameras_of(images))
@@ -437,10 +426,6 @@ def write_model(
 
 def read_model_poses(model: Path) -> dict[str, RigidTransform]:
     """Read ``cam_from_world`` by image name of a binary model, whose points need not be there.
-
-    Raises
-    ------
-    DataError : the model is broken.
     """
     with tempfile.TemporaryDirectory(prefix=f".{owned_name()}") as folder:
         for file in model.glob("*.bin"):
@@ -463,11 +448,6 @@ def read_model_poses(model: Path) -> dict[str, RigidTransform]:
 
 def undistort_model(model: Path, images: Path, output: Path) -> None:
     """Write ``images/`` and ``sparse/0`` without distortion, keypoints included.
-
-    Raises
-    ------
-    DataError : COLMAP cannot read an image of the model.
-    OutputError : the folder cannot be written to.
     """
     pycolmap = load_pycolmap()
     try:

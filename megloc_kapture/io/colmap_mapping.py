@@ -100,8 +100,6 @@ class DatabaseFeatures:
 
 def write_feature_database(path: Path, images: Iterable[DatabaseFeatures]) -> None:
     """Write COLMAP's database of images with SIFT features; equal cameras are one.
-
-    Raises OutputError: ``path`` is there already, or cannot be written.
     """
     pycolmap = load_pycolmap()
     path = Path(path)
@@ -191,11 +189,6 @@ def reconstruct(
     matches : (M, 2) keypoint rows for pairs (i, j) of indices into ``photographs``.
     known_cameras : the cameras stay as they are; else focal length and distortion are estimated.
     scratch : folder for COLMAP's database meanwhile, the system's unless given.
-
-    Raises
-    ------
-    DataError : there is no model, and what speaks against one.
-    OutputError : no room for the database.
     """
     pycolmap = load_pycolmap()
     sensors = sorted({photograph.sensor for photograph in photographs})

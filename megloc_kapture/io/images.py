@@ -265,7 +265,8 @@ def write_depth_map(path: Path | str, depth_m: ArrayLike) -> None:
 def extract_frames(video: Path, folder: Path, every: int) -> Iterator[str]:
     """Write every n-th frame of a video, the first included, as a JPEG file; yield their names.
 
-    The names are the frames' numbers from 0: ``000120.jpg``. OpenCV applies the rotation in the file.
+    The names are the frames' numbers from 0: ``000120.jpg``. OpenCV rotates frames as the file
+    says.
     """
     import cv2
 

