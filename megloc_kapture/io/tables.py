@@ -24,10 +24,11 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import (
+    ImageName,
     Table,
     flag,
     list_of,
@@ -36,7 +37,7 @@ from megloc_kapture.io.csv_table import (
     read_csv_table,
     write_csv_table,
 )
-from megloc_kapture.io.files import check_relative, named
+from megloc_kapture.io.files import named
 from megloc_kapture.values import ClusterPose, Options, Pose, RefinementRow, RigidTransform
 
 STATUS_FILE = "status.csv"
@@ -68,7 +69,7 @@ class QueryStatus(Options):
     remarks : steps that were skipped because the query or the map lacks what they need.
     """
 
-    image: str
+    image: ImageName
     status: Literal["localized", "failed"]
     reason: str = ""
     num_matches: int = Field(default=0, ge=0)
@@ -79,22 +80,6 @@ class QueryStatus(Options):
     candidates: tuple[str, ...] = ()
     refinement: str = ""
     remarks: str = ""
-
-    @model_validator(mode="after")
-    def _consistent(self) -> QueryStatus:
-        try:
-            check_relative(self.image)
-        except DataError as error:
-            raise ValueError(error.message) from error
-        if self.status == "localized" and self.fallback != "none":
-            raise ValueError("a localized query has no fallback pose")
-        if self.status == "localized" and self.reason:
-            raise ValueError("a localized query has no reason to fail")
-        if self.status == "failed" and not self.reason.strip():
-            raise ValueError("a failed query needs a reason")
-        if any(not name or "," in name for name in self.candidates):
-            raise ValueError("a candidate is empty or holds a ','")
-        return self
 
 
 _STATUS = Table(QueryStatus, keys=[("image",)], later=("confidence", "remarks"))

@@ -36,9 +36,9 @@ class FolderBlobs:
 
     def read(self, name: str) -> bytes:
         """The content of a blob."""
-        path = safe_join(self._folder, name)
-        with reading(path):
-            return path.read_bytes()
+        path = f"{self._folder}/{check_relative(name)}"  # much faster to make than a Path
+        with reading(path), open(path, "rb", buffering=0) as file:
+            return file.readall()
 
     def where(self, name: str) -> str:
         """The file that holds a blob, for messages."""
@@ -81,8 +81,7 @@ class TarBlobs:
         """The content of a blob."""
         offset, size = self._index[name]
         with reading(self._path), open(self._path, "rb", buffering=0) as file:
-            file.seek(offset)
-            content = file.read(size)
+            content = os.pread(file.fileno(), size, offset)
         if len(content) < size:
             raise DataError(f"truncated at member {name!r}", path=self._path)
         return content

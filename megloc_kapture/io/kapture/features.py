@@ -181,7 +181,7 @@ class FeatureReader:
     def length(self, image: str) -> int:
         """Number of rows of an image, from the size of its file alone."""
         source, name = self._source(image)
-        return self._num_rows(source.size(name), source.where(name))
+        return self._num_rows(source.size(name), source, name)
 
     def read(self, image: str) -> NDArray[Any]:
         """The array of an image, (N, dsize); (dsize,) for global features. Writable."""
@@ -194,7 +194,7 @@ class FeatureReader:
         """The array of an image, read-only; its values may be infinite or NaN."""
         source, name = self._source(image)
         content = source.read(name)
-        rows = self._num_rows(len(content), source.where(name))
+        rows = self._num_rows(len(content), source, name)
         array = np.frombuffer(content, dtype=self.config.dtype)
         return array if self.kind == "global_features" else array.reshape(rows, self.config.dsize)
 
@@ -203,14 +203,14 @@ class FeatureReader:
         source, name = self._source(image)
         return source.where(name)
 
-    def _num_rows(self, size: int, where: str) -> int:
+    def _num_rows(self, size: int, source: BlobSource, name: str) -> int:
         rows, rest = divmod(size, self.config.row_bytes)
         if rest or (self.kind == "global_features" and rows != 1):
             expected = "exactly one row" if self.kind == "global_features" else "whole rows"
             raise DataError(
                 f"{size} bytes are not {expected} of "
                 f"{self.config.dsize} x {self.config.dtype.name}; truncated?",
-                path=where,
+                path=source.where(name),
             )
         return rows
 

@@ -55,11 +55,13 @@ class KaptureVectors:
             with np.errstate(over="ignore"):  # float64 that float32 cannot hold is refused below
                 for row, image in zip(chunk, some, strict=True):
                     row[:] = self._reader.read_unchecked(image)
-            squared = np.einsum("ij,ij->i", chunk, chunk, dtype=np.float64)
-            bad = np.flatnonzero(~np.isfinite(squared))
-            if len(bad):
-                where = self._reader.where(some[bad[0]])
-                raise DataError("not all values are finite", path=where)
-            scaled = (squared > 0) & (np.abs(squared - 1) > _ROUNDING)
-            chunk[scaled] /= np.sqrt(squared[scaled])[:, None]
+            with np.errstate(over="ignore", invalid="ignore"):
+                squared = np.vecdot(chunk, chunk).astype(np.float64)
+            for k in np.flatnonzero(~((squared > 1e-24) & (squared < 1e30))):
+                squared[k] = np.square(chunk[k], dtype=np.float64).sum()
+                if not np.isfinite(squared[k]):
+                    raise DataError("not all values are finite", path=self._reader.where(some[k]))
+            scaled = np.flatnonzero((squared > 0) & (np.abs(squared - 1) > _ROUNDING))
+            if len(scaled):
+                chunk[scaled] /= np.sqrt(squared[scaled])[:, None]
         return rows

@@ -241,7 +241,7 @@ def test_broken_points_name_their_file(root: Path, tmp_path: Path) -> None:
     points = folder / "DUC_cutout_024_30_0.jpg.mat"
     content = points.read_bytes()
     points.write_bytes(content[: len(content) // 2])
-    with pytest.raises(DataError, match=r"DUC_cutout_024_30_0\.jpg\.mat: .*ends too early"):
+    with pytest.raises(DataError, match=r"DUC_cutout_024_30_0\.jpg\.mat: not a MAT file"):
         imported(root, tmp_path / "a")
     scipy.io.savemat(points, {"XYZcut": np.zeros((2, 2, 3))}, appendmat=False)
     with pytest.raises(DataError, match="XYZcut is 2x2x3, expected 30x40x3"):
