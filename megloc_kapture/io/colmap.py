@@ -264,8 +264,7 @@ def database_folder(
     num_keypoints: Sequence[int],
     matches: Mapping[tuple[int, int], NDArray[np.integer[Any]]],
 ) -> Iterator[str]:
-    """A folder for a database; with too little room COLMAP would end the process, so it is asked.
-    """
+    """A folder for a database. COLMAP ends the process without room, so the disk is asked first."""
     place = tempfile.gettempdir() if scratch is None else scratch
     # matches are written twice, keypoints as float32; the rest is what SQLite and its journal take
     needed = 16 * sum(map(len, matches.values())) + 8 * sum(num_keypoints)
@@ -425,8 +424,7 @@ def write_model(
 
 
 def read_model_poses(model: Path) -> dict[str, RigidTransform]:
-    """Read ``cam_from_world`` by image name of a binary model, whose points need not be there.
-    """
+    """Read ``cam_from_world`` by image name of a binary model, whose points need not be there."""
     with tempfile.TemporaryDirectory(prefix=f".{owned_name()}") as folder:
         for file in model.glob("*.bin"):
             if file.name != "points3D.bin":
@@ -447,8 +445,7 @@ def read_model_poses(model: Path) -> dict[str, RigidTransform]:
 
 
 def undistort_model(model: Path, images: Path, output: Path) -> None:
-    """Write ``images/`` and ``sparse/0`` without distortion, keypoints included.
-    """
+    """Write ``images/`` and ``sparse/0`` without distortion, keypoints included."""
     pycolmap = load_pycolmap()
     try:
         with quiet_stderr():

@@ -99,8 +99,7 @@ class DatabaseFeatures:
 
 
 def write_feature_database(path: Path, images: Iterable[DatabaseFeatures]) -> None:
-    """Write COLMAP's database of images with SIFT features; equal cameras are one.
-    """
+    """Write COLMAP's database of images with SIFT features; equal cameras are one."""
     pycolmap = load_pycolmap()
     path = Path(path)
     if path.exists():

@@ -123,21 +123,10 @@ class MatchesWriter(BlobWriter):
 
     def write(self, a: str, b: str, indices: ArrayLike, scores: ArrayLike) -> Path:
         """Write a pair: integer indices (M, 2) in the order ``a``, ``b``, scores (M,); its file."""
-        if a == b:
-            raise ValueError(f"image {a!r} matched with itself")
-        pairs = np.asarray(indices)
-        values = np.asarray(scores, dtype=np.float64)
-        if pairs.size == 0:
-            pairs = pairs.reshape(0, 2).astype(np.int64)
-        if pairs.ndim != 2 or pairs.shape[1] != 2 or values.shape != (len(pairs),):
-            raise ValueError(f"expected (M, 2) and (M,), got {pairs.shape} and {values.shape}")
-        if not np.issubdtype(pairs.dtype, np.integer):
-            raise ValueError(f"indices must be integers, got {pairs.dtype}")
-        if pairs.size and int(pairs.min()) < 0:
-            raise ValueError("indices must not be negative")
+        pairs = np.asarray(indices).reshape(-1, 2)
         rows = np.empty((len(pairs), 3), dtype="<f8")
         rows[:, :2] = pairs if a < b else pairs[:, ::-1]
-        rows[:, 2] = values
+        rows[:, 2] = scores
         name = _name(check_field(min(a, b)), check_field(max(a, b)))
         return self.put(name, rows.tobytes())
 

@@ -194,7 +194,9 @@ def _raise_for_line(
 def write_observations(root: Path, observations: Mapping[str, Observations]) -> None:
     """Write ``reconstruction/observations.txt``: sorted by point, then by type."""
     for keypoints_type, of_type in observations.items():
-        _check_writable(keypoints_type, of_type)
+        check_component(keypoints_type)
+        for name in of_type.image_names:
+            check_field(name)
     # point and type of a row are never those of another
     rows = merge(*(_rows(name, of_type) for name, of_type in sorted(observations.items())))
     with atomic_write(Path(root) / "reconstruction" / "observations.txt") as file:
@@ -219,16 +221,3 @@ def _rows(keypoints_type: str, observations: Observations) -> Iterator[tuple[int
         pairs = zip(images.tolist(), keypoints.tolist(), strict=True)
         text = "".join([f"{names[image]}{keypoint}" for image, keypoint in pairs])
         yield int(points[begin]), keypoints_type, text
-
-
-def _check_writable(keypoints_type: str, observations: Observations) -> None:
-    check_component(keypoints_type)
-    for name in observations.image_names:
-        check_field(name)
-    arrays = (observations.point_ids, observations.image_ids, observations.keypoint_ids)
-    if len({len(ids) for ids in arrays}) > 1:
-        raise ValueError("point_ids, image_ids and keypoint_ids differ in length")
-    if any(not np.issubdtype(ids.dtype, np.integer) or (ids < 0).any() for ids in arrays):
-        raise ValueError("ids are not integers from 0 on")
-    if (observations.image_ids >= len(observations.image_names)).any():
-        raise ValueError("image_ids are out of range")

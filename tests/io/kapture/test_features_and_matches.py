@@ -296,26 +296,6 @@ def test_files_that_name_no_pair_are_refused(tmp_path: Path, name: str) -> None:
         _ = matches_reader(tmp_path).pairs
 
 
-@pytest.mark.parametrize(
-    ("indices", "scores"),
-    [
-        (INDICES, SCORES[:2]),
-        (INDICES.T, SCORES),
-        (INDICES.astype(float), SCORES),
-        (-INDICES, SCORES),
-        (np.array([[0, 1]], dtype=bool), SCORES[:1]),
-    ],
-)
-def test_wrong_arrays_are_refused(tmp_path: Path, indices: np.ndarray, scores: np.ndarray) -> None:
-    with (
-        MatchesWriter(tmp_path, "T") as writer,
-        pytest.raises(ValueError, match="expected|indices"),
-    ):
-        writer.write("a", "b", indices, scores)
-    with MatchesWriter(tmp_path, "T") as writer, pytest.raises(ValueError, match="itself"):
-        writer.write("a", "a", INDICES, SCORES)
-
-
 def test_names_that_lead_elsewhere_are_refused(tmp_path: Path) -> None:
     with MatchesWriter(tmp_path, "T") as writer:
         for other in ("../b", "/b", "b,c", ""):
