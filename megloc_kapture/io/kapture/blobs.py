@@ -19,8 +19,12 @@ class FolderBlobs:
 
     def names(self) -> list[str]:
         """Names of all blobs, sorted."""
-        paths = self._folder.rglob(f"*{self._suffix}")
-        return sorted(path.relative_to(self._folder).as_posix() for path in paths)
+        found = []
+        for folder, _, files in os.walk(self._folder):
+            below = folder[len(str(self._folder)) :].lstrip("/")
+            prefix = f"{below}/" if below else ""
+            found += [prefix + name for name in files if name.endswith(self._suffix)]
+        return sorted(found)
 
     def __contains__(self, name: str) -> bool:
         try:
