@@ -14,8 +14,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from megloc_kapture.compiling import compiled_loop
 from megloc_kapture.values import RigidTransform
-from megloc_twins.compiling import compiled_loop
 
 _DECIMALS = 9  # a nanometre; errors of the functions that were used are a millionth of it
 _CUBIC = -0.75  # the slope at distance 1, as OpenCV has it

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from megloc_kapture.compiling import compiled_loop
 from megloc_kapture.errors import DataError
 from megloc_kapture.values import Camera, RigidTransform
-from megloc_twins.compiling import compiled_loop
 from megloc_twins.portable import Float32, Float64, log2
 from megloc_twins.surfaces import NUM_LEVELS, Atlas, Surfaces
 

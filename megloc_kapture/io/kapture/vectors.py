@@ -21,9 +21,6 @@ class KaptureVectors:
     reads, so any number of images will do.
     """
 
-    finite = True
-    """Rows that are not finite are refused when they are read."""
-
     def __init__(self, reader: FeatureReader, images: Sequence[str]) -> None:
         self._reader = reader
         self._images = images

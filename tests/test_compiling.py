@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 INNER = """
-from megloc_twins.compiling import compiled_loop
+from megloc_kapture.compiling import compiled_loop
 
 @compiled_loop
 def inner(x):
@@ -15,7 +15,7 @@ def inner(x):
 """
 MIDDLE = """
 from inner_loops import inner
-from megloc_twins.compiling import compiled_loop
+from megloc_kapture.compiling import compiled_loop
 
 @compiled_loop
 def middle(x):
@@ -23,7 +23,7 @@ def middle(x):
 """
 OUTER = """
 from middle_loops import middle
-from megloc_twins.compiling import compiled_loop
+from megloc_kapture.compiling import compiled_loop
 
 @compiled_loop
 def outer(x):
