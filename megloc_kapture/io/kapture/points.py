@@ -31,7 +31,10 @@ def read_points3d(path: Path) -> NDArray[np.float64]:
             try:
                 points = np.loadtxt(file, delimiter=",", comments="#", ndmin=2)
             except ValueError as error:
-                raise DataError(f"{error}; expected 3 or 6 numbers a row", path=path) from error
+                message = str(error).partition(";")[0]  # numpy's advice is for programmers
+                line = _line_of_another_length(path)
+                message = f"expected 3 or 6 columns in all rows: {message}"
+                raise DataError(message, path=path, line=line) from error
     if points.size == 0:
         return np.zeros((0, 6))
     if points.shape[1] not in POINTS_HEADERS:
@@ -40,6 +43,17 @@ def read_points3d(path: Path) -> NDArray[np.float64]:
     if len(bad):
         raise DataError(f"point {bad[0]} is not finite", path=path)
     return points if points.shape[1] == 6 else np.pad(points, ((0, 0), (0, 3)))
+
+
+def _line_of_another_length(path: Path) -> int | None:
+    """The first line whose number of columns is not that of the first row."""
+    columns = None
+    for number, text in enumerate(path.read_text(errors="replace").splitlines(), start=1):
+        if text.strip() and not text.startswith("#"):
+            columns = columns or text.count(",")
+            if text.count(",") != columns:
+                return number
+    return None
 
 
 def write_points3d(root: Path, points: ArrayLike) -> None:
