@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cache, partial
 from operator import itemgetter
@@ -153,7 +152,7 @@ def pyramid_mapping(
     for image in images:
         variants.put(image, [*others[image][0], *others[image][1]], *items.done[image])
     rows, hard_pairs = [], set(hard)
-    with closing(MatchesWriter(output, pyramid_type(local_type), orphan=True)) as writer:
+    with MatchesWriter(output, pyramid_type(local_type), orphan=True) as writer:
         for pair in named:
             matches, scores = stored.read(*pair)
             if pair in hard_pairs:
@@ -341,7 +340,7 @@ def pyramid_queries(
     features = PyramidFeatures(output, query, local_type, items.done)
     retry = partial(_retry, FolderSpec(query), FolderSpec(mapping), types, method)
     plugins = method.extractor, method.matcher
-    with closing(MatchesWriter(output, larger, orphan=True)) as writer:
+    with MatchesWriter(output, larger, orphan=True) as writer:
         results = work.map(retry, jobs, items.label("guided pyramid"), plugins=plugins)
         for (image, *_), found in zip(jobs, results, strict=True):
             files = [writer.write(image, *one) for one in found.matches]
