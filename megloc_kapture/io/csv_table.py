@@ -201,7 +201,7 @@ class Table(Generic[RowT]):
         """The records of a file, none of one that is absent."""
         return self.read(path) if path.exists() else []
 
-    def write(self, path: Path | str, rows: Iterable[object]) -> None:
+    def write(self, path: Path | str, rows: Iterable[Any]) -> None:
         """Write records, or anything with their attributes, in the order given."""
         known: set[tuple[tuple[str, ...], ...]] = set()
         lines = []
