@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.metrics import Threshold
-from megloc_kapture.evaluation.report.document import REPORT_HTML
+from megloc_kapture.evaluation.report.reports import REPORT_HTML
 from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.images import (
@@ -101,17 +101,15 @@ class Map:
         path: Path | str,
         result: Path | str | Results | None = None,
         truth: Path | str | None = None,
-        *,
-        rendered: Path | str | None = None,
     ) -> None:
         """Write a page that shows the map in 3D, and the queries of a result in it; see
         :func:`megloc_kapture.evaluation.view.write_view`."""
         from megloc_kapture.evaluation.view import write_view
 
         if isinstance(result, Results):
-            result.view(path, truth, rendered=rendered)
+            result.view(path, truth)
         else:
-            write_view(path, self.kapture_map.folder, result, truth, rendered=rendered)
+            write_view(path, self.kapture_map.folder, result, truth)
 
     @overload
     def localize(

@@ -69,7 +69,6 @@ _EXTRAS = {
     "distributed": "cluster",
     "faiss": "faiss",
     "h5py": "megadepth",
-    "rerun": "rerun",
     **dict.fromkeys(
         ("fastapi", "prometheus_client", "python_multipart", "starlette", "uvicorn"), "serve"
     ),

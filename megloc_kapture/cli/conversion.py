@@ -220,12 +220,8 @@ class View(Linked, Common):
     """Localized kapture folder, pose file or COLMAP model."""
     gt: Path | None = None
     """The true poses, likewise: queries are coloured by their error, and joined to it."""
-    rendered: Path | None = None
-    """Kapture folder of `megloc render --along RESULT`: shown beside the queries' photographs."""
     output: Output = Path("view.html")
     """File to write."""
-    rerun: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
-    """Write the same, with the images, for Rerun's viewer as well: `rerun FILE.rrd` shows it."""
     open: bool = False
     """Show it in the browser."""
     force: Overwrite = False
@@ -235,30 +231,16 @@ class View(Linked, Common):
         # only this command waits for it
         from megloc_kapture.evaluation.view import write_view
 
-        for path in (self.result, self.gt, self.rendered):
+        for path in (self.result, self.gt):
             if path is not None and not path.exists():
                 raise DataError("no such file or folder", path=path)
-        for needs, given in (
-            ("--gt needs a result to compare with it", self.gt),
-            ("--rendered needs the result it is of", self.rendered),
-        ):
-            if given is not None and self.result is None:
-                raise OptionError(f"{needs}: megloc view MAP RESULT")
+        if self.gt is not None and self.result is None:
+            raise OptionError("--gt needs a result to compare with it: megloc view MAP RESULT")
         folder = self.kapture(opened_map(self.map, console))
-        left_out = write_view(
-            self.output,
-            folder,
-            self.result,
-            self.gt,
-            force=self.force,
-            rerun=self.rerun,
-            rendered=None if self.rendered is None else self.kapture(self.rendered),
-        )
+        left_out = write_view(self.output, folder, self.result, self.gt, force=self.force)
         if left_out:
             console.say(left_out)
         console.result(f"view: {self.output}")
-        if self.rerun is not None:
-            console.result(f"recording: {self.rerun}")
         if self.open:
             import webbrowser
 

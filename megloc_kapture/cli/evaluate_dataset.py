@@ -11,11 +11,7 @@ import tyro
 from megloc_kapture.cli.common import Console, Deciding, Overwrite, Texts, Working
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.metrics import Threshold
-from megloc_kapture.evaluation.report.document import REPORT_HTML
-from megloc_kapture.evaluation.report.reports import (
-    AGREEMENT_TEXT,
-    RECALL_TEXT,
-)
+from megloc_kapture.evaluation.report.reports import AGREEMENT_TEXT, RECALL_TEXT, REPORT_HTML
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.tables import STATUS_FILE, read_status
 from megloc_kapture.localization.focal_length import misfits_text

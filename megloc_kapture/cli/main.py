@@ -277,7 +277,7 @@ megloc evaluate -i localized -i refined --gt my_scene/query_gt
 megloc export colmap -i my_map --query localized -o sparse/0
 megloc export tum --query localized -o localized.tum
 megloc view my_map --open
-megloc view my_map localized --gt my_scene/query_gt -o view.html --rerun view.rrd
+megloc view my_map localized --gt my_scene/query_gt -o view.html
 megloc train-field -i my_scene/mapping -o field --minutes 15
 megloc render field --pose 1,0,0,0,0.2,0,1.5 --camera SIMPLE_PINHOLE,320,240,260,160,120 -o view.png
 megloc render field --along localized -o rendered

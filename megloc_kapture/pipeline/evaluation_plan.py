@@ -236,11 +236,10 @@ class Evaluate(_RunStage):
         map_poses = work.folder(MAPPING).read().poses()
         provenance = self.settings() | {"versions": package_versions()}
         output = work.out / EVALUATION
-        # two runs give the same bytes, so seconds stand in manifests and timing.csv alone
-        context = replace(context_of(localized), seconds={})
+        context = context_of(localized)
         if not truth.is_dir():
             found = results_without_truth(
-                [localized], benchmark_of(tables), map_poses=map_poses, labels=[self._run.label]
+                [localized], benchmark_of(tables), labels=[self._run.label]
             )
             found = replace(found, results=(replace(found.results[0], context=context),))
             write_report(output, found, map_poses=map_poses, provenance=provenance)

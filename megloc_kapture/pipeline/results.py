@@ -147,13 +147,7 @@ class Results(Mapping[str, Pose | Failure]):
             rows.append(row)
         return pd.DataFrame(rows).set_index("image")
 
-    def view(
-        self,
-        path: Path | str,
-        truth: Path | str | None = None,
-        *,
-        rendered: Path | str | None = None,
-    ) -> None:
+    def view(self, path: Path | str, truth: Path | str | None = None) -> None:
         """Write a page that shows the images in the map in 3D; see
         :func:`megloc_kapture.evaluation.view.write_view`."""
         from megloc_kapture.evaluation.view import write_view
@@ -163,7 +157,7 @@ class Results(Mapping[str, Pose | Failure]):
             with contextlib.suppress(DataError):  # of a photograph perhaps nobody knows it
                 cameras[name] = data.camera_of(name)
         folder = self.localizer.map.folder
-        write_view(path, folder, self, truth, cameras=cameras, rendered=rendered)
+        write_view(path, folder, self, truth, cameras=cameras)
 
     def _check_extractors(self) -> None:
         """Make the extractors that queries without features need.

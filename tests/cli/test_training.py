@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import shutil
 import subprocess
@@ -17,9 +16,7 @@ import torch
 from corner import pose_at, write_kapture, write_scene
 from safetensors.torch import load_file, save_file
 
-import megloc_kapture as megloc_package
 from megloc_kapture.cli.main import main
-from megloc_kapture.errors import OptionError
 from megloc_kapture.features.xfeat import XFeatNetwork
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
@@ -227,56 +224,6 @@ def test_processes_render_the_same_views(
     assert one == two and len(one) >= 2 * len(KaptureFolder(mapping).read().poses())
     elsewhere = ("--scheduler", "tcp://127.0.0.1:1")
     megloc(*command, "-o", tmp_path / "x", *elsewhere).refused("without --executor dask")
-
-
-def test_the_view_shows_them_beside_the_photographs(
-    megloc: Any, finished: Path, field: Path, tmp_path: Path, data_of: Any
-) -> None:
-    found, rendered, page = finished / "localized", tmp_path / "rendered", tmp_path / "view.html"
-    assert megloc("render", field, "--along", found, "-o", rendered, *HERE).status == 0
-    view = ("view", finished / "map", found, "-o", page)
-    assert megloc(*view, "--rendered", rendered).status == 0
-    poses, photographs = KaptureFolder(found).read().poses(), KaptureFolder(finished / "query")
-    shown = {query["name"]: query["pictures"] for query in data_of(page)["queries"]}
-    assert len(poses) > 0 and {name for name, pictures in shown.items() if pictures} == set(poses)
-    for name in poses:
-        captions, addresses = zip(*shown[name], strict=True)
-        assert captions == ("photograph", "rendered at the pose", "its depth")
-        photograph, rendering, depth = (pixels_of(address) for address in addresses)
-        written = KaptureFolder(rendered)
-        whole = read_image_rgb(written.image_path(Path(name).with_suffix(".png").as_posix()))
-        # a JPEG is near what it is of, but for the fine grain of its colours
-        assert rendering.shape == whole.shape == depth.shape
-        own = cv2.resize(
-            read_image_rgb(photographs.image_path(name)),
-            photograph.shape[1::-1],
-            interpolation=cv2.INTER_AREA,
-        )
-        for picture, expected in ((rendering, whole), (photograph, own)):
-            assert apart(picture, expected) < 3
-        small = cv2.resize(photograph, whole.shape[1::-1], interpolation=cv2.INTER_AREA)
-        assert apart(small, whole) > 10
-    assert "img-src data:" in page.read_text() and len(page.read_text()) < 3_000_000
-    # without them as before, and those of other images are refused
-    assert megloc(*view).status == 0
-    assert all(query["pictures"] == [] for query in data_of(page)["queries"])
-    megloc(*view, "--rendered", finished / "mapping").refused("no image here is a query")
-    megloc("view", finished / "map", "--rendered", rendered, "-o", page).refused(
-        "--rendered needs the result it is of"
-    )
-    with pytest.raises(OptionError, match="renderings need the result"):
-        megloc_package.open_map(finished / "map").view(page, rendered=rendered)
-
-
-def apart(one: np.ndarray, other: np.ndarray) -> float:
-    smooth = [cv2.blur(each, (9, 9)).astype(float) for each in (one, other)]
-    return float(np.abs(smooth[0] - smooth[1]).mean())
-
-
-def pixels_of(address: str) -> np.ndarray:
-    head, text = address.split(",")
-    assert head == "data:image/jpeg;base64"
-    return cv2.imdecode(np.frombuffer(base64.b64decode(text), np.uint8), cv2.IMREAD_COLOR_RGB)
 
 
 def test_views_that_no_camera_took_join_the_map(
