@@ -68,4 +68,4 @@ def test_modern_maps_smaller_images_and_localizes_whole_ones(
 
 def test_a_given_map_is_not_resized(fountain: Path, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="keypoints are in the original images"):
-        evaluated(tmp_path / "workspace", fountain, modern("map=given+triangulate"))
+        evaluated(tmp_path / "workspace", fountain, modern("map=given"))
