@@ -43,13 +43,13 @@ IMPORT = """
 import json, resource, sys, time
 from pathlib import Path
 import numpy as np
-from megloc_kapture.datasets.formats.sparse_models import read_nvm
+from megloc_kapture.datasets.formats.nvm import read_nvm
 from megloc_kapture.datasets.reference_map import write_reference_map
 from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.values import Camera
 
 start, start_cpu = time.perf_counter(), time.process_time()
-[model] = read_nvm(Path(sys.argv[1]))
+model = read_nvm(Path(sys.argv[1]))
 read, read_cpu = time.perf_counter(), time.process_time()
 width, height = int(sys.argv[3]), int(sys.argv[4])
 data = KaptureData()
