@@ -34,7 +34,7 @@ from megloc_kapture.pipeline.datasets import (
     twin_of,
 )
 from megloc_kapture.pipeline.executors import open_executor
-from megloc_kapture.pipeline.export import ExportFormat, GeoOrigin, export
+from megloc_kapture.pipeline.export import ExportFormat, export
 from megloc_kapture.pipeline.map_making import import_colmap
 from megloc_kapture.pipeline.presets import assigned, options_with
 from megloc_kapture.stages.localized_folder import set_aside_unreadable
@@ -166,8 +166,8 @@ class Export(Common):
     """Write a map, localized queries or both for COLMAP, nerfstudio, evo and viewers."""
 
     format: tyro.conf.Positional[ExportFormat]
-    """colmap: a model; nerfstudio: transforms.json; tum, kitti: a trajectory, as evo reads it; ply:
-    points and camera frusta; geojson: camera centres on earth."""
+    """colmap: a model; nerfstudio: transforms.json; tum: a trajectory, as evo reads it; ply: points
+    and camera frusta."""
     input: Annotated[Path | None, tyro.conf.arg(aliases=["-i"])] = None
     """Kapture map, or a kapture folder of images with poses."""
     query: Path | None = None
@@ -176,9 +176,6 @@ class Export(Common):
     """Folder for colmap and nerfstudio, else a file."""
     sensor: str | None = None
     """Images of this camera only; several cameras of one moment are no trajectory."""
-    geo_origin: str | None = None
-    """Of geojson: latitude,longitude[,height] of the world's origin, whose axes are East, North
-    and Up there."""
     undistort: bool = False
     """Of colmap: also write images/, undistorted, and the model of these in sparse/0, with PINHOLE
     cameras, as programs for Gaussian splatting read them."""
@@ -192,21 +189,10 @@ class Export(Common):
             map=self.input,
             query=self.query,
             sensor=self.sensor,
-            origin=None if self.geo_origin is None else _origin(self.geo_origin),
             undistort=self.undistort,
             force=self.force,
         )
         console.result(f"{number} images exported: {self.output}")
-
-
-def _origin(text: str) -> GeoOrigin:
-    try:
-        values = [float(part) for part in text.split(",")]
-        if not 2 <= len(values) <= 3:
-            raise ValueError
-    except ValueError:
-        raise OptionError(f"--geo-origin takes latitude,longitude[,height], got {text!r}") from None
-    return GeoOrigin(*values)
 
 
 @dataclass(frozen=True, kw_only=True)

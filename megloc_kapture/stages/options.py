@@ -88,11 +88,10 @@ class PipelineOptions(Options):
     mapping_verification: KnownPoseOptions = KnownPoseOptions()
     query_verification: TwoViewOptions = TwoViewOptions()
     guided_pyramid: GuidedPyramidOptions = GuidedPyramidOptions()
-    map: Literal["triangulate", "lift", "given", "given+triangulate"] = Field(
+    map: Literal["triangulate", "lift", "given"] = Field(
         default="triangulate",
         description="points of the map: triangulated from matches; keypoints lifted through the "
-        "map images' depth maps; those of the model the dataset comes with; or the model's and "
-        "triangulated ones, of two keypoints types",
+        "map images' depth maps; or those of the model the dataset comes with",
     )
     given_features: PluginChoice = Field(
         default=PluginChoice(name="sift"), description="what a given model was made of"
@@ -161,7 +160,7 @@ class PipelineOptions(Options):
 
     def uses_given_map(self) -> bool:
         """Whether the model that the dataset comes with is localized in."""
-        return self.map.startswith("given")
+        return self.map == "given"
 
     def makes_points(self) -> bool:
         """Whether the map has points of features that are extracted here."""
@@ -173,7 +172,7 @@ class PipelineOptions(Options):
 
     def triangulates(self) -> bool:
         """Whether map images are matched with each other."""
-        return self.map in ("triangulate", "given+triangulate")
+        return self.map == "triangulate"
 
     def pairs_by_points(self) -> bool:
         """Whether map images are paired by the points of the model that the dataset comes with."""

@@ -169,13 +169,6 @@ def preprocess_images(
     -------
     Counts for the log: images, how many of them changed and have a mask, and the shares of
     pixels masked by each source.
-
-    Raises
-    ------
-    OptionError : a class that the segmenter does not have, an image too small to be cropped, or no
-        camera with enough images for its unchanging region.
-    DataError : an image or a mask is absent, broken, or not of its camera's size.
-    OutputError : the output lies in the folder it is made from, or cannot be written.
     """
     output = Path(output)
     if output.resolve().is_relative_to(folder.root.resolve()):
