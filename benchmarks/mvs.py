@@ -1,6 +1,6 @@
 """Depth by multi-view stereo: how right it is, how much of an image it fills, what it costs.
 
-    .venv/bin/python benchmarks/mvs.py --data DIR -o OUT [--by sweep patchmatchnet ppg]
+    .venv/bin/python benchmarks/mvs.py --data DIR -o OUT [--by sweep ppg]
         [--scenes fountain_p11 herzjesu_p25 hololens_room motorcycle] [--ppg-python PYTHON]
 
 DIR/SCENE has mapping/, query/ and query_gt/ in kapture. fountain_p11 and herzjesu_p25 (Strecha et

@@ -1,6 +1,6 @@
 """Depth by multi-view stereo on the rendered world, whose depth is exact, by class of surface.
 
-    .venv/bin/python benchmarks/mvs_twin.py -o OUT [--by sweep patchmatchnet] [--seed 0]
+    .venv/bin/python benchmarks/mvs_twin.py -o OUT [--by sweep] [--seed 0]
 
 A pixel is of one class, the first that fits: ``none``: nothing is there (sky), or the bonnet;
 ``thin``: what is nearer than what is around it and narrower than 9 pixels; ``textureless``: the

@@ -104,11 +104,8 @@ class TrainField(Linked, Common):
     """Kapture map: images with poses; masks and depth maps are used where there are any."""
     output: Output
     """Folder of the field: field.json and field.safetensors."""
-    kind: Literal["triplane", "nerfw", "gaussians"] = "triplane"
-    """triplane: minutes on a processor; nerfw: the published network, which needs a GPU; gaussians:
-    splats, which begin where the map's depth says."""
-    gaussians: int | None = None
-    """How many, of that kind; 8192 unless given."""
+    kind: Literal["triplane", "nerfw"] = "triplane"
+    """triplane: minutes on a processor; nerfw: the published network, which needs a GPU."""
     steps: int = 4000
     """Of the training."""
     minutes: float | None = None

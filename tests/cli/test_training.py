@@ -154,27 +154,6 @@ def test_an_interrupted_training_goes_on(
     assert not (out / "field.state.pt").exists()
 
 
-def test_gaussians_begin_where_depth_says(megloc: Any, mapping: Path, tmp_path: Path) -> None:
-    out, again = tmp_path / "field", tmp_path / "again"
-    options = ("--kind", "gaussians", "--gaussians", "1500", *QUICK[2:], "--steps", "20")
-    assert megloc("train-field", "-i", mapping, "-o", out, *options).status == 0
-    assert megloc("train-field", "-i", mapping, "-o", again, *options).status == 0
-    assert same_field(again, out)
-    rendered = tmp_path / "rendered"
-    assert megloc("render", out, "--along", mapping, "-o", rendered, *HERE).status == 0
-    maps, truth = (KaptureFolder(each) for each in (rendered, mapping))
-    for name in ("0000", "0003"):
-        found = np.fromfile(maps.root / f"sensors/records_data/{name}.depth", np.float32)
-        known = np.fromfile(truth.root / f"sensors/records_data/{name}.jpg.depth", np.float32)
-        assert np.median(found[found > 0]) == pytest.approx(np.median(known[known > 0]), rel=0.05)
-    command = ("train-field", "-i", mapping, "-o", tmp_path / "other", *QUICK)
-    megloc(*command, "--gaussians", "99").refused("gaussians changes nothing: the kind is triplane")
-    megloc(*command, "--kind", "gaussians", "--compiled").refused("compiled is of networks")
-    megloc(*command, "--kind", "gaussians", "--gaussians", "99999").refused(
-        "99999 Gaussians begin where depth says, and [0-9]+ pixels have any"
-    )
-
-
 def test_a_view_in_colour_and_depth(
     megloc: Any, mapping: Path, field: Path, tmp_path: Path
 ) -> None:

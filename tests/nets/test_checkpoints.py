@@ -22,8 +22,7 @@ from megloc_kapture.features.superpoint import (
     superpoint_from,
 )
 from megloc_kapture.features.xfeat import XFeatNetwork, load_xfeat
-from megloc_kapture.io.weights import find_weights, read_weights, sha256_of
-from megloc_kapture.mvs.learned import patchmatchnet_from
+from megloc_kapture.io.weights import find_weights, read_weights
 from megloc_kapture.nets.global_descriptors import (
     ApGemNet,
     EigenPlacesNet,
@@ -144,16 +143,3 @@ def test_the_published_files_load_strictly(shared_data: Path, name: str) -> None
         assert (numbers, net.descriptor_size) == ALIKED[name]
     else:
         assert net.ops[0].out_channels == R2D2_WIDTHS[name]
-
-
-def test_patchmatchnets_published_checkpoint_fits_strictly(shared_data: Path) -> None:
-    checkpoint = shared_data / "weights" / "patchmatchnet" / "params_000007.ckpt"
-    weights = find_weights(str(checkpoint))
-    tensors = read_weights(weights)
-    network = patchmatchnet_from(tensors, str(checkpoint))
-    assert sum(values.numel() for values in network.parameters()) == 222_632
-    assert not network.training
-    assert sha256_of(weights).startswith("477b056c")
-    del tensors["feature.inner1.bias"]
-    with pytest.raises(DataError, match="feature.inner1.bias"):
-        patchmatchnet_from(tensors, str(checkpoint))

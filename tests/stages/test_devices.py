@@ -292,8 +292,6 @@ def test_a_device_that_changes_nothing_is_refused() -> None:
     assert unheeded(options_of_preset("classic"), "cpu", "half") == ["device", "precision"]
     lpips = PluginChoice(name="perceptual", options={"distance": {"name": "lpips"}})
     assert unheeded(lpips, "cpu", "half") == []
-    stereo = PluginChoice(name="patchmatchnet")  # always in full precision
-    assert unheeded((stereo,), "cpu", "half") == ["precision"]
     choice = PluginChoice(name="nn")
     assert placed(choice, "cpu", "half") is choice
 
