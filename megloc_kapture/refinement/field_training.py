@@ -127,8 +127,7 @@ class FieldTrainer:
     @cached_property
     def _fingerprint(self) -> str:
         options = self.options.model_dump_json(exclude={"minutes"})
-        content = f"{options} {self._field.images}".encode() + self._data.digest()
-        return hashlib.sha256(content).hexdigest()
+        return hashlib.sha256(f"{options} {self._field.images}".encode()).hexdigest()
 
     def train(
         self,
@@ -232,14 +231,6 @@ class _Pixels:
             self._depth = np.concatenate(depths)
         self._rotations = np.stack([pose.rotation_matrix() for pose in self._poses])
         self._centres = np.stack([pose.center() for pose in self._poses])
-
-    def digest(self) -> bytes:
-        """Of all that is learned from."""
-        found = hashlib.sha256(repr(self._cameras).encode())
-        poses = self._camera_of, self._rotations, self._centres
-        for array in (self._rgb, self._usable, self._depth, *poses):
-            found.update(b"" if array is None else array.tobytes())
-        return found.digest()
 
     def frame(self) -> FieldFrame:
         """The frame about the cameras and what their depth shows; without, about the cameras."""

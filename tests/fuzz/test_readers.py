@@ -7,29 +7,25 @@ quick tier draws a few examples of each, the tests marked ``fuzz`` many.
 from __future__ import annotations
 
 import io
-import sys
 import tarfile
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import onnx
 import pytest
 import torch
 from hostile import EDITS, NUMBERS, TOKENS, Edit, changed
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from onnx import helper, numpy_helper
 from safetensors.torch import save
 from scipy.io import savemat
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io import dataset_tables, tables
+from megloc_kapture.io import dataset_tables, tables, weights
 from megloc_kapture.io.images import image_size, read_image_rgb
 from megloc_kapture.io.kapture import read_pairs, read_point_covariances, write_pairs
 from megloc_kapture.io.kapture.blobs import TarBlobs
@@ -38,10 +34,7 @@ from megloc_kapture.io.kapture.observations import Observations, read_observatio
 from megloc_kapture.io.kapture.points import read_points3d
 from megloc_kapture.io.kapture.sensors import read_kapture_data
 from megloc_kapture.io.mat_file import read_mat, read_mat_array
-from megloc_kapture.io.weights.containers import read_checkpoint
 
-BUNDLE = Path(__file__).parent.parent / "io/weights/data/tensor_bundle/graph.ckpt-7"
-PARTS = (".index", ".data-00000-of-00001")
 VERSION = "# kapture format: 1.1\n"
 POSE = "0.5, 0.5, 0.5, 0.5, 1.0, -2.0, 3.0"
 CELL = "1.0 0.0 0.0 0.0 1.0 -2.0 3.0"
@@ -68,34 +61,6 @@ def saved_torch(content: Any, *, legacy: bool = False) -> bytes:
     out = io.BytesIO()
     torch.save(content, out, _use_new_zipfile_serialization=not legacy)
     return out.getvalue()
-
-
-def saved_apgem() -> bytes:
-    """A checkpoint that holds an object of scikit-learn by name."""
-    module = "sklearn.decomposition.pca"
-    kind = type("PCA", (), {"__module__": module})
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("sklearn", "sklearn.decomposition", module):
-            patch.setitem(sys.modules, name, ModuleType(name))
-        patch.setattr(sys.modules[module], "PCA", kind, raising=False)
-        pca = kind()
-        pca.__dict__.update(
-            mean_=np.ones(2), components_=np.eye(2), explained_variance_=np.ones(2), whiten=False
-        )
-        return saved_torch({"state_dict": TENSORS, "pca": {"a": pca}}, legacy=True)
-
-
-def saved_npz() -> bytes:
-    out = io.BytesIO()
-    np.savez(out, **{name: value.numpy() for name, value in TENSORS.items()})
-    return out.getvalue()
-
-
-def saved_onnx() -> bytes:
-    tensors = [numpy_helper.from_array(value.numpy(), name) for name, value in TENSORS.items()]
-    tensors.append(helper.make_tensor("typed", onnx.TensorProto.FLOAT16, (2,), [1.0, -2.0]))
-    graph = helper.make_graph([], "graph", [], [], initializer=tensors)
-    return helper.make_model(graph).SerializeToString()
 
 
 def saved_tar(members: dict[str, bytes]) -> bytes:
@@ -151,13 +116,8 @@ def read_mats(path: Path) -> None:
     assert found.dtype == np.float64 and found.size * 8 <= len(content) * 1032
 
 
-def part(ending: str) -> bytes:
-    """A file of TensorFlow's checkpoint."""
-    return BUNDLE.with_name(BUNDLE.name + ending).read_bytes()
-
-
 def read_weights(path: Path) -> None:
-    read_checkpoint(path.read_bytes(), str(path), lambda _: part(PARTS[1]))
+    weights.read_weights(weights.describe(path.name, path))
 
 
 def read_pairs_again(path: Path) -> None:
@@ -299,15 +259,7 @@ READERS = {
     "torch, legacy": Reader(
         "x.pth", saved_torch({"state_dict": TENSORS}, legacy=True), read_weights
     ),
-    "AP-GeM": Reader("x.pt", saved_apgem(), read_weights),
     "safetensors": Reader("x.safetensors", save(TENSORS), read_weights),
-    "npz": Reader("x.npz", saved_npz(), read_weights),
-    "onnx": Reader("x.onnx", saved_onnx(), read_weights),
-    "NetVLAD": Reader("x.mat", saved_mat(compressed=True), read_weights),
-    "TensorFlow": Reader("x.index", part(".index"), read_weights),
-    "TensorFlow in a tar": Reader(
-        "x.tar", saved_tar({f"g{e}": part(e) for e in PARTS}), read_weights
-    ),
 }
 
 

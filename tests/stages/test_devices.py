@@ -78,7 +78,7 @@ def random_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_features_of_a_batch(
     shared_data: Path, random_weights: Path, frames: Any, name: str
 ) -> None:
-    of = {"aliked": "aliked/aliked-n16.pth", "xfeat": "xfeat/xfeat.onnx"}
+    of = {"aliked": "aliked/aliked-n16.pth", "xfeat": "xfeat/xfeat.pt"}
     of["r2d2"] = "r2d2/r2d2_WASF_N16.pt"
     path = shared_data / "weights" / of[name] if name in of else random_weights / f"{name}.pth"
     options = {"min_size": 96, "max_size": 144} if name == "r2d2" else {}
@@ -174,7 +174,7 @@ def test_matches_of_a_batch(
 ) -> None:
     monkeypatch.setattr(devices, "_limits", {})
     kinds = {
-        "lighterglue": ("xfeat/xfeat.onnx", "lighterglue/lighterglue_L3.onnx"),
+        "lighterglue": ("xfeat/xfeat.pt", "lighterglue/xfeat-lighterglue.pt"),
         "lightglue": ("aliked/aliked-n16rot.pth", "aliked_lightglue/aliked_lightglue.pth"),
     }
     files = [str(shared_data / "weights" / one) for one in kinds[name]]
