@@ -143,7 +143,7 @@ def test_fetch_refuses(megloc: Any, served: Path, folder: Path) -> None:
     megloc(*fetch, "unknown", "-q").refused("no file of weights that can be read")
     (served / "free.pth").write_bytes(BOUND)
     wrong, right = (hashlib.sha256(content).hexdigest() for content in (BOUND, FREE))
-    megloc(*fetch, "free", "-f", "-q").refused(f"sha256 {wrong} instead of {right}")
+    megloc(*fetch, "free", "-f", "-q").refused(f"expected sha256:{right} but got {wrong}")
     assert (folder / "free.pth").read_bytes() == FREE
     (served / "free.pth").unlink()
     megloc(*fetch, "free", "-f", "-q").refused("the server answers 404")

@@ -78,12 +78,12 @@ def test_disk_of_a_local_file(tmp_path: Path, photograph: Image) -> None:
     torch.manual_seed(0)
     network = DISK().eval()
     torch.save({"extractor": network.state_dict()}, tmp_path / "depth-save.pth")
-    options = {"weights": str(tmp_path / "depth-save.pth"), "max_keypoints": 50, "device": "cpu"}
+    options = {"weights": str(tmp_path / "depth-save.pth"), "max_keypoints": 10, "device": "cpu"}
     image = np.ascontiguousarray(photograph[:90, :120])
     mask = np.ones(image.shape[:2], bool)
     mask[:, :60] = False
     found = Disk(DiskOptions.model_validate(options)).extract(image, mask)
-    assert found.keypoints_px.shape == (50, 3) and found.descriptors.shape == (50, 128)
+    assert found.keypoints_px.shape == (10, 3) and found.descriptors.shape == (10, 128)
     assert found.keypoints_px[:, 0].min() > 60 and found.num_masked > 0
     tensor = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
     with torch.inference_mode():
