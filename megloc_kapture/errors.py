@@ -65,7 +65,6 @@ def suggestion(name: str, known: Iterable[str], *, listed: str = "known: ") -> s
 _EXTRAS = {
     "torch": "torch",
     "kornia": "kornia",
-    "onnx": "convert",
     "distributed": "cluster",
     "faiss": "faiss",
     "h5py": "megadepth",

@@ -263,7 +263,7 @@ megloc match -i my_scene/mapping --query my_scene/query --features-dir features 
 -o matches
 megloc triangulate -i my_scene/mapping --features-dir features --features-dir matches -o map
 megloc densify -i map -o map_with_depth --fuse cloud.ply
-megloc densify -i map -o map_with_depth --by patchmatchnet
+megloc densify -i map -o map_with_depth --by sweep
 megloc refine-map -i map -o map_refined --set refinement.uncertainty.max_robust_sigmas=2.5
 megloc refine-poses -i map --query my_scene/query --poses localized -o refined --by icp
 megloc train matcher -i my_scene/mapping --held-out other_scene/mapping -o matcher.safetensors

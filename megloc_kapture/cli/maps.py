@@ -152,7 +152,7 @@ class Densify(Reading, StageCommand):
     output: Output
     """Kapture folder of the map with depth."""
     by: str | None = None
-    """Estimator: sweep, patchmatchnet, colmap or a plugin; sweep unless given."""
+    """Estimator: sweep, colmap or a plugin; sweep unless given."""
     points: bool = False
     """Lift keypoints that have no point through the depth, with their uncertainty."""
     fuse: Path | None = None

@@ -31,7 +31,7 @@ PixelOriginChoice = Literal["auto", "corner", "centre"]
 AS_ASKED = "as asked for"
 
 _SAMPLED_IMAGES = 50
-_NETWORKS = ("aliked", "aslfeat", "r2d2", "superpoint", "xfeat")
+_NETWORKS = ("aliked", "aslfeat", "disk", "r2d2", "superpoint", "xfeat")
 # extractor of SIFT by whether descriptors are bytes
 _SIFT_OF = {True: "sift", False: "rootsift"}
 

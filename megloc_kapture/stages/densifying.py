@@ -81,7 +81,7 @@ class DensifyOptions(Options):
         "a point get one of it as well",
     )
     estimator: PluginChoice = Field(
-        default=PluginChoice(name="sweep"), description="sweep, patchmatchnet, colmap or a plugin"
+        default=PluginChoice(name="sweep"), description="sweep, colmap or a plugin"
     )
     num_sources: int = Field(
         default=4, ge=1, le=16, description="other map images that an image is compared with"

@@ -175,8 +175,7 @@ def weights_file(folder: Path) -> WeightsFile:
 def _opened(file: WeightsFile, device: Device) -> NeuralField:
     manifest = read_json_model(file.path.with_name(MANIFEST_FILE), FieldManifest)
     rows = light_rows(manifest.images, manifest.options.lights)
-    sizes = len(manifest.images), max(rows) + 1, manifest.options.gaussians
-    module = build_field(manifest.kind, *sizes)
+    module = build_field(manifest.kind, len(manifest.images), max(rows) + 1)
     load_strictly(module, read_weights(file), str(file.path))
     module.requires_grad_(False)
     return NeuralField(module.to(pick_device(device)), manifest.frame, manifest.images, rows)

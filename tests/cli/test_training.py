@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 import torch
 from corner import pose_at, write_kapture, write_scene
+from kornia.feature import XFeat
 from safetensors.torch import load_file, save_file
 
 from megloc_kapture.cli.main import main
-from megloc_kapture.features.xfeat import XFeatNetwork
+from megloc_kapture.errors import OptionError
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import read_status
@@ -35,7 +36,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         poses = {f"{k}.png": pose_at((shift + 0.8 * k - 2, 0, 0), 12 - 12 * k, 0) for k in range(3)}
         write_kapture(root / name, poses, with_poses=True, with_depth=True)
     torch.manual_seed(0)
-    save_file(XFeatNetwork().state_dict(), root / "xfeat.safetensors")
+    save_file(XFeat().net.state_dict(), root / "xfeat.safetensors")
     return root
 
 
@@ -48,7 +49,7 @@ def arguments(inputs: Path, *more: str | Path) -> list[str | Path]:
 def test_a_matcher_and_its_files(megloc: Any, inputs: Path, tmp_path: Path) -> None:
     output = tmp_path / "small.safetensors"
     mine, other = inputs / "mine", inputs / "other"
-    data = ("-i", mine, "--held-out", other, "--licence", f"{mine}=CC BY 4.0")
+    data = ("-i", mine, "--held-out", other)
     few = ("--set", "held_out_pairs=10")
     command = ["train", "matcher", *data, *arguments(inputs, "-o", output, *few)]
     done = megloc(*command)
@@ -56,9 +57,7 @@ def test_a_matcher_and_its_files(megloc: Any, inputs: Path, tmp_path: Path) -> N
     assert "held out loss" in done.out and f"trained: {output}" in done.out
     assert "bin_score" in load_file(output)
     manifest = json.loads(output.with_suffix(".json").read_text())
-    (told,) = manifest["training"]["data"]
-    assert (told["folder"], told["licence"]) == ("mine", "CC BY 4.0")
-    assert manifest["training"]["held_out_data"][0]["licence"] == "unknown"
+    assert list(manifest["training"]["data"]) == ["mine"]
     assert manifest["held_out"]["other"]["pairs"] == 10
     assert np.isfinite(manifest["held_out"]["other"]["loss"])
     again = megloc(*command)
@@ -72,8 +71,6 @@ def test_what_it_refuses(megloc: Any, inputs: Path, tmp_path: Path) -> None:
         (("--set", "step=3"), r"unknown option step; did you mean 'steps'"),
         (("--set", "pairs.labels.positive=3"), r"unknown option pairs\.labels\.positive"),
         (("--set", "layers=3"), r"option layers: it should be a multiple of 2"),
-        (("--set", "through=products", "--set", "layers=4"), r"layers changes nothing: through="),
-        (("--licence", "MIT"), r"--licence takes FOLDER=TEXT, got 'MIT'"),
         (("--features", "rootsift"), r"superpoint and xfeat can be trained"),
         (("--features", "superpoint"), r"the weights superpoint_v1 are missing"),
     ):
@@ -149,27 +146,6 @@ def test_an_interrupted_training_goes_on(
     assert megloc(*command).status == 0 and steps == [4, 5]
     assert same_field(out, field)
     assert not (out / "field.state.pt").exists()
-
-
-def test_gaussians_begin_where_depth_says(megloc: Any, mapping: Path, tmp_path: Path) -> None:
-    out, again = tmp_path / "field", tmp_path / "again"
-    options = ("--kind", "gaussians", "--gaussians", "1500", *QUICK[2:], "--steps", "20")
-    assert megloc("train-field", "-i", mapping, "-o", out, *options).status == 0
-    assert megloc("train-field", "-i", mapping, "-o", again, *options).status == 0
-    assert same_field(again, out)
-    rendered = tmp_path / "rendered"
-    assert megloc("render", out, "--along", mapping, "-o", rendered, *HERE).status == 0
-    maps, truth = (KaptureFolder(each) for each in (rendered, mapping))
-    for name in ("0000", "0003"):
-        found = np.fromfile(maps.root / f"sensors/records_data/{name}.depth", np.float32)
-        known = np.fromfile(truth.root / f"sensors/records_data/{name}.jpg.depth", np.float32)
-        assert np.median(found[found > 0]) == pytest.approx(np.median(known[known > 0]), rel=0.05)
-    command = ("train-field", "-i", mapping, "-o", tmp_path / "other", *QUICK)
-    megloc(*command, "--gaussians", "99").refused("gaussians changes nothing: the kind is triplane")
-    megloc(*command, "--kind", "gaussians", "--compiled").refused("compiled is of networks")
-    megloc(*command, "--kind", "gaussians", "--gaussians", "99999").refused(
-        "99999 Gaussians begin where depth says, and [0-9]+ pixels have any"
-    )
 
 
 def test_a_view_in_colour_and_depth(

@@ -78,7 +78,7 @@ def random_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_features_of_a_batch(
     shared_data: Path, random_weights: Path, frames: Any, name: str
 ) -> None:
-    of = {"aliked": "aliked/aliked-n16.pth", "xfeat": "xfeat/xfeat.onnx"}
+    of = {"aliked": "aliked/aliked-n16.pth", "xfeat": "xfeat/xfeat.pt"}
     of["r2d2"] = "r2d2/r2d2_WASF_N16.pt"
     path = shared_data / "weights" / of[name] if name in of else random_weights / f"{name}.pth"
     options = {"min_size": 96, "max_size": 144} if name == "r2d2" else {}
@@ -174,7 +174,7 @@ def test_matches_of_a_batch(
 ) -> None:
     monkeypatch.setattr(devices, "_limits", {})
     kinds = {
-        "lighterglue": ("xfeat/xfeat.onnx", "lighterglue/lighterglue_L3.onnx"),
+        "lighterglue": ("xfeat/xfeat.pt", "lighterglue/xfeat-lighterglue.pt"),
         "lightglue": ("aliked/aliked-n16rot.pth", "aliked_lightglue/aliked_lightglue.pth"),
     }
     files = [str(shared_data / "weights" / one) for one in kinds[name]]
@@ -292,8 +292,6 @@ def test_a_device_that_changes_nothing_is_refused() -> None:
     assert unheeded(options_of_preset("classic"), "cpu", "half") == ["device", "precision"]
     lpips = PluginChoice(name="perceptual", options={"distance": {"name": "lpips"}})
     assert unheeded(lpips, "cpu", "half") == []
-    stereo = PluginChoice(name="patchmatchnet")  # always in full precision
-    assert unheeded((stereo,), "cpu", "half") == ["precision"]
     choice = PluginChoice(name="nn")
     assert placed(choice, "cpu", "half") is choice
 
