@@ -37,12 +37,7 @@ from scenes import megloc
 
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
 from megloc_kapture.localization.cluster_poses import ClusterOptions
-from megloc_kapture.localization.ranking import (
-    DistinctiveInliers,
-    InlierCount,
-    InlierSpread,
-    ReprojectionScore,
-)
+from megloc_kapture.localization.ranking import DistinctiveInliers, InlierCount
 from megloc_kapture.plugins import PoseHypothesis, PoseRanker
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_unit
 from megloc_kapture.values import Failure, Pose, RigidTransform
@@ -63,9 +58,6 @@ PIPELINE = (
 SHOWN = 6  # of the options tried, the best
 RANKERS: dict[str, PoseRanker] = {
     "inliers": InlierCount(),
-    "spread": InlierSpread(),
-    "spread (32 cells)": InlierSpread(InlierSpread.Options(cells=32)),
-    "reprojection": ReprojectionScore(),
     **{
         f"distinctive (radius {radius:g}, power {power:g})": DistinctiveInliers(
             DistinctiveInliers.Options(radius=radius, power=power)
