@@ -47,9 +47,9 @@ from megloc_kapture.refinement.acceptance import (  # noqa: E402
 )
 from megloc_kapture.refinement.photometric import perturbed  # noqa: E402
 from megloc_kapture.refinement.references import (  # noqa: E402
-    REFERENCES,
     RenderingQuery,
     RenderingReference,
+    clear_prepared,
 )
 from megloc_kapture.refinement.rendering import refine_by_rendering  # noqa: E402
 from megloc_kapture.values import RigidTransform  # noqa: E402
@@ -202,7 +202,7 @@ def measure(
     options: RenderingOptions,
 ) -> PoseRefinement:
     """Refine twice: with references that are new, and with those that are known."""
-    REFERENCES.clear()
+    clear_prepared()
     for seconds in (result.new_seconds, result.seconds):
         begun, begun_cpu = time.perf_counter(), time.process_time()
         refined = refine_by_rendering(query, references, start, options)

@@ -47,12 +47,12 @@ from megloc_kapture.refinement.pyramid import (
     visibility,
 )
 from megloc_kapture.refinement.references import (
-    REFERENCES,
     Displacement,
     PyramidKind,
     ReferenceImages,
     RenderingQuery,
     RenderingReference,
+    prepared,
     pyramid_of,
     reference_of,
     refine_held_out,
@@ -168,10 +168,10 @@ class _Refining:
         self.threads = threads
         kind = PyramidKind(options.levels, options.max_side_px, options.appearance, features)
         ours = threads.submit(pyramid_of, query, kind)
-        prepared = list(threads.map(lambda each: REFERENCES.prepared(each, kind), references))
+        theirs = list(threads.map(lambda each: prepared(each, kind), references))
         self.query_levels = ours.result()
-        self.levels = [each.pyramid for each in prepared]
-        self.points = [each.points for each in prepared]
+        self.levels = [each.pyramid for each in theirs]
+        self.points = [each.points for each in theirs]
 
     def refine(self, start: RigidTransform) -> PoseRefinement:
         """See :func:`refine_by_rendering`."""
