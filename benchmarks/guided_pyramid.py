@@ -6,8 +6,7 @@
 A scene is a folder with mapping/, query/ and query_gt/ in kapture; cameras are pinholes. Its
 queries are taken as they are, and changed: turned; turned and at a third of the size; turned, and
 the middle third enlarged three times. Cameras and true poses change along. The map is triangulated
-once; every query is matched with all map images, without the pyramid (off), and with it (all, max;
-all pairs: all variants tried on every pair, none left out by the probed ones).
+once; every query is matched with all map images, without the pyramid (off), and with it (all, max).
 
 ``--choose`` compares sets of scales and of turns on the same queries by mode ``all`` instead.
 Plugins with options: ``--matcher '{name="superglue",options={weights="FILE"}}'``.
@@ -66,7 +65,6 @@ WAYS: dict[str, GuidedPyramidOptions] = {
     "off": GuidedPyramidOptions(),
     "all": GuidedPyramidOptions(mode="all"),
     "max": GuidedPyramidOptions(mode="max"),
-    "all pairs": GuidedPyramidOptions(mode="all", probed_pairs=None),
 }
 SETS: dict[str, GuidedPyramidOptions] = {
     "1/3 1/2 1 2 3, four turns": GuidedPyramidOptions(mode="all"),

@@ -75,27 +75,10 @@ TYPE = "exact"
 WORLD_SETTINGS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("not refined", {"depth": {"max_sigmas": None}}),
     ("defaults", {}),
-    ("reprojection 2 px", {"consistency": {"max_reprojection_error_px": 2.0}}),
-    ("angle 3 deg", {"consistency": {"min_angle_deg": 3.0}}),
-    ("deviation 0.5 % of depth", {"uncertainty": {"max_relative_deviation": 0.005}}),
-    ("deviation 0.3 % of depth", {"uncertainty": {"max_relative_deviation": 0.003}}),
-    ("deviation 0.2 % of depth", {"uncertainty": {"max_relative_deviation": 0.002}}),
-    ("deviation 4 cm", {"uncertainty": {"max_deviation": 0.04}}),
-    ("deviation 2 cm", {"uncertainty": {"max_deviation": 0.02}}),
     ("2 robust sigmas", {"uncertainty": {"max_robust_sigmas": 2.0}}),
     ("2.5 robust sigmas", {"uncertainty": {"max_robust_sigmas": 2.5}}),
     ("3 robust sigmas", {"uncertainty": {"max_robust_sigmas": 3.0}}),
     ("4 robust sigmas", {"uncertainty": {"max_robust_sigmas": 4.0}}),
-    ("surest 90 %", {"uncertainty": {"keep_quantile": 0.9}}),
-    ("surest 80 %", {"uncertainty": {"keep_quantile": 0.8}}),
-    ("surest 70 %", {"uncertainty": {"keep_quantile": 0.7}}),
-    (
-        "surest 80 %, 2.5 px",
-        {
-            "uncertainty": {"keep_quantile": 0.8},
-            "consistency": {"max_reprojection_error_px": 2.5},
-        },
-    ),
 )
 
 
@@ -356,10 +339,6 @@ DEPTH_SETTINGS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("2 sigmas", {"depth": {"max_sigmas": 2.0}}),
     ("5 sigmas of the sensor", {"depth": {"keypoint_noise_px": 0.0, "max_sigmas": 5.0}}),
     ("20 sigmas of the sensor", {"depth": {"keypoint_noise_px": 0.0, "max_sigmas": 20.0}}),
-    (
-        "deviation 5 % of depth",
-        {"depth": {"max_sigmas": None}, "uncertainty": {"max_relative_deviation": 0.05}},
-    ),
 )
 
 

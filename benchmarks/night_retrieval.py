@@ -35,7 +35,7 @@ from megloc_kapture.io.kapture import ImagePair, KaptureFolder, MatchesReader
 from megloc_kapture.matching.verification import TwoViewOptions
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.retrieval.fusion import FusionOptions, concatenate, fuse
+from megloc_kapture.retrieval.fusion import FusionOptions, fuse
 from megloc_kapture.stages.global_features import extract_vlad, vlad_type
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.work import Work
@@ -113,8 +113,6 @@ def fused(vectors: Vectors) -> dict[str, NDArray[np.floating]]:
     found = {name: rows @ rows.T for name, rows in vectors.items()}
     vlads = [name for name in found if name.startswith("vlad")]
     for label, names in (("vlads", vlads), ("all", list(vectors))):
-        some = concatenate([vectors[name] for name in names])
-        found[f"{label}, early"] = some @ some.T
         for method in ("ghm", "mean"):
             options = FusionOptions.model_validate({"method": method})
             found[f"{label}, late ({method})"] = fuse([found[name] for name in names], options)

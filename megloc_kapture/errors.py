@@ -67,7 +67,6 @@ _EXTRAS = {
     "kornia": "kornia",
     "onnx": "convert",
     "distributed": "cluster",
-    "faiss": "faiss",
     "h5py": "megadepth",
     "rerun": "rerun",
     **dict.fromkeys(

@@ -274,10 +274,6 @@ def align_poses(
     Parameters
     ----------
     source, target : quaternions (N, 4) and translations (N, 3) of the same cameras.
-
-    Raises
-    ------
-    DataError : fewer than three poses, or all of them at one place.
     """
     number = len(source[0])
     if number < 3:

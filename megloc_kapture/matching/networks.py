@@ -143,13 +143,7 @@ KindOptions = TypeVar("KindOptions", bound=LightGlueKindOptions)
 
 
 class _LightGlueKind(PairNetwork[KindOptions]):
-    """A matcher that is a network of LightGlue's kind.
-
-    Raises
-    ------
-    OptionError : kornia is not installed.
-    MissingWeightsError : the checkpoint is not there.
-    """
+    """A matcher that is a network of LightGlue's kind."""
 
     _load: Any  # of a checkpoint's tensors and the file's name
 

@@ -67,17 +67,11 @@ class Case:
 OF_MAPS = "nothing here uses it"
 # options of maps that are made: megloc localize refuses all of them
 MAKING = ("map", "given_features", "triangulation", "lifting", "refinement", "mvs", "stages")
-TOO_FEW = "map images are too few for product quantisation"
 OF_FOLDERS = "are for folders of images"
 PYRAMID = ("guided_pyramid.mode=all", "guided_pyramid.min_matches=200")
 BY_POSES, BY_SEQUENCE = (f'mapping_pairs.by=["{by}"]' for by in ("poses", "sequence"))
 CLUSTERED = ("localization.clusters={by='poses',radius=0.01}",)
 ONE_CLUSTER = ("localization.clusters.max_clusters=1",)
-
-
-def few_places(number: int, radius: float) -> tuple[str, ...]:
-    diversity = f"query_pairs.diversity={{max_per_place={number},radius={radius}}}"
-    return ("query_pairs.top_k=3", diversity)
 
 
 NO_NETWORK = "no network is chosen that has it"
@@ -112,11 +106,7 @@ CASES: dict[str, Case] = {
     "global_features": Case(
         '[{name="vlad",options={num_clusters=4}}]', "global_features/", ("query_pairs.top_k=2",)
     ),
-    "fusion.method": Case('"round_robin"', "pairs/", FUSED),
-    "fusion.gamma": Case("0.0001", "pairs/", FUSED),
-    "fusion.alpha": Case("1.0", "pairs/", (*FUSED, "fusion.method=min_and_max")),
-    "fusion.rank_constant": Case("0.01", "pairs/", (*FUSED, "fusion.method=reciprocal_rank")),
-    "fusion.list_length": Case("4", "pairs/", (*FUSED, "fusion.method=borda"), localize_value="1"),
+    "fusion.method": Case('"reciprocal_rank"', "pairs/", FUSED),
     "mapping_pairs.by": Case('["exhaustive"]', "pairs/mapping.txt"),
     "mapping_pairs.top_k": Case("2", "pairs/mapping.txt"),
     "mapping_pairs.poses.num_neighbours": Case("1", "pairs/mapping.txt", (BY_POSES,)),
@@ -135,10 +125,6 @@ CASES: dict[str, Case] = {
     ),
     "query_pairs.by": Case('"exhaustive"', "pairs/query.txt"),
     "query_pairs.top_k": Case("2", "pairs/query.txt"),
-    "query_pairs.quantized_above": Case("2", refused=TOO_FEW, localize=TOO_FEW),
-    "query_pairs.diversity.max_per_place": Case("1", "pairs/query.txt", few_places(3, 0.8)),
-    "query_pairs.diversity.radius": Case("0.9", "pairs/query.txt", few_places(1, 0.1)),
-    "query_pairs.diversity.angle_deg": Case("0.5", "pairs/query.txt", few_places(1, 0.9)),
     "reranking.by": Case('"verified"', "pairs/query.txt", also=("reranking.keep=3",)),
     "reranking.local_type": Case(
         '"rootsift"', "pairs/query.txt", (*TWO, "reranking.by=verified", "reranking.keep=2")
@@ -166,12 +152,6 @@ CASES: dict[str, Case] = {
     "guided_pyramid.scales": Case("[1.0,2.0]", "pyramid/", PYRAMID),
     "guided_pyramid.rotations_deg": Case("[0]", "pyramid/", PYRAMID),
     "guided_pyramid.max_side_px": Case("500", "pyramid/", PYRAMID),
-    "guided_pyramid.probed_pairs": Case(
-        "1", "pyramid/", (*PYRAMID, "guided_pyramid.probe_matches=1000")
-    ),
-    "guided_pyramid.probe_matches": Case(
-        "1000", "pyramid/", (*PYRAMID, "guided_pyramid.probed_pairs=1")
-    ),
     "map": Case('"lift"', "map/", scene="with_depth"),
     "given_features": Case('"rootsift"', refused="takes no given model"),
     "triangulation.max_reprojection_error_px": Case("0.2", "map/"),
@@ -191,17 +171,7 @@ CASES: dict[str, Case] = {
     "refinement.depth.window_px": Case(
         "31", "map/", ("refinement.depth.max_sigmas=0.1",), scene="with_depth"
     ),
-    "refinement.consistency.max_reprojection_error_px": Case("0.2", "map/"),
-    "refinement.consistency.min_angle_deg": Case("8.0", "map/"),
-    "refinement.consistency.min_track_length": Case("5", "map/"),
-    "refinement.uncertainty.max_deviation": Case("0.02", "map/"),
-    "refinement.uncertainty.max_relative_deviation": Case("0.003", "map/"),
-    "refinement.uncertainty.keep_quantile": Case("0.5", "map/"),
     "refinement.uncertainty.max_robust_sigmas": Case("0.5", "map/"),
-    "refinement.min_observations": Case(
-        "4", "map/", ("refinement.consistency.max_reprojection_error_px=0.5",)
-    ),
-    "refinement.ply": Case("true", "map/reconstruction/refinement_kept.ply"),
     "mvs.mode": Case("points", "map/", STEREO),
     "mvs.estimator": Case('{name="sweep",options={passes=1}}', "map/", STEREO),
     "mvs.num_sources": Case("1", "map/", STEREO),

@@ -33,9 +33,6 @@ class KaptureVectors:
     between reads, so any number of images will do.
     """
 
-    finite = True
-    """Vectors that are read are finite, or refused."""
-
     def __init__(self, reader: FeatureReader, images: Sequence[str]) -> None:
         self._reader = reader
         self._images = images
