@@ -29,12 +29,10 @@ def main() -> None:
     parser.add_argument("--kloc-python", help="also run kapture-localization, with this Python")
     options, arguments = parser.parse_known_args()
     run("map_reading.py")
-    run("nvm_reading.py")
     run("evaluation.py")
     run("localization.py")
     run("large_map.py")
     run("uncertainty.py")
-    run("pairs.py")
     scene = ("--scene", str(options.scene))
     run("end_to_end.py", *scene, *arguments)
     if options.kloc_python:

@@ -1,7 +1,7 @@
 """SIFT with descriptors normalised as RootSIFT (Arandjelovic and Zisserman, CVPR 2012, section 3).
 
 ``rootsift`` uses OpenCV's SIFT rather than pycolmap's: 2 to 5 times faster per image, with matches
-that fit the true poses as well (docs/experiments/features.md, benchmarks/speed/sift.py).
+that fit the true poses as well (docs/experiments/features.md).
 ``sift`` is COLMAP's: the features that official models and their databases are made of, Lowe's
 detector (IJCV 2004) as VLFeat has it, descriptors stored as bytes.
 """

@@ -50,7 +50,7 @@ Floats = NDArray[np.float64]
 # errors of a map are alike in neighbouring points, and lenses are no pinholes: deviations that
 # take every match for independent are too small by a factor (measured: docs/photos.md)
 _CORRELATED, _MIN_ERROR_PX = 5.0, 0.5
-_MIN_SIGMAS = 2.5
+_MIN_SIGMAS = 3.0
 _MIN_INLIERS = 30
 _DOES_NOT_FIT = "does not fit"
 _ROUNDS = 12

@@ -131,7 +131,7 @@ def _covered(length: int, scaled: int) -> tuple[NDArray[np.int64], NDArray[np.in
 
 
 class GuidedPyramidOptions(Options):
-    """Options of guided pyramid matching; benchmarks/guided_pyramid.py measures the scales."""
+    """Options of guided pyramid matching."""
 
     mode: Literal["off", "all", "max"] = Field(
         default="off", description="matches of all variants together, or of the richest"

@@ -12,7 +12,7 @@ every tap reads the input bilinearly at its own position plus an offset, zero ou
 A bilinear reading is the weighted sum of four rows of a table that has one row of channels per
 pixel, which is what ``embedding_bag`` computes, one contiguous row after the other; a product with
 the kernel as a matrix follows. On a processor this is several times faster than ``grid_sample``,
-whose channels lie far apart (benchmarks/speed/deformable.py).
+whose channels lie far apart.
 """
 
 from __future__ import annotations

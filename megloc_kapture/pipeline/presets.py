@@ -63,7 +63,7 @@ _MEGLOC = PipelineOptions(
     localization=LocalizationOptions(rank=PluginChoice(name="inliers")),
     pose_refinement=PoseRefinementOptions(references="cluster"),
 )
-# chosen by benchmarks/features.py among weights free for any use: docs/experiments/presets.md
+# chosen among weights free for any use: docs/experiments/presets.md
 _MODERN = PipelineOptions(
     preprocessing=PreprocessingOptions(max_size_px=1600),
     local_features=(

@@ -180,9 +180,6 @@ def _prepared(key: _ByContent, kind: PyramidKind) -> PreparedReference:
     return prepare(key.reference, kind)
 
 
-clear_prepared = _prepared.cache_clear
-
-
 def prepare(reference: RenderingReference, kind: PyramidKind) -> PreparedReference:
     """Pyramid and points of a reference; raises DataError for what does not fit its camera."""
     points = lift_points(reference.camera, reference.cam_from_world, reference.depth)

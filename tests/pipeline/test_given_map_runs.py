@@ -99,6 +99,11 @@ COVISIBLE = 'mapping_pairs.by=["covisibility"]'
             ["map=given+triangulate", "local_features.name=sift"],
             "'sift' is asked for twice",
         ),
+        (
+            "synthetic-aachen",
+            ["map=given+triangulate", "preprocessing.max_size_px=320"],
+            "keypoints are in the original images",
+        ),
         ("synthetic", [COVISIBLE], "synthetic comes with no model: .*by covisibility"),
         ("synthetic-4seasons", [COVISIBLE], "4seasons comes with no model: .*by covisibility"),
     ],

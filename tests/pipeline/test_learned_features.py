@@ -64,8 +64,3 @@ def test_modern_maps_smaller_images_and_localizes_whole_ones(
     assert np.median([errors(pose, truth[name])[0] for name, pose in found]) < 0.02
     with pytest.raises(OptionError, match=r"Query\(mask=...\)"):
         Localizer(opened, options=modern("preprocessing.masks.unchanging=true"))
-
-
-def test_a_given_map_is_not_resized(fountain: Path, tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="keypoints are in the original images"):
-        evaluated(tmp_path / "workspace", fountain, modern("map=given+triangulate"))
