@@ -28,10 +28,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import focal_px, normalized_from_px
-from megloc_kapture.geometry.poses import cross_matrix, unstack_poses
+from megloc_kapture.geometry.poses import cross_matrix, perturbed, unstack_poses
 from megloc_kapture.localization.map_index import PoseProblem, View, undo_recentring
 from megloc_kapture.values import Camera, Failure, Options, Pose, RigidTransform
 
@@ -51,8 +50,6 @@ _MAX_STEPS = 20
 _LAST_STEP = 1e-5
 # the first damping after a step that did not help
 _DAMPING = 1e-4
-# a symmetric matrix (3, 3) from its elements xx, xy, xz, yy, yz, zz
-_FULL = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 Floats = NDArray[np.float64]
 
 
@@ -193,7 +190,7 @@ def match_errors(problem: PoseProblem, rig_from_world: RigidTransform) -> tuple[
 
 @dataclass(frozen=True, eq=False)
 class _Projected:
-    """The points of a problem, projected by a pose in the recentred world.
+    """Some of a problem's points, projected by a pose in the recentred world.
 
     Attributes
     ----------
@@ -208,17 +205,26 @@ class _Projected:
     depths: Floats
 
     @classmethod
-    def of(cls, problem: PoseProblem, rig_from_world: RigidTransform) -> _Projected:
+    def of(
+        cls,
+        problem: PoseProblem,
+        rig_from_world: RigidTransform,
+        rows: NDArray[np.int64] | None = None,
+    ) -> _Projected:
+        """Project the matches ``rows`` (N,), ascending; all of them by default."""
         from megloc_kapture.geometry.projection import project_with_jacobian
 
-        in_rig = rig_from_world.apply(problem.points)
+        rows = np.arange(len(problem.points)) if rows is None else rows
+        in_rig = rig_from_world.apply(problem.points[rows])
+        bounds = np.searchsorted(rows, problem.starts).tolist()
         residuals, slopes, depths = [], [], []
-        for view, points in zip(problem.views, problem.split(in_rig), strict=True):
-            in_cam = view.cam_from_rig.apply(points)
+        for view, first, last in zip(problem.views, bounds[:-1], bounds[1:], strict=True):
+            in_cam = view.cam_from_rig.apply(in_rig[first:last])
             px, by_point = project_with_jacobian(view.camera, in_cam)
-            residuals.append(px - view.points_px)
-            turned = by_point.reshape(-1, 3) @ view.cam_from_rig.rotation_matrix()
-            slopes.append(turned.reshape(-1, 2, 3))
+            residuals.append(px - problem.points_px[rows[first:last]])
+            if view.cam_from_rig != RigidTransform.identity():
+                by_point = by_point @ view.cam_from_rig.rotation_matrix()
+            slopes.append(by_point)
             depths.append(in_cam[:, 2])
         return cls(
             np.concatenate(residuals), np.concatenate(slopes), in_rig, np.concatenate(depths)
@@ -229,38 +235,52 @@ class _Projected:
         errors = np.linalg.norm(self.residuals, axis=1)
         return np.where(np.isfinite(errors), errors, np.inf)
 
-    def jacobian_of(self, rows: NDArray[np.int64], whitening: Floats) -> Floats:
-        """Derivatives (n, 2, 6) of whitened residuals by a left perturbation of the pose."""
-        by_point = whitening @ self.slopes[rows]
+    def jacobian(self, whitening: Floats) -> Floats:
+        """Derivatives (N, 2, 6) of whitened residuals by a left perturbation of the pose."""
+        by_point = _whitened(self.slopes, whitening)
         # a^T (omega x p) = omega^T (p x a)
-        (x, y, z), (a, b, c) = self.in_rig[rows].T[:, :, None], np.moveaxis(by_point, 2, 0)
+        (x, y, z), (a, b, c) = self.in_rig.T[:, :, None], np.moveaxis(by_point, 2, 0)
         return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], axis=2)
 
 
 def _whitening(
     problem: PoseProblem, projected: _Projected, rig_from_world: RigidTransform, map_noise: float
 ) -> Floats:
-    """Inverse Cholesky factors (N, 2, 2) of the residuals' covariances ``I + m^2 J C J^T``."""
-    inverse = np.zeros((len(problem.points), 2, 2))
-    inverse[:, 0, 0] = inverse[:, 1, 1] = 1.0
+    """Inverse Cholesky factors of the residuals' covariances ``I + m^2 J C J^T``.
+
+    float64 (N, 3), the elements (0, 0), (1, 0) and (1, 1).
+    """
+    whitening = np.tile([1.0, 0.0, 1.0], (len(problem.points), 1))
     if len(problem.covariances) == 0 or map_noise == 0:
-        return inverse
+        return whitening
     by_world = projected.slopes.reshape(-1, 3) @ (map_noise * rig_from_world.rotation_matrix())
-    a = by_world.reshape(-1, 2, 3)
+    u, v = by_world.reshape(-1, 2, 3).transpose(1, 2, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        added = a @ problem.covariances[:, _FULL].reshape(-1, 3, 3) @ a.transpose(0, 2, 1)
-        s00, s01, s11 = 1.0 + added[:, 0, 0], added[:, 0, 1], 1.0 + added[:, 1, 1]
-        left = s11 - s01**2 / s00
+        s00 = 1.0 + _quadratic(problem.covariances, u, u)
+        s01 = _quadratic(problem.covariances, u, v)
+        left = 1.0 + _quadratic(problem.covariances, v, v) - s01**2 / s00
     # an unknown covariance counts as none
     known = (s00 > 0) & (s00 < np.inf) & (left > 0) & (left < np.inf)
     s00, s01, left = s00[known], s01[known], left[known]
-    inverse[known, 0, 0], inverse[known, 1, 1] = s00**-0.5, left**-0.5
-    inverse[known, 1, 0] = -s01 / s00 * left**-0.5
-    return inverse
+    whitening[known] = np.stack([s00**-0.5, -s01 / s00 * left**-0.5, left**-0.5], axis=1)
+    return whitening
 
 
-def _whitened(residuals: Floats, whitening: Floats) -> Floats:
-    return np.einsum("nij,nj->ni", whitening, residuals)
+def _quadratic(covariances: Floats, u: Floats, v: Floats) -> Floats:
+    """``u^T C v`` (N,) of vectors (3, N), C stored as xx, xy, xz, yy, yz, zz."""
+    xx, xy, xz, yy, yz, zz = covariances.T
+    return (
+        u[0] * (xx * v[0] + xy * v[1] + xz * v[2])
+        + u[1] * (xy * v[0] + yy * v[1] + yz * v[2])
+        + u[2] * (xz * v[0] + yz * v[1] + zz * v[2])
+    )
+
+
+def _whitened(values: Floats, whitening: Floats) -> Floats:
+    """Residuals (N, 2), or their derivatives (N, 2, K), times the inverse Cholesky factors."""
+    w00, w10, w11 = whitening.T.reshape(3, -1, *(1,) * (values.ndim - 2))
+    first, second = values[:, 0], values[:, 1]
+    return np.stack([w00 * first, w10 * first + w11 * second], axis=1)
 
 
 def _ransac(
@@ -338,7 +358,7 @@ def refine_pose(
         sigma = max(_median(squared) ** 0.5 / _RAYLEIGH_MEDIAN, _MIN_SIGMA_PX)
         if remaining > 0:
             pose = _minimised(problem, pose, rows, whitening[rows], sigma)
-    jacobian = projected.jacobian_of(rows, whitening[rows]).reshape(-1, 6)
+    jacobian = _Projected.of(problem, pose, rows).jacobian(whitening[rows]).reshape(-1, 6)
     variance = _variance(squared, (_CAUCHY_EFFICIENT * sigma) ** 2)
     covariance = pose_covariance(jacobian.T @ jacobian, variance)
     if covariance is None:
@@ -375,14 +395,14 @@ def _minimised(
     best, least, damping = pose, np.inf, 0.0
     gradient, hessian = np.zeros(6), np.zeros((6, 6))
     for _ in range(_MAX_STEPS):
-        projected = _Projected.of(problem, pose)
-        whitened = _whitened(projected.residuals[rows], whitening)
+        projected = _Projected.of(problem, pose, rows)
+        whitened = _whitened(projected.residuals, whitening)
         growth = 1.0 + (whitened**2).sum(axis=1) / squared_scale
         # a point that a step has put behind the camera makes the cost NaN
         cost = float(np.log(growth).sum())
         if cost < least:
             best, least, damping = pose, cost, 0.1 * damping
-            jacobian = projected.jacobian_of(rows, whitening) / growth[:, None, None]
+            jacobian = projected.jacobian(whitening) / growth[:, None, None]
             flat = jacobian.reshape(-1, 6)
             gradient, hessian = flat.T @ whitened.ravel(), flat.T @ flat
         else:
@@ -391,8 +411,7 @@ def _minimised(
             step = -np.linalg.solve(hessian + damping * np.diag(np.diagonal(hessian)), gradient)
         except np.linalg.LinAlgError:  # the inliers do not determine the pose
             return best
-        turn = RigidTransform.from_matrix(Rotation.from_rotvec(step[:3]).as_matrix(), step[3:])
-        pose = turn @ best
+        pose = perturbed(best, step)
         if -(gradient @ step) < _LAST_STEP * sigma**2:
             return pose
     return best

@@ -36,7 +36,6 @@ from megloc_kapture.refinement.acceptance import CHI2_OF_CHANCE
 from megloc_kapture.refinement.pyramid import (
     Appearance,
     DepthPoints,
-    FeatureMaps,
     Level,
     build_pyramid,
     lift_points,
@@ -146,7 +145,6 @@ class PyramidKind:
     levels: int
     max_side_px: int
     appearance: Appearance
-    features: FeatureMaps | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,12 +156,7 @@ class PreparedReference:
 
 
 def prepared(reference: RenderingReference, kind: PyramidKind) -> PreparedReference:
-    """The result of :func:`prepare`, kept for the references used last.
-
-    Feature maps are not kept: they are large.
-    """
-    if kind.features is not None:
-        return prepare(reference, kind)
+    """The result of :func:`prepare`, kept for the references used last."""
     return _prepared(_ByContent(_content(reference), reference), kind)
 
 

@@ -38,7 +38,7 @@ from megloc_kapture.values import Camera, RigidTransform
 
 SMALL_CAMERA = Camera("PINHOLE", 80, 60, (70.0, 70.0, 40.0, 30.0))
 HERE = RigidTransform.identity()
-KIND = PyramidKind(levels=2, max_side_px=640, appearance="intensity")
+KIND = PyramidKind(levels=2, max_side_px=640, appearance="normalised")
 Map = Mapping[str, RenderingReference]
 Verdict = Callable[[Map], Consistency]
 
@@ -84,16 +84,6 @@ def test_a_reference_is_prepared_once_and_any_other_content_anew() -> None:
     found += [prepared(one, replace(KIND, levels=1))]
     assert len({id(each) for each in (first, *found)}) == 9
     assert prepared(one, KIND) is first
-    # feature maps are not kept
-    calls = []
-
-    def maps(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        calls.append(image)
-        return np.ones((2, 30, 40), np.float32)
-
-    for _ in range(2):
-        prepared(one, replace(KIND, features=maps))
-    assert len(calls) == 2
     with pytest.raises(DataError, match="does not fit a camera"):
         prepared(replace(one, image=one.image[:50]), KIND)
 
