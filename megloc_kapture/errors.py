@@ -66,7 +66,6 @@ _EXTRAS = {
     "torch": "torch",
     "kornia": "kornia",
     "distributed": "cluster",
-    "faiss": "faiss",
     "h5py": "megadepth",
     **dict.fromkeys(
         ("fastapi", "prometheus_client", "python_multipart", "starlette", "uvicorn"), "serve"

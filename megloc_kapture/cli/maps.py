@@ -88,8 +88,8 @@ class MapPhotographs(Choosing, Working):
 class RefineMap(Reading, StageCommand):
     """Take points and observations out of a map that its images, or depth maps, contradict.
 
-    What is rejected is chosen with --set refinement.uncertainty.max_relative_deviation=0.02 and
-    its like; without, by the preset.
+    --set refinement.uncertainty.max_robust_sigmas=2.5 rejects uncertain points; the preset decides
+    otherwise.
     """
 
     uses = ("refinement",)
@@ -98,13 +98,10 @@ class RefineMap(Reading, StageCommand):
     """Kapture folder of the map; it stays as it is."""
     output: Output
     """Kapture folder of the refined map."""
-    ply: bool = False
-    """Write the kept and the rejected points as PLY files, coloured by uncertainty."""
     force: Force = False
 
     def run(self, console: Console) -> None:
-        changes: dict[str, object] = {"refinement": {"ply": True}} if self.ply else {}
-        options = self.options(changes).refinement
+        options = self.options().refinement
         source = self.kapture_map(self.input)
         with self.staged(self.output, MAP, force=self.force) as (out, work):
             refine_map(

@@ -278,7 +278,7 @@ def variants(options: PipelineOptions) -> dict[str, PipelineOptions]:
     """Options without one of the steps that these have, by the step's name, in their order."""
     no_masks = type(options.preprocessing.masks)()
     depth = options.refinement.depth.model_copy(update={"max_sigmas": None})
-    nothing_rejected = type(options.refinement)(depth=depth, ply=options.refinement.ply)
+    nothing_rejected = type(options.refinement)(depth=depth)
     # as many images, the first that retrieval finds
     unranked = _changed(options, "query_pairs", top_k=options.reranking.keep)
     unranked = _changed(unranked, "reranking", by="none")

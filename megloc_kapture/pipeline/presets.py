@@ -58,7 +58,7 @@ _MEGLOC = PipelineOptions(
     ),
     query_pairs=QueryPairsOptions(top_k=50),
     reranking=RerankingOptions(by="verified", local_type="superpoint"),
-    guided_pyramid=GuidedPyramidOptions(mode="all", count="matches", probed_pairs=None),
+    guided_pyramid=GuidedPyramidOptions(mode="all", count="matches"),
     refinement=MapRefinementOptions(uncertainty=UncertaintyOptions(max_robust_sigmas=2.5)),
     localization=LocalizationOptions(rank=PluginChoice(name="inliers")),
     pose_refinement=PoseRefinementOptions(references="cluster"),

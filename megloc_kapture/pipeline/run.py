@@ -344,7 +344,7 @@ def _steps_of(options: PipelineOptions, facts: DatasetFacts) -> list[_Step]:
         _Step(
             "uncertain points rejected",
             "refinement.uncertainty",
-            options.refinement.uncertainty.needs_deviations(),
+            options.refinement.uncertainty.max_robust_sigmas is not None,
             no_uncertainty,
         ),
         _Step(

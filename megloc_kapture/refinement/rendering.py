@@ -39,7 +39,6 @@ from megloc_kapture.refinement.photometric import (
 )
 from megloc_kapture.refinement.pyramid import (
     ChosenPoints,
-    FeatureMaps,
     Level,
     Visibility,
     choose_points,
@@ -47,12 +46,12 @@ from megloc_kapture.refinement.pyramid import (
     visibility,
 )
 from megloc_kapture.refinement.references import (
-    REFERENCES,
     Displacement,
     PyramidKind,
     ReferenceImages,
     RenderingQuery,
     RenderingReference,
+    prepared,
     pyramid_of,
     reference_of,
     refine_held_out,
@@ -81,27 +80,23 @@ def refine_by_rendering(
     references: Sequence[RenderingReference],
     cam_from_world: RigidTransform,
     options: RenderingOptions | None = None,
-    *,
-    features: FeatureMaps | None = None,
 ) -> PoseRefinement:
     """Refine the pose of an image by what reference images show, lifted by their depth.
 
     Returns the new pose with its covariance, or the old one and the reason. ``measures``: cost (of
     the robust loss, 0 to 0.5), correlation and overlap before and after, by how many of its
     standard errors the cost falls, how far the pose moved in m and deg, the points and references
-    used. Raises DataError for images, masks, depth maps or feature maps that do not fit their
-    cameras.
+    used. Raises DataError for images, masks or depth maps that do not fit their cameras.
 
     Parameters
     ----------
     references : all of them are used; those that do not see the same cost time only.
     cam_from_world : of the query, in the frame of the references' poses, metres.
-    features : compare a dense network's feature maps instead of brightness.
     """
     options = options or RenderingOptions()
     # what is independent goes to two threads; the order of results is that of the work
     with ThreadPoolExecutor(2) as threads:
-        return _Refining(query, references, options, features, threads).refine(cam_from_world)
+        return _Refining(query, references, options, threads).refine(cam_from_world)
 
 
 def judge_by_rendering(
@@ -119,7 +114,7 @@ def judge_by_rendering(
     bool (H, W), pixels of the query by which it is accepted or not; all unless given.
     """
     with ThreadPoolExecutor(2) as threads:
-        return _Refining(query, references, options, None, threads).judge(start, found, judged)
+        return _Refining(query, references, options, threads).judge(start, found, judged)
 
 
 def displacement_by_rendering(
@@ -127,8 +122,6 @@ def displacement_by_rendering(
     references: Sequence[RenderingReference],
     cam_from_world: RigidTransform,
     options: RenderingOptions | None = None,
-    *,
-    features: FeatureMaps | None = None,
 ) -> Displacement | None:
     """Displacement by :func:`refine_by_rendering` of a pose that should be right; raises as there.
 
@@ -137,7 +130,7 @@ def displacement_by_rendering(
     """
     options = options or RenderingOptions()
     with ThreadPoolExecutor(2) as threads:
-        refining = _Refining(query, references, options, features, threads)
+        refining = _Refining(query, references, options, threads)
         refined = refining.refine(cam_from_world)
         if not refined.accepted:
             # the same at the finest level alone, without looking around
@@ -160,18 +153,17 @@ class _Refining:
         query: RenderingQuery,
         references: Sequence[RenderingReference],
         options: RenderingOptions,
-        features: FeatureMaps | None,
         threads: Executor,
     ) -> None:
         self.options, self.least_overlap = options, max(options.min_overlap, 1e-9)
         self.camera = query.camera
         self.threads = threads
-        kind = PyramidKind(options.levels, options.max_side_px, options.appearance, features)
+        kind = PyramidKind(options.levels, options.max_side_px, options.appearance)
         ours = threads.submit(pyramid_of, query, kind)
-        prepared = list(threads.map(lambda each: REFERENCES.prepared(each, kind), references))
+        theirs = list(threads.map(lambda each: prepared(each, kind), references))
         self.query_levels = ours.result()
-        self.levels = [each.pyramid for each in prepared]
-        self.points = [each.points for each in prepared]
+        self.levels = [each.pyramid for each in theirs]
+        self.points = [each.points for each in theirs]
 
     def refine(self, start: RigidTransform) -> PoseRefinement:
         """See :func:`refine_by_rendering`."""
@@ -281,19 +273,13 @@ def _uncovered(start: RigidTransform, overlap: float) -> PoseRefinement:
 
 
 class Rendering:
-    """Plugin ``rendering``: poses refined by warping the references into the query.
-
-    ``features`` compares a dense network's feature maps instead of brightness.
-    """
+    """Plugin ``rendering``: poses refined by warping the references into the query."""
 
     name = "rendering"
     Options = RenderingOptions
 
-    def __init__(
-        self, options: RenderingOptions | None = None, *, features: FeatureMaps | None = None
-    ) -> None:
+    def __init__(self, options: RenderingOptions | None = None) -> None:
         self.options = options or RenderingOptions()
-        self.features = features
         self.require_consistent_map = self.options.require_consistent_map
 
     def hold_out(
@@ -301,7 +287,7 @@ class Rendering:
     ) -> Displacement | None:
         """Displacement of a map image; see :func:`~.references.refine_held_out`."""
         options = self.options.model_copy(update={"accept_always": False})
-        displace = partial(displacement_by_rendering, options=options, features=self.features)
+        displace = partial(displacement_by_rendering, options=options)
         return refine_held_out(
             image, images, scene, displace, max_references=self.options.max_references
         )
@@ -324,7 +310,7 @@ class Rendering:
         if not used:
             return PoseRefinement(cam_from_world, "no reference image has depth")
         seen = RenderingQuery(scene.query_image(query), camera, scene.query_mask(query))
-        return refine_by_rendering(seen, used, cam_from_world, self.options, features=self.features)
+        return refine_by_rendering(seen, used, cam_from_world, self.options)
 
 
 def best_rotations(

@@ -233,7 +233,6 @@ def pair_queries(
     database, described = retrieval.readers(mapping), retrieval.readers(query)
     candidates = Candidates(
         lambda members: vectors_of(database, [images[member] for member in members.tolist()]),
-        [poses[image] for image in images],
         retrieval,
     )
     for positions, permitted in pools:

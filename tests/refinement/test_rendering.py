@@ -21,10 +21,9 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import bearing_rays
-from megloc_kapture.geometry.poses import rotation_angles_deg
+from megloc_kapture.geometry.poses import perturbed, rotation_angles_deg
 from megloc_kapture.plugins import DepthView, PoseRefinement, PoseRefiner
 from megloc_kapture.refinement.acceptance import RenderingOptions
-from megloc_kapture.refinement.photometric import perturbed
 from megloc_kapture.refinement.pyramid import ChosenPoints, Level
 from megloc_kapture.refinement.references import RenderingQuery, RenderingReference
 from megloc_kapture.refinement.rendering import (
@@ -286,29 +285,6 @@ def test_a_depth_camera_beside_the_image_is_honoured(
     assert_found(refined, case.truth, 0.01, 0.1)
     wrong = run(replace(case, references=tuple(careless)), start)
     assert not wrong.accepted or errors(wrong.cam_from_world, case.truth)[0] > 0.03
-
-
-@pytest.mark.parametrize("appearance", ["intensity", "gradients"])
-def test_other_appearances_find_a_day_query(
-    case: Case, painter: PlaceRenderer, shots: tuple[Frame, list[Frame]], appearance: str
-) -> None:
-    day = showing(case, painter.render(shots[0]).image)
-    refined = run(day, start_from(case.truth, 6), appearance=appearance)
-    assert_found(refined, case.truth, 0.02, 0.1)
-
-
-def test_feature_maps_take_the_place_of_brightness(case: Case) -> None:
-    def maps(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-        smooth = cv2.resize(cv2.GaussianBlur(grey, (0, 0), 2.0), (320, 240))
-        down, across = np.gradient(smooth)
-        size = np.sqrt(cv2.blur(down**2 + across**2, (15, 15))) + 0.5
-        return np.stack([down / size, across / size]).astype(np.float32)
-
-    refined = refine_by_rendering(
-        case.query, case.references, start_from(case.truth, 7), features=maps
-    )
-    assert_found(refined, case.truth, 0.03, 0.15)
 
 
 def test_the_plugin_takes_the_first_references_that_have_depth(
