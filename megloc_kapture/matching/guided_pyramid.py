@@ -168,11 +168,6 @@ class GuidedPyramidOptions(Options):
         default=30, gt=0, description="matches with which a variant matched a probed pair"
     )
 
-    def idle(self) -> dict[str, str]:
-        if self.mode != "off":
-            return {}
-        return dict.fromkeys(self.all_but("mode"), "guided_pyramid.mode is off")
-
     @field_validator("scales")
     @classmethod
     def _positive(cls, scales: tuple[float, ...]) -> tuple[float, ...]:

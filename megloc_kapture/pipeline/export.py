@@ -105,10 +105,6 @@ def export_colmap(scene: Scene, output: Path) -> None:
     """Write a model: cameras, rigs, frames, images, points3D, in COLMAP's binary format.
 
     Every camera is a rig of its own. Queries bring no observations.
-
-    Raises
-    ------
-    DataError : map and queries share a name.
     """
     names = [image.name for image in scene.images]
     if len(set(names)) != len(names):
@@ -123,10 +119,6 @@ def export_undistorted(scene: Scene, output: Path) -> None:
     """Write PINHOLE cameras, ``images/`` and ``sparse/0``, as Gaussian splatting reads them.
 
     The original program ignores the folders in images' names, so ``/`` becomes ``_``.
-
-    Raises
-    ------
-    DataError : an image is missing or has another size than its camera, or two would have one name.
     """
     images = [replace(image, name=image.name.replace("/", "_")) for image in scene.images]
     for image in images:
@@ -148,10 +140,6 @@ def export_nerfstudio(scene: Scene, output: Path, *, beside: Path | None = None)
     Parameters
     ----------
     beside : folder that the images' paths are relative to, where it is not ``output``.
-
-    Raises
-    ------
-    DataError : an image without a file, or a camera model that nerfstudio has not.
     """
     frames = []
     for image in scene.images:
@@ -174,12 +162,7 @@ def export_nerfstudio(scene: Scene, output: Path, *, beside: Path | None = None)
 
 
 def export_tum(scene: Scene, output: Path) -> None:
-    """Write a TUM trajectory.
-
-    Raises
-    ------
-    DataError : images of two cameras have one timestamp, which such a file cannot tell apart.
-    """
+    """Write a TUM trajectory."""
     rows = []
     for image in sorted(scene.images, key=lambda one: one.timestamp):
         world_from_cam = image.cam_from_world.inverse()
@@ -244,12 +227,7 @@ def export_ply(scene: Scene, output: Path) -> None:
 
 
 def export_geojson(scene: Scene, output: Path, origin: GeoOrigin) -> None:
-    """Write the camera centres as points, with name, heading and role.
-
-    Raises
-    ------
-    DataError : the origin is no place on earth.
-    """
+    """Write the camera centres as points, with name, heading and role."""
     if not (-90 <= origin.latitude_deg <= 90 and -180 <= origin.longitude_deg <= 180):
         raise DataError(f"{origin.latitude_deg}, {origin.longitude_deg} is no latitude, longitude")
     earth_from_world = earth_from_enu(origin.latitude_deg, origin.longitude_deg, origin.height_m)
@@ -338,12 +316,6 @@ def export(
     Returns
     -------
     Number of images written.
-
-    Raises
-    ------
-    DataError : something is missing, broken, or cannot be said in the format.
-    OptionError : no such format, or what it needs was not given.
-    OutputError : the output is there already, unless ``force``, or cannot be written.
     """
     if name not in get_args(ExportFormat):
         raise OptionError(f"unknown format {name!r}; {suggestion(name, get_args(ExportFormat))}")

@@ -96,13 +96,6 @@ class FusionOptions(Options):
         "least as many as are asked for",
     )
 
-    def idle(self) -> dict[str, str]:
-        return {
-            name: f"{self.method} does not have it, {', '.join(methods)} do"
-            for name, methods in _OPTIONS_OF.items()
-            if self.method not in methods
-        }
-
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.method in ("mean_and_power", "mean_and_min") and self.gamma > 1:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -124,10 +124,6 @@ def match_image_again(
     Returns
     -------
     What was found with ``others``, then with ``only_scaled``.
-
-    Raises
-    ------
-    DataError : its features are of another size than the extractor's.
     """
     started = time.perf_counter()
     every = method.options.variants(itself.camera.width, itself.camera.height)
@@ -214,18 +210,13 @@ class PyramidFeatures:
     """Writes the type ``T-pyramid``: of each image the features of T, then those added.
 
     Files of images that nothing was added to are hard links to those of T where the file system
-    has them, so that they take no space twice. Raises DataError where an image of ``folder`` has
-    more or fewer descriptors of ``local_type`` than keypoints; ``done`` are images that have been
-    written before.
+    has them, so that they take no space twice.
     """
 
-    def __init__(
-        self, output: Path, folder: KaptureFolder, local_type: str, done: Iterable[str] = ()
-    ) -> None:
+    def __init__(self, output: Path, folder: KaptureFolder, local_type: str) -> None:
         name = pyramid_type(local_type)
         keypoints, descriptors = folder.keypoints(local_type), folder.descriptors(local_type)
-        images = set(folder.read().image_names()) - set(done)
-        self._left = [image for image in sorted(images) if image in keypoints]
+        self._left = [image for image in folder.read().image_names() if image in keypoints]
         for image in self._left:
             lengths = descriptors.length(image), keypoints.length(image)
             if lengths[0] != lengths[1]:
@@ -245,7 +236,7 @@ class PyramidFeatures:
     def write(
         self, image: str, added_px: NDArray[np.float32], added_descriptors: NDArray[Any]
     ) -> list[Path]:
-        """Write an image's features, with those added to it; the files. Raises OutputError."""
+        """Write an image's features, with those added to it; the files."""
         added, files = (added_px, added_descriptors), []
         self._left.remove(image)
         for (source, writer, folder), more in zip(self._kinds, added, strict=True):
@@ -258,7 +249,7 @@ class PyramidFeatures:
         return files
 
     def write_rest(self) -> None:
-        """Write the features of the images that nothing is added to; raises OutputError."""
+        """Write the features of the images that nothing is added to."""
         px, descriptors = (
             np.zeros((0, source.config.dsize), source.config.dtype) for source, *_ in self._kinds
         )
@@ -377,10 +368,6 @@ def retry_query(
     frame : pixels and mask of the query; called only where a candidate has few matches.
     num_found : matches of each candidate before verification; as many as in ``matches`` unless
         given.
-
-    Raises
-    ------
-    DataError : the image cannot be read, or its features are of another size than the query's.
     """
     base = {other: pairs for other, pairs, _ in matches}
     found = num_found or {}

@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -48,7 +48,7 @@ from megloc_kapture.stages.guided_pyramid import (
     tried_row,
     write_tried,
 )
-from megloc_kapture.stages.local_features import image_inputs, read_frame
+from megloc_kapture.stages.local_features import read_frame
 from megloc_kapture.stages.matches import (
     MATCHING_OPTIONS,
     Features,
@@ -56,7 +56,6 @@ from megloc_kapture.stages.matches import (
     Verification,
     cached_features,
     mapping_pairs,
-    matched_inputs,
 )
 from megloc_kapture.stages.stage import (
     FEATURES,
@@ -72,7 +71,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, Digest, FolderSpec, Work, content_of
+from megloc_kapture.stages.work import HERE, FolderSpec, Work
 
 _Pair = tuple[str, str]
 
@@ -100,11 +99,6 @@ def pyramid_mapping(
     Returns
     -------
     Counts for the log, and ``seconds_per_tried_pair``, of one worker.
-
-    Raises
-    ------
-    DataError : features or matches are missing, or an image; or the extractor's features are not
-        like those of ``local_type``.
     """
     data, poses = mapping.read(), mapping.read().poses()
 
@@ -127,31 +121,24 @@ def pyramid_mapping(
         # turning one image is turning the other: b is turned only where it is scaled
         others[b][1].append(a)
 
-    @cache
-    def side(image: str, digest: Digest) -> list[object]:
-        camera, *read, pose = matched_inputs(mapping, local_type, image, digest, posed=True)
-        return [[camera, pose], *read]
-
-    def inputs(image: str, digest: Digest) -> object:
-        beside = [[other, side(other, digest)] for names in others[image] for other in names]
-        frame = [method.mask_margin_px, image_inputs(mapping, image, digest)]
-        return [frame, side(image, digest), len(others[image][0]), beside]
-
     features = PyramidFeatures(output, mapping, local_type)
     spool = MatchSpool(output / ".variants", keypoints, mapping.descriptors(local_type))
     images = sorted(others)
-    items = work.items(f"matched variants of {local_type}", images, inputs)
-    todo = [(image, *others[image]) for image in images if image not in items.done]
     again = partial(_match_again, FolderSpec(mapping), local_type, method)
     plugins = method.extractor, method.matcher
-    results = work.map(again, todo, items.label("guided pyramid"), plugins=plugins)
-    for (image, *_), matched in zip(todo, results, strict=True):
-        file, spooled = spool.write(image, matched.found)
-        told = [spooled, matched.num_variants, matched.skipped, matched.seconds]
-        items.add(image, [file], told)
+    jobs = [(image, *others[image]) for image in images]
+    results = work.map(again, jobs, "guided pyramid", plugins=plugins)
     variants = _AllMatched(spool, keypoints)
-    for image in images:
-        variants.put(image, [*others[image][0], *others[image][1]], *items.done[image])
+    for (image, before, after), matched in zip(jobs, results, strict=True):
+        _, spooled = spool.write(image, matched.found)
+        variants.put(
+            image,
+            [*before, *after],
+            spooled,
+            matched.num_variants,
+            matched.skipped,
+            matched.seconds,
+        )
     rows, hard_pairs = [], set(hard)
     with closing(MatchesWriter(output, pyramid_type(local_type), orphan=True)) as writer:
         for pair in named:
@@ -166,7 +153,7 @@ def pyramid_mapping(
         assert own.px is not None
         features.write(image, own.px, spool.descriptors(own.descriptors_at))
     features.write_rest()
-    remove(spool.folder)  # a run that is stopped leaves it to the next
+    remove(spool.folder)
     return {
         "images_extracted_again": len(images),
         "images_extended": len(extended),
@@ -313,48 +300,29 @@ def pyramid_queries(
     both = dict.fromkeys((pair.query, pair.map) for pair in pairs)
     for image, other in sorted(both, key=itemgetter(0)):
         candidates.setdefault(image, []).append(other)
-    stored = query.matches(local_type)
-
-    @cache
-    def side(number: int, image: str, digest: Digest) -> list[object]:
-        return matched_inputs((query, mapping)[number], types[number], image, digest)
-
-    def inputs(image: str, digest: Digest) -> object:
-        of_pairs = [
-            [
-                other,
-                side(1, other, digest),
-                content_of(stored.read(image, other)),
-                before.get((image, other)),
-            ]
-            for other in candidates[image]
-        ]
-        read = image_inputs(query, image, digest)
-        return [method.mask_margin_px, read, side(0, image, digest), of_pairs]
-
-    items = work.items(local_type, list(candidates), inputs)
     jobs = [
         (image, others, {one: before[image, one] for one in others if (image, one) in before})
         for image, others in candidates.items()
-        if image not in items.done
     ]
-    features = PyramidFeatures(output, query, local_type, items.done)
+    features = PyramidFeatures(output, query, local_type)
     retry = partial(_retry, FolderSpec(query), FolderSpec(mapping), types, method)
     plugins = method.extractor, method.matcher
+    rows: list[Any] = []
+    seconds, num_extended = 0.0, 0
     with closing(MatchesWriter(output, larger, orphan=True)) as writer:
-        results = work.map(retry, jobs, items.label("guided pyramid"), plugins=plugins)
+        results = work.map(retry, jobs, "guided pyramid", plugins=plugins)
         for (image, *_), found in zip(jobs, results, strict=True):
-            files = [writer.write(image, *one) for one in found.matches]
-            files += features.write(image, found.added_px, found.added_descriptors)
-            tried = {"rows": found.rows, "seconds": found.seconds}
-            items.add(image, files, [len(found.added_px) > 0, tried])
+            for one in found.matches:
+                writer.write(image, *one)
+            features.write(image, found.added_px, found.added_descriptors)
+            num_extended += len(found.added_px) > 0
+            rows += found.rows
+            seconds += found.seconds
     features.write_rest()
-    done = [items.done[image] for image in candidates]
-    rows = [row for _, tried in done for row in tried["rows"]]
-    counts = write_tried(output, local_type, rows, sum(tried["seconds"] for _, tried in done))
+    counts = write_tried(output, local_type, rows, seconds)
     return {
         "images_extracted_again": len({row[0] for row in rows}),
-        "images_extended": sum(extended for extended, _ in done),
+        "images_extended": num_extended,
         "pairs": sum(map(len, candidates.values())),
         **counts,
     }
@@ -413,6 +381,7 @@ class PyramidMapping(_PyramidStage):
     name = "mapping_pyramid"
     version = 2
     uses = (*MATCHING_OPTIONS, "mapping_verification", "guided_pyramid", "mask_margin_px")
+    explained_by = ("guided_pyramid.mode", "guided_pyramid.min_matches")
     inputs = (Layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS, MAPPING_MATCHES)
     outputs = (MAPPING_PYRAMID,)
 
@@ -439,6 +408,7 @@ class PyramidQueries(_PyramidStage):
     name = "query_pyramid"
     version = 2
     uses = (*MATCHING_OPTIONS, "query_verification", "guided_pyramid", "mask_margin_px")
+    explained_by = ("guided_pyramid.mode", "guided_pyramid.min_matches")
     inputs = (Layout.mapping, Layout.query, LOCAL_FEATURES, MAP, QUERY_PAIRS, QUERY_MATCHES)
     outputs = (QUERY_PYRAMID,)
 

@@ -82,11 +82,6 @@ class TrainingOptions(NetworkOptions):
     held_out_pairs: int = Field(default=100, gt=0, description="of each held-out kapture")
     seed: int = Field(default=0, ge=0)
 
-    def idle(self) -> dict[str, str]:
-        if self.matcher_weights is None:
-            return {}
-        return {"layers": "it is that of matcher_weights"}
-
 
 class DescriptorOptions(TrainingOptions):
     """Options of training the descriptors of a frozen detector's keypoints."""
@@ -95,12 +90,6 @@ class DescriptorOptions(TrainingOptions):
         default="superglue",
         description="superglue: trained with it, as MegLoc; products: for nearest neighbours",
     )
-
-    def idle(self) -> dict[str, str]:
-        if self.through == "superglue":
-            return super().idle()
-        reason = "through=products trains no SuperGlue"
-        return dict.fromkeys(("layers", "deep_supervision", "matcher_weights"), reason)
 
 
 @dataclass

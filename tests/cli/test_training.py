@@ -75,7 +75,6 @@ def test_what_it_refuses(megloc: Any, inputs: Path, tmp_path: Path) -> None:
         (("--set", "step=3"), r"unknown option step; did you mean 'steps'"),
         (("--set", "pairs.labels.positive=3"), r"unknown option pairs\.labels\.positive"),
         (("--set", "layers=3"), r"option layers: it should be a multiple of 2"),
-        (("--set", "through=products", "--set", "layers=4"), r"layers changes nothing: through="),
         (("--licence", "MIT"), r"--licence takes FOLDER=TEXT, got 'MIT'"),
         (("--features", "rootsift"), r"superpoint and xfeat can be trained"),
         (("--features", "superpoint"), r"the weights superpoint_v1 are missing"),
@@ -168,7 +167,6 @@ def test_gaussians_begin_where_depth_says(megloc: Any, mapping: Path, tmp_path: 
         known = np.fromfile(truth.root / f"sensors/records_data/{name}.jpg.depth", np.float32)
         assert np.median(found[found > 0]) == pytest.approx(np.median(known[known > 0]), rel=0.05)
     command = ("train-field", "-i", mapping, "-o", tmp_path / "other", *QUICK)
-    megloc(*command, "--gaussians", "99").refused("gaussians changes nothing: the kind is triplane")
     megloc(*command, "--kind", "gaussians", "--compiled").refused("compiled is of networks")
     megloc(*command, "--kind", "gaussians", "--gaussians", "99999").refused(
         "99999 Gaussians begin where depth says, and [0-9]+ pixels have any"
