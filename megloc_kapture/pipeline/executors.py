@@ -14,7 +14,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from megloc_kapture.errors import MeglocError, OptionError
 from megloc_kapture.io.files import clear_leftovers, output_error, owned_name
@@ -57,7 +57,7 @@ def _limit_threads(stack: ExitStack) -> None:
     from threadpoolctl import threadpool_limits
 
     stack.enter_context(threadpool_limits(1))
-    torch = sys.modules.get("torch")
+    torch: Any = sys.modules.get("torch")
     if hasattr(torch, "set_num_threads"):  # False while another thread imports it
         stack.callback(torch.set_num_threads, torch.get_num_threads())
         torch.set_num_threads(1)
