@@ -82,18 +82,6 @@ class Options(BaseModel):
                 read[key] = listed(value) if _is_list(annotation) else value
         return read
 
-    def idle(self) -> dict[str, str]:
-        """Options that change nothing while the others are as they are: name to the reason.
-
-        Who sets one of them meant something else: it is refused (pipeline/presets.py).
-        """
-        return {}
-
-    @classmethod
-    def all_but(cls, *names: str) -> list[str]:
-        """Names of all options but these."""
-        return [name for name in cls.model_fields if name not in names]
-
 
 @dataclass(frozen=True, slots=True)
 class Camera:

@@ -294,13 +294,6 @@ class Computing:
         given = {"device": self.device, "precision": self.precision}
         return [f"{name}={value}" for name, value in given.items() if value is not None]
 
-    def check_computes(self, chosen: object) -> None:
-        """Raise OptionError where no network, of options or a tuple of them, has what is given."""
-        from megloc_kapture.stages.devices import unheeded
-
-        if lacking := unheeded(chosen, self.device or "auto", self.precision or "full"):
-            raise OptionError(f"--{lacking[0]} changes nothing: no network here has it")
-
 
 @dataclass(frozen=True, kw_only=True)
 class Choosing(Computing):

@@ -6,10 +6,10 @@ import logging
 import sys
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -36,13 +36,13 @@ from megloc_kapture.io.tables import STATUS_FILE
 from megloc_kapture.localization.focal_length import misfits_text
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
-from megloc_kapture.pipeline.local_types import LocalType, local_types_of
-from megloc_kapture.pipeline.localizer import LOCALIZING, Localizer
-from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
-from megloc_kapture.pipeline.query_folders import Photographs, Queries
+from megloc_kapture.pipeline.local_types import LocalType
+from megloc_kapture.pipeline.localizer import Localizer
+from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
+from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.service.requests import Limits
-from megloc_kapture.stages.matches import FeatureCache, iterate_candidates
+from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.stage import LOCALIZED
 
@@ -99,9 +99,6 @@ class Localize(Reading, Deciding, Common):
         localizer = Localizer(kapture_map, options=options)
         results = Results(localizer, folder, workers=workers, candidates=given, track=console.track)
         queries = results.queries
-        typed = assigned(self.assignments())
-        idle = _idle_for_queries(typed, localizer, queries, pairs=given is not None)
-        _refuse_idle(typed, localizer.types, localizer.options, idle)
         with staged_output(self.output, kind=LOCALIZED, force=self.force) as out:
             started = time.perf_counter()
             named = list(results.items())
@@ -184,9 +181,6 @@ class Serve(Reading, Deciding, Common):
             opening = self.opening(path, self.keypoints_type, self.pixel_origin)
             kapture_map = opening()
             _check_consistent(kapture_map, self.map, force=self.force)
-            typed = assigned(self.assignments())
-            types = local_types_of(kapture_map, options, FeatureCache())
-            _refuse_idle(typed, types, options, _idle_for_images(typed, options))
 
             def ready() -> None:
                 host = f"[{self.host}]" if ":" in self.host else self.host
@@ -224,9 +218,7 @@ def _read_token(path: Path) -> str:
 
 
 def _options_of(command: Deciding) -> PipelineOptions:
-    return options_of_preset(
-        command.preset or DEFAULT_PRESET, assignments=command.assignments(), used=LOCALIZING
-    )
+    return options_of_preset(command.preset or DEFAULT_PRESET, assignments=command.assignments())
 
 
 def _check_consistent(kapture_map: KaptureMap, path: Path, *, force: bool) -> None:
@@ -235,74 +227,6 @@ def _check_consistent(kapture_map: KaptureMap, path: Path, *, force: bool) -> No
         raise DataError(
             f"{fault}; the poses would be wrong (--force localizes all the same)", path=path
         )
-
-
-def _idle_for_queries(
-    typed: Mapping[str, Any],
-    localizer: Localizer,
-    queries: Queries,
-    *,
-    pairs: bool,
-) -> dict[str, str]:
-    """Options that change nothing for a map and these queries, and why.
-
-    Parameters
-    ----------
-    typed : nested tables of ``--set``.
-    pairs : whether the candidates are given.
-    """
-    idle = {}
-    if all(queries.lacking(local.name) is None for local in localizer.types):
-        reason = f"the queries bring their local features ({_names(localizer.types)})"
-        reason += ", nothing is extracted"
-        idle = dict.fromkeys(("preprocessing", "mask_margin_px"), reason)
-    shared = queries.types_of_all()
-    if pairs:
-        names = ("query_pairs", "global_features", "fusion")
-        idle |= dict.fromkeys(names, "--pairs gives the candidates")
-    elif shared and not localizer.compares_as_asked(shared):
-        idle["global_features"] = f"map and queries bring {', '.join(shared)}, which is compared"
-    localization = typed.get("localization", {})
-    if not queries.data().rigs:
-        if localization.get("rigs"):
-            idle["localization"] = "rigs: the queries have none"
-        elif localization.get("fallback") == "rig":
-            idle["localization"] = "fallback = rig: the queries have none"
-    return idle
-
-
-def _idle_for_images(typed: Mapping[str, Any], options: PipelineOptions) -> dict[str, str]:
-    """Options that change nothing for single images without depth, and why."""
-    idle = {}
-    localization = typed.get("localization", {})
-    if localization.get("rigs") or localization.get("fallback") == "rig":
-        idle["localization"] = "images come one by one, not on a rig"
-    if any(one.name == "icp" for one in options.pose_refinement.by):
-        idle["pose_refinement"] = "icp needs depth maps, and images come without"
-    return idle
-
-
-def _refuse_idle(
-    typed: Mapping[str, Any],
-    types: Sequence[LocalType],
-    options: PipelineOptions,
-    of_queries: Mapping[str, str],
-) -> None:
-    """Raise OptionError where an option that was typed changes nothing for these keypoints types,
-    or for the queries."""
-    idle = {}
-    if "guided_pyramid" in typed and options.matches_again():
-        obstacles = [local.pyramid_obstacle for local in types]
-        if all(obstacles):
-            idle["guided_pyramid"] = obstacles[0]
-    used = {local.choice.name for local in types if local.choice is not None}
-    unused = [one.name for one in options.local_features if one.name not in used]
-    if unused:
-        idle["local_features"] = f"the map is of {_names(types)}; nothing in it is of {unused[0]}"
-    idle |= of_queries
-    for name in typed:
-        if name in idle:
-            raise OptionError(f"--set {name} changes nothing: {idle[name]}")
 
 
 def _names(types: Sequence[LocalType]) -> str:

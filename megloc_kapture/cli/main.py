@@ -15,14 +15,11 @@ import os
 import re
 import signal
 import sys
-import threading
-import time
 import traceback
-import weakref
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Protocol
 
 from megloc_kapture.errors import MeglocError, missing_extra
 
@@ -38,15 +35,9 @@ _BESIDES = ("For full helptext", "Argument helptext", "Perhaps you meant", "Got 
 # help of a flag stands two steps in, its name one
 _HELP_INDENT = " " * 8
 
-_ONE_END_S = 5.0  # for what is cleared up at the end, until another signal ends that, too
-
-
-class Interrupted(KeyboardInterrupt):
-    """Somebody pressed Ctrl-C."""
-
 
 class Terminated(BaseException):
-    """The system, or somebody, asks the process to end."""
+    """SIGTERM asks the process to end."""
 
 
 class Command(Protocol):
@@ -302,74 +293,20 @@ def examples_text(arguments: Sequence[str]) -> str:
     return "\n".join(["examples:", *(f"  {one}" for one in (narrower or found)[:3])])
 
 
-class _Ending:
-    """How Ctrl-C and SIGTERM end the process: in an orderly way, and whatever they meet.
-
-    A compiled module that is being imported turns the exception of a signal into an error of its
-    own, or drops it, as callbacks of the interpreter do. So it is kept here what was met, and an
-    exception that is gone before :func:`main` has met it is raised again.
-    """
-
-    def __init__(self) -> None:
-        self.status: int | None = None  # of what was met
-        self._exception: weakref.ref[BaseException] | None = None
-        self._raised_s = 0.0
-        self._is_over = False
-        self._tell_unraisable = sys.unraisablehook
-
-    def obey(self) -> None:
-        """Let the signals of this process raise KeyboardInterrupt or Terminated."""
-        for one in (signal.SIGINT, signal.SIGTERM):
-            if signal.getsignal(one) != signal.SIG_IGN:  # as of what a shell runs behind
-                signal.signal(one, self._raise)
-        sys.unraisablehook = self._dropped
-
-    def ignore(self) -> None:
-        """Let nothing more disturb the end of the process."""
-        self._is_over = True
-        for one in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(one, signal.SIG_IGN)
-        sys.unraisablehook = self._tell_unraisable
-
-    def _raise(self, number: int, _frame: object) -> None:
-        ends = self._exception is not None and self._exception() is not None
-        # who presses twice means one end; who waited for it in vain, another
-        if ends and time.monotonic() < self._raised_s + _ONE_END_S:
-            return
-        interrupted = number == signal.SIGINT
-        self.status = INTERRUPTED if interrupted else TERMINATED
-        error = Interrupted() if interrupted else Terminated()
-        self._exception = weakref.ref(error, lambda _: self._raise_again(number))
-        self._raised_s = time.monotonic()
-        try:
-            raise error
-        finally:
-            del error  # its traceback has this frame, and it would live for ever
-
-    def _raise_again(self, number: int) -> None:
-        if not self._is_over:
-            # not from here, for what is raised while something is deleted is dropped
-            again = threading.Timer(0.01, os.kill, (os.getpid(), number))
-            again.daemon = True
-            again.start()
-
-    def _dropped(self, what: sys.UnraisableHookArgs) -> None:
-        if not issubclass(what.exc_type, Interrupted | Terminated):
-            self._tell_unraisable(what)
+def _terminate(number: int, frame: object) -> NoReturn:
+    raise Terminated
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command; exits with 0, 1 (defect), 2 (user's error), 3, 130 (Ctrl-C) or 143.
 
-    Without arguments it is the console script: those of the process, which signals end in an
-    orderly way.
+    Without arguments it is the console script, which takes those of the process.
     """
     given = sys.argv[1:] if arguments is None else arguments
-    ending = _Ending()
     debug = False
     try:
         if arguments is None:
-            ending.obey()
+            signal.signal(signal.SIGTERM, _terminate)
         if list(given) == ["--version"]:
             from megloc_kapture import __version__
 
@@ -384,20 +321,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         debug = command.debug
         status = command.run(command.console()) or DONE
         sys.stdout.flush()
-    except SystemExit:
-        raise
-    except BaseException as error:
-        if arguments is None:
-            ending.ignore()
-        if ending.status is None and not isinstance(error, KeyboardInterrupt):
-            status = _tell(error, debug)
-        else:
-            status = ending.status or INTERRUPTED
-            how = "terminated" if status == TERMINATED else "interrupted"
-            print(f"megloc: {how}; run the same command again to go on", file=sys.stderr)
-    finally:
-        if arguments is None:
-            ending.ignore()  # or Python would print tracebacks of its own ending
+    except (KeyboardInterrupt, Terminated) as error:
+        terminated = isinstance(error, Terminated)
+        status = TERMINATED if terminated else INTERRUPTED
+        how = "terminated" if terminated else "interrupted"
+        print(f"megloc: {how}; run the same command again to go on", file=sys.stderr)
+    except Exception as error:
+        status = _tell(error, debug)
     sys.exit(status)
 
 

@@ -69,14 +69,6 @@ class ClusterOptions(Options):
         default=10, gt=0, description="clusters tried, those with the most matches"
     )
 
-    def idle(self) -> dict[str, str]:
-        idle = {}
-        if self.by != "poses":
-            idle["radius"] = f"it is for clusters by poses, these are by {self.by}"
-        if self.by != "covisibility":
-            idle["min_shared_points"] = f"it is for covisibility, clusters are by {self.by}"
-        return idle
-
     @model_validator(mode="after")
     def _has_scale(self) -> ClusterOptions:
         if self.by == "poses" and self.radius is None:

@@ -158,11 +158,6 @@ class GuidedPyramidOptions(Options):
         description="an image is not enlarged beyond this; memory grows with the pixels",
     )
 
-    def idle(self) -> dict[str, str]:
-        if self.mode != "off":
-            return {}
-        return dict.fromkeys(self.all_but("mode"), "guided_pyramid.mode is off")
-
     @field_validator("scales")
     @classmethod
     def _positive(cls, scales: tuple[float, ...]) -> tuple[float, ...]:

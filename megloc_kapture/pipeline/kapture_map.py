@@ -90,12 +90,7 @@ class MapKeypoints:
         return found
 
     def check(self, images: Collection[str]) -> None:
-        """Compare the sizes of the images' feature files; reads none of them.
-
-        Raises
-        ------
-        DataError : a truncated file, or keypoints and descriptors of different length.
-        """
+        """Compare the sizes of the images' feature files; reads none of them."""
         if not self.has_descriptors(images):
             return
         for image in images:
@@ -151,11 +146,6 @@ class KaptureMap:
         allow_links_below : folders that links in the map may lead to.
         indices : of its keypoints types, from another process that has opened it; points and
             observations are not read then.
-
-        Raises
-        ------
-        DataError : no map, or broken: names the file.
-        OptionError : a type or pixel origin that is not there.
         """
         if pixel_origin not in ("auto", "corner", "centre"):
             raise OptionError(f"pixel_origin is {pixel_origin!r}; give auto, corner or centre")
@@ -197,12 +187,7 @@ class KaptureMap:
         return next(iter(self.keypoints.values())).pixel_origin
 
     def keypoints_of(self, name: str) -> MapKeypoints:
-        """The keypoints of a type that the map stores, whether any of them has a point.
-
-        Raises
-        ------
-        DataError : the map has no keypoints of that type.
-        """
+        """The keypoints of a type that the map stores, whether any of them has a point."""
         if name in self.keypoints:
             return self.keypoints[name]
         index = index_map(self.folder, name)
@@ -258,10 +243,6 @@ class KaptureMap:
         """Compare the sizes of all feature files that localizing reads; reads none of them.
 
         Observations are compared with keypoints when they are read, which :meth:`open` does.
-
-        Raises
-        ------
-        DataError : a truncated file, or keypoints and descriptors of different length.
         """
         for keypoints in self.keypoints.values():
             keypoints.check(self.images)

@@ -23,7 +23,7 @@ from megloc_kapture.plugins import (
     Matcher,
     PluginChoice,
 )
-from megloc_kapture.stages.devices import BATCH, placed
+from megloc_kapture.stages.devices import BATCH, with_device
 from megloc_kapture.stages.given_map import rows_found_again
 from megloc_kapture.stages.guided_pyramid import PyramidMethod, retry_query
 from megloc_kapture.stages.local_features import extract_all, read_frame
@@ -118,17 +118,12 @@ class LocalType:
         """The extractor, where one is known by the options or by the map's name of the type."""
         found = self.first.extractor()
         if self.choice is None or (found is not None and found.name != self.choice.name):
-            return placed(found, self._options.device, self._options.precision)
+            return with_device(found, self._options.device, self._options.precision)
         known = {} if found is None else found.options
         return PluginChoice(name=self.choice.name, options={**self.choice.options, **known})
 
     def of_query(self, image: QueryImage) -> Features:
-        """The features of a query: those that it brings, else extracted ones.
-
-        Raises
-        ------
-        DataError : it has neither features nor an image, or they cannot be extracted.
-        """
+        """The features of a query: those that it brings, else extracted ones."""
         brought = image.query.features
         local = next((brought[n] for n in equivalent_types(self.name) if n in brought), None)
         if local is None:
@@ -274,13 +269,7 @@ def _rank(local_type: str, choices: Sequence[LocalFeaturesChoice]) -> int:
 def extract_again(
     kapture_map: KaptureMap, keypoints: MapKeypoints, extractor: LocalFeatureExtractor
 ) -> dict[str, NDArray[Any]]:
-    """Descriptors of every map image, one row per stored keypoint; zero where it is not found.
-
-    Raises
-    ------
-    DataError : an image is missing, or most observed keypoints are not found again: then the map
-        was made with another extractor or other options.
-    """
+    """Descriptors of every map image, one row per stored keypoint; zero where it is not found."""
     if not kapture_map.has_images():
         raise DataError(
             f"the map has no descriptors of type {keypoints.name!r}, and no images to extract "

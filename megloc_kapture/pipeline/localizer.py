@@ -43,12 +43,6 @@ from megloc_kapture.stages.work import ordered_map
 from megloc_kapture.values import Camera, Device, Failure, Pose, RigidTransform
 
 _ALONE = RigidTransform.identity()
-# the options that localizing uses; the others are of maps that are made
-LOCALIZING = (
-    *("device", "precision", "preprocessing", "local_features", "mask_margin_px"),
-    *("global_features", "fusion", "query_pairs", "reranking", "matching", "verification"),
-    *("query_verification", "guided_pyramid", "localization", "pose_refinement"),
-)
 
 
 class Localizer:
@@ -64,11 +58,6 @@ class Localizer:
     kapture_map : the map.
     preset, device, precision : options by name, and where and how its networks compute: auto (a GPU
         where there is one), cpu, cuda, cuda:N; full or half. ``options`` gives all of it instead.
-
-    Raises
-    ------
-    DataError : the map has no descriptors, and they cannot be made again.
-    OptionError, PluginError : the options cannot be used.
 
     Examples
     --------
@@ -129,11 +118,6 @@ class Localizer:
         Returns
         -------
         Pose, or Failure, which is falsy and says why.
-
-        Raises
-        ------
-        DataError : the image cannot be read, is not of its camera's size, or its features cannot
-            be extracted because the map's type has no extractor.
         """
         permitted = None if prior is None else tuple(prior)
         return self.localize_query(replace(_query_of(image, camera), prior=permitted))
@@ -206,11 +190,6 @@ class Localizer:
         Returns
         -------
         Pose whose ``cam_from_world`` is ``rig_from_world``, or Failure.
-
-        Raises
-        ------
-        OptionError : the options have pose refiners, which refine cameras one by one:
-            :meth:`localize_units` gives the poses of the cameras.
         """
         if self.refiners.refiners:
             raise OptionError(

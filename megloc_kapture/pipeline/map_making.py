@@ -85,10 +85,10 @@ from megloc_kapture.stages.stage import (
     MAPPING,
     QUERY,
     ROOT,
-    Hashes,
     PipelineStage,
     Stage,
     StageWork,
+    files_fingerprint,
     wanted_stages,
 )
 from megloc_kapture.stages.structure import FindPoses, MatchPhotographs, StructureOptions
@@ -127,12 +127,7 @@ _WITH_POSES: tuple[type[PipelineStage], ...] = (
 
 
 def plan_map(mapping: KaptureFolder, options: PipelineOptions) -> list[Stage]:
-    """The stages that make a map of images with poses, without queries.
-
-    Raises
-    ------
-    OptionError : the options need a model that a dataset comes with.
-    """
+    """The stages that make a map of images with poses, without queries."""
     check_weights(options)
     options.retrieval()
     if options.uses_given_map() or options.pairs_by_points():
@@ -151,21 +146,15 @@ class ImportMapping(Stage):
         super().__init__(Options())
         self._mapping, self.root = mapping, mapping.root
 
-    def external(self, hashes: Hashes) -> Mapping[str, str]:
+    def external(self) -> Mapping[str, str]:
         root = self._mapping.root.resolve()
-        return {"images": hashes.of_files(root, mapping_files(self._mapping)), ROOT: str(root)}
+        return {"images": files_fingerprint(root, mapping_files(self._mapping)), ROOT: str(root)}
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         return import_mapping(self._mapping, work.out)
 
 
 GPS = "gps"
-# the options that making a map of photographs uses
-MAPPING_OPTIONS = (
-    *("device", "precision", "preprocessing", "local_features", "mask_margin_px"),
-    *("global_features", "fusion", "mapping_pairs", "matching", "mapping_verification"),
-    *("query_verification", "guided_pyramid", "triangulation", "refinement"),
-)
 _BY_POSES = frozenset({"poses", "covisibility"})
 
 
@@ -179,17 +168,18 @@ class ImportPhotographs(Stage):
         super().__init__(Options())
         self._photographs, self.root = photographs, photographs.root
 
-    def external(self, hashes: Hashes) -> Mapping[str, str]:
+    def external(self) -> Mapping[str, str]:
         data, files = self._photographs.data(), self._photographs.files()
+        root = self._photographs.root.resolve()
         content = {
-            "files": {name: hashes.of_file(path.resolve()) for name, path in files.items()},
+            "files": [sorted(files), files_fingerprint(root, map(Path.resolve, files.values()))],
             "sensors": {name: sensor.params for name, sensor in data.sensors.items()},
             "images": [[sensor, name] for (_, sensor), name in data.records_camera.items()],
             "unreadable": self._photographs.unreadable,
         }
         text = json.dumps(content, sort_keys=True, default=str)
         fingerprint = hashlib.sha256(text.encode()).hexdigest()
-        return {"photographs": fingerprint, ROOT: str(self._photographs.root.resolve())}
+        return {"photographs": fingerprint, ROOT: str(root)}
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         write_sensors(work.out / MAPPING, self._photographs.data())
@@ -213,21 +203,14 @@ class ImportPhotographs(Stage):
 def options_of_photographs(
     preset: str,
     assignments: Sequence[str] | Mapping[str, Any] = (),
-    *,
-    used: Sequence[str] | None = None,
 ) -> PipelineOptions:
-    """A preset's options, without those that would need poses or a known lens.
-
-    Raises
-    ------
-    OptionError : of :func:`options_of_preset`; or one that would need them was typed.
-    """
+    """Return a preset's options, without those that need poses or a known lens."""
     by = PRESETS[preset].mapping_pairs.by if preset in PRESETS else ()
     changes: list[dict[str, Any]] = [
         {"preprocessing": {"undistort": False}},
         {"mapping_pairs": {"by": [method for method in by if method not in _BY_POSES]}},
     ]
-    options = options_of_preset(preset, changes=changes, assignments=assignments, used=used)
+    options = options_of_preset(preset, changes=changes, assignments=assignments)
     if without := sorted(_BY_POSES.intersection(options.mapping_pairs.by)):
         raise OptionError(f"mapping_pairs.by {without[0]}: photographs have no poses yet")
     if options.preprocessing.undistort:
@@ -248,11 +231,6 @@ def structure_options(
     Parameters
     ----------
     scale : nothing; ``gps``; or two photographs and the metres between them.
-
-    Raises
-    ------
-    OptionError : the scale is none of these.
-    DataError : a photograph is not there, or none has a position.
     """
     gps, distance = None, None
     if tuple(scale) == (GPS,):
@@ -282,13 +260,7 @@ def structure_options(
 def plan_photographs(
     photographs: Photographs, options: PipelineOptions, structure: StructureOptions
 ) -> list[Stage]:
-    """The stages from photographs to a map.
-
-    Raises
-    ------
-    DataError : too few photographs.
-    MeglocError : the options cannot be used.
-    """
+    """The stages from photographs to a map."""
     check_weights(options)
     options.retrieval()
     if len(photographs.names) < MIN_IMAGES:
@@ -364,10 +336,6 @@ def import_colmap(
     Returns
     -------
     Counts for the log.
-
-    Raises
-    ------
-    DataError : see :class:`~megloc_kapture.datasets.colmap_map.ColmapReconstruction`.
     """
     read = ColmapReconstruction.read(source)
     if unit != METRES:
@@ -411,11 +379,6 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
     path : kapture folder, workspace, or a COLMAP model or workspace, see
         :func:`~megloc_kapture.datasets.colmap_map.find_colmap`.
     work : where features are extracted, if they have to be.
-
-    Raises
-    ------
-    DataError : it is a COLMAP model that cannot be imported.
-    OutputError : the cache cannot be written.
     """
     path = map_of_workspace(Path(path))
     if not is_colmap(path):

@@ -20,7 +20,7 @@ from megloc_kapture.pipeline.queries import Preprocessor, Query, QueryImage
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import GLOBAL_FEATURES, GlobalFeatureExtractor
 from megloc_kapture.stages.candidates import Candidates, Retrieval, vectors_of
-from megloc_kapture.stages.devices import placed
+from megloc_kapture.stages.devices import with_device
 from megloc_kapture.stages.global_features import (
     GlobalFeaturesChoice,
     VladSettings,
@@ -184,7 +184,7 @@ class MapRetrieval:
         """The map's vectors that an extractor is known for."""
         where = self._options.device, self._options.precision
         return tuple(
-            self._made_by(placed(choice, *where), name, 1.0, stored=True)
+            self._made_by(with_device(choice, *where), name, 1.0, stored=True)
             for name in self._map.global_types()
             if (choice := _choice_of(name)) is not None
         )

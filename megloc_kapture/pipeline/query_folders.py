@@ -76,7 +76,7 @@ class Queries(ABC):
 
     @abstractmethod
     def check(self) -> None:
-        """Check all that can be checked without reading features or pixels; raises DataError."""
+        """Check all that can be checked without reading features or pixels."""
 
     def lacking(self, local_type: str) -> str | None:
         """The first image without features that serve a type; None where all bring them."""
@@ -155,13 +155,7 @@ class KaptureQueries(Queries):
         )
 
     def check(self) -> None:
-        """See :meth:`Queries.check`.
-
-        Raises
-        ------
-        DataError : there are no images, or none that can be used; features are not as wide as the
-            map's, or would be taken for those of a map image.
-        """
+        """See :meth:`Queries.check`."""
         self._map.folder.check_features_apart(self._folder)
         if not self.names:
             raise DataError("there are no query images", path=self._folder.root)
@@ -336,12 +330,6 @@ class Photographs(Queries):
     root : the first folder, or that of the first file.
     passed_over : files of the folders that are no images.
     without_row : images that the list of cameras does not have.
-
-    Raises
-    ------
-    DataError : a file or folder is not there, there is no image, two have the same name, or kapture
-        cannot hold a name.
-    OptionError : ``every`` is not positive, or there is no video.
     """
 
     def __init__(
@@ -549,7 +537,7 @@ def _images_below(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def _check_name(name: str, path: Path) -> None:
-    """Refuse names that kapture's tables cannot hold; raises DataError."""
+    """Refuse names that kapture's tables cannot hold."""
     try:
         check_relative(name)
     except DataError as error:

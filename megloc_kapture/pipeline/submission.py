@@ -85,11 +85,6 @@ def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> N
     Parameters
     ----------
     tables : where the protocol was read; None: nowhere, it is the default.
-
-    Raises
-    ------
-    OptionError : unknown, without side tables where the dataset has rules of its own, or another
-        dataset's.
     """
     check_known(dataset)
     plain = (KAPTURE, SYNTHETIC)
@@ -135,11 +130,6 @@ def write_submission(
     ``poses`` written for them, ``missing``, queries of these that are ``doubtful`` (a pose of too
     little confidence), and of the poses ``fallbacks`` (guesses) and ``from_rig``; ``dummies`` are
     rows that hold no pose.
-
-    Raises
-    ------
-    DataError : something is missing or broken, or two images would bear one name.
-    OutputError : a file cannot be written.
     """
     beside = None if tables is None else tables.parent
     rules = Protocol() if tables is None else read_protocol(tables)
@@ -362,11 +352,6 @@ def keep_submission(place: Path, folder: Path) -> Path:
     Returns
     -------
     Where the copy stands.
-
-    Raises
-    ------
-    DataError : the submission or its provenance is missing or cannot be read.
-    OutputError : the copy cannot be written.
     """
     content = _content(place)
     beside = _read(provenance_path(place))

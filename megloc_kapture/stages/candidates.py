@@ -45,10 +45,7 @@ class Restrictions:
 
     @classmethod
     def read(cls, side_tables: Path) -> Restrictions:
-        """From a workspace's ``megloc/`` folder; absent tables restrict nothing.
-
-        Raises DataError: a broken table.
-        """
+        """From a workspace's ``megloc/`` folder; absent tables restrict nothing."""
         return cls(read_groups(side_tables), read_priors(side_tables))
 
     def frame(self, image: str) -> str:
@@ -108,11 +105,6 @@ class QueryPairsOptions(Options):
     )
     top_k: int = Field(default=50, gt=0, description="most similar map images per query")
 
-    def idle(self) -> dict[str, str]:
-        if self.by == "retrieval":
-            return {}
-        return dict.fromkeys(self.all_but("by"), "all map images are taken (exhaustive)")
-
 
 @dataclass(frozen=True)
 class Retrieval:
@@ -129,7 +121,7 @@ class Retrieval:
     fusion: FusionOptions = field(default_factory=FusionOptions)
 
     def readers(self, folder: KaptureFolder) -> list[FeatureReader]:
-        """Readers of a folder's vectors, by type; raises DataError where it has not one of them."""
+        """Readers of a folder's vectors, by type."""
         return [folder.global_features(name) for name in self.types]
 
     def rank(
@@ -182,10 +174,7 @@ def _search_part(search: FusedSearch, queries: Sequence[VectorBlocks], part: _Pa
 
 
 def vectors_of(readers: Sequence[FeatureReader], images: Sequence[str]) -> list[KaptureVectors]:
-    """Vectors of the images by type, unit rows, read when they are asked for.
-
-    Raises DataError: an image has none.
-    """
+    """Vectors of the images by type, unit rows, read when they are asked for."""
     for reader in readers:
         missing = [image for image in images if image not in reader]
         if missing:

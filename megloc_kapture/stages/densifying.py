@@ -89,11 +89,6 @@ class DensifyOptions(Options):
     max_size_px: int = Field(default=800, ge=64, description="longer side of the depth maps")
     agreement: AgreementOptions = AgreementOptions()
 
-    def idle(self) -> dict[str, str]:
-        if self.mode == "off":
-            return dict.fromkeys(self.all_but("mode"), "mvs.mode is off")
-        return {}
-
     def make_estimator(self) -> DepthEstimator:
         """The estimator; raises PluginError, MissingWeightsError."""
         found: DepthEstimator = load_plugin(
@@ -378,6 +373,7 @@ class Densify(PipelineStage):
     name = "densify"
     version = 4
     uses = ("mvs",)
+    explained_by = ("mvs.mode",)
     inputs = (Layout.sparse_map, SIDE_TABLES)
     outputs = (MAP,)
 

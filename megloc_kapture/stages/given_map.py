@@ -37,10 +37,7 @@ _SAME_PLACE_PX = 0.1
 
 
 def given_type(reference: KaptureFolder) -> str:
-    """The keypoints type of a given map.
-
-    Raises DataError: no points, or no or several types that observe them.
-    """
+    """The keypoints type of a given map."""
     if not reference.has_points():
         raise DataError(
             "no given map: reconstruction/points3d.txt or observations.txt is missing "
@@ -57,10 +54,7 @@ def given_type(reference: KaptureFolder) -> str:
 
 
 def check_given_type(reference: KaptureFolder, expected: str) -> None:
-    """Check that a given map is of the keypoints type that is extracted for it.
-
-    Raises DataError: it is of another one, or no map.
-    """
+    """Check that a given map is of the keypoints type that is extracted for it."""
     found = given_type(reference)
     if found != expected:
         raise DataError(
@@ -72,8 +66,6 @@ def check_given_type(reference: KaptureFolder, expected: str) -> None:
 def has_descriptors(reference: KaptureFolder) -> bool:
     """Whether every image that sees a point of a given map has descriptors; else the images'
     features have to be extracted anew for :func:`given_map`.
-
-    Raises DataError: see :func:`given_type`.
     """
     local_type = given_type(reference)
     if local_type not in reference.types("descriptors"):

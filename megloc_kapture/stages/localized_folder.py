@@ -154,8 +154,7 @@ def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, 
     """Take images that cannot be read out of a workspace's queries; returns why, by name.
 
     Their names and reasons go to ``tables``; the image files stay as they are. ``query``: kapture
-    folder in the workspace, which is written anew where an image is taken out. Raises DataError: no
-    image can be read; names the first.
+    folder in the workspace, which is written anew where an image is taken out.
     """
     folder = KaptureFolder(query)
     data = folder.read()

@@ -76,10 +76,6 @@ def triangulate_map(
     Returns
     -------
     Counts for the log; of several types also ``points_T`` and ``observations_T`` for each.
-
-    Raises
-    ------
-    DataError : no image has a pose, or a type is not there; or there is no point.
     """
     types = tuple(dict.fromkeys([local_types] if isinstance(local_types, str) else local_types))
     data = mapping.read()
@@ -241,7 +237,6 @@ def lift_map(
     """Lift the keypoints of the map's images through their depth maps, and write the map.
 
     Returns counts for the log. ``local_types``: keypoints types that get points, each its own.
-    Raises DataError: no image has a pose, or none has depth; a depth map is missing or broken.
     """
     data = mapping.read()
     poses = data.poses()
@@ -308,6 +303,7 @@ class GivenMap(PipelineStage):
 
     name = "points"
     uses = ("map", "given_features")
+    explained_by = ("map",)
     inputs = (REFERENCE, Layout.mapping, LOCAL_FEATURES, GLOBAL_FEATURES)
     outputs = (UNREFINED,)
 
@@ -326,6 +322,7 @@ class LiftPoints(PipelineStage):
 
     name = "points"
     uses = ("map", "lifting", "local_features.name", "local_features.options")
+    explained_by = ("map",)
     inputs = (Layout.mapping, LOCAL_FEATURES, GLOBAL_FEATURES)
     outputs = (UNREFINED,)
 
@@ -343,6 +340,7 @@ class TriangulatePoints(PipelineStage):
     name = "points"
     version = 2
     uses = ("triangulation", "guided_pyramid.mode", *LOCAL_TYPES)
+    explained_by = ("map",)
     inputs = (
         Layout.mapping,
         LOCAL_FEATURES,

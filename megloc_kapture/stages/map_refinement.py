@@ -229,8 +229,7 @@ def refine_map(
     ``restrictions``: the coordinate frames of the images, which are never compared.
     ``link_features``: the features in the source's own folder may become hard links (they are a map
     of ours, not somebody's data); those beside it always do. Returns counts for the log: points and
-    observations after, and what each filter removed. Raises DataError: no points, or something
-    broken; names the file.
+    observations after, and what each filter removed.
     """
     if not source.has_points():
         raise DataError(
@@ -464,6 +463,7 @@ class RefineMap(PipelineStage):
     name = "map"
     version = 3
     uses = ("refinement",)
+    explained_by = ("refinement.depth.max_sigmas", "refinement.uncertainty.max_robust_sigmas")
     inputs = (UNREFINED, SIDE_TABLES)
     outputs = (Layout.sparse_map,)
 

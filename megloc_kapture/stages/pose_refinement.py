@@ -88,10 +88,6 @@ class PoseRefinementOptions(Options):
         description="map images a refiner may choose from: that look the query's way, the nearest",
     )
 
-    def idle(self) -> dict[str, str]:
-        names = () if self.refines() else ("references", "max_references")
-        return dict.fromkeys(names, "pose_refinement.by is empty")
-
     def with_refiners(self, names: Sequence[str]) -> PoseRefinementOptions:
         """With these refiners, in this order, each with the options that it has here."""
         chosen = chosen_by_name(self.by, names)
@@ -149,10 +145,7 @@ class MapRefiners:
         return self._restrictions.frame(pose.candidates[0]) if pose.candidates else ""
 
     def test(self, poses: Iterable[Pose], *, work: Work = HERE) -> None:
-        """Test the frames of these poses that have not been tested.
-
-        Raises DataError: an image or a depth map cannot be read.
-        """
+        """Test the frames of these poses that have not been tested."""
         with self._lock:
             for frame in sorted({self._frame(pose) for pose in poses} - set(self._verdicts)):
                 self._verdicts[frame] = [
@@ -190,7 +183,7 @@ class MapRefiners:
         return tuple(near), tuple(one.reason if one else "" for one in self._verdicts[frame])
 
     def refine(self, image: str, camera: Camera, pose: Pose, scene: RankingScene) -> Pose:
-        """Refine the pose of one query; raises DataError, PluginError."""
+        """Refine the pose of one query."""
         if not self.refiners:
             return pose
         self.test([pose])
@@ -382,6 +375,7 @@ class RefinePoses(PipelineStage):
     name = "refine_poses"
     version = 4
     uses = ("pose_refinement",)
+    explained_by = ("pose_refinement.by", "pose_refinement.references")
     inputs = (SIDE_TABLES, Layout.query, MAP, UNREFINED_POSES)
     outputs = (LOCALIZED, REFINEMENT_TIMING)
 

@@ -353,6 +353,7 @@ class PyramidMapping(_PyramidStage):
     name = "mapping_pyramid"
     version = 2
     uses = (*MATCHING_OPTIONS, "mapping_verification", "guided_pyramid", "mask_margin_px")
+    explained_by = ("guided_pyramid.mode", "guided_pyramid.min_matches")
     inputs = (Layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS, MAPPING_MATCHES)
     outputs = (MAPPING_PYRAMID,)
 
@@ -379,6 +380,7 @@ class PyramidQueries(_PyramidStage):
     name = "query_pyramid"
     version = 2
     uses = (*MATCHING_OPTIONS, "query_verification", "guided_pyramid", "mask_margin_px")
+    explained_by = ("guided_pyramid.mode", "guided_pyramid.min_matches")
     inputs = (Layout.mapping, Layout.query, LOCAL_FEATURES, MAP, QUERY_PAIRS, QUERY_MATCHES)
     outputs = (QUERY_PYRAMID,)
 

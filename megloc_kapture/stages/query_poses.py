@@ -96,7 +96,7 @@ class LocalizationOptions(Options):
     )
 
     def make_ranker(self) -> PoseRanker:
-        """The ranker of candidate poses; raises PluginError."""
+        """The ranker of candidate poses."""
         ranker: PoseRanker = load_plugin(POSE_RANKERS, self.rank.name, self.rank.options)
         return ranker
 
@@ -302,6 +302,11 @@ class LocalizeQueries(PipelineStage):
     name = "localization"
     version = 10
     uses = ("localization", "guided_pyramid.mode", *LOCAL_TYPES)
+    explained_by = (
+        "localization.clusters.by",
+        "localization.rank",
+        "localization.min_confidence",
+    )
     inputs = (
         MAPPING,
         QUERY,

@@ -128,7 +128,7 @@ def depth_records(data: KaptureData) -> dict[str, DepthRecord]:
 
 
 def read_depth(folder: KaptureFolder, record: DepthRecord) -> NDArray[np.float32]:
-    """Depth (H, W) of a record, 0 where nothing is known; raises DataError."""
+    """Depth (H, W) of a record, 0 where nothing is known."""
     size = {"width": record.camera.width, "height": record.camera.height}
     return read_depth_map(folder.depth_path(record.path), **size)
 
@@ -226,7 +226,7 @@ class QueryScene(Protocol):
     """Pixels, mask and depth of query images by their names; see :class:`KaptureScene`."""
 
     def image(self, name: str) -> NDArray[np.uint8]:
-        """RGB pixels (H, W, 3); raises DataError."""
+        """RGB pixels (H, W, 3)."""
         ...
 
     def mask(self, name: str) -> NDArray[np.bool_] | None:
@@ -234,12 +234,12 @@ class QueryScene(Protocol):
         ...
 
     def depth(self, name: str) -> DepthView | None:
-        """Depth that was taken with the image; None without; raises DataError."""
+        """Depth that was taken with the image; None without."""
         ...
 
 
 def depth_of(folder: KaptureFolder, name: str) -> DepthView | None:
-    """Depth that was taken with an image of a folder; None without; raises DataError."""
+    """Depth that was taken with an image of a folder; None without."""
     return _images_of(folder).depth(name)
 
 

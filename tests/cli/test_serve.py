@@ -25,13 +25,6 @@ def nothing_is_served(monkeypatch: pytest.MonkeyPatch) -> None:
         (("--port", "99999"), "cannot listen at 127.0.0.1, port 99999: .*0 to 65535"),
         (("--host", "no.such.host.invalid"), "cannot listen at no.such.host.invalid"),
         (("--workers", "0"), "0 workers cannot work"),
-        (("--set", "localization.rigs=true"), "localization changes nothing: images come one by"),
-        (
-            ("--set", 'pose_refinement.by=["icp"]'),
-            "pose_refinement changes nothing: icp needs depth",
-        ),
-        (("--set", "local_features=sift"), "nothing in it is of sift"),
-        (("--set", "triangulation.min_angle_deg=8"), "nothing here uses it"),
         (("--set", "nothing=1"), "nothing"),
         (("--keypoints-type", "orb"), "no points of keypoints type 'orb'; there are: rootsift"),
         (("--features-dir", "nowhere"), "nowhere: no such folder"),

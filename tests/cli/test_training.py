@@ -18,7 +18,6 @@ from kornia.feature import XFeat
 from safetensors.torch import load_file, save_file
 
 from megloc_kapture.cli.main import main
-from megloc_kapture.errors import OptionError
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import read_status
