@@ -411,7 +411,7 @@ def _minimised(
             step = -np.linalg.solve(hessian + damping * np.diag(np.diagonal(hessian)), gradient)
         except np.linalg.LinAlgError:  # the inliers do not determine the pose
             return best
-        pose = perturbed(best, step)
+        pose = perturbed(best, np.asarray(step, np.float64))
         if -(gradient @ step) < _LAST_STEP * sigma**2:
             return pose
     return best

@@ -83,7 +83,8 @@ def read_pinhole(path: Path) -> Camera:
     if sizes[0] != sizes[-1]:
         raise lines[3].error(f"the image size is {sizes[0]} first, then {sizes[-1]}")
     with first.named():
-        return Camera("PINHOLE", *sizes[0], tuple(params[:4]))
+        width, height = sizes[0]
+        return Camera("PINHOLE", width, height, tuple(params[:4]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,7 +214,7 @@ def read_transformations(path: Path) -> Transformations:
             raise line.error(f"{name!r} is given twice")
         else:
             found[name] = line
-    transforms = []
+    transforms: list[RigidTransform] = []
     for name in ("transform_S_AS", "transform_w_gpsw", "transform_e_gpsw"):
         if name not in found:
             raise DataError(f"there is no {name}", path=path)
@@ -221,7 +222,8 @@ def read_transformations(path: Path) -> Transformations:
     scale = None
     if (row := found.get("GNSS scale")) is not None:
         scale = _scale(row, row.text)
-    return Transformations(*transforms, scale)
+    s_from_as, w_from_gpsw, e_from_gpsw = transforms
+    return Transformations(s_from_as, w_from_gpsw, e_from_gpsw, scale)
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,7 +54,7 @@ class KaptureVectors:
                     row[:] = self._reader.read_unchecked(image)
             with np.errstate(over="ignore", invalid="ignore"):
                 squared = np.vecdot(chunk, chunk).astype(np.float64)
-            for k in np.flatnonzero(~((squared > 1e-24) & (squared < 1e30))):
+            for k in map(int, np.flatnonzero(~((squared > 1e-24) & (squared < 1e30)))):
                 squared[k] = np.square(chunk[k], dtype=np.float64).sum()
                 if not np.isfinite(squared[k]):
                     raise DataError("not all values are finite", path=self._reader.where(some[k]))
