@@ -5,12 +5,11 @@ from __future__ import annotations
 import logging
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from datetime import timedelta
-from functools import partial
 from itertools import starmap
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -264,14 +263,13 @@ class Reading(Linked):
             allow_links_below=existing(self.allow_links_below),
         )
 
-    def opening(
+    def open_map(
         self, path: Path, keypoints_types: tuple[str, ...], pixel_origin: PixelOriginChoice
-    ) -> Callable[..., KaptureMap]:
-        """What opens a map with these flags; raises DataError for a folder that is not there."""
+    ) -> KaptureMap:
+        """Open a map with the features beside it."""
         from megloc_kapture.pipeline.kapture_map import KaptureMap
 
-        return partial(
-            KaptureMap.open,
+        return KaptureMap.open(
             path,
             keypoints_types=keypoints_types,
             features_dirs=existing(self.features_dir),
@@ -293,13 +291,6 @@ class Computing:
         """As ``--set`` takes them."""
         given = {"device": self.device, "precision": self.precision}
         return [f"{name}={value}" for name, value in given.items() if value is not None]
-
-    def check_computes(self, chosen: object) -> None:
-        """Raise OptionError where no network, of options or a tuple of them, has what is given."""
-        from megloc_kapture.stages.devices import unheeded
-
-        if lacking := unheeded(chosen, self.device or "auto", self.precision or "full"):
-            raise OptionError(f"--{lacking[0]} changes nothing: no network here has it")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -79,7 +79,7 @@ class Info(Reading, Common):
 
     def _describe_map(self, console: Console, root: Path) -> None:
         try:
-            opened = self.opening(root, self.keypoints_type, self.pixel_origin)()
+            opened = self.open_map(root, self.keypoints_type, self.pixel_origin)
         except MeglocError as error:
             line(console, "localizing", f"not possible: {error}")
             return

@@ -27,7 +27,6 @@ from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_consistency
 from megloc_kapture.pipeline.map_making import (
-    MAPPING_OPTIONS,
     describe_map,
     options_of_photographs,
     plan_photographs,
@@ -68,9 +67,7 @@ class MapPhotographs(Choosing, Working):
     force: Force = False
 
     def run(self, console: Console) -> None:
-        options = options_of_photographs(
-            self.preset or DEFAULT_PRESET, self.assignments(), used=MAPPING_OPTIONS
-        )
+        options = options_of_photographs(self.preset or DEFAULT_PRESET, self.assignments())
         photographs = Photographs(self.images, cameras_of_text(self.camera), every=self.every)
         for text in photographs.describe():
             console.say(text)
@@ -91,8 +88,6 @@ class RefineMap(Reading, StageCommand):
     What is rejected is chosen with --set refinement.uncertainty.max_relative_deviation=0.02 and
     its like; without, by the preset.
     """
-
-    uses = ("refinement",)
 
     input: Input
     """Kapture folder of the map; it stays as it is."""
@@ -115,12 +110,7 @@ class RefineMap(Reading, StageCommand):
 
 
 def report_lines(root: Path) -> list[str]:
-    """What the refinement of a map removed, as a table; empty where it was not refined.
-
-    Raises
-    ------
-    DataError : the report is broken.
-    """
+    """What the refinement of a map removed, as a table; empty where it was not refined."""
     path = root / "reconstruction" / REPORT_FILE
     if not path.is_file():
         return []
@@ -144,8 +134,6 @@ class Densify(Reading, StageCommand):
     The depth maps are kapture depth records; what a map with depth allows (verification, ranking
     by looks, refinement by rendering) works as with a depth sensor's.
     """
-
-    uses = ("mvs",)
 
     input: Input
     """Kapture folder of the map, with points; it stays as it is."""
@@ -183,8 +171,6 @@ class Densify(Reading, StageCommand):
 @dataclass(frozen=True, kw_only=True)
 class RefinePoses(Linked, StageCommand):
     """Refine the poses of localized queries; a pose that gets no better stays, and says why."""
-
-    uses = ("pose_refinement",)
 
     input: Input
     """Kapture map, with images and depth maps. Read only."""

@@ -324,14 +324,6 @@ def test_networks_compute_where_the_flags_say(
     name = f"local_features/xfeat/keypoints/{KaptureFolder(mapping).read().image_names()[0]}.kpt"
     both = [(place / name).read_bytes() for place in (features, tmp_path / "full")]
     assert both[0] != both[1]
-    pairs = tmp_path / "pairs.txt"
-    megloc("pairs-mapping", "-i", mapping, "-o", pairs, "--by", "sequence")
-    place = ("-i", mapping, "--features-dir", features, "--pairs", pairs, *INLINE)
-    refused = "changes nothing: no network here has it"
-    megloc("match", *place, "-o", tmp_path / "new", "--device", "cpu").refused(refused)
-    megloc(*extract, "-o", tmp_path / "new", "--precision", "half").refused(refused)
-    by = ["pairs-mapping", "-i", mapping, "-o", tmp_path / "new.txt", "--by", "sequence"]
-    megloc(*by, "--device", "cpu").refused(refused)
     run = ["eval", "kapture", "--root", scene, "-w", tmp_path / "run", "-q", "--dry-run"]
     megloc(*run, "--device", "cpu").refused("device changes nothing: no network is chosen")
     megloc(*run, "--preset", "modern", "--device", "gpu").refused("option device: String should")
