@@ -33,7 +33,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, recall_rows
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
-from megloc_kapture.pipeline.localizer import LOCALIZING, Localizer
+from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.map_making import (
     kapture_of,
     options_of_photographs,
@@ -255,9 +255,9 @@ def open_map(
     Raises
     ------
     DataError : it is no map, or broken, or contradicts itself; names file and line.
-    OptionError : an option that there is not, or that changes nothing.
+    OptionError : an unknown option.
     """
-    options = options_of_preset(preset, assignments=set or {}, used=LOCALIZING)
+    options = options_of_preset(preset, assignments=set or {})
     opened = KaptureMap.open(
         kapture_of(path),
         features_dirs=[Path(one) for one in features_dirs],

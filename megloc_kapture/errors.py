@@ -70,9 +70,7 @@ _EXTRAS = {
     "faiss": "faiss",
     "h5py": "megadepth",
     "rerun": "rerun",
-    **dict.fromkeys(
-        ("fastapi", "prometheus_client", "python_multipart", "starlette", "uvicorn"), "serve"
-    ),
+    **dict.fromkeys(("fastapi", "python_multipart", "starlette", "uvicorn"), "serve"),
 }
 
 

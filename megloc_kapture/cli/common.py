@@ -205,7 +205,7 @@ class Working(Common):
 
     @contextmanager
     def working(self, output: Path) -> Iterator[Work]:
-        """What to work with, by these flags; all workers must see the folder of the output."""
+        """Open the executor; all workers must see the folder of the output."""
         folder = output if output.is_dir() else output.absolute().parent
         with single_threaded(), self.open_executor(folder) as executor:
             yield Work(executor, self.console().track, self.workers or available_cores())
@@ -223,7 +223,7 @@ class Working(Common):
 
     @contextmanager
     def working_in(self, workspace: Workspace) -> Iterator[Work]:
-        """What to work with in a workspace, which is held meanwhile."""
+        """Open the executor for a workspace, and lock it."""
         with workspace.lock(), self.working(workspace.root) as work:
             yield work
 
@@ -256,7 +256,7 @@ class Reading(Linked):
     """Features folder beside the kapture folders; may be repeated."""
 
     def kapture(self, root: Path) -> KaptureFolder:
-        """A kapture folder with the features beside it; raises DataError for one not there."""
+        """A kapture folder with the given features folders."""
         return KaptureFolder(
             root,
             features_dirs=existing(self.features_dir),
@@ -266,7 +266,7 @@ class Reading(Linked):
     def open_map(
         self, path: Path, keypoints_types: tuple[str, ...], pixel_origin: PixelOriginChoice
     ) -> KaptureMap:
-        """Open a map with the features beside it."""
+        """Open a map with the given features folders."""
         from megloc_kapture.pipeline.kapture_map import KaptureMap
 
         return KaptureMap.open(
@@ -303,7 +303,7 @@ class Choosing(Computing):
     """Change an option: key.key=value; may be repeated."""
 
     def assignments(self) -> tuple[str, ...]:
-        """What is set by --set and by flags of its own."""
+        """Assignments by --set and by flags."""
         return (*self.set, *self.placement())
 
 
@@ -316,7 +316,7 @@ class Deciding(Choosing):
     challenges, where a wrong answer costs nothing. 0.6 unless given."""
 
     def assignments(self) -> tuple[str, ...]:
-        """What is set by --set and by flags of its own."""
+        """Assignments by --set and by flags."""
         if self.min_confidence is None:
             return super().assignments()
         return (*super().assignments(), f"localization.min_confidence={self.min_confidence:g}")

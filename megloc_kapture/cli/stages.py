@@ -68,7 +68,7 @@ _SOURCES = {
 @dataclass(frozen=True, kw_only=True)
 class StageCommand(Choosing, Working):
     def options(self, changes: dict[str, object] | None = None) -> PipelineOptions:
-        """The preset's options, with what the flags change."""
+        """Return the preset's options, with the changes of the flags."""
         return options_of_preset(
             self.preset or DEFAULT_PRESET,
             changes=[changes or {}, assigned(self.placement())],

@@ -42,11 +42,6 @@ class Results(Mapping[str, Pose | Failure]):
     workers : threads that localize.
     candidates : query name to the map images it is matched with, instead of retrieval.
     track : shows progress.
-
-    Raises
-    ------
-    DataError : the folder or the map is broken, or features can neither be read nor extracted.
-    OptionError : no worker.
     """
 
     def __init__(
@@ -107,10 +102,6 @@ class Results(Mapping[str, Pose | Failure]):
         Returns
         -------
         Counts: queries, localized, failed, fallbacks.
-
-        Raises
-        ------
-        OutputError : the folder has other things in it, unless ``force``.
         """
         with staged_output(Path(output), kind=LOCALIZED, force=force) as out:
             return self.write_to(out)

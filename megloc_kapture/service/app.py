@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import asyncio
 import hmac
-import time
 from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
 from pathlib import Path
 from typing import Annotated, Any
 
-import prometheus_client as prometheus
 from fastapi import Depends, FastAPI, Query, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, JSONResponse, Response
@@ -22,6 +20,7 @@ from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.images import decode_image_rgb, photo_of, turned_upright
@@ -38,14 +37,6 @@ _PAGE_POLICY = (
 )
 # a client that is still sending would not see the refusal, so this many times the limit is read
 _READ_BEYOND_LIMIT = 3
-_STATUSES = {
-    400: "a broken form",
-    401: "no token, or a wrong one",
-    413: "too many bytes or pixels",
-    415: "neither JPEG nor PNG, or another Content-Type",
-    422: "a broken image, or an impossible camera",
-    503: "too many images are waiting",
-}
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _FORM = {
     "type": "object",
@@ -142,12 +133,6 @@ class Answer(BaseModel):
         )
 
 
-class Refused(BaseModel):
-    """Why a request has no answer."""
-
-    error: str
-
-
 def read_camera(text: str) -> Camera:
     """Read a camera from JSON; raises DataError, which says what is wrong."""
     try:
@@ -209,14 +194,6 @@ class Service:
         self._num_threads = limits.threads or available_cores()
         self._threads = ThreadPoolExecutor(self._num_threads, thread_name_prefix="localize")
         self._pending = 0
-        self.registry = prometheus.CollectorRegistry()
-        self._seconds = prometheus.Histogram(
-            "megloc_image_seconds",
-            "Time to localize an image, waiting included",
-            ["localized"],
-            buckets=(0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60),
-            registry=self.registry,
-        )
 
     def check_token(self, request: Request) -> None:
         """Refuse requests without the token, in a time that does not depend on what was sent."""
@@ -234,15 +211,13 @@ class Service:
         content, camera_in_form = await self._image_in(request)
         if self._pending >= self._num_threads + self.limits.max_waiting:
             raise HTTPException(503, "too many images are waiting", {"retry-after": "2"})
-        started, self._pending = time.perf_counter(), self._pending + 1
+        self._pending += 1
         try:
-            answer = await asyncio.get_running_loop().run_in_executor(
+            return await asyncio.get_running_loop().run_in_executor(
                 self._threads, self._localize, content, camera_in_form or camera
             )
         finally:
             self._pending -= 1
-        self._seconds.labels(str(answer.localized).lower()).observe(time.perf_counter() - started)
-        return answer
 
     def _localize(self, content: bytes, camera: str | None) -> Answer:
         try:
@@ -302,14 +277,10 @@ def make_app(service: Service, overview: bytes) -> FastAPI:
     """
     app = FastAPI(title="megloc", description="Where was this photograph taken? Poses in one map.")
     protected = [Depends(service.check_token)]
-    responses: dict[int | str, dict[str, Any]] = {
-        status: {"model": Refused, "description": text} for status, text in _STATUSES.items()
-    }
 
     @app.post(
         "/localize",
         response_model=Answer,
-        responses=responses,
         dependencies=protected,
         openapi_extra={"requestBody": _REQUEST_BODY},
         summary="Localize an image",
@@ -331,11 +302,6 @@ def make_app(service: Service, overview: bytes) -> FastAPI:
     async def health() -> dict[str, str]:
         return {"status": "ok"}
 
-    @app.get("/metrics", dependencies=protected, summary="Counters for Prometheus")
-    async def metrics() -> Response:
-        text = prometheus.generate_latest(service.registry)
-        return Response(text, media_type=prometheus.CONTENT_TYPE_LATEST)
-
     @app.get("/", include_in_schema=False)
     async def page() -> FileResponse:
         return FileResponse(_PAGE, headers={"content-security-policy": _PAGE_POLICY})
@@ -347,6 +313,10 @@ def make_app(service: Service, overview: bytes) -> FastAPI:
     @app.exception_handler(RequestValidationError)
     async def refuse_parameter(_: Request, error: RequestValidationError) -> Response:
         return JSONResponse({"error": f"camera: {error.errors()[0]['msg']}"}, 422)
+
+    @app.exception_handler(ClientDisconnect)
+    async def leave(_: Request, __: ClientDisconnect) -> Response:
+        return Response(status_code=400)  # nobody reads it, and it is no internal error
 
     @app.exception_handler(Exception)
     async def fail(_: Request, __: Exception) -> Response:

@@ -22,6 +22,7 @@ from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import Camera
 
 _MAX_POINTS, _MAX_CAMERAS = 15_000, 3_000
+_SHUTDOWN_S = 60  # for running requests to finish; slow uploads are cut off then
 
 
 def prepared_localizer(kapture_map: KaptureMap, options: PipelineOptions) -> Localizer:
@@ -64,7 +65,12 @@ def serve(
     cv2.setNumThreads(1)  # the threads are for images
     app = make_app(Service(localizer, limits, token), map_overview(localizer.map))
     config = uvicorn.Config(
-        app, ws="none", log_config=None, access_log=log_requests, server_header=False
+        app,
+        ws="none",
+        log_config=None,
+        access_log=log_requests,
+        server_header=False,
+        timeout_graceful_shutdown=_SHUTDOWN_S,
     )
     with single_threaded():
         uvicorn.Server(config).run([bound])

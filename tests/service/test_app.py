@@ -136,7 +136,6 @@ def test_the_answer_is_what_openapi_says(client: TestClient, photos: list[Photo]
     api = client.get("/openapi.json").json()
     call = api["paths"]["/localize"]["post"]
     assert set(call["requestBody"]["content"]) == {"multipart/form-data", "image/jpeg", "image/png"}
-    assert {"200", "401", "413", "415", "422", "503"} <= set(call["responses"])
     said = client.post("/localize", **photos[0].form()).json()
     model = api["components"]["schemas"]["Answer"]
     assert set(said) == set(model["properties"]) == set(model["required"])
@@ -159,13 +158,6 @@ def test_the_map_from_above(client: TestClient, localizer: Localizer) -> None:
     flat = np.reshape(seen["cameras"], (-1, 4))
     np.testing.assert_allclose(flat[:, :2], (centers - seen["origin"]) @ axes.T, rtol=1e-3)
     assert seen["images"] == len(flat) == 7 and len(seen["points"]) > 200
-
-
-def test_metrics_are_prometheus(localizer: Localizer, photos: list[Photo]) -> None:
-    with client_of(localizer, Limits(threads=1)) as client:
-        client.post("/localize", **photos[0].form())
-        text = client.get("/metrics").text
-    assert 'megloc_image_seconds_count{localized="true"} 1.0' in text
 
 
 # ------------------------------------------------------------------------------------- refusals
@@ -290,7 +282,7 @@ def test_the_token_is_needed_for_all_that_tells_of_the_map(
         wrong = ("", "Bearer", f"Basic {token}", "Bearer correct horse batter", f"Bearer {token}s")
         for shown in (*wrong, f"bearer {token.upper()}", "Bearer \xff\xfe"):
             given = {"authorization": shown.encode("latin-1")} if shown else {}
-            for method, path in (("POST", "/localize"), ("GET", "/map"), ("GET", "/metrics")):
+            for method, path in (("POST", "/localize"), ("GET", "/map")):
                 answer = client.request(method, path, headers=given)
                 error = refused(answer, 401)
                 assert token not in error and answer.headers["www-authenticate"] == "Bearer"
