@@ -253,7 +253,7 @@ def open_map(
     Raises
     ------
     DataError : it is no map, or broken, or contradicts itself; names file and line.
-    OptionError : an option that there is not, or that changes nothing.
+    OptionError : an unknown option.
     """
     options = options_of_preset(preset, assignments=set or {})
     opened = KaptureMap.open(

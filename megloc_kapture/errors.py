@@ -67,9 +67,7 @@ _EXTRAS = {
     "kornia": "kornia",
     "distributed": "cluster",
     "h5py": "megadepth",
-    **dict.fromkeys(
-        ("fastapi", "prometheus_client", "python_multipart", "starlette", "uvicorn"), "serve"
-    ),
+    **dict.fromkeys(("fastapi", "python_multipart", "starlette", "uvicorn"), "serve"),
 }
 
 

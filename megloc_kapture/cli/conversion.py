@@ -82,10 +82,6 @@ class Import(Common):
         if name == MEGADEPTH:
             self._import_megadepth(console)
             return
-        if self.images or self.database:
-            raise OptionError(f"--images and --database are of colmap, not of {self.dataset}")
-        if self.unit != NO_METRES:
-            raise OptionError(f"--unit is of colmap, not of {self.dataset}")
         choice = choose_dataset(
             KAPTURE if name == SYNTHETIC else name,
             self.root,
@@ -107,7 +103,6 @@ class Import(Common):
             console.result(text.rstrip())
 
     def _import_colmap(self, console: Console) -> None:
-        self._refuse_unused("a COLMAP model", {"--set": self.set})
         source = find_colmap(self.root, images=self.images, database=self.database)
         with (
             staged_output(self.output, kind=MAP, force=self.force) as out,
@@ -122,17 +117,11 @@ class Import(Common):
             console.say("unit: units of the map, whose scale is not known; --unit m if in metres")
 
     def _import_megadepth(self, console: Console) -> None:
-        self._refuse_unused("MegaDepth", {"--images": self.images, "--database": self.database})
         options = options_with(MegaDepthOptions, self.set)
         with staged_output(self.output, kind=MEGADEPTH, force=self.force) as out:
             work = Work(track=console.track)
             counts = import_megadepth(self.root, out, options, work=work)
         console.counts(counts)
-
-    def _refuse_unused(self, what: str, flags: dict[str, object]) -> None:
-        of_datasets = {"--query-prefix": self.query_prefix, "--allow-missing": self.allow_missing}
-        if given := [flag for flag, value in (flags | of_datasets).items() if value]:
-            raise OptionError(f"{given[0]} changes nothing of {what}")
 
 
 @dataclass(frozen=True, kw_only=True)

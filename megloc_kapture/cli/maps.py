@@ -107,12 +107,7 @@ class RefineMap(Reading, StageCommand):
 
 
 def report_lines(root: Path) -> list[str]:
-    """What the refinement of a map removed, as a table; empty where it was not refined.
-
-    Raises
-    ------
-    DataError : the report is broken.
-    """
+    """What the refinement of a map removed, as a table; empty where it was not refined."""
     path = root / "reconstruction" / REPORT_FILE
     if not path.is_file():
         return []

@@ -297,12 +297,7 @@ class Preprocess(Linked, Computing, Working):
             console.say(line)
 
     def options(self) -> PreprocessingOptions:
-        """The options that the flags make.
-
-        Raises
-        ------
-        OptionError : one has a value that it cannot have.
-        """
+        """The options that the flags make."""
         masks: dict[str, Any] = {
             "segmenter": None if self.segmenter is None else {"name": self.segmenter},
             "dynamic": self.dynamic or None,

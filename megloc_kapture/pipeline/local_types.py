@@ -52,7 +52,7 @@ class LocalType:
     points : keypoints of the map that observe its points.
     first : those that queries are matched with at first: of a guided pyramid's type, where pairs
         with few matches are tried again, the type that it is made of.
-    choice : what the options say of this type of features; None where they do not name it.
+    choice : the options' entry for this type of features; None if they do not name it.
     cache : of the map's features, shared with other types.
     """
 
@@ -71,12 +71,7 @@ class LocalType:
         self._again: dict[str, NDArray[Any]] | None = None
 
     def prepare(self) -> None:
-        """Extract the map's descriptors again where it has none.
-
-        Raises
-        ------
-        DataError, PluginError, MissingWeightsError : they cannot be.
-        """
+        """Extract the map's descriptors again where it has none."""
         if not self.first.has_descriptors(self._map.images):
             self._again = extract_again(self._map, self.first, self.extractor)
 
@@ -95,13 +90,7 @@ class LocalType:
 
     @cached_property
     def extractor(self) -> LocalFeatureExtractor:
-        """The extractor of the type.
-
-        Raises
-        ------
-        DataError : none is installed, or the options' makes features of another type.
-        PluginError, MissingWeightsError : it cannot be made.
-        """
+        """The extractor of the type."""
         found = self.brought()
         if found is None:
             raise DataError(
@@ -185,7 +174,7 @@ class LocalType:
 
     @cached_property
     def pyramid_obstacle(self) -> str:
-        """Why guided pyramid matching cannot extract features of this type; empty where it can."""
+        """The reason why guided pyramid matching cannot extract this type; empty if it can."""
         try:
             _ = self.extractor
         except MissingWeightsError:
@@ -240,7 +229,7 @@ def local_types_of(
 
 
 def _choices(options: PipelineOptions) -> list[LocalFeaturesChoice]:
-    """What the options say of types, ours first, then the given map's."""
+    """The options' entries for types of features, ours first, then the given map's."""
     own = list(options.local_features) if options.makes_points() else []
     if options.uses_given_map():
         given = options.given_features
@@ -249,21 +238,10 @@ def _choices(options: PipelineOptions) -> list[LocalFeaturesChoice]:
 
 
 def _rank(local_type: str, choices: Sequence[LocalFeaturesChoice]) -> int:
-    """Which choice makes a type, by name alone: no network is loaded for that.
-
-    Types are called as their plugin, or their weights, which begin with its name.
-    """
-    base = base_type(local_type)
-    plain = plain_name(base)
-    fitting = [rank for rank, one in enumerate(choices) if plain.startswith(plain_name(one.name))]
-
-    def distance(rank: int) -> int:
-        weights = str(choices[rank].options.get("weights", "")).removesuffix(".pth")
-        if plain_name(weights) == plain:
-            return 0
-        return 1 if plain_name(choices[rank].name) == plain else 2
-
-    return min(fitting, key=distance, default=len(choices))
+    """The position of the choice that makes a type, whose name begins with that of its plugin."""
+    plain = plain_name(base_type(local_type))
+    fitting = (rank for rank, one in enumerate(choices) if plain.startswith(plain_name(one.name)))
+    return next(fitting, len(choices))
 
 
 def extract_again(

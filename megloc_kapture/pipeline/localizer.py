@@ -240,10 +240,10 @@ class Localizer:
         *,
         as_rig: bool = False,
     ) -> tuple[list[Pose | Failure], list[_Matching]]:
-        """What becomes of the matches of all cameras, see :func:`localize_unit`, and these.
+        """Match and localize all cameras; returns a result per camera, and the matches.
 
-        What orders candidates by their matches, and guided pyramids, need all matches at first;
-        else no more candidates are matched than are taken.
+        Reranking and guided pyramids need the matches with all candidates first; otherwise no more
+        candidates are matched than are used.
         """
         cameras = [self._begin(image, at) for image, (_, at) in zip(images, unit, strict=True)]
         whole = self.options.reranking.reranks() or self.options.matches_again()
@@ -369,10 +369,6 @@ class Localizer:
     def _known_images(self) -> frozenset[str]:
         return frozenset(self.map.folder.read().image_names())
 
-    def compares_as_asked(self, global_types: Collection[str]) -> bool:
-        """Whether queries that bring these global features are compared by the options' own."""
-        return self._retrieval.names_one_of(global_types)
-
     def describe_retrieval(self, global_types: Collection[str]) -> str:
         """How the candidates of queries that bring these global features are found, for people."""
         options = self.options.query_pairs
@@ -388,8 +384,8 @@ class _Matching:
     Attributes
     ----------
     of_types : of each keypoints type, the matches with as many of ``ranked`` as were asked for.
-    view, candidates, left_out : what these make, what reranking leaves of them, and the steps that
-        were left out, in words.
+    view, candidates : the matches for the solver, and the candidates that reranking keeps.
+    left_out : remarks on steps that were left out.
     """
 
     image: QueryImage

@@ -19,12 +19,10 @@ import logging
 import math
 import os
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-from pydantic import BaseModel
 
 from megloc_kapture.datasets.colmap_map import (
     ColmapFolders,
@@ -51,11 +49,10 @@ from megloc_kapture.io.dataset_tables import (
 from megloc_kapture.io.files import (
     clear_leftovers,
     output_error,
-    read_json_model,
     remove,
     temporary_name,
     user_cache,
-    write_json_model,
+    write_bytes,
 )
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.io.output_folders import replace_directory
@@ -201,8 +198,7 @@ class ImportPhotographs(Stage):
 
 
 def options_of_photographs(
-    preset: str,
-    assignments: Sequence[str] | Mapping[str, Any] = (),
+    preset: str, assignments: Sequence[str] | Mapping[str, Any] = ()
 ) -> PipelineOptions:
     """Return a preset's options, without those that need poses or a known lens."""
     by = PRESETS[preset].mapping_pairs.by if preset in PRESETS else ()
@@ -275,7 +271,7 @@ def plan_photographs(
 
 
 def describe_map(workspace: Path, photographs: Photographs) -> list[str]:
-    """What became of the photographs, in lines for people."""
+    """Lines about the map, and about photographs that are not in it."""
     tables = workspace / SIDE_TABLES
     missing = read_unreadable(tables, UNREGISTERED_FILE)
     everything = len(photographs.names) + len(photographs.unreadable)
@@ -305,16 +301,8 @@ def _too_few(number: int, unreadable: Mapping[str, str]) -> DataError:
     return DataError(told)
 
 
-_STAMP = "colmap.json"
-_VERSION = 2  # of the import: another one makes all maps anew
-
-
-class _Stamp(BaseModel):
-    """What a map was imported from: paths, and size and time of each file."""
-
-    version: int
-    images: str | None
-    files: dict[str, tuple[int, int]]
+_STAMP = "colmap.txt"
+_VERSION = 3  # of the import: another one makes all maps anew
 
 
 def colmap_maps_folder() -> Path:
@@ -384,12 +372,12 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
     if not is_colmap(path):
         return path
     source = find_colmap(path)
-    stamp = _stamp(source.images, source.files())
+    stamp = _stamp(source).encode()
     place = Path(os.path.realpath(source.model))
     digest = hashlib.sha256(os.fsencode(place)).hexdigest()[:16]
     folder = colmap_maps_folder()
     kept = folder / f"{place.name[:40]}-{digest}"
-    if _read_stamp(kept) == stamp:
+    if (kept / _STAMP).is_file() and (kept / _STAMP).read_bytes() == stamp:
         return kept
     made = folder / temporary_name()
     try:
@@ -397,7 +385,7 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
         clear_leftovers(folder)
         made.mkdir()
         import_colmap(source, made, work=work)
-        write_json_model(made / _STAMP, stamp)
+        write_bytes(made / _STAMP, stamp)
         replace_directory(made, kept)
     except OSError as error:
         raise output_error(folder, error) from error
@@ -407,21 +395,13 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
     return kept
 
 
-def _stamp(images: Path | None, files: Iterable[Path]) -> _Stamp:
-    found = {}
-    for file in files:
+def _stamp(source: ColmapFolders) -> str:
+    """The sources of an imported map: image folder, and size and time of each file."""
+    lines = [f"import {_VERSION}", f"images {source.images and os.path.realpath(source.images)}"]
+    for file in source.files():
         try:
             status = file.stat()
         except OSError as error:
             raise DataError(f"cannot read: {error.strerror}", path=file) from error
-        found[os.path.realpath(file)] = (status.st_size, status.st_mtime_ns)
-    where = None if images is None else os.path.realpath(images)
-    return _Stamp(version=_VERSION, images=where, files=found)
-
-
-def _read_stamp(folder: Path) -> _Stamp | None:
-    """The stamp of an imported map; None where there is none that can be read."""
-    try:
-        return read_json_model(folder / _STAMP, _Stamp)
-    except DataError:
-        return None
+        lines.append(f"{os.path.realpath(file)} {status.st_size} {status.st_mtime_ns}")
+    return "\n".join(lines)

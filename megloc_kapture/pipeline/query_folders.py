@@ -260,7 +260,7 @@ class KaptureQueries(Queries):
 
     @cached_property
     def _priors(self) -> dict[str, tuple[str, ...]]:
-        """What the map's dataset permits; queries of one pool share their tuple."""
+        """Map images permitted by the dataset; queries of one pool share their tuple."""
         images = self._map.images
         found = {}
         for positions, permitted in self._map.restrictions.pools(self.names, images):
@@ -349,8 +349,6 @@ class Photographs(Queries):
         self._calibrated = {k: v for root in roots for k, v in _calibrated(root).items()}
         self._scaled: list[tuple[Camera, Camera]] = []
         videos = [name for name in files if Path(name).suffix.lower() in VIDEO_SUFFIXES]
-        if every is not None and not videos:
-            raise OptionError("--every changes nothing: there is no video among the images")
         self._images: dict[str, _Image] = {}
         self._frames: tempfile.TemporaryDirectory[str] | None = None
         for name, path in files.items():
@@ -370,11 +368,11 @@ class Photographs(Queries):
             )
 
     def known_cameras(self) -> bool:
-        """Whether the cameras of all images are given."""
+        """Return whether the cameras of all images are given."""
         return all(image.camera.focal_deviation == 0 for image in self._images.values())
 
     def describe(self) -> list[str]:
-        """What is special about the files, in lines for people."""
+        """Lines about files that are left out or have no camera in the list."""
         lines = []
         if self.passed_over:
             said = f"{len(self.passed_over)} files that are no images are left out"

@@ -90,9 +90,7 @@ def test_a_model_of_unknown_scale(megloc: Any, colmap_room: Path, tmp_path: Path
     [
         (("--scale", "0000.jpg", "0002.jpg"), "takes gps, or two photographs and the metres"),
         (("--scale", "0000.jpg", "0002.jpg", "far"), "'far' is no distance in metres"),
-        (("--set", "localization.rigs=true"), "localization"),
         (("--camera", "PINHOLE,1"), "not such a list"),
-        (("--every", "3"), "there is no video"),
         (("--preset", "modrn"), "unknown preset"),
     ],
 )

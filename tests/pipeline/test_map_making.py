@@ -71,16 +71,16 @@ def test_three_lines(workspace: Path, scene: Path, monkeypatch: pytest.MonkeyPat
 def test_a_model_that_has_changed_is_imported_again(workspace: Path) -> None:
     first = kapture_of(workspace)
     points = len(KaptureFolder(first).points3d())
-    inode = (first / "colmap.json").stat().st_ino
+    inode = (first / "colmap.txt").stat().st_ino
     assert kapture_of(workspace / "sparse" / "0") == first
-    assert (first / "colmap.json").stat().st_ino == inode
+    assert (first / "colmap.txt").stat().st_ino == inode
     model = pycolmap.Reconstruction(workspace / "sparse" / "0")
     model.delete_point3D(next(iter(model.points3D)))
     model.write_binary(workspace / "sparse" / "0")
     assert kapture_of(workspace) == first
     assert len(KaptureFolder(first).points3d()) == points - 1
     # so is one whose map was spoilt, or whose images lie elsewhere
-    (first / "colmap.json").write_text("{")
+    (first / "colmap.txt").write_text("{")
     assert kapture_of(workspace) == first
     os.rename(workspace / "images", workspace / "sparse" / "images")
     link = first / "sensors" / "records_data"
