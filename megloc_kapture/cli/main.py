@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 DONE, DEFECT, USER_ERROR, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
 
-
 class Terminated(BaseException):
     """SIGTERM asks the process to end."""
 

@@ -180,7 +180,6 @@ class MapRetrieval:
                     database if len(positions) == len(database) else database[positions]
                     for database in databases
                 ],
-                [self._map.poses[name] for name in self._map.images],
                 Retrieval(names, weights, self._options.fusion),
             )
         return self._candidates[names]

@@ -249,8 +249,11 @@ class Service:
 
         form = await Request(request.scope, receive).form(max_files=1, max_fields=4)
         image, camera = form.get("image"), form.get("camera")
-        is_form = isinstance(image, UploadFile) and not isinstance(camera, UploadFile)
-        if not is_form or set(form) - {"image", "camera"}:
+        if (
+            not isinstance(image, UploadFile)
+            or isinstance(camera, UploadFile)
+            or set(form) - {"image", "camera"}
+        ):
             raise HTTPException(422, "a form has a file `image`, and may have a text `camera`")
         return await image.read(), camera
 
