@@ -33,6 +33,8 @@ _ALL = 1 << 30  # keypoints: masks come before the best are selected
 
 
 class _KorniaFeatures(LocalNetwork[LocalOptions]):
+    name: str
+
     def __init__(self, options: LocalOptions | None = None) -> None:
         require_kornia(self.name)
         super().__init__(options)

@@ -108,7 +108,7 @@ def load_lightglue(
                 width_confidence=width_confidence,
             )
         finally:
-            torch.backends.cuda.enable_flash_sdp(flash)  # type: ignore[no-untyped-call]
+            torch.backends.cuda.enable_flash_sdp(flash)
     adaptive = depth_confidence > 0 or width_confidence > 0
     last = f"log_assignment.{max(layers)}."
     optional = ("token_confidence.", "log_assignment.")
