@@ -48,6 +48,7 @@ def fetch(url: str, path: Path, *, sha256: str | None = None, progress: Any = No
         path.parent.mkdir(parents=True, exist_ok=True)
         pooch.core.stream_download(url, path, known, downloader)
     except requests.exceptions.HTTPError as error:
+        # such as "404 Client Error: Not Found for url: ..."
         raise TransferError(f"{url}: the server answers {error}") from error
     except requests.exceptions.RequestException as error:
         raise TransferError(f"{url}: the transfer broke: {error}") from error

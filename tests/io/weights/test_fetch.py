@@ -94,7 +94,7 @@ def test_a_whole_file(server: Server, place: Path) -> None:
     [
         ({"content": b"another"}, DataError, "what came is not the published file: .*" + SHA256),
         ({"break_after": 1000}, TransferError, "the transfer broke"),
-        ({"status": 404}, TransferError, "the server answers 404 Not Found"),
+        ({"status": 404}, TransferError, "the server answers 404"),
         ({"address": "http://127.0.0.1:9"}, TransferError, "the transfer broke"),
     ],
     ids=["another file", "broken", "refused", "no server"],
