@@ -82,8 +82,9 @@ def read_pinhole(path: Path) -> Camera:
         sizes.append([line.count_of(text, "size") for text in line.comma_fields])
     if sizes[0] != sizes[-1]:
         raise lines[3].error(f"the image size is {sizes[0]} first, then {sizes[-1]}")
+    width, height = sizes[0]
     with first.named():
-        return Camera("PINHOLE", *sizes[0], tuple(params[:4]))
+        return Camera("PINHOLE", width, height, tuple(params[:4]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +222,8 @@ def read_transformations(path: Path) -> Transformations:
     scale = None
     if (row := found.get("GNSS scale")) is not None:
         scale = _scale(row, row.text)
-    return Transformations(*transforms, scale)
+    s_from_as, w_from_gpsw, e_from_gpsw = transforms
+    return Transformations(s_from_as, w_from_gpsw, e_from_gpsw, scale)
 
 
 @dataclass(frozen=True, eq=False)
