@@ -82,8 +82,8 @@ def read_pinhole(path: Path) -> Camera:
         sizes.append([line.count_of(text, "size") for text in line.comma_fields])
     if sizes[0] != sizes[-1]:
         raise lines[3].error(f"the image size is {sizes[0]} first, then {sizes[-1]}")
+    width, height = sizes[0]
     with first.named():
-        width, height = sizes[0]
         return Camera("PINHOLE", width, height, tuple(params[:4]))
 
 
@@ -214,7 +214,7 @@ def read_transformations(path: Path) -> Transformations:
             raise line.error(f"{name!r} is given twice")
         else:
             found[name] = line
-    transforms: list[RigidTransform] = []
+    transforms = []
     for name in ("transform_S_AS", "transform_w_gpsw", "transform_e_gpsw"):
         if name not in found:
             raise DataError(f"there is no {name}", path=path)
