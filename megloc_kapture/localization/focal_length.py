@@ -267,8 +267,11 @@ def estimate_with_intrinsics(
     if free is not None:
         other = _with_camera(problem, _scaled(given, free))
         of_other = estimate_pose(other, options)
-        better = isinstance(of_other, PoseEstimate) and of_other.num_inliers > found.num_inliers
-        if better and _is_possible(other, of_other, given):
+        if (
+            isinstance(of_other, PoseEstimate)
+            and of_other.num_inliers > found.num_inliers
+            and _is_possible(other, of_other, given)
+        ):
             problem, found = other, of_other
     if isinstance(found, PoseEstimate):
         fit = _fit(problem, found.rig_from_world, found.inliers, given)

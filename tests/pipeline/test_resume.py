@@ -14,7 +14,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pandas as pd
 import pytest
 
 from megloc_kapture.pipeline.datasets import choose_dataset
@@ -87,13 +86,6 @@ nearest = patches.plugins:Nearest
 nudge = patches.plugins:Nudge
 """
 OPTIONS = ("local_features=corners", "global_features=thumbnail", "matching=nearest")
-EVERY_STAGE = (
-    *("local_features=corners", "matching=nearest", "global_features.vlad.options.num_clusters=8"),
-    *("preprocessing.max_size_px=320", "localization.min_confidence=0"),
-    *("guided_pyramid.mode=all", "guided_pyramid.min_matches=1000"),
-    "guided_pyramid.rotations_deg=[0]",
-)
-REFINED = ('pose_refinement.by=["nudge","rendering"]', "localization.min_confidence=0")
 
 
 @pytest.fixture
@@ -249,67 +241,6 @@ def test_one_new_image_costs_one_image(runs: Runs) -> None:
     records.write_text("".join(line for line in text.splitlines(True) if "0003.jpg" not in line))
     runs.run()
     assert not any("0003.jpg" in name for name in contents(runs.root))
-
-
-@pytest.fixture
-def whole(runs: Runs) -> Runs:
-    """Runs of all stages up to the poses."""
-    runs.options, runs.last = EVERY_STAGE, "localization"
-    return runs
-
-
-def test_images_vectors_pyramids_and_poses_go_on_inside_their_stages(whole: Runs) -> None:
-    whole.stopped("pre-processing", 3)
-    whole.stopped("VLAD", 4)
-    assert whole.told["pre-processing"][1] == "pre-processing"  # that of the queries
-    whole.stopped("guided", 3)
-    assert whole.told["VLAD"] == (7, "VLAD, 4 of 11 kept")
-    whole.run(last="query_matches")
-    assert whole.told["guided"] == (4, "guided pyramid, 3 of 7 kept")
-    whole.stopped("guided", 2)
-    whole.stopped("localizing", 1)
-    assert whole.told["guided"] == (2, "guided pyramid, 2 of 4 kept")
-    reports = whole.run()
-    assert whole.told["localizing"] == (3, "localizing, 1 of 4 kept")
-    assert reports["localization"].kept_items == "1 of 4 kept"
-    whole.check_undisturbed()
-
-
-def test_one_changed_query_is_localized_anew_and_no_other(whole: Runs) -> None:
-    whole.run()
-    name = sorted((whole.scene / "query/sensors/records_data").iterdir())[1].name
-    paint(whole.scene, f"query/sensors/records_data/{name}")
-    reports = whole.run()
-    assert kept_of(reports) == {
-        "preprocess": "10 of 11 kept",
-        "local_features": "10 of 11 kept",
-        "global_features": "11 of 12 kept",  # the vocabulary is one
-        "mapping_matches": "21 of 21 kept",
-        "query_matches": "21 of 28 kept",
-        "query_pyramid": "3 of 4 kept",
-        "localization": "3 of 4 kept",
-    }
-    assert whole.told["localizing"] == (1, "localizing, 3 of 4 kept")
-    whole.check_undisturbed()
-
-
-def test_refinement_of_poses_goes_on_inside_its_stage(whole: Runs) -> None:
-    whole.options, whole.last = (*OPTIONS, *REFINED), "refine_poses"
-    whole.stopped("refining", 2)
-    reports = whole.run()
-    assert whole.told["refining"] == (2, "refining, 2 of 4 kept")
-    assert reports["refine_poses"].kept_items == "3 of 5 kept"  # and the map's consistency
-    table = pd.read_csv(whole.root / "localized" / "refinement.csv")
-    assert sorted(table["moved_m"] > 0) == [False] * 4 + [True] * 4  # rendering wants depth
-    whole.check_undisturbed()
-    name = sorted((whole.scene / "query/sensors/records_data").iterdir())[1].name
-    paint(whole.scene, f"query/sensors/records_data/{name}")
-    whole.run()
-    assert whole.told["refining"] == (1, "refining, 3 of 4 kept")
-    whole.check_undisturbed()
-    # a map image that no query needs may be looked at all the same
-    paint(whole.scene, CHANGED)
-    assert "kept" not in whole.run()["refine_poses"].kept_items
 
 
 def test_a_pose_a_mask_and_another_camera_count(runs: Runs) -> None:
