@@ -408,7 +408,8 @@ def _minimised(
         else:
             damping = max(10.0 * damping, _DAMPING)
         try:
-            step = -np.linalg.solve(hessian + damping * np.diag(np.diagonal(hessian)), gradient)
+            damped = hessian + damping * np.diag(np.diagonal(hessian))
+            step = np.asarray(-np.linalg.solve(damped, gradient), np.float64)
         except np.linalg.LinAlgError:  # the inliers do not determine the pose
             return best
         pose = perturbed(best, np.asarray(step, np.float64))

@@ -64,9 +64,6 @@ class RenderingOptions(Options):
     levels: int = Field(
         default=3, ge=1, description="of the pyramids, each of half the size; begin at the coarsest"
     )
-    search_deg: float = Field(
-        default=4.0, ge=0, description="turns of the camera that are tried at the coarsest level"
-    )
     max_translation_m: float = Field(
         default=0.5, gt=0, description="a pose whose centre moves further is not accepted"
     )

@@ -46,7 +46,7 @@ CAMERA = Camera("PINHOLE", 240, 180, (195.0, 197.0, 120.0, 90.0))
 PX_PER_M = 60
 SLOW = pytest.mark.slow
 # two threads on small images wait for each other most of the time
-QUICK = RenderingOptions(max_references=3, search_deg=2.0)
+QUICK = RenderingOptions(max_references=3)
 # origin, unit vectors of the texture's columns and rows, metres along them
 WALLS = (
     ((-4.0, -3.0, 4.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), 6, 6),
