@@ -150,9 +150,8 @@ class NeuralField:
         shape = camera.height, camera.width
         rendered = self.render_rays(self.rays(camera, cam_from_world), appearance)
         rgb = (rendered.rgb * 255).round().clamp(0, 255).byte().cpu().numpy().reshape(*shape, 3)
-        depth = torch.where(rendered.opacity > 0.5, rendered.depth, 0.0)
-        depth_m = depth.cpu().numpy().reshape(shape).astype(np.float32)
-        return FieldRendering(rgb, depth_m, camera)
+        depth_m = torch.where(rendered.opacity > 0.5, rendered.depth, 0.0).cpu().numpy()
+        return FieldRendering(rgb, depth_m.reshape(shape).astype(np.float32), camera)
 
     def render_rays(self, rays: Rays, appearance: torch.Tensor | None = None) -> Rendered:
         """Render rays in parts, all with one appearance (A,) or the mean; no transients."""
