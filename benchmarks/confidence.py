@@ -6,8 +6,8 @@
 
 A scene is a folder with mapping/, query/ and query_gt/ in kapture. ``collect`` maps each and
 localizes in it, with every pose kept: its own queries, the same made worse (half and a third of the
-size, blurred, dark, cropped, covered) and upside down; the same mirrored, and the images of all
-other scenes and of a folder of photographs, which have no right pose there. ``fit`` leaves out one
+size, blurred, dark, cropped, covered) and upside down; and the images of all other scenes
+and of a folder of photographs, which have no right pose there. ``fit`` leaves out one
 scene after the other, with its images as queries of the others, and prints what the calibration of
 the rest makes of it beside the rule "at least 12 inliers"; ``--write`` puts the calibration of all
 data into the package. Scenes whose names begin alike, up to the first ``_``, are the same place.
@@ -42,7 +42,7 @@ from megloc_kapture.geometry.cameras import principal_point_px, shift_principal_
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.localization import confidence
-from megloc_kapture.localization.confidence import MAP_POINTS, MIRRORED, TERMS
+from megloc_kapture.localization.confidence import MAP_POINTS, TERMS
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import assigned
 from megloc_kapture.preprocessing.frames import scaled_camera
@@ -118,9 +118,6 @@ def cases(scene: Path, scenes: Sequence[Path], unrelated: Path | None, most: int
         upside = np.ascontiguousarray(pixels[::-1, ::-1])
         of_upside = shift_principal_point(camera, across, along)
         yield f"{name}#upside_down", "upside_down", upside, of_upside, turned @ pose
-        mirrored = np.ascontiguousarray(pixels[:, ::-1])
-        of_mirrored = shift_principal_point(camera, across, 0.0)
-        yield f"{name}#mirrored", "mirrored", mirrored, of_mirrored, None
     seen = {place(scene.name)}
     for other in scenes:
         if place(other.name) in seen:
@@ -144,8 +141,6 @@ def collect(
     changes: Sequence[str] = (),
 ) -> pd.DataFrame:
     """Localize every query of one map, and keep every pose."""
-    # of every pose: what the others' calibration makes of it is not known yet
-    confidence.MIRROR_ASKED = 0.0, 2.0
     with TemporaryDirectory() as folder:
         place = Path(folder) / "map"
         built = megloc.build_map(scene / "mapping", preset, set=assigned(changes), workspace=place)
@@ -213,7 +208,7 @@ def fitted(table: pd.DataFrame, terms: Sequence[str], origin: str) -> confidence
 def confidences(table: pd.DataFrame, model: confidence.Calibration) -> NDArray[np.float64]:
     """Confidences of the rows; NaN without a pose."""
     found = np.full(len(table), np.nan)
-    for at, row in enumerate(table.fillna({MAP_POINTS: 1.0, MIRRORED: 1.0}).to_dict("records")):
+    for at, row in enumerate(table.fillna({MAP_POINTS: 1.0}).to_dict("records")):
         if row["localized"]:
             found[at] = model.probability(row)
     return found
@@ -253,7 +248,6 @@ def summary(table: pd.DataFrame, found: NDArray[np.float64], accepted: float) ->
     return {
         "wrong queries": str(count),
         "accepted": f"{wrong} ({100 * wrong / count:.2f} %, {low:.2f}-{high:.2f})",
-        "of them mirrored": str(int((taken & (table.kind == "mirrored")).sum())),
         "wrong poses of own": str(int((taken & ~strays & ~right).sum())),
         "right own": f"{kept} of {before}",
         "right, made worse": f"{worse_kept} of {worse_all}",

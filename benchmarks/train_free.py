@@ -7,8 +7,8 @@
     .venv/bin/python benchmarks/train_free.py inliers --scene DIR ...    # matchers on real pairs
 
 XFeat's weights are Apache-2.0 and the rendered worlds are this project's own, so what comes out may
-be published under a free licence; the manifests beside the files say what went in. Other data with
-their licences: ``--also FOLDER=LICENCE`` (kapture with depth), ``--photographs FOLDER=LICENCE``.
+be published under a free licence. Other data: ``--also FOLDER`` (kapture with depth),
+``--photographs FOLDER``.
 Everything lies below ``runs/train_free``. The worlds are photograph albums as those of Aachen's
 twin, of seeds from 1000 on, those held out from 2000 on; no test, no other benchmark draws these.
 """
@@ -37,7 +37,6 @@ from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import ImageFeatures, RigidTransform
 
-RENDERED_LICENCE = "BSD-3-Clause"
 TRAINING_SEED, HELD_OUT_SEED = 1000, 2000
 ALBUM = {"stations_per_place": 6, "day_queries": 16, "night_queries": 24}
 PAIRS = {"pairs.max_size_px": 640, "max_keypoints": 512, "check_every": 250}
@@ -86,11 +85,7 @@ def train(task: str, root: Path, arguments: argparse.Namespace) -> None:
     """Train, or go on."""
     rendered = [folder for folder in sorted((root / "worlds").iterdir()) if folder.is_dir()]
     held_out = [folder for folder in rendered if int(folder.name) >= HELD_OUT_SEED]
-    also, photographs = (
-        dict(text.rsplit("=", 1) for text in given or ())
-        for given in (arguments.also, arguments.photographs)
-    )
-    kaptures = [*(folder for folder in rendered if folder not in held_out), *also]
+    kaptures = [*(folder for folder in rendered if folder not in held_out), *arguments.also]
     chosen = {**PAIRS, **(DESCRIPTOR if task == "descriptor" else MATCHER)}
     if task == "matcher":
         chosen["features.options.descriptor_weights"] = str(root / "xfeat-night.safetensors")
@@ -102,11 +97,10 @@ def train(task: str, root: Path, arguments: argparse.Namespace) -> None:
         task,
         root / f"{name}.safetensors",
         kaptures=kaptures,
-        photographs=list(photographs),
+        photographs=arguments.photographs,
         held_out=held_out,
         features="xfeat",
         set={**chosen, **asked},
-        licences={**dict.fromkeys(map(str, rendered), RENDERED_LICENCE), **also, **photographs},
     )
     print({key: round(value, 5) for key, value in last.items()})
 
@@ -214,8 +208,8 @@ def main() -> None:
     parser.add_argument("--held-out", type=int, default=2, help="worlds")
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(5)), help="evaluated")
     parser.add_argument("--scene", type=Path, nargs="+", default=[], help="evaluated beside them")
-    parser.add_argument("--also", action="append", metavar="KAPTURE=LICENCE")
-    parser.add_argument("--photographs", action="append", metavar="FOLDER=LICENCE")
+    parser.add_argument("--also", action="append", default=[], metavar="KAPTURE")
+    parser.add_argument("--photographs", action="append", default=[], metavar="FOLDER")
     parser.add_argument("--set", action="append", metavar="KEY=VALUE", help="of megloc train")
     parser.add_argument("--workers", type=int, default=1)
     arguments = parser.parse_args()

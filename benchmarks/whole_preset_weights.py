@@ -1,9 +1,10 @@
-"""Random weights for the preset ``megloc`` in the containers that its networks are published in.
+"""Random weights for the preset ``megloc``, in files as they are published or converted.
 
     .venv/bin/python benchmarks/whole_preset_weights.py DIR
     MEGLOC_WEIGHTS=DIR make eval DATASET=synthetic-aachen PRESET=megloc
 
-Every file has the official name, container, keys and shapes; the numbers are drawn from a seed.
+Every file has the official or the converted name, and its keys and shapes; the numbers are drawn
+from a seed.
 Where torch's own way to begin a network would let nothing through (a score map that is flat, a
 graph that drowns the descriptors), the numbers are scaled so that features still answer to texture
 and matches to descriptors: then every stage after them has something to do.
@@ -12,20 +13,15 @@ and matches to descriptors: then every stage after them has something to do.
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 from zlib import crc32
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy.io import savemat
-from tensorflow_checkpoints import write_saved_model, write_tensorflow_checkpoint
+from safetensors.torch import save_file
 from torch import nn
 
 from megloc_kapture.features.aslfeat import AslFeatNet
@@ -37,23 +33,10 @@ from megloc_kapture.nets.lpips import Lpips
 from megloc_kapture.nets.superglue import SuperGlueNet
 from megloc_kapture.preprocessing.deeplab import DeepLabV3Plus
 
-_PCA_MODULE = "sklearn.decomposition.pca"
 _MEAN_RGB = (123.68, 116.779, 103.939)
 _STANDING_CLASSES = 11  # of Cityscapes, before person, rider and the vehicles
 # how sharply SuperGlue tells similar descriptors apart, and the cosine that the dustbin has
 _SHARPNESS, _DUSTBIN_COSINE = 30.0, 0.6
-_TENSORFLOW_WORDS = {
-    "weight": "kernel",
-    "bias": "bias",
-    "running_mean": "moving_mean",
-    "running_var": "moving_variance",
-}
-_SLIM_NORMS = {
-    "weight": "gamma",
-    "bias": "beta",
-    "running_mean": "moving_mean",
-    "running_var": "moving_variance",
-}
 
 
 @dataclass(frozen=True)
@@ -88,9 +71,9 @@ def write_random_weights(folder: Path, seed: int = 0, sizes: Sizes = OFFICIAL) -
 
 
 def _official_name(name: str) -> str:
-    """The published file; of a TensorFlow checkpoint its index."""
-    names = [file.name for file in registry()[name].files]
-    return next((each for each in names if each.endswith(".index")), names[0])
+    """The published file that is read as it is, or the converted one."""
+    names = [file.name for file in registry()[name].files if not file.convert]
+    return names[0] if names else registry()[name].converted
 
 
 def _superpoint(path: Path, _: Sizes) -> None:
@@ -116,12 +99,8 @@ def _superglue(path: Path, _: Sizes) -> None:
 
 
 def _aslfeat(path: Path, _: Sizes) -> None:
-    variables = {}
-    for key, value in AslFeatNet().state_dict().items():
-        *scopes, word = key.split(".")
-        name = "/".join([*scopes, _TENSORFLOW_WORDS.get(word, word)])
-        variables[name] = _tensorflow_layout(_aslfeat_values(key, value))
-    write_tensorflow_checkpoint(path, variables)
+    state = AslFeatNet().state_dict()
+    save_file({key: _aslfeat_values(key, value) for key, value in state.items()}, path)
 
 
 def _aslfeat_values(key: str, value: torch.Tensor) -> torch.Tensor:
@@ -136,17 +115,8 @@ def _aslfeat_values(key: str, value: torch.Tensor) -> torch.Tensor:
 
 
 def _netvlad(path: Path, sizes: Sizes) -> None:
-    net = _vgg_netvlad(sizes)
-    layers: list[Any] = [{"type": "relu"}] * 34
-    for number, layer in enumerate(net.base_model["base"].children()):
-        if isinstance(layer, nn.Conv2d):
-            layers[number] = _matconvnet("conv", layer.weight.permute(2, 3, 1, 0), layer.bias)
-    centres = net.net_vlad.centroids
-    layers[30] = _matconvnet("custom", net.net_vlad.conv.weight[:, :, 0, 0].T, -centres.T)
-    layers[33] = _matconvnet("conv", net.pca_layer.weight.permute(2, 3, 1, 0), net.pca_layer.bias)
-    image = np.tile(np.array(_MEAN_RGB, np.float32), (2, 2, 1))
-    meta = {"normalization": {"averageImage": image}}
-    savemat(path, {"net": {"layers": _cell(layers), "meta": meta}})
+    state = {**_vgg_netvlad(sizes).state_dict(), "average_image": torch.tensor(_MEAN_RGB)}
+    save_file(state, path)
 
 
 def _openibl(path: Path, sizes: Sizes) -> None:
@@ -163,27 +133,11 @@ def _vgg_netvlad(sizes: Sizes) -> VggNetVlad:
     return net
 
 
-def _matconvnet(kind: str, first: torch.Tensor, second: torch.Tensor | None) -> dict[str, Any]:
-    """A layer of MatConvNet; a vector is one row."""
-    values = [first.numpy(), np.atleast_2d(torch.zeros(0) if second is None else second.numpy())]
-    return {"type": kind, "weights": _cell(values)}
-
-
-def _cell(values: list[Any]) -> NDArray[Any]:
-    found = np.empty((1, len(values)), object)
-    for column, value in enumerate(values):
-        found[0, column] = value
-    return found
-
-
 def _delg(path: Path, _: Sizes) -> None:
-    net = DelgNet(101, "slim")
-    variables = {
-        _slim_name(key): _tensorflow_layout(_delg_values(key, value))
-        for key, value in net.state_dict().items()
-        if not key.endswith("num_batches_tracked")
-    }
-    write_saved_model(path, path.name.removesuffix(".tar.gz"), variables)
+    state = DelgNet(101, "slim").state_dict()
+    counters = {key for key in state if key.endswith("num_batches_tracked")}
+    values = {k: _delg_values(k, value) for k, value in state.items() if k not in counters}
+    save_file(values, path)
 
 
 def _delg_values(key: str, value: torch.Tensor) -> torch.Tensor:
@@ -196,55 +150,17 @@ def _delg_values(key: str, value: torch.Tensor) -> torch.Tensor:
     return 0.4 * torch.rand(value.shape) - 0.2
 
 
-def _slim_name(key: str) -> str:
-    """A key of torchvision's ResNet as TF-Slim's name of the variable."""
-    *parts, word = key.split(".")
-    if parts == ["embedding"]:
-        return f"whitening/{'weights' if word == 'weight' else 'biases'}"
-    scope = "resnet_v1_101"
-    if parts[0].startswith("layer"):
-        stage, block, *parts = parts
-        scope += f"/block{stage.removeprefix('layer')}/unit_{int(block) + 1}/bottleneck_v1"
-    norm = parts[0].startswith("bn") or parts[-1] == "1"
-    layer = "shortcut" if parts[0] == "downsample" else parts[0].replace("bn", "conv")
-    return f"{scope}/{layer}/" + (f"BatchNorm/{_SLIM_NORMS[word]}" if norm else "weights")
-
-
 def _apgem(path: Path, _: Sizes) -> None:
     net = ApGemNet(101)
     net.fc.bias.zero_()  # which would be most of a vector of random weights
-    attributes = {
-        "mean_": (0.001 * torch.randn(2048)).numpy(),
-        "components_": (torch.randn(2048, 2048) / 45).numpy(),
-        "explained_variance_": (torch.rand(2048) + 0.01).numpy(),
-        "whiten": True,
+    whitening = {
+        "mean": 0.001 * torch.randn(2048),
+        "components": torch.randn(2048, 2048) / 45,
+        "explained_variance": torch.rand(2048) + 0.01,
+        "whiten": torch.tensor(True),
     }
-    options = {"arch": "resnet101_rmac", "out_dim": 2048, "pooling": "gem", "gemp": 3}
-    with _pca_class() as kind:
-        pca = kind()
-        pca.__dict__ |= attributes
-        state = {f"module.{key}": value for key, value in net.state_dict().items()}
-        parts = {"state_dict": state, "model_options": options, "pca": {"Landmarks_clean": pca}}
-        torch.save(parts | {"preprocess": {"mean": [0.485, 0.456, 0.406], "input_size": 224}}, path)
-
-
-@contextmanager
-def _pca_class() -> Iterator[type]:
-    """A class that is pickled under scikit-learn's name, which is not installed here."""
-    kind = type("PCA", (), {"__module__": _PCA_MODULE})
-    parts = _PCA_MODULE.split(".")
-    names = [".".join(parts[:count]) for count in range(1, len(parts) + 1)]
-    before = {name: sys.modules.get(name) for name in names}
-    sys.modules |= {name: ModuleType(name) for name in names}
-    sys.modules[_PCA_MODULE].__dict__["PCA"] = kind
-    try:
-        yield kind
-    finally:
-        for name, module in before.items():
-            if module is None:
-                del sys.modules[name]
-            else:
-                sys.modules[name] = module
+    parts = {f"pca.Landmarks_clean.{part}": value for part, value in whitening.items()}
+    save_file({**net.state_dict(), **parts}, path)
 
 
 def _lpips_trunk(path: Path, sizes: Sizes) -> None:
@@ -297,15 +213,6 @@ def _spread(net: nn.Module) -> Any:
         if value.ndim > 2:
             nn.init.kaiming_normal_(value)
     return net
-
-
-def _tensorflow_layout(value: torch.Tensor) -> NDArray[np.float32]:
-    """Kernels (H, W, in, out) where torch has (out, in, H, W); dense layers as 1x1 kernels."""
-    if value.ndim == 2:
-        value = value[:, :, None, None]
-    if value.ndim == 4:
-        value = value.permute(2, 3, 1, 0)
-    return np.ascontiguousarray(value.numpy(), np.float32).reshape(value.shape)
 
 
 def main() -> None:

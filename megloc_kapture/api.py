@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.metrics import Threshold
-from megloc_kapture.evaluation.report.document import REPORT_HTML
+from megloc_kapture.evaluation.report.reports import REPORT_HTML
 from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.images import (
@@ -33,7 +33,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, recall_rows
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
-from megloc_kapture.pipeline.localizer import LOCALIZING, Localizer
+from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.map_making import (
     kapture_of,
     options_of_photographs,
@@ -101,17 +101,15 @@ class Map:
         path: Path | str,
         result: Path | str | Results | None = None,
         truth: Path | str | None = None,
-        *,
-        rendered: Path | str | None = None,
     ) -> None:
         """Write a page that shows the map in 3D, and the queries of a result in it; see
         :func:`megloc_kapture.evaluation.view.write_view`."""
         from megloc_kapture.evaluation.view import write_view
 
         if isinstance(result, Results):
-            result.view(path, truth, rendered=rendered)
+            result.view(path, truth)
         else:
-            write_view(path, self.kapture_map.folder, result, truth, rendered=rendered)
+            write_view(path, self.kapture_map.folder, result, truth)
 
     @overload
     def localize(
@@ -255,9 +253,9 @@ def open_map(
     Raises
     ------
     DataError : it is no map, or broken, or contradicts itself; names file and line.
-    OptionError : an option that there is not, or that changes nothing.
+    OptionError : an unknown option.
     """
-    options = options_of_preset(preset, assignments=set or {}, used=LOCALIZING)
+    options = options_of_preset(preset, assignments=set or {})
     opened = KaptureMap.open(
         kapture_of(path),
         features_dirs=[Path(one) for one in features_dirs],

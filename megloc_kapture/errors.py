@@ -65,14 +65,9 @@ def suggestion(name: str, known: Iterable[str], *, listed: str = "known: ") -> s
 _EXTRAS = {
     "torch": "torch",
     "kornia": "kornia",
-    "onnx": "convert",
     "distributed": "cluster",
-    "faiss": "faiss",
     "h5py": "megadepth",
-    "rerun": "rerun",
-    **dict.fromkeys(
-        ("fastapi", "prometheus_client", "python_multipart", "starlette", "uvicorn"), "serve"
-    ),
+    **dict.fromkeys(("fastapi", "python_multipart", "starlette", "uvicorn"), "serve"),
 }
 
 

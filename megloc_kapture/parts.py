@@ -86,7 +86,6 @@ def train(
     held_out: Sequence[Path | str] = (),
     features: str = "superpoint",
     set: Mapping[str, Any] | None = None,
-    licences: Mapping[str, str] | None = None,
     threads: int = 1,
     force: bool = False,
 ) -> dict[str, float]:
@@ -101,7 +100,6 @@ def train(
     photographs : folders of images, trained on under random homographies.
     features : the extractor whose features are matched, or whose detector is frozen.
     set : options, ``{"steps": 20000}``.
-    licences : of the folders, by their paths as they are given; for the manifest.
 
     Returns
     -------
@@ -121,6 +119,5 @@ def train(
         [KaptureFolder(path) for path in kaptures],
         [Path(path) for path in photographs],
         [KaptureFolder(path) for path in held_out],
-        {Path(path): licence for path, licence in (licences or {}).items()},
     )
     return run_training(options, data, Path(output), force=force, threads=threads)

@@ -8,13 +8,16 @@ from contextlib import suppress
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
 from megloc_kapture.errors import MeglocError, PluginError, missing_extra, suggestion
 from megloc_kapture.plugins import PROTOCOLS
 from megloc_kapture.values import Options
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 
 def entry_points(**of: str) -> metadata.EntryPoints:
@@ -41,10 +44,7 @@ def plugin_names(group: str) -> list[str]:
 def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) -> Any:
     """Make the plugin ``name`` of ``group``, with its options.
 
-    Raises
-    ------
-    PluginError : no such plugin, it cannot be imported, does not fulfil the group's protocol, or
-        refuses its options; says which and why.
+    Raises PluginError: no such plugin, or it refuses its options.
     """
     kind = plugin_class(group, name)
     model: Any = getattr(kind, "Options", None)
@@ -62,6 +62,29 @@ def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) ->
     except Exception as error:  # whatever a foreign constructor raises
         reason = " ".join(str(error).split())
         raise PluginError(f"plugin {name!r} refuses its options: {reason}") from error
+
+
+def checked_array(
+    who: str, array: Any, shape: tuple[int | None, ...], *dtypes: str
+) -> NDArray[Any]:
+    """Return an array of a plugin if it has this shape, one of these types and finite values.
+
+    ``who`` names the plugin and the image in the error; None in ``shape`` means any length.
+    """
+    import numpy as np
+
+    if not isinstance(array, np.ndarray):
+        found = type(array).__name__
+    else:
+        lengths = zip(array.shape, shape, strict=False)
+        fits = array.ndim == len(shape) and all(b in (None, a) for a, b in lengths)
+        if fits and array.dtype.name in dtypes:
+            if not np.isfinite(array).all():
+                raise PluginError(f"{who}: values that are not finite")
+            return array
+        found = f"{array.dtype} {array.shape}"
+    wanted = ", ".join("N" if length is None else str(length) for length in shape)
+    raise PluginError(f"{who}: got {found}, expected {' or '.join(dtypes)} ({wanted})")
 
 
 def option_fault(error: ValidationError, model: type[Options]) -> str:

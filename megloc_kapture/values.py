@@ -82,18 +82,6 @@ class Options(BaseModel):
                 read[key] = listed(value) if _is_list(annotation) else value
         return read
 
-    def idle(self) -> dict[str, str]:
-        """Options that change nothing while the others are as they are: name to the reason.
-
-        Who sets one of them meant something else: it is refused (pipeline/presets.py).
-        """
-        return {}
-
-    @classmethod
-    def all_but(cls, *names: str) -> list[str]:
-        """Names of all options but these."""
-        return [name for name in cls.model_fields if name not in names]
-
 
 @dataclass(frozen=True, slots=True)
 class Camera:
@@ -362,8 +350,8 @@ class Pose:
     clusters : all clusters of candidates that were tried, that of the best candidate first.
     cluster : the one this pose comes from, an index into ``clusters``.
     refinements : what each pose refiner made of it, in their order.
-    remarks : steps that were left out because the query, or the map, lacks what they need; that the
-        camera's focal length does not fit, or that the image seems to be mirrored.
+    remarks : steps that were left out because the query, or the map, lacks what they need; or that
+        the camera's focal length does not fit.
     confidence : the probability that the pose is right, None where it was not asked for; of the
         pose before refinement by other means.
     evidence : the terms behind it, see :mod:`megloc_kapture.localization.confidence`.

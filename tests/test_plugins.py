@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import pytest
 from megloc_kapture.errors import PluginError
 from megloc_kapture.features.rootsift import RootSift
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
-from megloc_kapture.plugin_loading import load_plugin, plugin_names
+from megloc_kapture.plugin_loading import checked_array, load_plugin, plugin_names
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS
 from megloc_kapture.values import LocalFeatures
 
@@ -185,3 +186,20 @@ def test_a_second_package_may_not_mix_up_names_and_groups(
     monkeypatch.syspath_prepend(rival)
     with pytest.raises(PluginError, match=message):
         load_plugin(group, name)
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        ([[1.0]], r"x: got list, expected float32 or uint8 \(N, 2\)"),
+        (np.ones((1, 2)), r"got float64 \(1, 2\), expected"),
+        (np.ones(2, np.float32), r"got float32 \(2,\), expected"),
+        (np.ones((1, 3), np.float32), r"got float32 \(1, 3\), expected"),
+        (np.full((1, 2), np.nan, np.float32), "values that are not finite"),
+    ],
+)
+def test_arrays_of_plugins_are_checked(array: Any, message: str) -> None:
+    with pytest.raises(PluginError, match=message):
+        checked_array("plugin x", array, (None, 2), "float32", "uint8")
+    whole = np.ones((3, 2), np.uint8)
+    assert checked_array("plugin x", whole, (None, 2), "float32", "uint8") is whole

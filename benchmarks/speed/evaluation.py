@@ -22,8 +22,7 @@ from typing import TypeVar
 import numpy as np
 from timing import Timed, table
 
-from megloc_kapture.evaluation.check.reading import read_reference
-from megloc_kapture.evaluation.check.submission import check_submission
+from megloc_kapture.evaluation.check import check_submission, read_reference
 from megloc_kapture.evaluation.evaluate import evaluate_results
 from megloc_kapture.evaluation.pose_files import write_pose_file
 from megloc_kapture.evaluation.protocols import benchmark_of, protocol_of

@@ -1,6 +1,6 @@
 """Retrieval from kapture's files: ours, the bare matrix product and kapture-localization's tool.
 
-    .venv/bin/python benchmarks/speed/retrieval.py [--million] [--short-list 200000 [...]]
+    .venv/bin/python benchmarks/speed/retrieval.py [--million]
 
 The top 50 of 1,000 queries in 10,000 images of 4096 dimensions, from the vectors in the page cache:
 in one tar, and as one file per image. The product has its vectors in memory and knows no order; it
@@ -8,9 +8,7 @@ is what no search can do without. All run in turn in this process, several times
 threads. Two lengths are measured of ours and of kapture-localization: the search alone, from the
 opening of the vectors to the ranking, and the whole tool, from the kapture folders to the pairs
 file. The pairs of all are compared. ``--million`` searches a million vectors that are made block by
-block, in a process of its own, and prints the memory that took. ``--short-list`` searches so many
-vectors of a mixture, kept in a tar, exactly and by product quantisation with short lists, and
-prints the share of the exact ``top-k`` that is found: nothing else is measured then.
+block, in a process of its own, and prints the memory that took.
 """
 
 from __future__ import annotations
@@ -27,16 +25,15 @@ import sys
 import tarfile
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from kloc_tools import tool_scripts
 from numpy.typing import NDArray
-from timing import peak_gib, table
+from timing import table
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture import (
@@ -55,8 +52,6 @@ from megloc_kapture.io.kapture.vectors import KaptureVectors
 from megloc_kapture.retrieval.fusion import FusionOptions
 from megloc_kapture.retrieval.search import (
     FusedSearch,
-    QuantizedRows,
-    short_lists,
 )
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -331,84 +326,6 @@ def million(options: argparse.Namespace) -> None:
     print(json.dumps({"seconds": spent, "gib": memory, "found": found}))
 
 
-# -------------------------------------------------------------------------------- short lists
-
-PER_CENTRE = 200  # rows of a mixture's component
-LENGTHS = (100, 300, 1000)
-
-
-class Mixture:
-    """Unit rows around centres on a walk, as descriptors of images along a drive.
-
-    A row's cosine with its centre is 0.5 to 0.8, that of neighbouring centres 0.9: what is
-    nearest to a query stands out from some thousand rows by little.
-    """
-
-    def __init__(self, count: int, dimension: int) -> None:
-        self.count = count
-        self.centres = random_vectors([3], max(1, count // PER_CENTRE), dimension)
-        for before, centre in pairwise(self.centres):
-            centre *= np.sqrt(1 - 0.9**2)
-            centre += 0.9 * before
-            centre /= np.linalg.norm(centre)
-
-    def drawn(self, number: int, seed: int) -> Vectors:
-        random = np.random.default_rng([4, seed])
-        share = random.uniform(0.5, 0.8, (number, 1)).astype(np.float32)
-        rows = random_vectors([5, seed], number, self.centres.shape[1])
-        rows *= np.sqrt(1 - share**2)
-        rows += share * self.centres[random.integers(0, len(self.centres), number)]
-        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-        return rows
-
-    def rows(self) -> Iterator[Vectors]:
-        for start in range(0, self.count, 10_000):
-            yield from self.drawn(min(10_000, self.count - start), start)
-
-
-def measure_short_lists(count: int, options: argparse.Namespace) -> bool:
-    """Print recall of the exact ranking, seconds and memory; whether 0.99 is reached."""
-    made = Mixture(count, options.dimension)
-    folder = options.cache / f"mixture_{count}_{options.dimension}"
-    names = [f"map/{k // 1000:04d}/{k % 1000:03d}.jpg" for k in range(count)]
-    generate(folder, names, made.rows(), options.dimension, tar=True)
-    queries = made.drawn(options.queries, count)
-    del made
-    rows_of: list[tuple[str, ...]] = [
-        ("", "seconds", "cpu s", "cpu ms/query", "peak GiB", "recall")
-    ]
-
-    def step(name: str, work: Callable[[], Any], per: int = 0) -> Any:
-        peak_gib(reset=True)
-        clock, start = time.perf_counter(), time.process_time()
-        found = work()
-        clock, spent = time.perf_counter() - clock, time.process_time() - start
-        each = f"{1000 * spent / per:.1f}" if per else ""
-        rows_of.append((name, f"{clock:.0f}", f"{spent:.0f}", each, f"{peak_gib():.2f}"))
-        return found
-
-    def recall(found: NDArray[np.int64]) -> float:
-        same = [len(set(a) & set(b)) for a, b in zip(exact, found, strict=True)]
-        return float(np.mean(same)) / options.top_k
-
-    def opened() -> KaptureVectors:
-        mapping = KaptureFolder(folder)
-        return KaptureVectors(mapping.global_features(TYPE), sorted(mapping.read().poses()))
-
-    rows = step("open kapture folder and tar", opened)
-    exactly = FusedSearch(options.top_k, FusionOptions())
-    search = partial(exactly.lists, [queries], [rows])
-    ((exact, _),) = step("exact", search, len(queries))
-    codes = [step("codes made", lambda: QuantizedRows(rows))]
-    for length in LENGTHS:
-        among = partial(short_lists, exactly, [queries], [rows], codes, length=length)
-        ((found, _),) = step(f"short lists of {length}", among, len(queries))
-        rows_of[-1] = (*rows_of[-1], f"{recall(found):.4f}")
-    print(f"{count} x {options.dimension} in a tar, {len(queries)} queries")
-    print(table([(*row, "")[:6] for row in rows_of]))
-    return recall(found) >= 0.99
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--images", type=int, default=10_000)
@@ -419,16 +336,11 @@ def main() -> int:
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "megloc-bench")
     parser.add_argument("--million", action="store_true", help="search generated vectors as well")
     parser.add_argument("--million-images", type=int, default=MILLION)
-    parser.add_argument("--short-list", type=int, nargs="+", metavar="IMAGES", default=[])
     parser.add_argument("--only-million", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.only_million:
         million(options)
         return 0
-    if options.short_list:
-        return (
-            0 if all([measure_short_lists(count, options) for count in options.short_list]) else 1
-        )
     load = os.getloadavg()[0]
     print(
         f"{options.queries} queries in {options.images} images x {options.dimension}, "

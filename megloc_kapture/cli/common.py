@@ -5,12 +5,11 @@ from __future__ import annotations
 import logging
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from datetime import timedelta
-from functools import partial
 from itertools import starmap
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -206,7 +205,7 @@ class Working(Common):
 
     @contextmanager
     def working(self, output: Path) -> Iterator[Work]:
-        """What to work with, by these flags; all workers must see the folder of the output."""
+        """Open the executor; all workers must see the folder of the output."""
         folder = output if output.is_dir() else output.absolute().parent
         with single_threaded(), self.open_executor(folder) as executor:
             yield Work(executor, self.console().track, self.workers or available_cores())
@@ -224,7 +223,7 @@ class Working(Common):
 
     @contextmanager
     def working_in(self, workspace: Workspace) -> Iterator[Work]:
-        """What to work with in a workspace, which is held meanwhile."""
+        """Open the executor for a workspace, and lock it."""
         with workspace.lock(), self.working(workspace.root) as work:
             yield work
 
@@ -257,21 +256,20 @@ class Reading(Linked):
     """Features folder beside the kapture folders; may be repeated."""
 
     def kapture(self, root: Path) -> KaptureFolder:
-        """A kapture folder with the features beside it; raises DataError for one not there."""
+        """A kapture folder with the given features folders."""
         return KaptureFolder(
             root,
             features_dirs=existing(self.features_dir),
             allow_links_below=existing(self.allow_links_below),
         )
 
-    def opening(
+    def open_map(
         self, path: Path, keypoints_types: tuple[str, ...], pixel_origin: PixelOriginChoice
-    ) -> Callable[..., KaptureMap]:
-        """What opens a map with these flags; raises DataError for a folder that is not there."""
+    ) -> KaptureMap:
+        """Open a map with the given features folders."""
         from megloc_kapture.pipeline.kapture_map import KaptureMap
 
-        return partial(
-            KaptureMap.open,
+        return KaptureMap.open(
             path,
             keypoints_types=keypoints_types,
             features_dirs=existing(self.features_dir),
@@ -294,13 +292,6 @@ class Computing:
         given = {"device": self.device, "precision": self.precision}
         return [f"{name}={value}" for name, value in given.items() if value is not None]
 
-    def check_computes(self, chosen: object) -> None:
-        """Raise OptionError where no network, of options or a tuple of them, has what is given."""
-        from megloc_kapture.stages.devices import unheeded
-
-        if lacking := unheeded(chosen, self.device or "auto", self.precision or "full"):
-            raise OptionError(f"--{lacking[0]} changes nothing: no network here has it")
-
 
 @dataclass(frozen=True, kw_only=True)
 class Choosing(Computing):
@@ -312,7 +303,7 @@ class Choosing(Computing):
     """Change an option: key.key=value; may be repeated."""
 
     def assignments(self) -> tuple[str, ...]:
-        """What is set by --set and by flags of its own."""
+        """Assignments by --set and by flags."""
         return (*self.set, *self.placement())
 
 
@@ -325,7 +316,7 @@ class Deciding(Choosing):
     challenges, where a wrong answer costs nothing. 0.6 unless given."""
 
     def assignments(self) -> tuple[str, ...]:
-        """What is set by --set and by flags of its own."""
+        """Assignments by --set and by flags."""
         if self.min_confidence is None:
             return super().assignments()
         return (*super().assignments(), f"localization.min_confidence={self.min_confidence:g}")

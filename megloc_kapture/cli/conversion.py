@@ -34,7 +34,7 @@ from megloc_kapture.pipeline.datasets import (
     twin_of,
 )
 from megloc_kapture.pipeline.executors import open_executor
-from megloc_kapture.pipeline.export import ExportFormat, GeoOrigin, export
+from megloc_kapture.pipeline.export import ExportFormat, export
 from megloc_kapture.pipeline.map_making import import_colmap
 from megloc_kapture.pipeline.presets import assigned, options_with
 from megloc_kapture.stages.localized_folder import set_aside_unreadable
@@ -82,10 +82,6 @@ class Import(Common):
         if name == MEGADEPTH:
             self._import_megadepth(console)
             return
-        if self.images or self.database:
-            raise OptionError(f"--images and --database are of colmap, not of {self.dataset}")
-        if self.unit != NO_METRES:
-            raise OptionError(f"--unit is of colmap, not of {self.dataset}")
         choice = choose_dataset(
             KAPTURE if name == SYNTHETIC else name,
             self.root,
@@ -107,7 +103,6 @@ class Import(Common):
             console.result(text.rstrip())
 
     def _import_colmap(self, console: Console) -> None:
-        self._refuse_unused("a COLMAP model", {"--set": self.set})
         source = find_colmap(self.root, images=self.images, database=self.database)
         with (
             staged_output(self.output, kind=MAP, force=self.force) as out,
@@ -122,17 +117,11 @@ class Import(Common):
             console.say("unit: units of the map, whose scale is not known; --unit m if in metres")
 
     def _import_megadepth(self, console: Console) -> None:
-        self._refuse_unused("MegaDepth", {"--images": self.images, "--database": self.database})
         options = options_with(MegaDepthOptions, self.set)
         with staged_output(self.output, kind=MEGADEPTH, force=self.force) as out:
             work = Work(track=console.track)
             counts = import_megadepth(self.root, out, options, work=work)
         console.counts(counts)
-
-    def _refuse_unused(self, what: str, flags: dict[str, object]) -> None:
-        of_datasets = {"--query-prefix": self.query_prefix, "--allow-missing": self.allow_missing}
-        if given := [flag for flag, value in (flags | of_datasets).items() if value]:
-            raise OptionError(f"{given[0]} changes nothing of {what}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,8 +155,8 @@ class Export(Common):
     """Write a map, localized queries or both for COLMAP, nerfstudio, evo and viewers."""
 
     format: tyro.conf.Positional[ExportFormat]
-    """colmap: a model; nerfstudio: transforms.json; tum, kitti: a trajectory, as evo reads it; ply:
-    points and camera frusta; geojson: camera centres on earth."""
+    """colmap: a model; nerfstudio: transforms.json; tum: a trajectory, as evo reads it; ply: points
+    and camera frusta."""
     input: Annotated[Path | None, tyro.conf.arg(aliases=["-i"])] = None
     """Kapture map, or a kapture folder of images with poses."""
     query: Path | None = None
@@ -176,9 +165,6 @@ class Export(Common):
     """Folder for colmap and nerfstudio, else a file."""
     sensor: str | None = None
     """Images of this camera only; several cameras of one moment are no trajectory."""
-    geo_origin: str | None = None
-    """Of geojson: latitude,longitude[,height] of the world's origin, whose axes are East, North
-    and Up there."""
     undistort: bool = False
     """Of colmap: also write images/, undistorted, and the model of these in sparse/0, with PINHOLE
     cameras, as programs for Gaussian splatting read them."""
@@ -192,21 +178,10 @@ class Export(Common):
             map=self.input,
             query=self.query,
             sensor=self.sensor,
-            origin=None if self.geo_origin is None else _origin(self.geo_origin),
             undistort=self.undistort,
             force=self.force,
         )
         console.result(f"{number} images exported: {self.output}")
-
-
-def _origin(text: str) -> GeoOrigin:
-    try:
-        values = [float(part) for part in text.split(",")]
-        if not 2 <= len(values) <= 3:
-            raise ValueError
-    except ValueError:
-        raise OptionError(f"--geo-origin takes latitude,longitude[,height], got {text!r}") from None
-    return GeoOrigin(*values)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,12 +195,8 @@ class View(Linked, Common):
     """Localized kapture folder, pose file or COLMAP model."""
     gt: Path | None = None
     """The true poses, likewise: queries are coloured by their error, and joined to it."""
-    rendered: Path | None = None
-    """Kapture folder of `megloc render --along RESULT`: shown beside the queries' photographs."""
     output: Output = Path("view.html")
     """File to write."""
-    rerun: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
-    """Write the same, with the images, for Rerun's viewer as well: `rerun FILE.rrd` shows it."""
     open: bool = False
     """Show it in the browser."""
     force: Overwrite = False
@@ -235,30 +206,16 @@ class View(Linked, Common):
         # only this command waits for it
         from megloc_kapture.evaluation.view import write_view
 
-        for path in (self.result, self.gt, self.rendered):
+        for path in (self.result, self.gt):
             if path is not None and not path.exists():
                 raise DataError("no such file or folder", path=path)
-        for needs, given in (
-            ("--gt needs a result to compare with it", self.gt),
-            ("--rendered needs the result it is of", self.rendered),
-        ):
-            if given is not None and self.result is None:
-                raise OptionError(f"{needs}: megloc view MAP RESULT")
+        if self.gt is not None and self.result is None:
+            raise OptionError("--gt needs a result to compare with it: megloc view MAP RESULT")
         folder = self.kapture(opened_map(self.map, console))
-        left_out = write_view(
-            self.output,
-            folder,
-            self.result,
-            self.gt,
-            force=self.force,
-            rerun=self.rerun,
-            rendered=None if self.rendered is None else self.kapture(self.rendered),
-        )
+        left_out = write_view(self.output, folder, self.result, self.gt, force=self.force)
         if left_out:
             console.say(left_out)
         console.result(f"view: {self.output}")
-        if self.rerun is not None:
-            console.result(f"recording: {self.rerun}")
         if self.open:
             import webbrowser
 

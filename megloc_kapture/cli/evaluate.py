@@ -47,8 +47,6 @@ class Evaluate(Common):
     align: Literal["none", "se3", "sim3"] = "none"
     """Align the poses with the truth first, as evo does: sim3 with scale, for maps in a frame and
     scale of their own; se3 without. Robust: the poses that agree determine it."""
-    seeds: bool = False
-    """The results are runs of one method with different seeds: report mean and spread."""
     side_tables: Path | None = None
     """The workspace's megloc/ folder (conditions, protocol); found beside truth or results by
     itself."""
@@ -65,7 +63,7 @@ class Evaluate(Common):
         )
         from megloc_kapture.evaluation.metrics import Threshold
         from megloc_kapture.evaluation.report.reports import AnyReported, report_text, write_report
-        from megloc_kapture.evaluation.statistics import compare, over_seeds
+        from megloc_kapture.evaluation.statistics import compare
 
         self._check()
         benchmark = benchmark_beside(
@@ -86,11 +84,7 @@ class Evaluate(Common):
                 mapping=self.map,
                 align=self.align,
             )
-            found = evaluations[0]
-            if self.seeds:
-                found = over_seeds(evaluations)
-            elif len(evaluations) > 1:
-                found = compare(evaluations)
+            found = compare(evaluations) if len(evaluations) > 1 else evaluations[0]
         if self.output is not None:
             with staged_output(self.output, kind=EVALUATION, force=self.force) as out:
                 write_report(out, found)
@@ -103,10 +97,6 @@ class Evaluate(Common):
         twice = next((p for p in self.input if resolved.count(p.resolve()) > 1), None)
         if twice is not None:
             raise OptionError(f"{twice} is given twice")
-        if self.seeds and len(self.input) < 2:
-            raise OptionError("--seeds needs at least two results (-i)")
-        if self.seeds and self.gt is None:
-            raise OptionError("--seeds needs true poses (--gt)")
         if self.align != "none" and self.gt is None:
             raise OptionError("--align needs true poses (--gt)")
         existing([path for path in (self.side_tables, self.map) if path is not None])
@@ -200,8 +190,7 @@ class Check(Common):
 
     def run(self, console: Console) -> int:
         """Run it; returns 2 where there are problems."""
-        from megloc_kapture.evaluation.check.reading import read_reference
-        from megloc_kapture.evaluation.check.submission import check_submission
+        from megloc_kapture.evaluation.check import check_submission, read_reference
         from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
         from megloc_kapture.pipeline.datasets import TWIN_PREFIX, check_known
         from megloc_kapture.pipeline.submission import check_dataset

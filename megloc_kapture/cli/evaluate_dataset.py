@@ -11,25 +11,20 @@ import tyro
 from megloc_kapture.cli.common import Console, Deciding, Overwrite, Texts, Working
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.metrics import Threshold
-from megloc_kapture.evaluation.report.document import REPORT_HTML
-from megloc_kapture.evaluation.report.reports import (
-    AGREEMENT_TEXT,
-    RECALL_TEXT,
-)
+from megloc_kapture.evaluation.report.reports import AGREEMENT_TEXT, RECALL_TEXT, REPORT_HTML
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.tables import STATUS_FILE, read_status
 from megloc_kapture.localization.focal_length import misfits_text
 from megloc_kapture.pipeline.datasets import BenchmarkFile, DatasetChoice
 from megloc_kapture.pipeline.evaluation_plan import (
-    ablate,
-    outcomes_text,
+    explain,
+    explained,
     plan_evaluation,
     recall_rows,
-    write_outcomes,
 )
 from megloc_kapture.pipeline.plan import all_kept, run_plan
 from megloc_kapture.pipeline.presets import assigned
-from megloc_kapture.pipeline.run import choose_run, steps_text
+from megloc_kapture.pipeline.run import choose_run
 from megloc_kapture.pipeline.submission import FOLDER, keep_submission
 from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.stage import EVALUATION, LOCALIZED
@@ -69,13 +64,8 @@ class Eval(Deciding, Working):
     """Stop behind this stage."""
     dry_run: bool = False
     """Say which stages would run, and why."""
-    verify: bool = False
-    """Compare the content of all files in the workspace with what stages wrote, not only their
-    sizes and times; a stage whose files have changed runs again."""
     explain: bool = False
-    """List the steps of the paper, which of them this run does and why; nothing is run."""
-    ablate: bool = False
-    """Run again without each of the steps in turn, in ablation/, and print what each adds."""
+    """List the stages, which of them this run has and which options decide that; run nothing."""
     fail_below: float | None = None
     """Exit with 3 when the share of queries at the last threshold is lower (0 to 1)."""
     force: Overwrite = False
@@ -96,7 +86,7 @@ class Eval(Deciding, Working):
             find_root=not self.explain,
         )
         if self.explain:
-            console.result(steps_text(run.steps()))
+            console.result(explained(explain(run.options)))
             return 0
         if self.thresholds:
             parsed = [Threshold.parse(text) for text in self.thresholds]
@@ -117,14 +107,8 @@ class Eval(Deciding, Working):
                 first=self.from_stage,
                 last=self.until,
                 dry_run=self.dry_run,
-                verify=self.verify,
                 say=console.say,
             )
-            if self.ablate and not self.dry_run:
-                outcomes = ablate(run, workspace, stages, work, console.say)
-                path = write_outcomes(workspace, outcomes)
-                console.result(outcomes_text(outcomes))
-                console.result(f"ablation   {shown(path)}")
         if self.dry_run:
             return 0
         if all_kept(reports):
@@ -150,11 +134,12 @@ class Eval(Deciding, Working):
         """Raise OptionError for what needs true poses, where they are not measured against."""
         if self.fail_below is not None and not 0.0 <= self.fail_below <= 1.0:
             raise OptionError(f"--fail-below is a share between 0 and 1, got {self.fail_below:g}")
-        for flag, given in (("fail-below", self.fail_below is not None), ("ablate", self.ablate)):
-            if given and self.until not in (None, "evaluation"):
-                raise OptionError(f"--{flag} needs stage evaluation; --until {self.until} skips it")
-            if given and not choice.has_truth():
-                raise OptionError(f"--{flag} needs true poses: {choice.root}/query_gt is missing")
+        if self.fail_below is None:
+            return
+        if self.until not in (None, "evaluation"):
+            raise OptionError(f"--fail-below needs stage evaluation; --until {self.until} skips it")
+        if not choice.has_truth():
+            raise OptionError(f"--fail-below needs true poses: {choice.root}/query_gt is missing")
 
     def _hand_in(self, console: Console, pose_file: Path, submissions: Path | None) -> None:
         """Say where the pose file is, and put it among the others where that is wanted."""

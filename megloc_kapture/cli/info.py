@@ -1,4 +1,4 @@
-"""``megloc info`` and ``options``: what a kapture folder has, and which options there are."""
+"""``megloc info`` and ``options``: the contents of a kapture folder, and the list of options."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Info(Reading, Common):
 
     def _describe_map(self, console: Console, root: Path) -> None:
         try:
-            opened = self.opening(root, self.keypoints_type, self.pixel_origin)()
+            opened = self.open_map(root, self.keypoints_type, self.pixel_origin)
         except MeglocError as error:
             line(console, "localizing", f"not possible: {error}")
             return
@@ -132,7 +132,7 @@ def describe_content(console: Console, folder: KaptureFolder) -> None:
 
 
 def describe_sizes(folder: KaptureFolder) -> Iterator[str]:
-    """Where images are of another size than their cameras, in words; reads headers only."""
+    """Describe images of another size than their cameras; reads headers only."""
     scaled, errors = cameras_of_folder(folder)
     for sensor_id, camera in scaled.items():
         known = folder.read().sensors[sensor_id].camera()
@@ -161,7 +161,7 @@ def describe_refinement(console: Console, folder: KaptureFolder) -> None:
 
 
 def describe_extraction(local_type: str, extractor: PluginChoice | None) -> str:
-    """Where features of queries can come from, in words."""
+    """Describe how features of queries can be obtained."""
     if extractor is None:
         return f"must be given in kapture: no extractor for {local_type} is installed"
     try:
@@ -174,7 +174,7 @@ def describe_extraction(local_type: str, extractor: PluginChoice | None) -> str:
 def describe_descriptors(
     opened: KaptureMap, keypoints: MapKeypoints, extractor: PluginChoice | None
 ) -> str:
-    """What is known of a map's descriptors, in words."""
+    """Describe the state of a map's descriptors."""
     if keypoints.has_descriptors(opened.images):
         return "there"
     if extractor is None:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import logging
+import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
+from pydantic import ValidationError
 
 from megloc_kapture.cli.common import (
     Common,
@@ -24,7 +26,6 @@ from megloc_kapture.cli.common import (
     Texts,
     cameras_of_text,
     opened_map,
-    refuse_given,
 )
 from megloc_kapture.datasets.kapture_folders import is_kapture
 from megloc_kapture.errors import DataError, OptionError
@@ -36,17 +37,20 @@ from megloc_kapture.io.tables import STATUS_FILE
 from megloc_kapture.localization.focal_length import misfits_text
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
-from megloc_kapture.pipeline.local_types import LocalType, local_types_of
-from megloc_kapture.pipeline.localizer import LOCALIZING, Localizer
-from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
-from megloc_kapture.pipeline.query_folders import Photographs, Queries
+from megloc_kapture.pipeline.local_types import LocalType
+from megloc_kapture.pipeline.localizer import Localizer
+from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
+from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.pipeline.results import Results
-from megloc_kapture.service.requests import Limits
-from megloc_kapture.stages.matches import FeatureCache, iterate_candidates
+from megloc_kapture.plugin_loading import option_fault
+from megloc_kapture.service import Limits
+from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.stage import LOCALIZED
 
 _MIN_TOKEN_LENGTH = 16
+_LOOPBACK = ("127.0.0.1", "::1", "localhost")
+_LIMITS = Limits()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +95,7 @@ class Localize(Reading, Deciding, Common):
         else:
             folder = self.kapture(self.query)
         path = opened_map(self.input, console, force=self.force)
-        kapture_map = self.opening(path, self.keypoints_type, self.pixel_origin)()
+        kapture_map = self.open_map(path, self.keypoints_type, self.pixel_origin)
         _check_consistent(kapture_map, self.input, force=self.force)
         options = _options_of(self)
         given = None if self.pairs is None else dict(iterate_candidates(read_pairs(self.pairs)))
@@ -99,9 +103,6 @@ class Localize(Reading, Deciding, Common):
         localizer = Localizer(kapture_map, options=options)
         results = Results(localizer, folder, workers=workers, candidates=given, track=console.track)
         queries = results.queries
-        typed = assigned(self.assignments())
-        idle = _idle_for_queries(typed, localizer, queries, pairs=given is not None)
-        _refuse_idle(typed, localizer.types, localizer.options, idle)
         with staged_output(self.output, kind=LOCALIZED, force=self.force) as out:
             started = time.perf_counter()
             named = list(results.items())
@@ -141,8 +142,6 @@ class Localize(Reading, Deciding, Common):
         for path in self.images:
             if is_kapture(path):
                 raise OptionError(f"--images {path}: a kapture folder; give it by --query")
-        if self.query is not None:
-            refuse_given("--images", camera=self.camera, every=self.every)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,16 +151,19 @@ class Serve(Reading, Deciding, Common):
     map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
     """Kapture map: keypoints, points3d and observations; or a COLMAP model. Read only."""
     host: str = "127.0.0.1"
-    """Address to listen at; 0.0.0.0: every one of this machine."""
+    """Address to listen at; any other than this machine's own needs --token-file."""
     port: int = 8000
     """Port to listen at; 0: a free one."""
-    workers: int = 1
-    """Processes that share the map's index; every limit is of each of them."""
-    limits: Limits = Limits()
     token_file: Path | None = None
-    """File with a token that clients have to send, 16 characters or more; none unless given."""
-    proxy: str = ""
-    """Address of a reverse proxy, whose X-Forwarded-For says who the client is."""
+    """File with a token that clients have to send, 16 characters or more."""
+    threads: int | None = None
+    """Images that are localized at once; all cores unless given."""
+    max_waiting: int = _LIMITS.max_waiting
+    """Images that may wait for a thread; more are refused (503)."""
+    max_mb: float = _LIMITS.max_mb
+    """Size of a request."""
+    max_megapixels: float = _LIMITS.max_megapixels
+    """Size of an image."""
     keypoints_type: Texts = ()
     """Keypoints type to localize with; may be repeated; all that have points unless given."""
     pixel_origin: PixelOriginChoice = "auto"
@@ -170,47 +172,34 @@ class Serve(Reading, Deciding, Common):
     """Localize in a map that contradicts itself."""
 
     def run(self, console: Console) -> None:
-        from megloc_kapture.cli.main import INTERRUPTED, TERMINATED, Terminated
-        from megloc_kapture.service.server import bind, serve
+        from megloc_kapture.service.server import bind, prepared_localizer, serve
 
-        if self.workers < 1:
-            raise OptionError(f"{self.workers} workers cannot work; give 1 or more")
-        threads = self.limits.threads or max(1, available_cores() // self.workers)
-        limits = self.limits.model_copy(update={"threads": threads})
+        limits = self._limits()
         token = None if self.token_file is None else _read_token(self.token_file)
+        if token is None and self.host not in _LOOPBACK:
+            raise OptionError(f"--host {self.host}: other machines can ask; give --token-file")
         options = _options_of(self)
         with bind(self.host, self.port) as bound:
             path = opened_map(self.map, console, force=self.force)
-            opening = self.opening(path, self.keypoints_type, self.pixel_origin)
-            kapture_map = opening()
+            kapture_map = self.open_map(path, self.keypoints_type, self.pixel_origin)
             _check_consistent(kapture_map, self.map, force=self.force)
-            typed = assigned(self.assignments())
-            types = local_types_of(kapture_map, options, FeatureCache())
-            _refuse_idle(typed, types, options, _idle_for_images(typed, options))
-
-            def ready() -> None:
-                host = f"[{self.host}]" if ":" in self.host else self.host
-                where = f"http://{host}:{bound.getsockname()[1]}/"
-                console.result(f"{len(kapture_map.images)} map images, served at {where}")
-                if token is None and self.host not in ("127.0.0.1", "::1", "localhost"):
-                    console.say("warning: without --token-file everybody may ask")
-
+            localizer = prepared_localizer(kapture_map, options)
+            host = f"[{self.host}]" if ":" in self.host else self.host
+            where = f"http://{host}:{bound.getsockname()[1]}/"
+            console.result(f"{len(kapture_map.images)} map images, served at {where}")
+            log_requests = logging.getLogger().isEnabledFor(logging.INFO)
             try:
-                serve(
-                    opening,
-                    kapture_map,
-                    options,
-                    bound,
-                    limits=limits,
-                    workers=self.workers,
-                    proxy=self.proxy,
-                    token=token,
-                    log_requests=logging.getLogger().isEnabledFor(logging.INFO),
-                    ready=ready,
-                )
-            except (KeyboardInterrupt, Terminated) as end:
+                serve(localizer, bound, limits=limits, token=token, log_requests=log_requests)
+            except KeyboardInterrupt:
                 console.say("stopped")
-                sys.exit(TERMINATED if isinstance(end, Terminated) else INTERRUPTED)
+                sys.exit(128 + signal.SIGINT)
+
+    def _limits(self) -> Limits:
+        try:
+            return Limits(**{name: getattr(self, name) for name in Limits.model_fields})
+        except ValidationError as error:
+            name, _, reason = option_fault(error, Limits).partition(": ")
+            raise OptionError(f"--{name.replace('_', '-')}: {reason}") from error
 
 
 def _read_token(path: Path) -> str:
@@ -224,9 +213,7 @@ def _read_token(path: Path) -> str:
 
 
 def _options_of(command: Deciding) -> PipelineOptions:
-    return options_of_preset(
-        command.preset or DEFAULT_PRESET, assignments=command.assignments(), used=LOCALIZING
-    )
+    return options_of_preset(command.preset or DEFAULT_PRESET, assignments=command.assignments())
 
 
 def _check_consistent(kapture_map: KaptureMap, path: Path, *, force: bool) -> None:
@@ -235,74 +222,6 @@ def _check_consistent(kapture_map: KaptureMap, path: Path, *, force: bool) -> No
         raise DataError(
             f"{fault}; the poses would be wrong (--force localizes all the same)", path=path
         )
-
-
-def _idle_for_queries(
-    typed: Mapping[str, Any],
-    localizer: Localizer,
-    queries: Queries,
-    *,
-    pairs: bool,
-) -> dict[str, str]:
-    """Options that change nothing for a map and these queries, and why.
-
-    Parameters
-    ----------
-    typed : nested tables of ``--set``.
-    pairs : whether the candidates are given.
-    """
-    idle = {}
-    if all(queries.lacking(local.name) is None for local in localizer.types):
-        reason = f"the queries bring their local features ({_names(localizer.types)})"
-        reason += ", nothing is extracted"
-        idle = dict.fromkeys(("preprocessing", "mask_margin_px"), reason)
-    shared = queries.types_of_all()
-    if pairs:
-        names = ("query_pairs", "global_features", "fusion")
-        idle |= dict.fromkeys(names, "--pairs gives the candidates")
-    elif shared and not localizer.compares_as_asked(shared):
-        idle["global_features"] = f"map and queries bring {', '.join(shared)}, which is compared"
-    localization = typed.get("localization", {})
-    if not queries.data().rigs:
-        if localization.get("rigs"):
-            idle["localization"] = "rigs: the queries have none"
-        elif localization.get("fallback") == "rig":
-            idle["localization"] = "fallback = rig: the queries have none"
-    return idle
-
-
-def _idle_for_images(typed: Mapping[str, Any], options: PipelineOptions) -> dict[str, str]:
-    """Options that change nothing for single images without depth, and why."""
-    idle = {}
-    localization = typed.get("localization", {})
-    if localization.get("rigs") or localization.get("fallback") == "rig":
-        idle["localization"] = "images come one by one, not on a rig"
-    if any(one.name == "icp" for one in options.pose_refinement.by):
-        idle["pose_refinement"] = "icp needs depth maps, and images come without"
-    return idle
-
-
-def _refuse_idle(
-    typed: Mapping[str, Any],
-    types: Sequence[LocalType],
-    options: PipelineOptions,
-    of_queries: Mapping[str, str],
-) -> None:
-    """Raise OptionError where an option that was typed changes nothing for these keypoints types,
-    or for the queries."""
-    idle = {}
-    if "guided_pyramid" in typed and options.matches_again():
-        obstacles = [local.pyramid_obstacle for local in types]
-        if all(obstacles):
-            idle["guided_pyramid"] = obstacles[0]
-    used = {local.choice.name for local in types if local.choice is not None}
-    unused = [one.name for one in options.local_features if one.name not in used]
-    if unused:
-        idle["local_features"] = f"the map is of {_names(types)}; nothing in it is of {unused[0]}"
-    idle |= of_queries
-    for name in typed:
-        if name in idle:
-            raise OptionError(f"--set {name} changes nothing: {idle[name]}")
 
 
 def _names(types: Sequence[LocalType]) -> str:

@@ -1,52 +1,30 @@
-"""``megloc``: parse, run, and turn errors into one line and an exit status.
+"""``megloc``: parse the arguments, run a command, and turn errors into messages and an exit status.
 
-Examples stand behind every page of help, and what is wrong with arguments is said in one line.
-
-Heavy modules are imported within :func:`main`, where Ctrl-C is met by one line as well.
+Heavy modules are imported within :func:`main`, so that Ctrl-C is handled during imports as well.
 """
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import io
 import operator
 import os
-import re
 import signal
 import sys
-import threading
-import time
 import traceback
-import weakref
-from collections.abc import Iterator, Sequence
-from difflib import get_close_matches
+from collections.abc import Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Protocol
 
-from megloc_kapture.errors import MeglocError, missing_extra
+from megloc_kapture.errors import MeglocError, OptionError, missing_extra, suggestion
 
 if TYPE_CHECKING:
     from megloc_kapture.cli.common import Console
 
 DONE, DEFECT, USER_ERROR, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
-_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
-_RULE = re.compile(r"[─-]{3,}")
-# what the box says besides: where help is found, and the help itself
-_BESIDES = ("For full helptext", "Argument helptext", "Perhaps you meant", "Got errors")
-# help of a flag stands two steps in, its name one
-_HELP_INDENT = " " * 8
-
-_ONE_END_S = 5.0  # for what is cleared up at the end, until another signal ends that, too
-
-
-class Interrupted(KeyboardInterrupt):
-    """Somebody pressed Ctrl-C."""
-
 
 class Terminated(BaseException):
-    """The system, or somebody, asks the process to end."""
+    """SIGTERM asks the process to end."""
 
 
 class Command(Protocol):
@@ -54,12 +32,10 @@ class Command(Protocol):
 
     debug: bool
 
-    def console(self) -> Console:
-        """The console that the flags ask for."""
-        ...
+    def console(self) -> Console: ...
 
     def run(self, console: Console) -> int | None:
-        """Run it; returns the exit status, nothing where all went well."""
+        """Run it; returns the exit status, None for success."""
         ...
 
 
@@ -120,7 +96,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
 
 
 def command_class(name: str) -> type[Any]:
-    """The command of a name; its module is imported."""
+    """Import the command of a name."""
     if name in COMMANDS:
         module, _, kind = COMMANDS[name][0].partition(":")
         found: type[Any] = getattr(import_module(f"megloc_kapture.cli.{module}"), kind)
@@ -131,7 +107,10 @@ def command_class(name: str) -> type[Any]:
 
 
 def _parser(given: Sequence[str]) -> Any:
-    """What tyro parses: the command that is given, or the names of all of them for help."""
+    """The type that tyro parses; only the given command has its flags, the others their names.
+
+    Raises OptionError for an unknown command.
+    """
     from dataclasses import make_dataclass
 
     import tyro
@@ -140,6 +119,9 @@ def _parser(given: Sequence[str]) -> Any:
     from megloc_kapture.plugins import STAGES
 
     stages = [name.replace("_", "-") for name in plugin_names(STAGES)]
+    if given and not given[0].startswith("-") and given[0] not in [*COMMANDS, *stages]:
+        commands = suggestion(given[0], [*COMMANDS, *stages], listed="commands: ")
+        raise OptionError(f"unknown command {given[0]!r}; {commands}")
     annotated: Any = Annotated  # of types that are values here, which mypy does not follow
     completes = given[:1] and given[0].startswith("--tyro-")  # then all that there is
     texts = {name: f"Run the stage {name}, of another package." for name in stages}
@@ -154,222 +136,20 @@ def _parser(given: Sequence[str]) -> Any:
     return functools.reduce(operator.or_, entries)
 
 
-@contextlib.contextmanager
-def one_line_errors(arguments: Sequence[str]) -> Iterator[None]:
-    """Turn the box that tyro draws around an argument error into one line on standard error.
-
-    tyro has no public call for its errors' texts, so its drawing is read: nothing else is
-    printed to standard error while arguments are parsed.
-    """
-    drawn = io.StringIO()
-    # help goes to people: it keeps the width of their terminal
-    asks_help = not {"-h", "--help"}.isdisjoint(arguments)
-    width = contextlib.nullcontext() if asks_help else _wide_terminal()
-    try:
-        with width, contextlib.redirect_stderr(drawn):
-            yield
-    except SystemExit as end:
-        if end.code:
-            print(f"megloc: {summary(drawn.getvalue())}{_did_you_mean(arguments)}", file=sys.stderr)
-        elif asks_help:
-            print(examples_text(arguments))
-        raise
-    print(drawn.getvalue(), end="", file=sys.stderr)
-
-
-def _did_you_mean(arguments: Sequence[str]) -> str:
-    """A suggestion for a misspelt command or flag; empty where none is close."""
-    if not arguments or arguments[0] not in COMMANDS:
-        words, known = list(arguments[:1]), list(COMMANDS)
-    else:
-        names = getattr(command_class(arguments[0]), "__dataclass_fields__", {})
-        known = [f"--{name.replace('_', '-')}" for name in names]
-        words = [word.split("=")[0] for word in arguments if word.startswith("--")]
-    unknown = [word for word in words if word not in known]
-    close = [match for word in unknown for match in get_close_matches(word, known, n=1)]
-    return f"; did you mean {' '.join(close)}?" if close else ""
-
-
-def summary(drawn: str) -> str:
-    """The text of a drawn box without its frame and what stands in it besides, on one line."""
-    drawn = drawn.replace("__tyro-dummy-inner__.", "")  # tyro's own name of our command
-    first, *lines = _COLOUR.sub("", drawn).splitlines() or [""]
-    # where standard output knows no more than ASCII, the frame is of blanks, with a rule
-    if not (first.startswith("╭") or (lines and _RULE.fullmatch(lines[0].strip()))):
-        return " ".join(drawn.split()) or "the arguments cannot be used"
-    title = first.strip("╭─╮ ")
-    sections: list[list[str]] = [[]]
-    for line in lines:
-        text = line[2:].rstrip(" │╯")
-        if not text or _RULE.fullmatch(text):
-            sections.append([])
-        elif not text.startswith(_HELP_INDENT):
-            sections[-1].append(text)
-    told = [_joined(s) for s in sections if s and not s[0].startswith(_BESIDES)]
-    told = told or [title]
-    helped = re.search(r"megloc(?: [a-z-]+){0,2} --help", drawn)
-    if not told[0].startswith((title, "Missing", "Error", "invalid")):
-        told[0] = f"{title}: {told[0]}"
-    told.append(f"see {helped[0] if helped else 'megloc --help'}")
-    return "; ".join(text.rstrip(".") for text in told)
-
-
-def _joined(lines: list[str]) -> str:
-    """Lines to one: what is set in is a list."""
-    text = lines[0]
-    listed = False
-    for line in lines[1:]:
-        text += (", " if listed and line.startswith(" ") else " ") + line.strip()
-        listed = line.startswith(" ")
-    return text
-
-
-@contextlib.contextmanager
-def _wide_terminal() -> Iterator[None]:
-    """No box is so wide that its lines have to be wrapped while the block runs."""
-    before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = "10000"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["COLUMNS"]
-        else:
-            os.environ["COLUMNS"] = before
-
-
-_TEXT = """
-megloc map photos/ -o my_map
-megloc map photos/ walk.mp4 -o my_map --scale a.jpg b.jpg 2.35
-megloc localize -i my_map --images IMG_0001.jpg holiday/ walk.mp4 -o localized
-megloc localize -i my_map --query my_scene/query -o localized
-megloc eval kapture --root my_scene
-megloc eval kapture --root my_scene --set localization.pose.max_error_px=8 --dry-run
-megloc eval aachen --root /data/Aachen-Day-Night --executor dask --scheduler tcp://host:8786
-megloc import aachen /data/Aachen-Day-Night -o aachen
-megloc import colmap sparse/0 --images photos --database features.db -o my_map
-megloc synth -o my_scene
-megloc synth aachen -o twin --seed 1
-megloc preprocess -i my_scene/mapping -o smaller --resize 1600 --undistort
-megloc preprocess -i my_scene/mapping -o masked --segmenter deeplabv3plus --unchanging
-megloc extract-local -i my_scene/mapping -i my_scene/query -o features
-megloc extract-local -i my_scene/mapping --features aliked xfeat -o features
-megloc extract-global -i my_scene/mapping --query my_scene/query --features-dir features -o features
-megloc pairs-mapping -i my_scene/mapping --by poses -o pairs_mapping.txt
-megloc pairs-mapping -i my_scene/mapping --by retrieval --features-dir features -o pairs_mapping.txt
-megloc pairs-query -i my_scene/mapping --query my_scene/query --features-dir features -o pairs.txt
-megloc match -i my_scene/mapping --features-dir features --pairs pairs_mapping.txt -o matches
-megloc match -i my_scene/mapping --query my_scene/query --features-dir features --pairs pairs.txt \
--o matches
-megloc triangulate -i my_scene/mapping --features-dir features --features-dir matches -o map
-megloc densify -i map -o map_with_depth --fuse cloud.ply
-megloc densify -i map -o map_with_depth --by patchmatchnet
-megloc refine-map -i map -o map_refined --set refinement.uncertainty.max_robust_sigmas=2.5
-megloc refine-poses -i map --query my_scene/query --poses localized -o refined --by icp
-megloc train matcher -i my_scene/mapping --held-out other_scene/mapping -o matcher.safetensors
-megloc train descriptor -i my_scene/mapping --features xfeat -o descriptor.safetensors
-megloc serve my_map
-megloc serve my_map --host 0.0.0.0 --token-file token.txt --workers 2
-megloc submit aachen -i runs/aachen-megloc/localized -o poses.txt
-megloc check aachen poses.txt --data runs/aachen-megloc
-megloc evaluate -i localized --gt my_scene/query_gt -o evaluation
-megloc evaluate -i localized -i refined --gt my_scene/query_gt
-megloc export colmap -i my_map --query localized -o sparse/0
-megloc export tum --query localized -o localized.tum
-megloc view my_map --open
-megloc view my_map localized --gt my_scene/query_gt -o view.html --rerun view.rrd
-megloc train-field -i my_scene/mapping -o field --minutes 15
-megloc render field --pose 1,0,0,0,0.2,0,1.5 --camera SIMPLE_PINHOLE,320,240,260,160,120 -o view.png
-megloc render field --along localized -o rendered
-megloc weights list
-megloc weights fetch --preset modern
-megloc weights add superpoint_v1.pth
-megloc info my_map
-megloc options localization.pose
-megloc options aliked --preset modern
-megloc doctor
-"""
-EXAMPLES = tuple(_TEXT.strip().splitlines())
-
-
-def examples_text(arguments: Sequence[str]) -> str:
-    """The end of the help page that these arguments ask for."""
-    words = [word for word in arguments if not word.startswith("-")]
-    found = [one for one in EXAMPLES if one.split()[1] in (words[:1] or ("localize", "eval"))]
-    if not found:  # the command of a stage of another package
-        found = [f"megloc {words[0]} -w runs/kapture-my_scene-classic"]
-    narrower = [one for one in found if one.split()[2:3] == words[1:2]]  # of megloc weights fetch
-    return "\n".join(["examples:", *(f"  {one}" for one in (narrower or found)[:3])])
-
-
-class _Ending:
-    """How Ctrl-C and SIGTERM end the process: in an orderly way, and whatever they meet.
-
-    A compiled module that is being imported turns the exception of a signal into an error of its
-    own, or drops it, as callbacks of the interpreter do. So it is kept here what was met, and an
-    exception that is gone before :func:`main` has met it is raised again.
-    """
-
-    def __init__(self) -> None:
-        self.status: int | None = None  # of what was met
-        self._exception: weakref.ref[BaseException] | None = None
-        self._raised_s = 0.0
-        self._is_over = False
-        self._tell_unraisable = sys.unraisablehook
-
-    def obey(self) -> None:
-        """Let the signals of this process raise KeyboardInterrupt or Terminated."""
-        for one in (signal.SIGINT, signal.SIGTERM):
-            if signal.getsignal(one) != signal.SIG_IGN:  # as of what a shell runs behind
-                signal.signal(one, self._raise)
-        sys.unraisablehook = self._dropped
-
-    def ignore(self) -> None:
-        """Let nothing more disturb the end of the process."""
-        self._is_over = True
-        for one in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(one, signal.SIG_IGN)
-        sys.unraisablehook = self._tell_unraisable
-
-    def _raise(self, number: int, _frame: object) -> None:
-        ends = self._exception is not None and self._exception() is not None
-        # who presses twice means one end; who waited for it in vain, another
-        if ends and time.monotonic() < self._raised_s + _ONE_END_S:
-            return
-        interrupted = number == signal.SIGINT
-        self.status = INTERRUPTED if interrupted else TERMINATED
-        error = Interrupted() if interrupted else Terminated()
-        self._exception = weakref.ref(error, lambda _: self._raise_again(number))
-        self._raised_s = time.monotonic()
-        try:
-            raise error
-        finally:
-            del error  # its traceback has this frame, and it would live for ever
-
-    def _raise_again(self, number: int) -> None:
-        if not self._is_over:
-            # not from here, for what is raised while something is deleted is dropped
-            again = threading.Timer(0.01, os.kill, (os.getpid(), number))
-            again.daemon = True
-            again.start()
-
-    def _dropped(self, what: sys.UnraisableHookArgs) -> None:
-        if not issubclass(what.exc_type, Interrupted | Terminated):
-            self._tell_unraisable(what)
+def _terminate(number: int, frame: object) -> NoReturn:
+    raise Terminated
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command; exits with 0, 1 (defect), 2 (user's error), 3, 130 (Ctrl-C) or 143.
 
-    Without arguments it is the console script: those of the process, which signals end in an
-    orderly way.
+    Without arguments it is the console script, which takes those of the process.
     """
     given = sys.argv[1:] if arguments is None else arguments
-    ending = _Ending()
     debug = False
     try:
         if arguments is None:
-            ending.obey()
+            signal.signal(signal.SIGTERM, _terminate)
         if list(given) == ["--version"]:
             from megloc_kapture import __version__
 
@@ -377,27 +157,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sys.exit(DONE)
         import tyro
 
-        with one_line_errors(given):
-            command: Command = tyro.cli(
-                _parser(given), args=given, prog="megloc", config=(tyro.conf.OmitArgPrefixes,)
-            )
+        command: Command = tyro.cli(
+            _parser(given), args=given, prog="megloc", config=(tyro.conf.OmitArgPrefixes,)
+        )
         debug = command.debug
         status = command.run(command.console()) or DONE
         sys.stdout.flush()
-    except SystemExit:
-        raise
-    except BaseException as error:
-        if arguments is None:
-            ending.ignore()
-        if ending.status is None and not isinstance(error, KeyboardInterrupt):
-            status = _tell(error, debug)
-        else:
-            status = ending.status or INTERRUPTED
-            how = "terminated" if status == TERMINATED else "interrupted"
-            print(f"megloc: {how}; run the same command again to go on", file=sys.stderr)
-    finally:
-        if arguments is None:
-            ending.ignore()  # or Python would print tracebacks of its own ending
+    except (KeyboardInterrupt, Terminated) as error:
+        terminated = isinstance(error, Terminated)
+        status = TERMINATED if terminated else INTERRUPTED
+        how = "terminated" if terminated else "interrupted"
+        print(f"megloc: {how}; run the same command again to go on", file=sys.stderr)
+    except Exception as error:
+        status = _tell(error, debug)
     sys.exit(status)
 
 

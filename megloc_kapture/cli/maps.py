@@ -21,13 +21,12 @@ from megloc_kapture.cli.common import (
 )
 from megloc_kapture.cli.stages import StageCommand, restrictions_beside
 from megloc_kapture.errors import OptionError
-from megloc_kapture.evaluation.report.refinement import consistency_sentence
+from megloc_kapture.evaluation.report.wording import consistency_sentence
 from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_consistency
 from megloc_kapture.pipeline.map_making import (
-    MAPPING_OPTIONS,
     describe_map,
     options_of_photographs,
     plan_photographs,
@@ -68,9 +67,7 @@ class MapPhotographs(Choosing, Working):
     force: Force = False
 
     def run(self, console: Console) -> None:
-        options = options_of_photographs(
-            self.preset or DEFAULT_PRESET, self.assignments(), used=MAPPING_OPTIONS
-        )
+        options = options_of_photographs(self.preset or DEFAULT_PRESET, self.assignments())
         photographs = Photographs(self.images, cameras_of_text(self.camera), every=self.every)
         for text in photographs.describe():
             console.say(text)
@@ -88,23 +85,18 @@ class MapPhotographs(Choosing, Working):
 class RefineMap(Reading, StageCommand):
     """Take points and observations out of a map that its images, or depth maps, contradict.
 
-    What is rejected is chosen with --set refinement.uncertainty.max_relative_deviation=0.02 and
-    its like; without, by the preset.
+    --set refinement.uncertainty.max_robust_sigmas=2.5 rejects uncertain points; the preset decides
+    otherwise.
     """
-
-    uses = ("refinement",)
 
     input: Input
     """Kapture folder of the map; it stays as it is."""
     output: Output
     """Kapture folder of the refined map."""
-    ply: bool = False
-    """Write the kept and the rejected points as PLY files, coloured by uncertainty."""
     force: Force = False
 
     def run(self, console: Console) -> None:
-        changes: dict[str, object] = {"refinement": {"ply": True}} if self.ply else {}
-        options = self.options(changes).refinement
+        options = self.options().refinement
         source = self.kapture_map(self.input)
         with self.staged(self.output, MAP, force=self.force) as (out, work):
             refine_map(
@@ -115,12 +107,7 @@ class RefineMap(Reading, StageCommand):
 
 
 def report_lines(root: Path) -> list[str]:
-    """What the refinement of a map removed, as a table; empty where it was not refined.
-
-    Raises
-    ------
-    DataError : the report is broken.
-    """
+    """What the refinement of a map removed, as a table; empty where it was not refined."""
     path = root / "reconstruction" / REPORT_FILE
     if not path.is_file():
         return []
@@ -145,14 +132,12 @@ class Densify(Reading, StageCommand):
     by looks, refinement by rendering) works as with a depth sensor's.
     """
 
-    uses = ("mvs",)
-
     input: Input
     """Kapture folder of the map, with points; it stays as it is."""
     output: Output
     """Kapture folder of the map with depth."""
     by: str | None = None
-    """Estimator: sweep, patchmatchnet, colmap or a plugin; sweep unless given."""
+    """Estimator: sweep, colmap or a plugin; sweep unless given."""
     points: bool = False
     """Lift keypoints that have no point through the depth, with their uncertainty."""
     fuse: Path | None = None
@@ -183,8 +168,6 @@ class Densify(Reading, StageCommand):
 @dataclass(frozen=True, kw_only=True)
 class RefinePoses(Linked, StageCommand):
     """Refine the poses of localized queries; a pose that gets no better stays, and says why."""
-
-    uses = ("pose_refinement",)
 
     input: Input
     """Kapture map, with images and depth maps. Read only."""

@@ -29,8 +29,6 @@ from megloc_kapture.stages.options import PipelineOptions
 class ExtractGlobal(Reading, StageCommand):
     """Describe every image by one vector: VLAD trained on the map, or image networks."""
 
-    uses = ("global_features",)
-
     input: Input
     """Kapture folder of the map; VLAD is trained on its descriptors."""
     query: Folders = ()
@@ -67,8 +65,6 @@ class ExtractGlobal(Reading, StageCommand):
 @dataclass(frozen=True, kw_only=True)
 class PairsMapping(Reading, StageCommand):
     """Choose which images of a map are matched with each other."""
-
-    uses = ("mapping_pairs", "fusion")
 
     input: Input
     """Kapture folder with poses."""
@@ -115,8 +111,6 @@ class PairsMapping(Reading, StageCommand):
 class PairsQuery(Reading, StageCommand):
     """Choose the map images each query is matched with."""
 
-    uses = ("query_pairs", "fusion")
-
     input: Input
     """Kapture folder of the map."""
     query: Path
@@ -151,11 +145,7 @@ class PairsQuery(Reading, StageCommand):
         query = self.kapture(self.query)
         mapping.check_features_apart(query)
         by = "exhaustive" if self.exhaustive else "retrieval"
-        matching = ("local_features", "matching", "verification", "query_verification")
-        also = () if self.rerank is None else matching
-        options = self.options({"query_pairs": _changes(by, self.topk)}, also=also)
-        of_types = (chosen.matching for chosen in options.local_features)
-        self.check_computes((options.matching, *of_types))
+        options = self.options({"query_pairs": _changes(by, self.topk)})
         retrieval = None
         if not self.exhaustive:
             retrieval = _retrieval(mapping, self.features, self.fusion, options)

@@ -41,7 +41,7 @@ from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.plugin_loading import load_plugin, option_fault, plugin_class
 from megloc_kapture.plugins import MATCHERS, STAGES, chosen_by_name
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.devices import placed
+from megloc_kapture.stages.devices import with_device
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.map_points import triangulate_map
 from megloc_kapture.stages.matches import check_given_poses, match_pairs
@@ -67,31 +67,13 @@ _SOURCES = {
 
 @dataclass(frozen=True, kw_only=True)
 class StageCommand(Choosing, Working):
-    uses: ClassVar[tuple[str, ...]] = ()
-    """The options that the command acts on, by their first key; --set takes no others."""
-
-    def options(
-        self, changes: dict[str, object] | None = None, *, also: Sequence[str] = ()
-    ) -> PipelineOptions:
-        """The preset's options, with what the flags change.
-
-        Parameters
-        ----------
-        also : options that are acted on beside :attr:`uses`, because of other flags.
-
-        Raises
-        ------
-        OptionError : see ``options_of_preset``; or a device is given and no network is used.
-        """
-        used = (*self.uses, *also)
-        options = options_of_preset(
+    def options(self, changes: dict[str, object] | None = None) -> PipelineOptions:
+        """Return the preset's options, with the changes of the flags."""
+        return options_of_preset(
             self.preset or DEFAULT_PRESET,
             changes=[changes or {}, assigned(self.placement())],
             assignments=self.set,
-            used=used,
         )
-        self.check_computes(tuple(getattr(options, name) for name in used))
-        return options
 
     def named(self, key: str, names: Sequence[str]) -> dict[str, object]:
         """Changes that choose plugins by their names, with the settings that the preset has of
@@ -124,8 +106,6 @@ def restrictions_beside(folder: Path) -> Restrictions:
 @dataclass(frozen=True, kw_only=True)
 class ExtractLocal(Linked, StageCommand):
     """Extract local features of all images of kapture folders."""
-
-    uses = ("local_features", "mask_margin_px")
 
     input: Inputs = ()
     """Kapture folder; may be repeated (map and queries)."""
@@ -163,8 +143,6 @@ class ExtractLocal(Linked, StageCommand):
 class Match(Reading, StageCommand):
     """Match and verify image pairs; with known poses within a map, else by a two-view model."""
 
-    uses = ("local_features", "matching", "verification")
-
     input: Input
     """Kapture folder of the map."""
     query: Path | None = None
@@ -185,11 +163,9 @@ class Match(Reading, StageCommand):
         mapping = self.kapture_map(self.input)
         local_type = only_type(mapping, "descriptors", self.features)
         changes: dict[str, object] = {"matching": {"name": self.matcher}} if self.matcher else {}
-        between = "mapping_verification" if self.query is None else "query_verification"
-        options = self.options(changes, also=(between,))
+        options = self.options(changes)
         # --matcher also where the preset has another one for this type
         chosen = options.matching if self.matcher else options.matching_of(local_type)
-        self.check_computes(chosen)
         matcher = load_plugin(MATCHERS, chosen.name, chosen.options)
         first, verification = mapping, options.verify_mapping()
         if self.query is not None:
@@ -208,8 +184,6 @@ class Match(Reading, StageCommand):
 @dataclass(frozen=True, kw_only=True)
 class Triangulate(Reading, StageCommand):
     """Triangulate verified matches of images with known poses into a kapture map."""
-
-    uses = ("triangulation",)
 
     input: Input
     """Kapture folder with images and poses."""
@@ -323,12 +297,7 @@ class Preprocess(Linked, Computing, Working):
             console.say(line)
 
     def options(self) -> PreprocessingOptions:
-        """The options that the flags make.
-
-        Raises
-        ------
-        OptionError : one has a value that it cannot have.
-        """
+        """The options that the flags make."""
         masks: dict[str, Any] = {
             "segmenter": None if self.segmenter is None else {"name": self.segmenter},
             "dynamic": self.dynamic or None,
@@ -346,8 +315,7 @@ class Preprocess(Linked, Computing, Working):
             options = PreprocessingOptions.model_validate({**tree, "masks": {**masks, **changes}})
         except ValidationError as error:
             raise OptionError(f"option {option_fault(error, PreprocessingOptions)}") from error
-        self.check_computes(options)
-        return placed(options, self.device or "auto", self.precision or "full")
+        return with_device(options, self.device or "auto", self.precision or "full")
 
     def _fixed_masks(self) -> Iterator[dict[str, Any]]:
         takes = "CAMERA=VALUE"

@@ -20,7 +20,6 @@ from megloc_kapture.cli.common import (
     Overwrite,
     Texts,
     Working,
-    assigned_pairs,
     camera_of_text,
     refuse_given,
 )
@@ -47,8 +46,6 @@ class Train(Linked, Common):
     """Folder of images, trained on under random homographies; may be repeated."""
     held_out: Folders = ()
     """Kapture folder with poses and depth to evaluate on; may be repeated."""
-    licence: Texts = ()
-    """Licence of a folder, for the manifest: FOLDER=TEXT; may be repeated."""
     output: Output
     """File to write: X.safetensors; beside it X.json, X.csv and X.state.pt."""
     features: str | None = None
@@ -68,12 +65,10 @@ class Train(Linked, Common):
 
         changes = {} if self.features is None else {"features.name": self.features}
         options = options_with(TASKS[self.task], self.set, changes)
-        licences = assigned_pairs("--licence", self.licence, "FOLDER=TEXT")
         data = TrainingData(
             [self.kapture_map(path) for path in self.input],
             self.photographs,
             [self.kapture(path) for path in self.held_out],
-            {Path(folder): licence for folder, licence in licences},
         )
         last = train(
             options,
@@ -104,11 +99,8 @@ class TrainField(Linked, Common):
     """Kapture map: images with poses; masks and depth maps are used where there are any."""
     output: Output
     """Folder of the field: field.json and field.safetensors."""
-    kind: Literal["triplane", "nerfw", "gaussians"] = "triplane"
-    """triplane: minutes on a processor; nerfw: the published network, which needs a GPU; gaussians:
-    splats, which begin where the map's depth says."""
-    gaussians: int | None = None
-    """How many, of that kind; 8192 unless given."""
+    kind: Literal["triplane", "nerfw"] = "triplane"
+    """triplane: minutes on a processor; nerfw: the published network, which needs a GPU."""
     steps: int = 4000
     """Of the training."""
     minutes: float | None = None

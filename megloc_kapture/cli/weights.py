@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from megloc_kapture.cli.common import Common, Console, Output, Overwrite
-from megloc_kapture.errors import MeglocError, OptionError, OutputError, missing_extra
+from megloc_kapture.errors import (
+    DataError,
+    MeglocError,
+    OptionError,
+    OutputError,
+    missing_extra,
+)
 from megloc_kapture.evaluation.pose_files import installed_version
 from megloc_kapture.io.weights import (
     MissingWeightsError,
@@ -21,15 +26,20 @@ from megloc_kapture.io.weights import (
     WeightsFile,
     describe,
     files_of,
+    how_to_convert,
     how_to_get,
     lookup,
     read_weights,
     registry,
     sha256_of,
+    to_convert,
     weights_folder,
 )
 from megloc_kapture.io.weights.adding import add_weights, convert_weights, fetch, prove
 from megloc_kapture.pipeline.presets import check_weights, options_of_preset
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 WRONG_FILES = 2
 
@@ -97,19 +107,27 @@ class Fetch(Common):
         if place.is_file() and not self.force:
             if file.sha256 in (None, sha256_of(describe(weights.name, place))):
                 console.result(f"{weights.name}: already there, {place}")
+                _say_to_convert(console, weights, file, place)
                 return
             raise OutputError(f"{place}: stands there, but is not the published file; -f fetches")
 
-        def watch(chunks: Iterator[bytes], total: int) -> Iterable[bytes]:
-            return console.track(chunks, total, f"{file.name}, MiB")
-
         console.say(f"{weights.name}: {url}")
         console.say(f"  licence: {weights.licence}: {weights.terms}")
-        found = fetch(url, place, size=file.size, sha256=file.sha256, watch=watch)
-        told = "sha256 right" if file.sha256 else f"sha256 {found}, which the registry cannot check"
+        with _progress(console) as progress:
+            bar = _Bar(progress, f"  {file.name}")
+            fetch(url, place, sha256=file.sha256, progress=bar)
+        state = "sha256 right"
         if file.sha256 is None:
-            read_weights(describe(weights.name, place))
-        console.result(f"{weights.name}: {place} ({place.stat().st_size} bytes, {told})")
+            found = describe(weights.name, place)
+            state = f"sha256 {sha256_of(found)}, which the registry cannot check"
+            if not file.convert:
+                try:
+                    read_weights(found)
+                except DataError:
+                    place.unlink()
+                    raise
+        console.result(f"{weights.name}: {place} ({place.stat().st_size} bytes, {state})")
+        _say_to_convert(console, weights, file, place)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +135,7 @@ class Add(Common):
     """Copy a file that was downloaded by hand into the folder of weights, once it is proven."""
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
-    """File; of a TensorFlow checkpoint its .index or the published tar."""
+    """Downloaded file, or X.safetensors that scripts/convert_weights.py has written."""
     name: str | None = None
     """Network that it is for; told by its sha256 or its name unless given."""
     unverified: bool = False
@@ -132,10 +150,10 @@ class Add(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Convert(Common):
-    """Write the tensors of any checkpoint that can be read safely as safetensors."""
+    """Write the tensors of a checkpoint of torch as safetensors."""
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
-    """Checkpoint: .pth, .pt, .npz, .onnx, TensorFlow's .index, or a tar with one."""
+    """Checkpoint of torch; scripts/convert_weights.py converts other files."""
     output: Output
     """File to write; must end in .safetensors."""
     force: Overwrite = False
@@ -157,7 +175,7 @@ class Check(Common):
         """Run it; returns 2 where a file is wrong."""
         wrong = sum(_wrong(console, lookup(name)) for name in self.names)
         if not self.names:
-            wrong = sum(_wrong(console, w) for w in registry().values() if _state(w) != "missing")
+            wrong = sum(_wrong(console, w) for w in registry().values() if _state(w) == "there")
         console.result(f"wrong files: {wrong}" if wrong else "no file is wrong")
         return WRONG_FILES if wrong else 0
 
@@ -189,7 +207,7 @@ class WeightsCommand:
 
 
 def summary() -> str:
-    """How many networks have their weights, and where; for ``megloc doctor``."""
+    """Say how many networks have their weights, and where."""
     there = [weights.name for weights in registry().values() if _state(weights) == "there"]
     names = f": {', '.join(there)}" if there else ""
     return f"{len(there)} of {len(registry())} in {weights_folder()}{names}"
@@ -202,6 +220,42 @@ def _missing(preset: str) -> tuple[str, ...]:
     except MissingWeightsError as error:
         return error.names
     return ()
+
+
+def _progress(console: Console) -> Progress:
+    from rich.console import Console as RichConsole
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn()
+    hidden = console.quiet or not console.terminal
+    return Progress(*columns, console=RichConsole(stderr=True), transient=True, disable=hidden)
+
+
+class _Bar:
+    """A bar of rich with the part of tqdm's interface that pooch uses."""
+
+    def __init__(self, progress: Progress, label: str) -> None:
+        self._progress, self._task = progress, progress.add_task(label, total=None)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "total":
+            self._progress.update(self._task, total=value)
+        else:
+            super().__setattr__(name, value)
+
+    def update(self, size: int) -> None:
+        self._progress.advance(self._task, size)
+
+    def reset(self) -> None:
+        self._progress.reset(self._task)
+
+    def close(self) -> None:
+        self._progress.stop_task(self._task)
+
+
+def _say_to_convert(console: Console, weights: Weights, file: PublishedFile, place: Path) -> None:
+    if file.convert and next(files_of(weights), None) is None:
+        console.result(f"{weights.name}: convert it once: {how_to_convert(weights, place)}")
 
 
 def _fetchable(weights: Weights, accepted: bool) -> tuple[Weights, PublishedFile, str]:
@@ -222,17 +276,14 @@ def _fetchable(weights: Weights, accepted: bool) -> tuple[Weights, PublishedFile
 def _wrong(console: Console, weights: Weights) -> int:
     """Print the state of each file of a network; the number that are wrong."""
     wrong = 0
-    try:
-        paths = list(files_of(weights))
-        if not paths:
-            raise MissingWeightsError(how_to_get(weights))
-    except MeglocError as error:
-        console.result(f"wrong: {error}")
+    paths = list(files_of(weights))
+    if not paths:
+        console.result(f"wrong: {how_to_get(weights)}")
         return 1
     for path in paths:
         file = describe(weights.name, path)
         try:
-            prove(file, sha256_of(file), file.published, weights)
+            prove(file, file.published, weights)
             console.result(f"{weights.name}: {path} ({_trust(file)})")
         except MeglocError as error:
             wrong += 1
@@ -247,16 +298,13 @@ def _trust(file: WeightsFile) -> str:
 
 
 def _state(weights: Weights) -> str:
-    try:
-        return "there" if next(files_of(weights), None) else "missing"
-    except MeglocError:
-        return "wrong"
+    if next(files_of(weights), None):
+        return "there"
+    return "to convert" if to_convert(weights) else "missing"
 
 
 def _row(weights: Weights) -> tuple[str, ...]:
-    there: list[PublishedFile | None] = []
-    with suppress(MeglocError):
-        there = [describe(weights.name, path).published for path in files_of(weights)]
+    there = [describe(weights.name, path).published for path in files_of(weights)]
     file = next((one for one in weights.files if one in there), weights.files[0])
     size = "?" if file.size is None else f"{file.size / 1e6:.2f} MB"
     name = f"{weights.name} *" if weights.unverified else weights.name

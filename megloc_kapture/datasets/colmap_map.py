@@ -16,19 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
-from megloc_kapture.datasets.formats.colmap_model import (
-    BINARY_FILES,
-    TEXT_FILES,
-    ColmapModel,
-)
-from megloc_kapture.datasets.formats.colmap_reading import (
-    ColmapRigs,
-    colmap_model_files,
-    is_binary,
-    read_colmap_model,
-    read_colmap_rigs,
-    rig_files,
-)
 from megloc_kapture.datasets.kapture_folders import (
     cameras_of_images,
     is_kapture,
@@ -36,6 +23,13 @@ from megloc_kapture.datasets.kapture_folders import (
 )
 from megloc_kapture.datasets.reference_map import write_reference_map
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.colmap_model import (
+    BINARY_FILES,
+    TEXT_FILES,
+    ColmapModel,
+    colmap_model_files,
+    read_colmap_model,
+)
 from megloc_kapture.io.files import link_records
 from megloc_kapture.io.kapture import (
     KaptureData,
@@ -75,7 +69,6 @@ class ColmapFolders:
     def files(self) -> Iterator[Path]:
         """The files that an import reads, images apart."""
         yield from colmap_model_files(self.model)
-        yield from rig_files(self.model, binary=is_binary(self.model))
         if self.database is not None:
             yield self.database
 
@@ -98,10 +91,6 @@ def find_colmap(
     ----------
     path : folder of the model, or the workspace.
     images, database : instead of those that would be found.
-
-    Raises
-    ------
-    DataError : no model, or several; no such folder of images, no such database.
     """
     models = _models(path)
     if not models:
@@ -170,7 +159,6 @@ class ColmapReconstruction:
         """Read the model; DataError names what is broken, or what kapture cannot hold."""
         model = read_colmap_model(source.model)
         names = kapture_names(model, source.model)
-        rigs = read_colmap_rigs(source.model, binary=is_binary(source.model))
         if source.images is not None:
             missing = sorted(name for name in names if not (source.images / name).is_file())
             if missing:
@@ -192,7 +180,7 @@ class ColmapReconstruction:
             if (new := scaled.get(image.camera_id)) and (old := model.cameras[image.camera_id])
         }
         as_images = replace(model, cameras={**model.cameras, **scaled})
-        return cls(source, model, kapture_data(as_images, names, rigs), names, scales)
+        return cls(source, model, kapture_data(as_images, names), names, scales)
 
     @property
     def renamed(self) -> dict[str, str]:
@@ -218,12 +206,6 @@ class ColmapReconstruction:
         -------
         Counts for the log; without descriptors in a database ``found_again``, the share of the
         observations whose keypoints were found again.
-
-        Raises
-        ------
-        OtherFeaturesError : no points; or no database, and points of other features than SIFT.
-        DataError : the database is broken or that of another model, or there is neither a database
-            nor a folder of images.
         """
         source = self.source
         local_type = None
@@ -331,24 +313,21 @@ def kapture_names(model: ColmapModel, folder: Path) -> dict[str, str]:
     return names
 
 
-def kapture_data(model: ColmapModel, names: dict[str, str], rigs: ColmapRigs) -> KaptureData:
-    """Sensors, rigs, records and poses of a model.
+def kapture_data(model: ColmapModel, names: dict[str, str]) -> KaptureData:
+    """Return the sensors, rigs of several cameras, records and poses of a model.
 
-    Parameters
-    ----------
-    names : of the images in kapture, by those in the model.
-    rigs : those of one camera say nothing, and are left out.
+    ``names`` are those of the images in kapture, by those in the model.
     """
     data = KaptureData()
     sensor_of = {camera_id: f"cam{camera_id}" for camera_id in sorted(model.cameras)}
     for camera_id, camera in model.cameras.items():
         data.sensors[sensor_of[camera_id]] = Sensor.from_camera(camera)
     records = {image.image_id: image for image in model.images}
-    times = {image_id: rigs.frames.get(image_id, image_id) for image_id in records}
+    times = {image_id: model.frames.get(image_id, image_id) for image_id in records}
     shared = {(times[image_id], image.camera_id) for image_id, image in records.items()}
-    if len(shared) < len(records) or not records.keys() <= rigs.frames.keys():
-        times = {image_id: image_id for image_id in records}  # no moments, or several of one
-    for rig_id, cams_from_rig in rigs.cams_from_rig.items():
+    if len(shared) < len(records):
+        times = {image_id: image_id for image_id in records}  # frames with two images of a camera
+    for rig_id, cams_from_rig in model.cams_from_rig.items():
         members = {sensor_of[k]: v for k, v in cams_from_rig.items() if k in sensor_of}
         if len(members) > 1:
             data.rigs[f"rig{rig_id}"] = members

@@ -1,21 +1,15 @@
-"""Any pair of kapture folders as a dataset: mapping/, query/ and perhaps query_gt/ and megloc/; and
-challenge datasets as naver's kapture distributes them, the official images in kapture folders.
-
-kapture's downloader unpacks an archive per part, ``mapping/`` and ``query/`` (Aachen's queries by
-day and at night apart, RobotCar's locations each in a folder of its own); its importers write the
-same. Images keep their official names, and the queries have no poses.
-"""
+"""Any pair of kapture folders as a dataset: mapping/, query/ and perhaps query_gt/ and megloc/."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import (
     GROUPS_FILE,
     NAMES_FILE,
@@ -47,8 +41,6 @@ Key = TypeVar("Key")
 
 MAPPING, QUERY, QUERY_GT = "mapping", "query", "query_gt"
 _SENSORS = "sensors/sensors.txt"
-# below the root; kapture's guide to converting Aachen puts them beside the official files
-_PARENTS = ("", "kapture")
 
 
 def is_kapture(folder: Path) -> bool:
@@ -57,12 +49,7 @@ def is_kapture(folder: Path) -> bool:
 
 
 def check_root(root: Path) -> Path:
-    """The root of a pair of kapture folders.
-
-    Raises
-    ------
-    DataError : it is no folder, or lacks mapping/ or query/.
-    """
+    """The root of a pair of kapture folders."""
     root = Path(root)
     if not root.is_dir():
         raise DataError("no such folder", path=root)
@@ -148,19 +135,8 @@ def import_kapture_folders(
 ) -> dict[str, float]:
     """Import ``root``'s folders into ``output``: checked, written anew, images linked.
 
-    Parameters
-    ----------
-    query_prefix : a folder name put before the queries' names, for datasets whose map and queries
-        share names.
-    protocol_change : what the user wants different in the protocol.
-
-    Returns
-    -------
-    Counts for the log.
-
-    Raises
-    ------
-    DataError : something is missing or broken, or map and queries share names.
+    ``query_prefix`` is a folder name put before the queries' names, for datasets whose map and
+    queries share names. Returns counts for the log.
     """
     mapping, map_data, query, query_data = checked_folders(root, query_prefix)
     rename = prefixed(query_prefix)
@@ -361,79 +337,3 @@ def _renamed_tables(
         names={rename(query): name for query, name in tables.names.items()},
         relocalization=[replace(pair, query=rename(pair.query)) for pair in tables.relocalization],
     )
-
-
-# ----------------------------------------------------------- challenges as kapture has them
-
-
-@dataclass(frozen=True, slots=True)
-class KaptureImage:
-    """One image of a kapture folder.
-
-    Parameters
-    ----------
-    name : below ``records_data``.
-    file : it, or the link to it.
-    sensor_id : of its camera in the folder's ``sensors.txt``.
-    cam_from_world : None where the folder has no pose for it.
-    """
-
-    name: str
-    file: Path
-    timestamp: int
-    sensor_id: str
-    camera: Camera
-    cam_from_world: RigidTransform | None
-
-
-def parents(root: Path) -> tuple[Path, ...]:
-    """The folders in which the parts of a dataset may lie, the root first."""
-    return tuple(Path(root) / name for name in _PARENTS)
-
-
-def kapture_parent(root: Path) -> Path | None:
-    """The folder, ``root`` or one in it, that has ``mapping/`` as a kapture folder; else None."""
-    return next((parent for parent in parents(root) if is_kapture(parent / MAPPING)), None)
-
-
-def without_model(root: Path) -> OptionError:
-    """The error where a dataset's own model is asked for and kapture folders are there."""
-    return OptionError(
-        f"the reference model is read from the official layout, and {root} has kapture folders; "
-        "in a kapture map megloc localize localizes"
-    )
-
-
-def read_images(folder: Path, is_there: Callable[[Path], bool]) -> list[KaptureImage]:
-    """Read the camera images of a kapture folder in the order of their times, then sensors' ids.
-
-    An image whose file is not there is left out; of each camera the first image's size is checked.
-
-    Raises
-    ------
-    DataError : broken tables, an uncalibrated camera, an image of another size than its camera's.
-    """
-    kapture = KaptureFolder(folder)
-    data = kapture.read()
-    images = []
-    checked: set[str] = set()
-    for (timestamp, sensor_id), name in sorted(data.records_camera.items()):
-        file = kapture.image_path(name)
-        if not is_there(file):
-            continue
-        if sensor_id not in checked:
-            check_image_size(file, data.camera_of(name))
-            checked.add(sensor_id)
-        pose = data.device_from_world(timestamp, sensor_id)
-        camera = data.camera_of(name)
-        images.append(KaptureImage(name, file, timestamp, sensor_id, camera, pose))
-    return images
-
-
-def tables_and_images(folders: Iterable[Path]) -> Iterator[Path]:
-    """Every file that the images of these kapture folders come from."""
-    for folder in folders:
-        kapture = KaptureFolder(folder)
-        yield from files_of(kapture, images=False)
-        images = (kapture.image_path(name) for name in kapture.read().image_names())
-        yield from (image for image in images if image.exists())

@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.datasets.formats.colmap_reading import read_colmap_model
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.colmap_model import read_colmap_model
 from megloc_kapture.io.files import check_component, link_records, safe_join
 from megloc_kapture.io.images import image_size, write_depth_map
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors

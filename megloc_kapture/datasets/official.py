@@ -37,15 +37,9 @@ _MISSING_SHOWN = 5
 
 
 class DatasetCard(Options):
-    """The address of a dataset and its layout on disk; for messages.
+    """The address of a dataset and its layout on disk, for messages.
 
-    Parameters
-    ----------
-    title : its name in prose.
-    published_at : the official address.
-    size : of the download, in words.
-    folders : names the root usually has, below MEGLOC_DATA.
-    layout : the paths that must be there, in words.
+    ``folders`` are names that the root usually has, below MEGLOC_DATA.
     """
 
     title: str
@@ -55,7 +49,7 @@ class DatasetCard(Options):
     layout: str
 
     def without(self, root: Path, absent: Sequence[str]) -> DataError:
-        """The error for a folder that is not this dataset, as it has no folders of these names."""
+        """Return the error for a folder that lacks folders of the dataset."""
         return DataError(
             f"not {self.title}, no folder {' and '.join(absent)}; it has to lie as {self.layout}",
             path=root,
@@ -85,14 +79,13 @@ class Missing:
     files: list[Path] = field(default_factory=list)
 
     def require(self, file: Path) -> bool:
-        """Return True where ``file`` exists; else remember it as missing."""
+        """Return whether a file exists; else remember it."""
         if file.exists():
             return True
         self.files.append(file)
         return False
 
     def by_folder(self) -> list[str]:
-        """The missing files, a text for each folder, sorted."""
         folders: dict[Path, list[str]] = {}
         for file in self.files:
             folders.setdefault(file.parent, []).append(file.name)
@@ -103,7 +96,7 @@ class Missing:
         ]
 
     def refuse(self) -> None:
-        """Raise DataError with what is missing, folder by folder."""
+        """Raise DataError where files are missing."""
         if not self.files:
             return
         parts = self.by_folder()
@@ -153,13 +146,7 @@ class OfficialDataset(SideTables):
 
 
 def check_official(dataset: OfficialDataset, *, allow_missing: bool = False) -> None:
-    """Check that a dataset is complete enough to be written.
-
-    Raises
-    ------
-    DataError : files are missing and that was not allowed, nothing is left of the map (or of the
-        queries, where nothing may be missing), or map and queries share names.
-    """
+    """Check that a dataset is complete enough to be written."""
     if dataset.missing is not None and not allow_missing:
         dataset.missing.refuse()
     root = dataset.missing.root if dataset.missing is not None else None
@@ -173,13 +160,7 @@ def check_official(dataset: OfficialDataset, *, allow_missing: bool = False) -> 
 
 
 def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: bool = False) -> None:
-    """Write a dataset below ``output``: mapping/, query/, query_gt/ and megloc/.
-
-    Raises
-    ------
-    DataError : see :func:`check_official`.
-    OutputError : something cannot be written.
-    """
+    """Write a dataset below ``output``: mapping/, query/, query_gt/ and megloc/."""
     check_official(dataset, allow_missing=allow_missing)
     for part, data in ((MAPPING, dataset.mapping), (QUERY, dataset.query)):
         write_sensors(output / part, data)
@@ -222,10 +203,6 @@ def read_ground_truth(
     Returns
     -------
     The poses in the local frame (with ``query``'s sensors and records) or None, and the groups.
-
-    Raises
-    ------
-    DataError : the folder is broken.
     """
     folder = root / GROUND_TRUTH
     if not (folder / QUERY).exists():

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -13,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase, FeatureType
-from megloc_kapture.datasets.formats.sparse_models import SparsePoints, image_order
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.files import link_records
 from megloc_kapture.io.kapture import (
     FeatureConfig,
@@ -26,7 +25,7 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 
-# a database of another model has its features elsewhere; this one's differ by printed digits
+# the database of another model has its features elsewhere; this one's differ by printed digits
 _MAX_SHIFT_PX = 1.0
 
 
@@ -61,11 +60,8 @@ def write_reference_map(
 
     Row i of ``points3d.txt`` is point i of the model. Images of the model that ``data`` does not
     record are left out, with their observations. Without a database the keypoints of an image are
-    those that see points, in the order of their ids in the model, numbered anew without gaps; of
-    two positions for one feature the first counts. With one they are all keypoints of the database,
-    under its numbers, beside their descriptors, and an image that has none there has empty ones,
-    as if they had been extracted. An image that sees a point twice with the same
-    feature does so once.
+    those that observe points, in the order of their ids in the model, numbered anew without gaps.
+    With one they are all keypoints of the database, with their descriptors.
 
     Parameters
     ----------
@@ -73,49 +69,63 @@ def write_reference_map(
     data : sensors, records and poses of the images.
     links : folders of images, see :func:`~megloc_kapture.io.files.link_records`.
     image_names : name in ``data`` of each image of the model, in its order.
-    points : of the model; ``image_ids`` count in ``image_names``.
     keypoints_type : the type name of keypoints and descriptors.
     database : COLMAP database with the features of the model; its images have the names of
         ``image_names``, or these with another suffix.
-    database_names : of images that have quite another name there.
+    database_names : names in the database of images that have another name there.
     scales : of images whose camera in ``data`` is another size than in the model, in x and y.
 
     Returns
     -------
-    How many images, keypoints, points and observations were written, by these words.
-
-    Raises
-    ------
-    DataError : the database is broken, or is not that of the model.
-    ValueError : ``image_names`` are not unique, or ids out of range.
-    OutputError : something cannot be written.
+    Numbers of images, keypoints, points and observations, by these words.
     """
-    if len(set(image_names)) != len(image_names):
-        raise ValueError("image_names are not unique")
-    points.check_images(len(image_names))
-    points = points.sorted_by_point()
     write_sensors(output, data)
     link_records(output, links)
     write_points3d(output, np.concatenate([points.xyz, points.rgb], axis=1))
-
-    recorded = set(data.records_camera.values())
-    names = tuple(sorted(recorded.intersection(image_names)))
-    features: Features = partial(_seen_features, points)
+    names = tuple(sorted(set(data.records_camera.values()).intersection(image_names)))
     with ExitStack() as stack:
+        source = None
         if database is not None:
             opened = stack.enter_context(ColmapDatabase(database))
-            of_database = _DatabaseFeatures(
-                points, opened, output, keypoints_type, database_names or {}
+            source = stack.enter_context(
+                _DatabaseFeatures(opened, output, keypoints_type, database_names or {})
             )
-            stack.callback(of_database.close)
-            features = of_database.of_image
         config = FeatureConfig(keypoints_type.upper(), np.dtype(np.float32), 2)
         writer = FeatureWriter(output, "keypoints", keypoints_type, config)
         stack.enter_context(writer)
-        with_empty = database is not None
-        observations, num_keypoints = _write_features(
-            names, image_names, points, features, writer, scales or {}, with_empty=with_empty
-        )
+        positions = {name: position for position, name in enumerate(image_names)}
+        order = np.argsort(points.image_ids, kind="stable")
+        ends = np.cumsum([0, *np.bincount(points.image_ids, minlength=len(image_names)).tolist()])
+        keypoint_ids = np.full(len(order), -1, np.int32)  # -1: a left out observation
+        new_ids = np.zeros(len(image_names), np.int32)
+        num_keypoints = 0
+        for new_id, name in enumerate(names):
+            position = positions[name]
+            new_ids[position] = new_id
+            rows = order[ends[position] : ends[position + 1]]
+            features, xy_px = points.feature_ids[rows].astype(np.int64), points.xy_px[rows]
+            if source is None:
+                _, first, numbers = np.unique(features, return_index=True, return_inverse=True)
+                keypoints = xy_px[first]
+            else:
+                keypoints, numbers = source.of_image(name, features, xy_px), features
+            if scales and name in scales:
+                keypoints = keypoints * np.array(scales[name], np.float32)
+            num_keypoints += len(keypoints)
+            # with a database an image without features has empty files, as after extraction
+            if len(keypoints) or source is not None:
+                writer.write(name, keypoints)
+            pairs = np.stack([points.point_ids[rows], numbers], axis=1)
+            _, first = np.unique(pairs, axis=0, return_index=True)  # each pair once
+            keypoint_ids[rows[first]] = numbers[first]
+    kept = np.flatnonzero(keypoint_ids >= 0)
+    observations = Observations(
+        keypoints_type,
+        names,
+        points.point_ids[kept],
+        new_ids[points.image_ids[kept]],
+        keypoint_ids[kept],
+    )
     write_observations(output, {keypoints_type: observations})
     return {
         "images": len(names),
@@ -125,36 +135,17 @@ def write_reference_map(
     }
 
 
-# keypoints of an image (N, 2), and which of them each of its observations, given as rows, is
-Features = Callable[[str, NDArray[np.int64]], tuple[NDArray[np.float32], NDArray[np.int64]]]
-
-
-def _seen_features(
-    points: SparsePoints, name: str, rows: NDArray[np.int64]
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """The features of an image that see points, numbered without gaps."""
-    _, first, numbers = np.unique(points.feature_ids[rows], return_index=True, return_inverse=True)
-    return points.xy_px[rows[first]], numbers
-
-
-class _DatabaseFeatures:
-    """All features of a database, under its numbers; writes the descriptors on the way."""
+class _DatabaseFeatures(AbstractContextManager["_DatabaseFeatures"]):
+    """All features of a database; writes the descriptors of the images it is asked for."""
 
     def __init__(
-        self,
-        points: SparsePoints,
-        database: ColmapDatabase,
-        output: Path,
-        keypoints_type: str,
-        names: Mapping[str, str],
+        self, database: ColmapDatabase, output: Path, keypoints_type: str, names: Mapping[str, str]
     ) -> None:
         self._database = database
         self._type = database.feature_type() or FeatureType(keypoints_type, "u1")
         if self._type.name != keypoints_type:
             raise self._error(f"has features of type {self._type.name}, not {keypoints_type}")
-        self._names = names
-        self._points = points
-        self._output = output
+        self._output, self._names = output, names
         self._by_stem: dict[str, list[str]] = {}
         for name in database.images:
             self._by_stem.setdefault(_without_suffix(name), []).append(name)
@@ -162,31 +153,42 @@ class _DatabaseFeatures:
         self._without: list[str] = []
 
     def of_image(
-        self, name: str, rows: NDArray[np.int64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """See Features; DataError where the database does not have the features of the model."""
+        self, name: str, features: NDArray[np.int64], xy_px: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Return the keypoints of an image, which the model's features (M,) at (M, 2) must fit."""
         name_there = self._name_there(name)
         if name_there is None:
-            if len(rows):
+            if len(features):
                 raise self._error(f"has no image {name!r}")
             self._without.append(name)
-            return np.empty((0, 2), np.float32), np.empty(0, np.int64)
+            return np.empty((0, 2), np.float32)
         keypoints = self._database.keypoints(name_there)
-        numbers = self._points.feature_ids[rows].astype(np.int64)
-        self._check(name_there, keypoints, numbers, self._points.xy_px[rows])
+        if len(features) and features.max() >= len(keypoints):
+            raise self._error(
+                f"is not of this model: its image {name_there!r} has {len(keypoints)} keypoints, "
+                f"the model names feature {features.max()}"
+            )
+        shifts = np.abs(keypoints[features] - xy_px).max(axis=1, initial=0.0)
+        if len(shifts) and shifts.max() > _MAX_SHIFT_PX:
+            worst = int(shifts.argmax())
+            (x, y), (model_x, model_y) = keypoints[features[worst]], xy_px[worst]
+            raise self._error(
+                f"is not of this model: feature {features[worst]} of {name_there!r} is at "
+                f"({x:.1f}, {y:.1f}), in the model at ({model_x:.1f}, {model_y:.1f})"
+            )
         descriptors = self._database.descriptors(name_there, self._type)
         if descriptors is not None:
-            self._write_descriptors(name, name_there, descriptors, len(keypoints))
+            self._write(name, descriptors, len(keypoints))
         elif len(keypoints) == 0:
             self._without.append(name)
-        return keypoints, numbers
+        return keypoints
 
-    def close(self) -> None:
-        """Write empty descriptors where there are no keypoints."""
+    def __exit__(self, *raised: object) -> None:
+        """Write empty descriptors of the images without keypoints."""
         if self._writer is not None:
             for name in self._without:
-                empty = np.empty((0, self._writer.config.dsize), self._writer.config.dtype)
-                self._writer.write(name, empty)
+                config = self._writer.config
+                self._writer.write(name, np.empty((0, config.dsize), config.dtype))
 
     def _name_there(self, name: str) -> str | None:
         name = self._names.get(name, name)
@@ -197,103 +199,20 @@ class _DatabaseFeatures:
             raise self._error(f"has several images for {name!r}: {', '.join(found)}")
         return found[0] if found else None
 
-    def _check(
-        self,
-        name: str,
-        keypoints: NDArray[np.float32],
-        numbers: NDArray[np.int64],
-        xy_px: NDArray[np.float32],
-    ) -> None:
-        """Raise DataError where the database's features are not those of the model."""
-        if not len(numbers):
-            return
-        last = int(numbers.max())
-        if last >= len(keypoints):
-            raise self._error(
-                f"is not of this model: its image {name!r} has {len(keypoints)} keypoints, "
-                f"the model names feature {last}"
-            )
-        shifts = np.abs(keypoints[numbers] - xy_px).max(axis=1)
-        worst = int(np.argmax(shifts))
-        if shifts[worst] > _MAX_SHIFT_PX:
-            x, y = keypoints[numbers[worst]].tolist()
-            there = xy_px[worst].tolist()
-            raise self._error(
-                f"is not of this model: feature {int(numbers[worst])} of {name!r} is at "
-                f"({x:.1f}, {y:.1f}), in the model at ({there[0]:.1f}, {there[1]:.1f})"
-            )
-
-    def _write_descriptors(
-        self, name: str, name_there: str, descriptors: NDArray[Any], num_keypoints: int
-    ) -> None:
-        kind = self._type.name
+    def _write(self, name: str, descriptors: NDArray[Any], num_keypoints: int) -> None:
+        kind, size = self._type.name, descriptors.shape[1]
         if self._writer is None:
-            size = descriptors.shape[1]
             config = FeatureConfig(kind.upper(), descriptors.dtype, size, kind, "L2")
             self._writer = FeatureWriter(self._output, "descriptors", kind, config)
         expected = (num_keypoints, self._writer.config.dsize)
         if descriptors.shape != expected:
             raise self._error(
-                f"descriptors of {name_there!r} have the shape {descriptors.shape}, "
-                f"expected {expected}"
+                f"descriptors of {name!r} have the shape {descriptors.shape}, expected {expected}"
             )
         self._writer.write(name, descriptors)
 
     def _error(self, message: str) -> DataError:
         return DataError(message, path=self._database.path)
-
-
-def _write_features(
-    names: Sequence[str],
-    image_names: Sequence[str],
-    points: SparsePoints,
-    features: Features,
-    writer: FeatureWriter,
-    scales: Mapping[str, tuple[float, float]],
-    *,
-    with_empty: bool,
-) -> tuple[Observations, int]:
-    """Write the keypoints of images ``names``; returns the observations and how many they are."""
-    positions = {name: position for position, name in enumerate(image_names)}
-    order = image_order(points.image_ids)
-    ends = np.cumsum([0, *np.bincount(points.image_ids, minlength=len(image_names)).tolist()])
-    numbers = np.zeros(len(order), np.int32)
-    kept = np.zeros(len(order), np.bool_)
-    new_ids = np.zeros(len(image_names), np.int32)
-    num_keypoints = 0
-    for new_id, name in enumerate(names):
-        position = positions[name]
-        new_ids[position] = new_id
-        # ascending, as the order among equals is kept
-        rows = order[ends[position] : ends[position + 1]]
-        keypoints, numbers_of_image = features(name, rows)
-        if name in scales:
-            keypoints = keypoints * np.array(scales[name], np.float32)
-        num_keypoints += len(keypoints)
-        if len(keypoints) or with_empty:
-            writer.write(name, keypoints)
-        numbers[rows] = numbers_of_image
-        kept[rows] = _first_time(points.point_ids[rows], numbers_of_image)
-    selected = slice(None) if kept.all() else np.flatnonzero(kept)
-    observations = Observations(
-        writer.type_name,
-        tuple(names),
-        points.point_ids[selected],
-        new_ids[points.image_ids[selected]],
-        numbers[selected],
-    )
-    return observations, num_keypoints
-
-
-def _first_time(point_ids: NDArray[np.int64], numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Mask (O,) of the first observations of each pair of a point and a keypoint."""
-    first = np.ones(len(point_ids), np.bool_)
-    # points ascend: only where one repeats can a pair do so
-    if len(point_ids) and (point_ids[1:] == point_ids[:-1]).any():
-        order = np.lexsort((numbers, point_ids))
-        same = np.diff(point_ids[order]) == 0
-        first[order[1:][same & (np.diff(numbers[order]) == 0)]] = False
-    return first
 
 
 def _without_suffix(name: str) -> str:

@@ -262,10 +262,6 @@ def row_members(
         there is only the row ``"all"``.
     order : conditions in the order to report them; others follow, sorted, those without last.
     pools : name -> conditions; a pool without queries is left out.
-
-    Raises
-    ------
-    OptionError : two rows would bear one name.
     """
     of_query = np.array(list(conditions), str)
     present = set(of_query.tolist())

@@ -66,11 +66,6 @@ def names_in_pose_file(images: Iterable[str], names: Names) -> dict[str, str]:
 
     By a rule that is the order of the names; by a table (image -> name) the table's, and images
     that are not in it have no name.
-
-    Raises
-    ------
-    DataError : two images would bear one name (names both), or a name holds white space, which
-        the format cannot express.
     """
     wanted = set(images)
     if isinstance(names, str):
@@ -102,11 +97,6 @@ def format_pose_file(poses: Poses, *, names: Names = "full") -> str:
     poses : image -> ``cam_from_world``.
     names : a rule, and the rows are sorted by name; or the challenge's list as image -> name, and
         the rows stand in its order: images that are not in it are left out.
-
-    Raises
-    ------
-    DataError : see :func:`names_in_pose_file`; or a pose that is not finite or whose quaternion
-        is off unit length by 1e-3 or more (names the image).
     """
     lines = []
     for image, name in names_in_pose_file(poses, names).items():
@@ -117,7 +107,7 @@ def format_pose_file(poses: Poses, *, names: Names = "full") -> str:
 
 
 def write_pose_file(path: Path | str, poses: Poses, *, names: Names = "full") -> None:
-    """Write a pose file atomically; see :func:`format_pose_file`. OutputError: it cannot be."""
+    """Write a pose file atomically; see :func:`format_pose_file`."""
     write_bytes(path, format_pose_file(poses, names=names).encode("utf-8"))
 
 
@@ -127,11 +117,6 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
     Runs of spaces, tabs and CRLF line ends are taken; empty lines and comments are passed over. A
     row of nan, or with a quaternion of zeros, is how other tools write a query that failed: it is
     left out, and a warning is logged.
-
-    Raises
-    ------
-    DataError : not eight columns, a number that is none, a quaternion off unit length by 1e-3 or
-        more (below, it is normalised), or a name given twice. Names file and line.
     """
     text = read_text(path)
     rows = (_colmap_rows if is_colmap_images(text) else _rows)(text)
@@ -191,13 +176,7 @@ def poses_by_image(
     image's path; where none fits also with another ending (``.jpg`` for ``.png``, as servers take
     it); any other stays as it is, unknown, for the evaluation to report.
 
-    Parameters
-    ----------
-    names : the challenge's list, image -> name in the pose file.
-
-    Raises
-    ------
-    DataError : a name fits several images, or two names fit one.
+    ``names`` is the challenge's list, image -> name in the pose file.
     """
     known = set(images)
     listed = {name: image for image, name in (names or {}).items()}
@@ -239,8 +218,7 @@ def _stem(name: str) -> str:
 
 
 def parse_number(text: str) -> float:
-    """A decimal number; "nan" and the like become one that :func:`checked_pose` refuses. DataError:
-    anything else that Python would take ("1_0", digits of other scripts) or not take."""
+    """A decimal number; "nan" and the like become one that :func:`checked_pose` refuses."""
     if FLOAT_PATTERN.fullmatch(text):
         return float(text)
     if text.lower().lstrip("+-") in ("nan", "inf", "infinity"):
@@ -253,8 +231,7 @@ def checked_pose(
     translation: tuple[float, float, float],
     whose: str,
 ) -> RigidTransform:
-    """The pose with a unit quaternion; one that is unit to rounding keeps its very digits.
-    DataError: not finite, or a quaternion off unit length by 1e-3 or more; names ``whose``."""
+    """The pose with a unit quaternion; one that is unit to rounding keeps its very digits."""
     # beyond, squares overflow
     if not all(abs(v) < 1e100 for v in (*quat_wxyz, *translation)):
         raise DataError(f"{whose}: the pose is not finite")
@@ -282,8 +259,7 @@ class RelativePose:
 
 
 def timestamp_of(image: str) -> int:
-    """The timestamp that an image of 4Seasons is named after (``.../1600000000000000000.png``);
-    DataError: the name is no timestamp."""
+    """The timestamp that an image of 4Seasons is named after (``.../1600000000000000000.png``)."""
     stem = PurePosixPath(image).stem
     if not _TIMESTAMP.fullmatch(stem):
         raise DataError(f"image {image!r} is not named after a timestamp, as MLAD's rows need")
@@ -306,11 +282,6 @@ def format_mlad_file(rows: Iterable[RelativePose]) -> str:
     """The text of a pose file, in the order of ``rows``.
 
     Numbers have the fewest digits that read back to the same float64.
-
-    Raises
-    ------
-    DataError : a row without a pose (every row needs one), a pose that is not finite or whose
-        quaternion is off unit length by 1e-3 or more.
     """
     lines = []
     for row in rows:
@@ -329,12 +300,6 @@ def read_mlad_file(path: Path | str) -> list[RelativePose]:
 
     Runs of spaces, tabs and CRLF line ends are taken; empty lines are passed over. The last line
     may be without its end, as common tools write it.
-
-    Raises
-    ------
-    DataError : not nine columns (or two, in every row: a list of pairs), a timestamp or number
-        that is none, a pose that is not finite, a quaternion off unit length by 1e-3 or more, a
-        pair given twice. Names file and line.
     """
     rows: list[RelativePose] = []
     known: set[tuple[int, int]] = set()
@@ -357,7 +322,7 @@ def read_mlad_file(path: Path | str) -> list[RelativePose]:
 
 
 def parse_timestamp(text: str) -> int:
-    """A timestamp; raises DataError for anything that is not a whole number in plain digits."""
+    """A timestamp: a whole number in plain digits."""
     if not _TIMESTAMP.fullmatch(text):
         raise DataError(f"{text!r} is not a timestamp (a whole number)")
     return int(text)
@@ -426,12 +391,6 @@ def write_provenance(
     ----------
     target : the pose file, or the folder of a challenge that takes several.
     files : names of the pose files below the folder ``target``; None: it is a file.
-
-    Raises
-    ------
-    DataError : a pose file cannot be read.
-    ValueError : an entry of ``provenance`` would replace one of ours, or is not JSON.
-    OutputError : the file cannot be written.
     """
     target = Path(target)
     paths = {target.name: target} if files is None else {name: target / name for name in files}
@@ -464,7 +423,7 @@ def read_confidences(target: Path | str) -> dict[str, float]:
     """Image -> confidence of its pose, as the JSON beside a pose file has it under ``confidence``.
 
     Empty where there is none, where the JSON is about something else, and, with a warning, where
-    it tells the SHA-256 of another pose file. DataError: a confidence is no probability.
+    it tells the SHA-256 of another pose file.
     """
     target, path = Path(target), provenance_path(target)
     try:

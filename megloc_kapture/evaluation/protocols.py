@@ -72,8 +72,7 @@ PROTOCOLS = {
 
 
 def protocol_of(name: str) -> Protocol:
-    """The protocol of a dataset; ``synthetic-X`` is scored as X is, and its truth is there.
-    OptionError: an unknown name; lists the known ones."""
+    """The protocol of a dataset; ``synthetic-X`` is scored like X, and its truth is known."""
     if name in PROTOCOLS:
         return PROTOCOLS[name]
     layout = name.removeprefix(TWIN_PREFIX)
@@ -133,11 +132,6 @@ def benchmark_of(side_tables: Path | str | None = None, dataset: str | None = No
     """Benchmark of a workspace's ``megloc/`` folder, of a dataset by name, or the default.
 
     A name takes the place of the workspace's protocol; groups and frame stay the workspace's.
-
-    Raises
-    ------
-    DataError : a table is broken.
-    OptionError : an unknown dataset.
     """
     named = None if dataset is None else protocol_of(dataset)
     if side_tables is None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -12,7 +10,6 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.pose_files import (
@@ -35,18 +32,14 @@ from megloc_kapture.io.dataset_tables import (
     read_world,
     unit_of,
 )
-from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import (
-    CLUSTERS_FILE,
     CONSISTENCY_FILE,
     COVARIANCE_FILE,
     REFINEMENT_FILE,
     STATUS_FILE,
-    ClusterRow,
     ConsistencyRow,
     QueryStatus,
-    read_clusters,
     read_consistency,
     read_covariances,
     read_refinement,
@@ -61,7 +54,6 @@ Poses = Mapping[str, RigidTransform]
 # parts of a workspace; datasets and the pipeline write them
 # the map's own keypoints are what queries were matched with; before there is one, its images do
 _MAPS = ("map", "preprocessed/mapping", "mapping")
-_MANIFESTS = "stages"
 _QUERY, _QUERY_MATCHES = "query", "matches/query"
 _QUERY_PYRAMID, _MAPPING_PYRAMID = "pyramid/query", "pyramid/mapping"
 _SENSORS = "sensors/sensors.txt"
@@ -79,11 +71,9 @@ class ResultContext:
     queries : images and cameras of the queries, their keypoints, their matches with the map.
     mapping : images, cameras and poses of the map.
     side_tables : the tables of the dataset.
-    clusters : query -> the clusters of candidates it was tried in.
     refinements : query -> what each step of refining its pose came to.
     consistency : what the map's own images said of it, before poses were refined.
     masked : folders whose images have masks, with the keypoints that were found in them.
-    seconds : stage of the run -> seconds that it took, in their order.
     localized : image -> what localizing gave, of results in memory.
     cameras : image -> its camera, of queries that are in no folder.
     unit : of the map; thresholds in metres say nothing where it is another one.
@@ -92,34 +82,30 @@ class ResultContext:
     queries: KaptureFolder | None = None
     mapping: KaptureFolder | None = None
     side_tables: Path | None = None
-    clusters: Mapping[str, Sequence[ClusterRow]] = field(default_factory=dict)
     refinements: Mapping[str, Sequence[RefinementRow]] = field(default_factory=dict)
     consistency: Sequence[ConsistencyRow] = ()
     masked: Sequence[KaptureFolder] = ()
-    seconds: Mapping[str, float] = field(default_factory=dict)
     localized: Mapping[str, Pose] = field(default_factory=dict)
     cameras: Mapping[str, Camera] = field(default_factory=dict)
     unit: str = METRES
 
     @cached_property
     def frames(self) -> dict[str, str]:
-        """Map image or query -> its coordinate frame, where a dataset has several. DataError: the
-        tables are broken."""
+        """Map image or query -> its coordinate frame, where a dataset has several."""
         groups = {} if self.side_tables is None else read_groups(self.side_tables)
         return {image: group.frame for image, group in groups.items() if group.frame}
 
     def map_poses(self) -> dict[str, RigidTransform]:
-        """``cam_from_world`` of the map's images; empty without a map. DataError: it is broken."""
+        """``cam_from_world`` of the map's images; empty without a map."""
         return {} if self.mapping is None else self.mapping.read().poses()
 
     def query_images(self) -> list[str]:
-        """Names of the queries; empty where they are not known. DataError: the folder is broken."""
+        """Names of the queries; empty where they are not known."""
         return [] if self.queries is None else self.queries.read().image_names()
 
 
 def first_map_poses(contexts: Iterable[ResultContext]) -> dict[str, RigidTransform]:
-    """``cam_from_world`` of the images of the first map with any; empty where there is none.
-    DataError: a map is broken."""
+    """``cam_from_world`` of the images of the first map with any; empty where there is none."""
     return next((poses for context in contexts if (poses := context.map_poses())), {})
 
 
@@ -138,16 +124,10 @@ def side_tables_near(result: Path | str) -> Path | None:
 
 
 def context_of(result: Path | str, *, mapping: Path | str | None = None) -> ResultContext:
-    """Find what a report of ``result`` can show.
+    """Find what a report of a localized kapture folder or a pose file can show.
 
-    Parameters
-    ----------
-    result : a localized kapture folder or a pose file.
-    mapping : kapture folder of the map, where it is not the workspace's.
+    ``mapping`` is the kapture folder of the map, if it is not the workspace's.
 
-    Raises
-    ------
-    DataError : a broken table of clusters, of refinement or of consistency.
     """
     workspace, found = workspace_of(result), Path(result)
     features, candidates, maps = [], [found], []
@@ -170,45 +150,15 @@ def context_of(result: Path | str, *, mapping: Path | str | None = None) -> Resu
         queries=None if queries is None else KaptureFolder(queries, features_dirs=features),
         mapping=None if map_path is None else KaptureFolder(map_path, features_dirs=features),
         side_tables=None if workspace is None else workspace / SIDE_TABLES,
-        clusters=_if_there(read_clusters, found / CLUSTERS_FILE) or {},
         refinements=refinements,
         consistency=_if_there(read_consistency, found / CONSISTENCY_FILE) or (),
         unit=unit_of(result),
         masked=[] if workspace is None else _masked(workspace),
-        seconds={} if workspace is None else _seconds(workspace / _MANIFESTS),
     )
 
 
 def _if_there(read: Callable[[Path], Read], path: Path) -> Read | None:
     return read(path) if path.is_file() else None
-
-
-class _Manifest(BaseModel):
-    """What a report shows of a stage's manifest, which holds more."""
-
-    stage: str
-    seconds: float = Field(ge=0, allow_inf_nan=False)
-    started: str
-
-
-def _seconds(folder: Path) -> dict[str, float]:
-    found = []
-    for path in sorted(folder.glob("*.json")):
-        # a stage without a manifest that can be read runs anew
-        with contextlib.suppress(DataError):
-            found.append(read_json_model(path, _Manifest))
-    return {one.stage: one.seconds for one in sorted(found, key=lambda one: one.started)}
-
-
-def are_ranked(candidates: Iterable[Sequence[str]]) -> bool:
-    """Whether lists of candidates are rankings: not where all of them stand in the order of names,
-    and there would be a chance of less than 1 % to find them so."""
-    chance = 1.0
-    for images in candidates:
-        if list(images) != sorted(images):
-            return True
-        chance /= math.factorial(min(len(images), 20))
-    return chance > 0.01
 
 
 def _masked(workspace: Path) -> list[KaptureFolder]:
@@ -273,10 +223,6 @@ def read_result(
         MLAD's pairs) a pose file of the MLAD challenges or a folder with several.
     images : those that the short names of a pose file may stand for.
     references : ``cam_from_world`` of the map's images, for MLAD's pose files.
-
-    Raises
-    ------
-    DataError : broken, or of another kind; names file and line.
     """
     path = Path(source)
     is_mlad = benchmark.protocol.pose_file == "mlad"
@@ -298,12 +244,7 @@ def read_result(
 
 
 def read_poses(source: Path) -> dict[str, RigidTransform]:
-    """Read ``cam_from_world`` by name of a kapture folder, a COLMAP model or a pose file.
-
-    Raises
-    ------
-    DataError : missing or broken.
-    """
+    """Read ``cam_from_world`` by name of a kapture folder, a COLMAP model or a pose file."""
     if not source.exists():
         raise DataError("no such file or folder", path=source)
     if (model := model_of(source)) is not None:
@@ -323,10 +264,7 @@ def model_of(folder: Path) -> Path | None:
 def result_in_memory(
     estimated: Mapping[str, Pose | Failure] | Mapping[str, RigidTransform], *, label: str = ""
 ) -> Result:
-    """A result of poses by image: what localizing gave, or ``cam_from_world`` alone.
-
-    DataError: one of the latter is not finite, or has a quaternion off unit length by 1e-3 or more.
-    """
+    """A result of poses by image: those of the localizer, or ``cam_from_world`` alone."""
     poses: dict[str, RigidTransform] = {}
     statuses: dict[str, QueryStatus] = {}
     covariances = {}

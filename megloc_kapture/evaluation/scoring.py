@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 
     from megloc_kapture.evaluation.report.reports import AnyReported
     from megloc_kapture.evaluation.statistics import Comparison
-    from megloc_kapture.evaluation.without_truth import NearCandidates
 
 _CHI2_95 = 12.592  # quantile of six degrees of freedom
 
@@ -70,8 +69,6 @@ class QueryResult:
     fallback : what kind of guess a fallback pose is.
     candidates : map images the pose comes from, best first; from the status table.
     confidence : probability that the pose is right, as the result says; None where it does not.
-    near : its distance from the candidates; None where nobody asked, without an estimated pose, or
-        where no candidate has a pose in the map.
     """
 
     image: str
@@ -85,7 +82,6 @@ class QueryResult:
     fallback: Fallback = "none"
     candidates: tuple[str, ...] = ()
     confidence: float | None = None
-    near: NearCandidates | None = None
 
 
 class Reported(ABC):
@@ -100,12 +96,11 @@ class Reported(ABC):
     def __str__(self) -> str:
         from megloc_kapture.evaluation.report.reports import report_text
 
-        # of this class there are the four kinds that reports know
+        # the three subclasses are what reports know
         return report_text(cast("AnyReported", self)).removesuffix("\n")
 
     def html(self, path: Path | str) -> None:
-        """Write the report as an HTML page; raises DataError where the map that the context of a
-        result knows is broken, OutputError where the file cannot be written."""
+        """Write the report as an HTML page."""
         from megloc_kapture.evaluation.report.reports import render_report
 
         write_bytes(path, render_report(cast("AnyReported", self)).encode("utf-8"))
@@ -265,12 +260,6 @@ def evaluate_poses(
     nowhere : images that are known to show nothing of the map.
     confidences : of poses, where ``statuses`` do not say them.
     covariances : of poses, float64 (6, 6) as of ``Pose``.
-
-    Raises
-    ------
-    DataError : no scored query has a true pose, so that there is nothing to count; or an image
-        that shows nothing of the map has one.
-    OptionError : two rows of the table would bear one name, or there is no threshold.
     """
     if not thresholds:
         raise OptionError("at least one recall threshold is needed")
@@ -349,8 +338,6 @@ def query_result(
     has_pose: bool,
     errors: tuple[float, float],
     confidence: float | None = None,
-    no_pose: str = "no pose in the result",
-    near: NearCandidates | None = None,
 ) -> QueryResult:
     """The outcome of a query.
 
@@ -358,11 +345,10 @@ def query_result(
     ----------
     status : its row of ``status.csv``, whose confidence goes before ``confidence``.
     errors : metres and degrees.
-    no_pose : the reason of a query without pose and without status.
     """
     if status is None:
         outcome: Outcome = "localized" if has_pose else "missing"
-        reason = "" if has_pose else no_pose
+        reason = "" if has_pose else "no pose in the result"
         return QueryResult(image, condition, outcome, reason, *errors, confidence=confidence)
     outcome, reason = "missing", status.reason
     if has_pose and status.fallback == "none":
@@ -382,7 +368,6 @@ def query_result(
         status.fallback if has_pose else "none",
         status.candidates,
         status.confidence,
-        near,
     )
 
 
@@ -428,11 +413,6 @@ def evaluate_pairs(
     -------
     The errors' position is the relative translation's; ``by_center`` has the distances of the
     centres. Pairs whose query has no true pose are named in ``without_truth``.
-
-    Raises
-    ------
-    DataError : a reference has no pose, a pair is listed twice, or no pair can be counted.
-    OptionError : there is no threshold.
     """
     absent = next((pair for pair in pairs if pair.reference not in references), None)
     if absent is not None:

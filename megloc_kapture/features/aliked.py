@@ -271,10 +271,7 @@ def _folded(weight: torch.Tensor, norm: nn.BatchNorm2d) -> tuple[torch.Tensor, t
 
 
 def aliked_from(tensors: Mapping[str, torch.Tensor], where: str) -> AlikedNet:
-    """The network of a checkpoint, its variant read from the shapes; in eval mode.
-
-    Raises DataError that names keys that are missing, unexpected or of another shape.
-    """
+    """The network of a checkpoint, its variant read from the shapes; in eval mode."""
     try:
         first = tensors["block1.conv1.weight"].shape[0]
         second, third, fourth = (tensors[f"conv{level}.weight"].shape[1] for level in (2, 3, 4))

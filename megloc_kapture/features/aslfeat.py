@@ -1,21 +1,14 @@
-"""ASLFeat local features (Luo et al., CVPR 2020), with the variables of the official checkpoint.
+"""ASLFeat local features (Luo et al., CVPR 2020), with the official checkpoint converted.
 
-The published checkpoint is TensorFlow's. The module's keys are its variables' names with dots for
-slashes, and torch's words for the last part:
-
-    conv0/kernel                            conv0.weight, (in, out last) -> (out, in first)
-    conv0/bn/moving_mean, moving_variance   conv0.bn.running_mean, running_var
-    deform_param/conv6/offset/kernel, bias  deform_param.conv6.offset.weight, bias
-    tower/conv1/instance_max                tower.conv1.instance_max
-
-Batch normalisation is folded into the convolutions, so the module is for inference only.
+The module's keys are the names of TensorFlow's variables with dots for slashes, and torch's words
+for the last part (``scripts/convert_weights.py``). Batch normalisation is folded into the
+convolutions, so the module is for inference only.
 """
 
 from __future__ import annotations
 
-import logging
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -54,12 +47,6 @@ STRIDE = 4  # of the features; their pixel (i, j) is read at the image's (4 i, 4
 _SCORED = {"conv1": (3, 1 / 6), "conv3": (2, 2 / 6), "conv6": (1, 3 / 6)}
 _DEFORMABLE = ("conv6_0", "conv6_1", "conv6")
 _NORM_EPSILON = 1e-5
-# what optimisers keep beside a variable, under its name, and beside all of them
-_LEFT_OUT = (
-    *("Adam", "Adam_1", "Momentum", "RMSProp", "RMSProp_1", "ExponentialMovingAverage"),
-    *("global_step", "beta1_power", "beta2_power", "learning_rate"),
-)
-_TORCH_WORDS = {"kernel": "weight", "moving_mean": "running_mean", "moving_variance": "running_var"}
 _VALUES_AT_ONCE = {"cpu": 1 << 19, "cuda": 1 << 27}
 _BORDER_PX = 5
 _NOTHING = (np.zeros((0, 3), np.float32), np.zeros(0, np.float32), torch.zeros(0, DESCRIPTOR_SIZE))
@@ -279,42 +266,10 @@ class _Scale(nn.Module):
         self.register_buffer("instance_max", torch.ones(()))
 
 
-def aslfeat_state(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """A state dict for :class:`AslFeatNet` of a TensorFlow checkpoint's variables, name -> values.
-
-    Names and layouts are changed as the module's text says, what an optimiser keeps is left out;
-    a name without slashes stays as it is, so that a state dict of the module passes unchanged.
-    """
-    left_out = set(optimiser_variables(tensors))
-    state = {}
-    for name, values in tensors.items():
-        if name in left_out:
-            continue
-        scope, _, word = name.rpartition("/")
-        if word == "kernel" and values.ndim == 4:
-            values = values.permute(3, 2, 0, 1).contiguous()
-        key = f"{scope}/{_TORCH_WORDS.get(word, word)}" if scope else name
-        state[key.replace("/", ".")] = values
-    return state
-
-
-def optimiser_variables(names: Iterable[str]) -> list[str]:
-    """Those of a checkpoint's variables that only its training needs, sorted."""
-    return sorted(name for name in names if name.rpartition("/")[2] in _LEFT_OUT)
-
-
 def aslfeat_from(tensors: Mapping[str, torch.Tensor], where: str) -> AslFeatNet:
-    """The network of a checkpoint, in eval mode; a note in the log names what was left out.
-
-    ``tensors`` are as of :func:`aslfeat_state`. Raises DataError for variables that are missing,
-    unexpected or of another shape, and for a scale that is not positive.
-    """
-    if left_out := optimiser_variables(tensors):
-        logging.getLogger(__name__).info(
-            "%s: left out, needed in training only: %s", where, ", ".join(left_out)
-        )
+    """Build the network from a converted checkpoint, in eval mode."""
     net = AslFeatNet()
-    load_strictly(net, aslfeat_state(tensors), where)
+    load_strictly(net, tensors, where)
     for name in _SCORED:
         scale = float(net.get_buffer(f"tower.{name}.instance_max"))
         if not 0 < scale < float("inf"):

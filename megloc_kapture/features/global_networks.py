@@ -1,9 +1,8 @@
-"""Global features by networks: NetVLAD, OpenIBL, AP-GeM, DELG, EigenPlaces and MegaLoc.
+"""Global features by networks: NetVLAD, OpenIBL, AP-GeM, DELG and MegaLoc.
 
 Plugins of group ``megloc_kapture.global_features`` with their authors' weights: NetVLAD
 (Arandjelovic et al., CVPR 2016), OpenIBL (Ge et al., ECCV 2020, "SFRS"), AP-GeM (Revaud et al.,
-ICCV 2019), DELG (Cao et al., ECCV 2020), EigenPlaces (Berton et al., ICCV 2023) and MegaLoc (Berton
-and Masone, CVPR Workshops 2025).
+ICCV 2019), DELG (Cao et al., ECCV 2020) and MegaLoc (Berton and Masone, CVPR Workshops 2025).
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ from megloc_kapture.nets.global_descriptors import (
     STRIDE_PX,
     VggNetVlad,
     apgem_from,
-    eigenplaces_from,
     netvlad,
     openibl,
     whitening_from,
@@ -75,17 +73,13 @@ class GlobalNetwork(Checkpointed[GlobalOptions]):
         self.name = stem if self.method in stem else f"{self.method}-{stem}"
 
     def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The vector of an RGB image, uint8 (H, W, 3): float32 (D,), unit length.
-
-        Raises DataError where the checkpoint does not fit, or the image is too small, OptionError
-        where the device is not there.
-        """
+        """The vector of an RGB image, uint8 (H, W, 3): float32 (D,), unit length."""
         return self.describe_many([image])[0]
 
     def describe_many(self, images: Images) -> NDArray[np.float32]:
         """The vectors of images of one size, float32 (B, D), in their order, of one batch.
 
-        As one by one but for rounding. Raises as :meth:`describe`.
+        As one by one but for rounding.
         """
         made = self.network(self._load, *self._load_with, channels_last=self._channels_last)
         network, device = made
@@ -243,8 +237,7 @@ class DelgOptions(GlobalNetworkOptions):
 
     weights: str = Field(
         default="delg-r101-gldv2clean",
-        description="delg-{r50,r101}-{gld,gldv2clean}, or a file: a SavedModel's tar, or the "
-        ".index in its folder variables",
+        description="delg-{r50,r101}-{gld,gldv2clean}, or a converted file",
     )
     max_size_px: int | None = Field(
         default=1024, ge=32, description="longer side that scale 1 is of; none: the image's own"
@@ -280,31 +273,6 @@ def _with_longer_side(image: NDArray[np.uint8], max_size_px: int | None) -> NDAr
     scale = max_size_px / max(height, width)
     size = max(round(width * scale), 1), max(round(height * scale), 1)
     return _bilinear(image, size)
-
-
-class EigenPlacesOptions(GlobalNetworkOptions):
-    """Options of EigenPlaces."""
-
-    weights: str = Field(
-        default="eigenplaces",
-        description="eigenplaces (ResNet-50, 2048-d), or a file, also of ResNet-101, of fewer "
-        "components, or CosPlace's",
-    )
-    max_size_px: int | None = Field(
-        default=1024,
-        ge=32,
-        description="longer side that the network sees; none: the image's own, as the authors "
-        "evaluate",
-    )
-
-
-class EigenPlaces(GlobalNetwork[EigenPlacesOptions]):
-    """EigenPlaces' vector of an image, float32 (D,), unit length; D is 2048 or the checkpoint's."""
-
-    name = method = "eigenplaces"
-    Options = EigenPlacesOptions
-    _load = staticmethod(eigenplaces_from)
-    _channels_last = True
 
 
 class MegaLocOptions(GlobalNetworkOptions):

@@ -43,8 +43,7 @@ class LocalNetwork(Checkpointed[LocalOptions], ABC):
         """Extract from an RGB image, uint8 (H, W, 3).
 
         Keypoints on False pixels of the mask (H, W) are removed after non-maximum suppression,
-        before the best are selected. Raises DataError where the checkpoint does not fit,
-        OptionError where the device is not there.
+        before the best are selected.
         """
         return self.extract_many([image], [mask])[0]
 

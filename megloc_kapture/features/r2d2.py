@@ -151,10 +151,7 @@ class R2D2Network(nn.Module):
 
 
 def load_r2d2(tensors: Mapping[str, torch.Tensor], where: str) -> R2D2Network:
-    """The network of a checkpoint, for inference; its width is the file's.
-
-    Raises DataError that names the keys that do not fit.
-    """
+    """The network of a checkpoint, for inference; its width is the file's."""
     first = tensors.get("ops.0.weight")
     if first is None or first.ndim != 4:
         raise DataError(

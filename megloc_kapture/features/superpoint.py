@@ -201,11 +201,7 @@ class SplitSuperPoint(nn.Module):
 def superpoint_from(
     tensors: Mapping[str, torch.Tensor], where: str, descriptor_weights: WeightsFile | None = None
 ) -> SuperPointNet | SplitSuperPoint | SuperPointBatchNormNet:
-    """The network of a checkpoint, of either layout, maybe with the descriptors of another file.
-
-    Raises DataError that names what does not fit, and the file, OptionError for a second file
-    where the first is of the retraining.
-    """
+    """The network of a checkpoint, of either layout, maybe with the descriptors of another file."""
     if any(key.startswith("backbone.") for key in tensors):
         if descriptor_weights is not None:
             raise OptionError(
@@ -233,10 +229,10 @@ def superpoint_with_descriptor(
 ) -> SuperPointNet | SplitSuperPoint:
     """The detector of one checkpoint and the descriptors of another.
 
-    Raises DataError that names the keys that do not fit, and the file. ``detector``: an official
-    checkpoint; its descriptor head may be missing and is not used; ``descriptor``: the descriptor
-    head alone, which then works on the detector's features, or the head with a backbone of its own.
-    A detector head in it is not used: that of the other file is frozen.
+    ``detector``: an official checkpoint; its descriptor head may be missing and is not used;
+    ``descriptor``: the descriptor head alone, which then works on the detector's features, or the
+    head with a backbone of its own. A detector head in it is not used: that of the other file is
+    frozen.
     """
     head = {key: value for key, value in descriptor.items() if not key.startswith("convP")}
     frozen = {key: value for key, value in detector.items() if not key.startswith("convD")}

@@ -100,7 +100,7 @@ def learn_whitening(vectors: Float32, dimensions: int, power: float = 1.0) -> Pc
     unlike. So the deviation that each is divided by may be taken to a power below one, as AP-GeM's
     published whitening does (Revaud et al., ICCV 2019: the variance to the power 0.25, which is 0.5
     here). At most so many dimensions are kept, and never more than the vectors vary in, which is
-    less than N. Raises DataError for fewer than two different vectors.
+    less than N.
     """
     mean = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)
     vectors -= mean
@@ -166,11 +166,6 @@ def train_vlad(
     ----------
     length, read : how many descriptors an image has, and these (N, D).
     each : what shares the description of the images, which whitening is learnt from.
-
-    Raises
-    ------
-    DataError : no descriptors, fewer distinct ones than clusters, values that are not finite, or
-        too few images for whitening.
     """
     options = options or VladOptions()
     rows = sample_rows(map(length, images), options.training_descriptors, options.seed)
@@ -207,10 +202,7 @@ def _read_and_aggregate(
 def train_vocabulary(
     descriptors: NDArray[np.floating[Any]], options: VladOptions | None = None
 ) -> Vocabulary:
-    """k-means (k-means++ start, Lloyd) over descriptors (N, D), once per vocabulary; no whitening.
-
-    Raises DataError for fewer distinct descriptors than clusters, or values that are not finite.
-    """
+    """Cluster descriptors (N, D) by k-means (k-means++), once per vocabulary, unwhitened."""
     options = options or VladOptions()
     data = np.ascontiguousarray(descriptors, dtype=np.float32)
     if len(data) < options.num_clusters:

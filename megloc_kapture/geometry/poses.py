@@ -274,10 +274,6 @@ def align_poses(
     Parameters
     ----------
     source, target : quaternions (N, 4) and translations (N, 3) of the same cameras.
-
-    Raises
-    ------
-    DataError : fewer than three poses, or all of them at one place.
     """
     number = len(source[0])
     if number < 3:
@@ -350,3 +346,16 @@ def _similarity(
     )[0].as_matrix()
     scale = float((weights[:, None] * b * (a @ rotation.T)).sum()) / spread
     return scale, rotation, means[1] - scale * rotation @ means[0]
+
+
+def perturbed(cam_from_world: RigidTransform, step: NDArray[np.float64]) -> RigidTransform:
+    """Return ``exp(omega) R`` and ``exp(omega) t + v`` for a step (omega, v).
+
+    Omega in radians, v in the unit of the pose.
+    """
+    angle = float(np.linalg.norm(step[:3]))
+    # sin(x / 2) / x, through its limit
+    half_sinc = 0.5 * float(np.sinc(0.5 * angle / np.pi))
+    x, y, z = (half_sinc * step[:3]).tolist()
+    tx, ty, tz = step[3:].tolist()
+    return RigidTransform((float(np.cos(0.5 * angle)), x, y, z), (tx, ty, tz)) @ cam_from_world

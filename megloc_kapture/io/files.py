@@ -347,6 +347,6 @@ def first_problem(error: ValidationError) -> str:
     """The first problem of a validation in one line: ``field: what is wrong``."""
     problem = error.errors(include_url=False)[0]
     field = ".".join(map(str, problem["loc"]))
-    message = problem["msg"].removeprefix("Value error, ")
+    message = problem["msg"].removeprefix("Value error, ").replace("Input should", "it should")
     more = error.error_count() - 1
     return (f"{field}: " if field else "") + message + (f" (and {more} more)" if more else "")

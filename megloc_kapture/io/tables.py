@@ -92,7 +92,8 @@ def read_status(path: Path | str) -> dict[str, QueryStatus]:
 
 def write_status(path: Path | str, statuses: Iterable[QueryStatus]) -> None:
     """Write ``status.csv``, sorted by image."""
-    _STATUS.write(path, sorted(statuses, key=lambda status: status.image))
+    ordered = sorted(statuses, key=lambda status: status.image)
+    _STATUS.write(path, ordered)
 
 
 _UPPER = np.triu_indices(6)
@@ -208,7 +209,8 @@ def read_refinement(path: Path | str) -> list[RefinementRow]:
 
 def write_refinement(path: Path, rows: Iterable[RefinementRow]) -> None:
     """Write ``refinement.csv`` by image; the steps of one stay in order."""
-    _REFINEMENT.write(path, sorted(rows, key=lambda row: row.image))
+    ordered = sorted(rows, key=lambda row: row.image)
+    _REFINEMENT.write(path, ordered)
 
 
 _Median = Annotated[float, or_empty(number(".6g"), math.nan)]

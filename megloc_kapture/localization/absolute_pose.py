@@ -22,7 +22,7 @@ from __future__ import annotations
 import ctypes
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.geometry.cameras import focal_px, normalized_from_px
-from megloc_kapture.geometry.poses import cross_matrix, unstack_poses
+from megloc_kapture.geometry.poses import cross_matrix, perturbed, unstack_poses
 from megloc_kapture.localization.map_index import PoseProblem, View, undo_recentring
 from megloc_kapture.values import Camera, Failure, Options, Pose, RigidTransform
 
@@ -45,6 +45,11 @@ _CAUCHY_EFFICIENT = 2.385
 # a handful of perfect matches is no proof of perfection
 _MIN_VARIANCE_PX2 = 0.1**2
 _MAX_CONDITION = 1e12
+_MAX_STEPS = 20
+# squared length in standard deviations (for one pixel) of a step that is the last one
+_LAST_STEP = 1e-5
+# the first damping after a step that did not help
+_DAMPING = 1e-4
 Floats = NDArray[np.float64]
 
 
@@ -153,7 +158,7 @@ def estimate_pose(problem: PoseProblem, options: AbsolutePoseOptions) -> PoseEst
             num_matches=count,
         )
     rig_from_world = _ransac(problem, rays, usable, options)
-    errors_px, _ = _measured(problem, rig_from_world, usable)
+    errors_px = np.where(usable, _Projected.of(problem, rig_from_world).errors_px, np.inf)
     inliers = errors_px <= options.max_error_px
     num_inliers = int(np.count_nonzero(inliers))
     if num_inliers < options.min_inliers:
@@ -171,29 +176,111 @@ def _too_few_agree(num_inliers: int, count: int, options: AbsolutePoseOptions) -
 
 
 def match_errors(problem: PoseProblem, rig_from_world: RigidTransform) -> tuple[Floats, Floats]:
-    """Errors in pixels (N,) of all matches, and the same by Mahalanobis' distance, where an error
-    of one pixel, and what the point's covariance makes of it, count as one.
+    """Errors in pixels (N,) of all matches, and their Mahalanobis distances (N,).
 
+    In the latter an error has the variance of one pixel, plus that of the point's covariance.
     Infinite behind the camera and where a point is not finite.
     """
-    usable = np.asarray(np.isfinite(problem.points).all(axis=1))
-    return _measured(problem, undo_recentring(rig_from_world, -problem.offset), usable)
+    pose = undo_recentring(rig_from_world, -problem.offset)
+    projected = _Projected.of(problem, pose)
+    whitened = _whitened(projected.residuals, _whitening(problem, projected, pose, 1.0))
+    distances = np.linalg.norm(whitened, axis=1)
+    return projected.errors_px, np.where(np.isfinite(distances), distances, np.inf)
 
 
-def _measured(
-    problem: PoseProblem, rig_from_world: RigidTransform, usable: NDArray[np.bool_]
-) -> tuple[Floats, Floats]:
-    """:func:`match_errors` of the usable matches, by a pose in the recentred world."""
-    from megloc_kapture.localization import kernels
+@dataclass(frozen=True, eq=False)
+class _Projected:
+    """Some of a problem's points, projected by a pose in the recentred world.
 
-    count = len(usable)
-    errors, squared = np.empty(count), np.full(count, np.inf)
-    rotation, translation = rig_from_world.rotation_matrix(), np.array(rig_from_world.translation)
-    whitening, depths = np.empty((count, 3)), np.empty(count)
-    kernels.measure(
-        problem.matches, usable, rotation, translation, errors, whitening, squared, depths
+    Attributes
+    ----------
+    residuals : float64 (N, 2), pixels; NaN behind a camera and where a point is not finite.
+    slopes : float64 (N, 2, 3), derivatives by the points in the rig.
+    in_rig, depths : float64 (N, 3) the points in the rig, (N,) their depths in the camera.
+    """
+
+    residuals: Floats
+    slopes: Floats
+    in_rig: Floats
+    depths: Floats
+
+    @classmethod
+    def of(
+        cls,
+        problem: PoseProblem,
+        rig_from_world: RigidTransform,
+        rows: NDArray[np.int64] | None = None,
+    ) -> _Projected:
+        """Project the matches ``rows`` (N,), ascending; all of them by default."""
+        from megloc_kapture.geometry.projection import project_with_jacobian
+
+        rows = np.arange(len(problem.points)) if rows is None else rows
+        in_rig = rig_from_world.apply(problem.points[rows])
+        bounds = np.searchsorted(rows, problem.starts).tolist()
+        residuals, slopes, depths = [], [], []
+        for view, first, last in zip(problem.views, bounds[:-1], bounds[1:], strict=True):
+            in_cam = view.cam_from_rig.apply(in_rig[first:last])
+            px, by_point = project_with_jacobian(view.camera, in_cam)
+            residuals.append(px - problem.points_px[rows[first:last]])
+            if view.cam_from_rig != RigidTransform.identity():
+                by_point = by_point @ view.cam_from_rig.rotation_matrix()
+            slopes.append(by_point)
+            depths.append(in_cam[:, 2])
+        return cls(
+            np.concatenate(residuals), np.concatenate(slopes), in_rig, np.concatenate(depths)
+        )
+
+    @property
+    def errors_px(self) -> Floats:
+        errors = np.linalg.norm(self.residuals, axis=1)
+        return np.where(np.isfinite(errors), errors, np.inf)
+
+    def jacobian(self, whitening: Floats) -> Floats:
+        """Derivatives (N, 2, 6) of whitened residuals by a left perturbation of the pose."""
+        by_point = _whitened(self.slopes, whitening)
+        # a^T (omega x p) = omega^T (p x a)
+        (x, y, z), (a, b, c) = self.in_rig.T[:, :, None], np.moveaxis(by_point, 2, 0)
+        return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], axis=2)
+
+
+def _whitening(
+    problem: PoseProblem, projected: _Projected, rig_from_world: RigidTransform, map_noise: float
+) -> Floats:
+    """Inverse Cholesky factors of the residuals' covariances ``I + m^2 J C J^T``.
+
+    float64 (N, 3), the elements (0, 0), (1, 0) and (1, 1).
+    """
+    whitening = np.tile([1.0, 0.0, 1.0], (len(problem.points), 1))
+    if len(problem.covariances) == 0 or map_noise == 0:
+        return whitening
+    by_world = projected.slopes.reshape(-1, 3) @ (map_noise * rig_from_world.rotation_matrix())
+    u, v = by_world.reshape(-1, 2, 3).transpose(1, 2, 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        s00 = 1.0 + _quadratic(problem.covariances, u, u)
+        s01 = _quadratic(problem.covariances, u, v)
+        left = 1.0 + _quadratic(problem.covariances, v, v) - s01**2 / s00
+    # an unknown covariance counts as none
+    known = (s00 > 0) & (s00 < np.inf) & (left > 0) & (left < np.inf)
+    s00, s01, left = s00[known], s01[known], left[known]
+    whitening[known] = np.stack([s00**-0.5, -s01 / s00 * left**-0.5, left**-0.5], axis=1)
+    return whitening
+
+
+def _quadratic(covariances: Floats, u: Floats, v: Floats) -> Floats:
+    """``u^T C v`` (N,) of vectors (3, N), C stored as xx, xy, xz, yy, yz, zz."""
+    xx, xy, xz, yy, yz, zz = covariances.T
+    return (
+        u[0] * (xx * v[0] + xy * v[1] + xz * v[2])
+        + u[1] * (xy * v[0] + yy * v[1] + yz * v[2])
+        + u[2] * (xz * v[0] + yz * v[1] + zz * v[2])
     )
-    return errors, np.sqrt(squared)
+
+
+def _whitened(values: Floats, whitening: Floats) -> Floats:
+    """Residuals (N, 2), or their derivatives (N, 2, K), times the inverse Cholesky factors."""
+    w00, w10, w11 = whitening.T.reshape(3, -1, *(1,) * (values.ndim - 2))
+    first, second = values[:, 0], values[:, 1]
+    return np.stack([w00 * first, w10 * first + w11 * second], axis=1)
 
 
 def _ransac(
@@ -257,31 +344,23 @@ def refine_pose(
     over the matches of all views in order (inliers by their error in pixels, whatever their
     points' uncertainty); or Failure with the reason.
     """
-    from megloc_kapture.localization import kernels
-
     count = len(problem.points)
-    problem = replace(problem, covariances=problem.covariances * options.map_noise**2)
-    start = undo_recentring(estimate.rig_from_world, -problem.offset)
-    pose = start.rotation_matrix(), np.array(start.translation)
-    matches = problem.matches
-    errors, squared, depths = np.empty(count), np.empty(count), np.empty(count)
-    whitening, gradient, information = np.empty((count, 3)), np.empty(6), np.empty((6, 6))
+    pose = undo_recentring(estimate.rig_from_world, -problem.offset)
     for remaining in range(_ROUNDS, -1, -1):
-        kernels.measure(matches, estimate.usable, *pose, errors, whitening, squared, depths)
-        inliers = errors <= options.max_error_px
+        projected = _Projected.of(problem, pose)
+        inliers = estimate.usable & (projected.errors_px <= options.max_error_px)
         rows = np.flatnonzero(inliers)
         if len(rows) < options.min_inliers:
             return _too_few_agree(len(rows), count, options)
-        sigma = max(_median(squared[rows]) ** 0.5 / _RAYLEIGH_MEDIAN, _MIN_SIGMA_PX)
-        squared_scale = (_CAUCHY_EFFICIENT * sigma) ** 2
+        whitening = _whitening(problem, projected, pose, options.map_noise)
+        whitened = _whitened(projected.residuals[rows], whitening[rows])
+        squared = (whitened**2).sum(axis=1)
+        sigma = max(_median(squared) ** 0.5 / _RAYLEIGH_MEDIAN, _MIN_SIGMA_PX)
         if remaining > 0:
-            pose = kernels.levenberg_marquardt(
-                matches, rows, whitening, *pose, sigma, squared_scale
-            )
-    kernels.normal_equations(matches, rows, whitening, *pose, np.inf, gradient, information)
-    covariance = pose_covariance(
-        np.triu(information) + np.triu(information, 1).T, _variance(squared[rows], squared_scale)
-    )
+            pose = _minimised(problem, pose, rows, whitening[rows], sigma)
+    jacobian = _Projected.of(problem, pose, rows).jacobian(whitening[rows]).reshape(-1, 6)
+    variance = _variance(squared, (_CAUCHY_EFFICIENT * sigma) ** 2)
+    covariance = pose_covariance(jacobian.T @ jacobian, variance)
     if covariance is None:
         return Failure(
             "the pose is not determined by its inliers (degenerate configuration)",
@@ -290,13 +369,53 @@ def refine_pose(
         )
     # a left perturbation acts in the camera frame: the covariance does not see the offset
     found = Pose(
-        cam_from_world=undo_recentring(RigidTransform.from_matrix(*pose), problem.offset),
+        cam_from_world=undo_recentring(pose, problem.offset),
         num_matches=count,
         num_inliers=len(rows),
         inliers=inliers,
         covariance=covariance,
     )
-    return check_stable(found, covariance, _median(depths[rows]), options)
+    return check_stable(found, covariance, _median(projected.depths[rows]), options)
+
+
+def _minimised(
+    problem: PoseProblem,
+    pose: RigidTransform,
+    rows: NDArray[np.int64],
+    whitening: Floats,
+    sigma: float,
+) -> RigidTransform:
+    """Minimise the Cauchy loss of whitened residuals by Levenberg-Marquardt.
+
+    With the weight ``w = 1 / (1 + e^2 / c^2)`` of a residual of length e, the gradient sums
+    ``w J^T r`` and the Hessian ``w^2 J^T J``: the expectation of the loss' second derivative over
+    the directions of r. Steps by it converge faster than reweighted least squares.
+    """
+    squared_scale = (_CAUCHY_EFFICIENT * sigma) ** 2
+    best, least, damping = pose, np.inf, 0.0
+    gradient, hessian = np.zeros(6), np.zeros((6, 6))
+    for _ in range(_MAX_STEPS):
+        projected = _Projected.of(problem, pose, rows)
+        whitened = _whitened(projected.residuals, whitening)
+        growth = 1.0 + (whitened**2).sum(axis=1) / squared_scale
+        # a point that a step has put behind the camera makes the cost NaN
+        cost = float(np.log(growth).sum())
+        if cost < least:
+            best, least, damping = pose, cost, 0.1 * damping
+            jacobian = projected.jacobian(whitening) / growth[:, None, None]
+            flat = jacobian.reshape(-1, 6)
+            gradient, hessian = flat.T @ whitened.ravel(), flat.T @ flat
+        else:
+            damping = max(10.0 * damping, _DAMPING)
+        try:
+            damped = hessian + damping * np.diag(np.diagonal(hessian))
+            step = np.asarray(-np.linalg.solve(damped, gradient), np.float64)
+        except np.linalg.LinAlgError:  # the inliers do not determine the pose
+            return best
+        pose = perturbed(best, np.asarray(step, np.float64))
+        if -(gradient @ step) < _LAST_STEP * sigma**2:
+            return pose
+    return best
 
 
 def check_stable(

@@ -30,7 +30,7 @@ from megloc_kapture.localization.absolute_pose import (
     refine_pose,
     transform_covariance,
 )
-from megloc_kapture.localization.confidence import MatchSources, match_sources, with_confidence
+from megloc_kapture.localization.confidence import match_sources, with_confidence
 from megloc_kapture.localization.focal_length import (
     estimate_with_intrinsics,
     focal_misfit,
@@ -38,7 +38,6 @@ from megloc_kapture.localization.focal_length import (
     refine_with_intrinsics,
 )
 from megloc_kapture.localization.map_index import Correspondences, MapIndex, PoseProblem, QueryView
-from megloc_kapture.localization.mirrored import mirror_matches
 from megloc_kapture.localization.ranking import poses_agree
 from megloc_kapture.localization.structure import displacements_rad
 from megloc_kapture.plugins import HypothesisView, PoseHypothesis, RankingScene
@@ -69,14 +68,6 @@ class ClusterOptions(Options):
     max_clusters: int = Field(
         default=10, gt=0, description="clusters tried, those with the most matches"
     )
-
-    def idle(self) -> dict[str, str]:
-        idle = {}
-        if self.by != "poses":
-            idle["radius"] = f"it is for clusters by poses, these are by {self.by}"
-        if self.by != "covisibility":
-            idle["min_shared_points"] = f"it is for covisibility, clusters are by {self.by}"
-        return idle
 
     @model_validator(mode="after")
     def _has_scale(self) -> ClusterOptions:
@@ -243,8 +234,7 @@ def localize_in_clusters(
             sources = match_sources(views, found, ranked[best].images, centers or {})
             if scene is not None:
                 seen = partial(displacements_rad, problem, views, found, scene)
-                reflected = partial(_mirror_matches, views, ranked[best].images, sources, scene)
-                sources = replace(sources, displacements_rad=seen, mirror_matches=reflected)
+                sources = replace(sources, displacements_rad=seen)
             known = result.camera is None
             misfit = focal_misfit(problem, result, options) if known else None
             result = with_confidence(
@@ -261,28 +251,6 @@ def localize_in_clusters(
         inlier_points_world=problem.points[result.inliers] + problem.offset,
     )
     return pose, problem
-
-
-def _mirror_matches(
-    views: Sequence[QueryView],
-    cluster: Sequence[str],
-    sources: MatchSources,
-    scene: RankingScene,
-    pose: Pose,
-) -> tuple[int, int]:
-    """Matches as they are and reflected, with the map images of each view, most inliers first."""
-    assert pose.inliers is not None  # it was estimated here
-    sighted = np.repeat(pose.inliers, sources.support)
-    counts = np.bincount(sources.images[sighted], minlength=len(cluster))
-    by_inliers = [cluster[at] for at in np.argsort(-counts, kind="stable")]
-    matched = [set(view.matched_images()) for view in views]
-    return mirror_matches(
-        [
-            (view.name, [image for image in by_inliers if image in own])
-            for view, own in zip(views, matched, strict=True)
-        ],
-        scene,
-    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,6 @@ from megloc_kapture.geometry.cameras import focal_px, project
 from megloc_kapture.localization.absolute_pose import center_deviation, match_errors
 from megloc_kapture.localization.focal_length import FocalMisfit
 from megloc_kapture.localization.map_index import Correspondences, PoseProblem, QueryView
-from megloc_kapture.localization.mirrored import chance_of, is_mirrored
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
 Floats = NDArray[np.float64]
@@ -44,9 +43,6 @@ _MIN_NOISE_PX = 0.3
 _USUAL_RATIO, _FEW = 2.9, 20
 # a wrong focal length may move the camera by as much, a share of the distance to what it sees
 _TOLERATED_SHIFT = 0.03
-# of confidences from the one to below the other it is asked whether the image is mirrored, which
-# takes 0.3 s
-MIRROR_ASKED = 0.1, 0.995
 
 TERMS: dict[str, str] = {
     "surprise": "hardly more matches agree than would by chance",
@@ -60,9 +56,6 @@ TERMS: dict[str, str] = {
     "support": "few map images agree with the pose",
 }
 """The terms of the model, and what a low contribution of each says."""
-MIRRORED = "mirrored"
-"""Beside the terms: by what probability chance makes features match better in the mirror so much.
-There only where the image seems to be mirrored, see :meth:`Calibration.probability`."""
 
 MAP_POINTS = "map_points"
 """Besides the terms: the number of map points in the camera's view over the number that a trusted
@@ -85,8 +78,6 @@ class MatchSources:
     local_types : keypoints types of the matches.
     displacements_rad : of a pose the angles by which the scene stands elsewhere in the query than
         the pose says, by the looks of its map images; empty where that cannot be told.
-    mirror_matches : of a pose how many features match the map's images as they are, and how many
-        reflected, see :mod:`megloc_kapture.localization.mirrored`.
     """
 
     support: NDArray[np.int64]
@@ -97,7 +88,6 @@ class MatchSources:
     seen: Sequence[Floats]
     local_types: Collection[str] = ()
     displacements_rad: Callable[[Pose], Floats] | None = None
-    mirror_matches: Callable[[Pose], tuple[int, int]] | None = None
 
 
 def evidence_of(
@@ -163,17 +153,6 @@ def with_confidence(
         confidence *= (_TOLERATED_SHIFT / max(misfit.shift, _TOLERATED_SHIFT)) ** 2
         why = misfit.remark
         remarks = (*remarks, why)
-    asked = confidence >= min_confidence and _is_asked(confidence)
-    if asked and sources.mirror_matches is not None:
-        as_it_is, mirrored = sources.mirror_matches(pose)
-        if is_mirrored(as_it_is, mirrored):
-            evidence[MIRRORED] = chance_of(as_it_is, mirrored)
-            confidence = model.probability(evidence)
-            why = (
-                f"the image seems to be mirrored: {as_it_is} features match the map's images as "
-                f"they are, {mirrored} reflected"
-            )
-            remarks = (*remarks, why)
     if confidence >= min_confidence:
         return replace(pose, confidence=confidence, evidence=evidence, remarks=remarks)
     return Failure(
@@ -184,11 +163,6 @@ def with_confidence(
         confidence=confidence,
         remarks=() if misfit is None else (misfit.remark,),
     )
-
-
-def _is_asked(confidence: float) -> bool:
-    lowest, beyond_doubt = MIRROR_ASKED
-    return lowest <= confidence < beyond_doubt
 
 
 def _surprise(problem: PoseProblem, errors_px: Floats, max_error_px: float) -> float:
@@ -323,15 +297,13 @@ class Calibration:
     def probability(self, evidence: Mapping[str, float]) -> float:
         """The probability that a pose of this evidence is right, from 0 to 1.
 
-        That of the terms, times :data:`MAP_POINTS` and :data:`MIRRORED` where the evidence has
-        them.
+        That of the terms, times :data:`MAP_POINTS` where the evidence has it.
         """
         logit = self.bias + sum(
             weight * evidence[name] for name, weight in sorted(self.weights.items())
         )
         of_terms = 1.0 / (1.0 + math.exp(-min(max(logit, -700.0), 700.0)))
-        of_terms *= evidence.get(MAP_POINTS, 1.0)
-        return of_terms * evidence.get(MIRRORED, 1.0) if _is_asked(of_terms) else of_terms
+        return of_terms * evidence.get(MAP_POINTS, 1.0)
 
 
 OF_ALL = "all"

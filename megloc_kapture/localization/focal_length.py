@@ -1,19 +1,18 @@
-"""Intrinsics of a camera, from the matches of its pose, or of the poses of several photographs.
+"""Focal length and other intrinsics of a query's camera, from the matches of its pose.
 
-A wrong focal length hides in the pose: the camera is moved nearer or farther, and most matches
-still agree. What gives it away is perspective. With a pose at hand the focal length is set free
-(Gauss-Newton on rays, Cauchy weights), and what comes of it depends on the camera:
+A wrong focal length hides in the pose: the camera moves nearer or farther, and most matches still
+agree; only perspective contradicts it. So the focal length is set free once a pose is known
+(Gauss-Newton on rays with Cauchy weights):
 
-- one that is known stays as it is; where another focal length fits better by far more than its
-  uncertainty (:func:`focal_misfit`), a remark says so, and the confidence is lower;
-- one whose focal length is not certain (``Camera.focal_deviation``) gets the most probable one, and
-  principal point and radial distortion, where its model has one, with what was known before as a
-  prior. The first estimate is by P4Pf where P3P with the given focal length has fewer inliers. The
-  covariance of the pose has the uncertainty of the intrinsics in it. What was known is doubted
-  where the matches contradict it: of a photograph that was cropped, whose principal point is far
-  off the middle, and of one whose EXIF tells of another lens.
+- A calibrated camera stays as it is. Where another focal length fits better by far more than its
+  uncertainty (:func:`focal_misfit`), the pose gets a remark and a lower confidence.
+- A camera with an uncertain focal length (``Camera.focal_deviation``) gets the most probable focal
+  length, principal point and radial distortion, with EXIF, the image's centre and no distortion as
+  a prior. The covariance of the pose contains the uncertainty of the intrinsics. pycolmap's
+  refinement has no prior, and returns no covariance of the focal length.
+- Photographs of one camera share their estimates (:func:`solve_with_shared_camera`).
 
-Of a flat scene seen straight on matches say nothing: then what was known before stays.
+Matches with a flat scene seen straight on do not determine the focal length: then the prior stays.
 """
 
 from __future__ import annotations
@@ -59,26 +58,21 @@ _SMALL_STEP = 1e-4
 # intrinsics are settled when the focal length moves by less, as a share
 _SETTLED = 1e-4
 _MAX_UPDATES = 8
-# P4Pf's focal length may be that many deviations from what was known
+# P4Pf's focal length may differ by as many deviations from the prior; beyond, the prior is doubted
 _MAX_DEVIATIONS = 3.0
-# standard deviations of what nobody tells of a camera: the principal point's as a share of the
-# larger side, and the radial distortion's
+# the prior of a focal length that the matches contradict, and the least deviation of one that may
+# be doubted: one that was calibrated, or estimated from several images, is not
+_DOUBTED_DEVIATION, _MIN_DOUBTED = 0.7, 0.1
+# prior standard deviations: of the principal point as a share of the larger side, and of the
+# radial distortion
 _PRINCIPAL_POINT_DEVIATION, _DISTORTION_DEVIATION = 0.01, 0.1
 # a calibrated camera may be off by as much: the focal length, and the radial distortion
 _CALIBRATED, _CALIBRATED_DISTORTION = 0.01, 0.02
 # errors of neighbouring points are alike: they average out as those of so many matches would
 _INDEPENDENT = 30
-# matches were verified with the given focal length: another that they tell is off by such a share
-# of the difference
+# matches were verified with the given focal length: the better one is uncertain by such a share of
+# the difference
 _BIASED_BY = 0.1
-# what is believed where the matches contradict it, instead of EXIF's 0.1 and the above
-_DOUBTED_FOCAL, _DOUBTED_PRINCIPAL_POINT = 0.7, 0.3
-# a focal length that was calibrated, or estimated of several images, is not doubted
-_MIN_DOUBTED = 0.1
-# what contradicts: that large a shift of the principal point, a share of the larger side, or
-# _MAX_DEVIATIONS of the focal length; both by as many of their own uncertainty
-_MIN_CROP = 0.04
-_DOUBT_ROUNDS = 3
 # an estimate this many standard deviations off is of another zoom
 _MAX_SIGMAS = 3.0
 # errors of a map, and a lens that is none of the model, are alike in photographs: their number
@@ -249,95 +243,67 @@ def misfits_text(remarks: Iterable[str], where: str) -> str | None:
 
 
 def estimate_remark(camera: Camera, given: Camera) -> str:
-    """Name the focal length that was estimated of an uncertain camera."""
+    """Name the focal length that was estimated for an uncertain camera."""
     found_px, given_px = focal_px(camera), focal_px(given)
-    told = (
+    return (
         f"focal length estimated: {found_px:.0f} +- {camera.focal_deviation * found_px:.0f} px "
         f"({given_px:.0f} px +- {100 * given.focal_deviation:.0f} % was assumed)"
     )
-    x, y = _shift(camera, given)
-    if max(abs(x), abs(y)) > _MIN_CROP:
-        told += (
-            f"; the photograph was cropped: its principal point is {abs(100 * x):.0f} % and "
-            f"{abs(100 * y):.0f} % of the larger side off the middle"
-        )
-    return told
 
 
 def estimate_with_intrinsics(
     problem: PoseProblem, options: AbsolutePoseOptions
 ) -> tuple[PoseProblem, PoseEstimate | Failure]:
-    """Estimate pose and intrinsics of an uncertain camera; the problem is then that camera's."""
+    """Estimate pose and intrinsics of an uncertain camera; the problem returned has that camera.
+
+    The camera of the problem has a larger ``focal_deviation`` where the matches contradict the
+    given focal length, as with the EXIF of another lens.
+    """
     given = problem.views[0].camera
     found = estimate_pose(problem, options)
     free = focal_from_matches(
         problem.points_px, problem.points, given, options.max_error_px, options.seed
     )
-    may_doubt, doubting = given.focal_deviation >= _MIN_DOUBTED, None
-    camera = given if free is None else scale_focal(given, free / focal_px(given))
-    far = _is_doubted(camera, given)
-    if free is not None and (may_doubt or not far):
-        other = _with_camera(problem, camera)
+    if free is not None:
+        other = _with_camera(problem, _scaled(given, free))
         of_other = estimate_pose(other, options)
-        if isinstance(of_other, PoseEstimate) and of_other.num_inliers > found.num_inliers:
-            if far:
-                doubting = other, of_other
-            else:
-                problem, found = other, of_other
+        if (
+            isinstance(of_other, PoseEstimate)
+            and of_other.num_inliers > found.num_inliers
+            and _is_possible(other, of_other, given)
+        ):
+            problem, found = other, of_other
     if isinstance(found, PoseEstimate):
         fit = _fit(problem, found.rig_from_world, found.inliers, given)
         if fit is not None:
-            better = _with_camera(problem, _changed(problem.views[0].camera, fit.change))
-            of_better = estimate_pose(better, options)
-            if isinstance(of_better, PoseEstimate) and of_better.num_inliers >= found.num_inliers:
-                problem, found = better, of_better
-        doubting = doubting or (problem, found)
-    if doubting is not None and may_doubt:
-        doubted = _doubted(*doubting, given, options)
-        if doubted is not None and doubted[1].num_inliers >= found.num_inliers:
-            return doubted
+            refined = _with_camera(problem, _changed(problem.views[0].camera, fit.change))
+            estimate = estimate_pose(refined, options)
+            if isinstance(estimate, PoseEstimate) and estimate.num_inliers >= found.num_inliers:
+                return refined, estimate
     return problem, found
 
 
-def _doubted(
-    problem: PoseProblem, found: PoseEstimate, given: Camera, options: AbsolutePoseOptions
-) -> tuple[PoseProblem, PoseEstimate] | None:
-    """The estimate that believes little of what is known of the camera; None where the matches do
-    not contradict that beyond doubt."""
-    for _ in range(_DOUBT_ROUNDS):
-        if found.num_inliers < _MIN_INLIERS:
-            return None
-        fit = _fit(problem, found.rig_from_world, found.inliers, given, doubting=True)
-        if fit is None:
-            return None
-        camera = _changed(problem.views[0].camera, fit.change)
-        if not _is_doubted(camera, given, _MAX_DEVIATIONS * fit.deviations):
-            return None
-        problem = _with_camera(problem, camera)
-        estimate = estimate_pose(problem, options)
-        if not isinstance(estimate, PoseEstimate):
-            return None
-        found = estimate
-    return problem, found
+def _scaled(given: Camera, focal: float) -> Camera:
+    """The camera with another focal length; its prior is weak where that contradicts it."""
+    camera = scale_focal(given, focal / focal_px(given))
+    if abs(math.log(focal / focal_px(given))) > _MAX_DEVIATIONS * given.focal_deviation:
+        return replace(camera, focal_deviation=max(_DOUBTED_DEVIATION, given.focal_deviation))
+    return camera
 
 
-def _is_doubted(camera: Camera, given: Camera, beyond: Floats | None = None) -> bool:
-    """Whether a camera contradicts the given one, ``beyond`` what its uncertainty explains."""
-    bounds = np.zeros(3) if beyond is None else beyond[:3]
-    zoom = abs(math.log(focal_px(camera) / focal_px(given)))
-    shift = np.abs(_shift(camera, given))
-    to_share = focal_px(camera) / max(camera.width, camera.height)
-    return bool(
-        zoom > max(_MAX_DEVIATIONS * given.focal_deviation, bounds[0])
-        or (shift > np.maximum(_MIN_CROP, to_share * bounds[1:3])).any()
-    )
-
-
-def _shift(camera: Camera, given: Camera) -> tuple[float, float]:
-    """How far the principal point is from the given one, as shares of the larger side."""
-    larger = max(camera.width, camera.height)
-    x, y = np.subtract(principal_point_px(camera), principal_point_px(given)) / larger
-    return float(x), float(y)
+def _is_possible(problem: PoseProblem, found: PoseEstimate, given: Camera) -> bool:
+    """Whether the prior allows the focal length, or the matches certainly contradict the prior."""
+    camera = problem.views[0].camera
+    change = math.log(focal_px(camera) / focal_px(given))
+    if abs(change) <= _MAX_DEVIATIONS * given.focal_deviation:
+        return True
+    if given.focal_deviation < _MIN_DOUBTED or found.num_inliers < _MIN_INLIERS:
+        return False
+    fit = _fit(problem, found.rig_from_world, found.inliers, given)
+    if fit is None:
+        return False
+    change += float(fit.change[0])
+    return abs(change) > _MAX_DEVIATIONS * max(given.focal_deviation, fit.deviation)
 
 
 def refine_with_intrinsics(
@@ -384,18 +350,15 @@ def _changed(camera: Camera, change: Floats) -> Camera:
     return with_distortion(camera, radial_distortion(camera) + float(change[3]))
 
 
-def _prior_of(camera: Camera, given: Camera, *, doubting: bool) -> tuple[Floats, Floats]:
-    """The change that makes a camera the given one, and its standard deviations."""
+def _prior_of(camera: Camera, given: Camera) -> tuple[Floats, Floats]:
+    """The change that turns a camera into the given one, and its standard deviations."""
     focal = focal_px(camera)
     shift = np.subtract(principal_point_px(given), principal_point_px(camera)) / focal
-    # a focal length that is known this well was calibrated, or estimated of several images: the
+    # larger where the matches contradict the given focal length
+    known = max(given.focal_deviation, camera.focal_deviation)
+    # a focal length that is known this well was calibrated, or estimated from several images: the
     # rest is known as well then
-    known = given.focal_deviation
-    share = min(_PRINCIPAL_POINT_DEVIATION, known)
-    # a camera that contradicts the given one does so because the matches did
-    if doubting or (known >= _MIN_DOUBTED and _is_doubted(camera, given)):
-        known, share = max(_DOUBTED_FOCAL, known), _DOUBTED_PRINCIPAL_POINT
-    deviation = share * max(camera.width, camera.height) / focal
+    deviation = min(_PRINCIPAL_POINT_DEVIATION, known) * max(camera.width, camera.height) / focal
     change = [math.log(focal_px(given) / focal), *shift]
     deviations = [known, deviation, deviation]
     if camera.model in RADIAL_MODELS:
@@ -409,16 +372,13 @@ def _fit(
     rig_from_world: RigidTransform,
     inliers: NDArray[np.bool_],
     given: Camera,
-    *,
-    doubting: bool = False,
 ) -> _Fit | None:
-    """The camera that fits the inliers best; None where nothing determines it.
+    """The camera that fits the inliers best; None where they do not determine it.
 
-    ``given``: the camera as it is known before, with its deviation. ``doubting``: little of it is
-    believed.
+    ``given``: the prior, with its deviation.
     """
     (view,) = problem.views
-    expected, deviations = _prior_of(view.camera, given, doubting=doubting)
+    expected, deviations = _prior_of(view.camera, given)
     start = view.cam_from_rig @ rig_from_world
     solved = _free_camera(
         normalized_from_px(view.camera, problem.points_px[inliers]),
@@ -548,8 +508,8 @@ def shared_camera(cameras: Sequence[Camera]) -> Camera:
 def solve_with_shared_camera(poses: Sequence[Pose], options: AbsolutePoseOptions) -> list[Pose]:
     """Poses of photographs of one camera, solved again with what all of them tell of it.
 
-    A photograph whose own estimate contradicts the others', as one at another zoom or one that was
-    cropped, keeps it; and so does one whose pose was refined by other means.
+    A photograph whose own estimate contradicts the others', as at another zoom, keeps it; and so
+    does one whose pose was refined by other means.
 
     The poses come with the camera that was estimated of each, and their inliers.
     """
@@ -562,7 +522,6 @@ def solve_with_shared_camera(poses: Sequence[Pose], options: AbsolutePoseOptions
         for camera in usable
         if abs(math.log(focal_px(camera) / focal_px(shared)))
         <= _MAX_SIGMAS * math.hypot(camera.focal_deviation, shared.focal_deviation)
-        and max(map(abs, _shift(camera, shared))) <= _MIN_CROP
     ]
     if len(near) < 2:
         return list(poses)

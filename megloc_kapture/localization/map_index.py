@@ -290,8 +290,6 @@ class PoseProblem:
         the others: far from the origin (ECEF) float64 loses what a recentred world keeps.
     covariances : float64 (N, 6), or (0, 6) where no view has any.
     starts : int64 (V + 1,) first match of each view.
-    cameras : of the views in their rig, as :func:`~megloc_kapture.geometry.projection.packed_views`
-        has them.
     """
 
     views: tuple[View, ...]
@@ -299,14 +297,11 @@ class PoseProblem:
     points: Floats
     covariances: Floats
     starts: NDArray[np.int64]
-    cameras: tuple[NDArray[Any], ...]
     offset: Floats
 
     @classmethod
     def of(cls, views: Sequence[View]) -> PoseProblem:
         """The problem of any number of views, their matches in the same order."""
-        from megloc_kapture.geometry.projection import packed_views
-
         starts = np.zeros(len(views) + 1, dtype=np.int64)
         np.cumsum([len(view.points_px) for view in views], out=starts[1:])
         world = _joined([view.points_world for view in views], 3)
@@ -324,14 +319,8 @@ class PoseProblem:
             points=world - offset,
             covariances=_joined(covariances, 6),
             starts=starts,
-            cameras=packed_views([v.camera for v in views], [v.cam_from_rig for v in views]),
             offset=offset,
         )
-
-    @property
-    def matches(self) -> tuple[NDArray[Any], ...]:
-        """The arrays that :mod:`~megloc_kapture.localization.kernels` calls ``matches``."""
-        return (self.points_px, self.points, self.covariances, self.starts, *self.cameras)
 
     def split(self, per_match: NDArray[Any]) -> list[NDArray[Any]]:
         """One part for each view of what runs over the matches of all views, as inliers (N,)."""

@@ -7,7 +7,6 @@ view from the cluster's map images with depth.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from typing import NamedTuple
@@ -32,66 +31,17 @@ from megloc_kapture.plugins import (
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 
-class _SumOfViews(ABC):
-    """Scores that are summed over the views of a hypothesis."""
+class InlierCount:
+    """Plugin ``inliers``: the number of inliers."""
 
     def score(
         self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene
     ) -> NDArray[np.float64]:
         """Scores (H,)."""
         return np.array(
-            [sum(self._of(view, each.max_error_px) for view in each.views) for each in hypotheses],
+            [sum(int(view.inliers.sum()) for view in each.views) for each in hypotheses],
             dtype=np.float64,
         )
-
-    @abstractmethod
-    def _of(self, view: HypothesisView, max_error_px: float) -> float:
-        """What a view adds; ``max_error_px`` is the largest error of an inlier."""
-
-
-class InlierCount(_SumOfViews):
-    """Plugin ``inliers``: the number of inliers."""
-
-    def _of(self, view: HypothesisView, max_error_px: float) -> float:
-        return float(view.inliers.sum())
-
-
-class InlierSpreadOptions(Options):
-    """Options of the ranker ``spread``."""
-
-    cells: int = Field(default=16, gt=1, description="along the longer side of the image")
-
-
-class InlierSpread(_SumOfViews):
-    """Plugin ``spread``: the cells of a grid over the image that hold inliers.
-
-    A repeated detail gives many inliers in one part of the image, the right pose has them all over
-    it (Irschara et al., "From structure-from-motion point clouds to fast location recognition",
-    CVPR 2009, section 4: effective inliers). Of equal numbers of cells more inliers win.
-    """
-
-    Options = InlierSpreadOptions
-
-    def __init__(self, options: InlierSpreadOptions | None = None) -> None:
-        self.options = options or InlierSpreadOptions()
-
-    def _of(self, view: HypothesisView, max_error_px: float) -> float:
-        size_px = max(view.camera.width, view.camera.height) / self.options.cells
-        inliers = view.points_px[view.inliers]
-        occupied = np.unique(np.floor(inliers / size_px), axis=0)
-        # a fraction that never reaches one cell
-        return len(occupied) + len(inliers) / (1.0 + len(inliers))
-
-
-class ReprojectionScore(_SumOfViews):
-    """Plugin ``reprojection``: inliers weighted by how well they fit.
-
-    The sum of ``1 - (error / max_error)^2`` over the inliers: MSAC's score (Torr and Zisserman,
-    "MLESAC", CVIU 2000, section 3) with its sign turned.
-    """
-
-    def _of(self, view: HypothesisView, max_error_px: float) -> float:
-        return float((1.0 - (view.errors_px[view.inliers] / max_error_px) ** 2).sum())
 
 
 class DistinctiveInliersOptions(Options):
@@ -372,10 +322,6 @@ def aligned_view(
     images : map images of the place, best first; those nearest to the pose that have depth are
         warped.
     source_of : reads a map image; default :func:`warp_source`.
-
-    Raises
-    ------
-    DataError : an image or its depth cannot be read.
     """
     options = options or AlignedViewOptions()
     read = source_of or (lambda name: warp_source(name, scene))

@@ -102,21 +102,6 @@ def shares_seen(
 
 
 @compiled_loop
-def reprojection_errors(
-    point_ids, image_ids, keypoints, xyz, rotations, translations, models, params, out
-):
-    """Distances (O,) in pixels of keypoints (O, 2) from their points; infinite behind."""
-    p = np.empty(8)
-    for o in range(len(point_ids)):
-        k = image_ids[o]
-        x, y, z = moved(rotations[k], translations[k], xyz, point_ids[o])
-        project_point(models[k], params[k], x, y, z, p)
-        du, dv = p[0] - keypoints[o, 0], p[1] - keypoints[o, 1]
-        error = math.sqrt(du * du + dv * dv)
-        out[o] = error if error == error else math.inf
-
-
-@compiled_loop
 def mean_depths(starts, image_ids, xyz, rotations, translations, out):
     """Mean depths (N,) of points in their images; NaN where no image observes one."""
     for i in range(len(xyz)):
@@ -128,29 +113,6 @@ def mean_depths(starts, image_ids, xyz, rotations, translations, out):
             total += translations[k, 2]
         count = starts[i + 1] - starts[i]
         out[i] = total / count if count > 0 else math.nan
-
-
-@compiled_loop
-def seen_at_angle(starts, image_ids, xyz, centers, max_cosine, out):
-    """Mask (N,) of points seen under an angle whose cosine is at most ``max_cosine``."""
-    for i in range(len(xyz)):
-        x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-        wide = False
-        for o in range(starts[i], starts[i + 1]):
-            a = image_ids[o]
-            ax, ay, az = x - centers[a, 0], y - centers[a, 1], z - centers[a, 2]
-            for other in range(o + 1, starts[i + 1]):
-                b = image_ids[other]
-                bx, by, bz = x - centers[b, 0], y - centers[b, 1], z - centers[b, 2]
-                product = ax * bx + ay * by + az * bz
-                lengths = math.sqrt((ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz))
-                # of a centre that is the point itself there is no angle
-                if lengths > 0.0 and abs(product) <= max_cosine * lengths:
-                    wide = True
-                    break
-            if wide:
-                break
-        out[i] = wide
 
 
 @compiled_loop

@@ -12,15 +12,13 @@ observations, its inverse the point's covariance, and the roots of the covarianc
 the deviations along three orthogonal axes. ``d pi / d p_c`` is that of the camera's own model,
 distortion included.
 
-Points are rejected by them, and by reprojection error, triangulation angle and track length as
-COLMAP's ``ObservationManager`` has them. Arrays in, masks out; nothing is moved.
+Arrays in, masks out; nothing is moved.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,48 +117,20 @@ def _starts(ids: NDArray[np.integer], count: int) -> NDArray[np.int64]:
     return starts
 
 
-class ConsistencyOptions(Options):
-    """Options: limits on reprojection errors, angles and tracks; none: no limit."""
-
-    max_reprojection_error_px: float | None = Field(
-        default=None, gt=0, description="an observation farther from its keypoint is dropped"
-    )
-    min_angle_deg: float | None = Field(
-        default=None,
-        ge=0,
-        le=90,
-        description="a point that no two images see at this angle is dropped, unless only one "
-        "image sees it",
-    )
-    min_track_length: int | None = Field(
-        default=None, ge=1, description="a point with fewer observations is dropped"
-    )
-
-
 class UncertaintyOptions(Options):
-    """Options: limits on the points' uncertainty; none: no limit.
+    """A limit on the points' uncertainty.
 
     The deviation of a point is the largest of its three, for a noise of 1 px in the images. Points
     whose uncertainty is not known (lifted ones, which a single image sees) stay.
     """
 
-    max_deviation: float | None = Field(default=None, gt=0, description="in the map's unit")
-    max_relative_deviation: float | None = Field(
-        default=None, gt=0, description="share of the point's mean depth in its images"
-    )
-    keep_quantile: float | None = Field(
-        default=None, gt=0, le=1, description="share of the points that stays, the surest ones"
-    )
     max_robust_sigmas: float | None = Field(
         default=None,
         gt=0,
         description="how far the logarithm of a point's share of its depth may lie above the "
-        "map's median, in standard deviations estimated from the median absolute deviation",
+        "map's median, in standard deviations estimated from the median absolute deviation; none: "
+        "no limit",
     )
-
-    def needs_deviations(self) -> bool:
-        """True if any point can be rejected."""
-        return any(limit is not None for limit in self.model_dump().values())
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,26 +164,6 @@ class ObservedPoints:
             begin = end
 
 
-def reprojection_errors_px(
-    observed: ObservedPoints, keypoints_px: NDArray[np.floating[Any]]
-) -> Floats:
-    """Distance (O,) of each observation's keypoint (O, 2) from its point; infinite behind."""
-    from megloc_kapture.geometry.projection import packed_views
-    from megloc_kapture.mapping import kernels
-
-    errors = np.empty(len(observed.point_ids))
-    if len(errors):
-        kernels.reprojection_errors(
-            observed.point_ids,
-            observed.image_ids,
-            np.ascontiguousarray(keypoints_px, dtype=np.float64),
-            observed.xyz,
-            *packed_views(observed.cameras, observed.cams_from_world),
-            errors,
-        )
-    return errors
-
-
 def mean_depths(observed: ObservedPoints) -> Floats:
     """Mean depth (N,) of each point in the images that observe it; NaN where none does."""
     from megloc_kapture.geometry.projection import packed_views
@@ -230,49 +180,21 @@ def track_lengths(observed: ObservedPoints) -> NDArray[np.int64]:
     return np.bincount(observed.point_ids, minlength=len(observed.xyz))
 
 
-def seen_at_angle(observed: ObservedPoints, min_angle_deg: float) -> Mask:
-    """Mask (N,) of the points that two images see at this angle or a wider one.
-
-    The angle is COLMAP's: that between the rays, or between one and the other turned round, where
-    that is less.
-    """
-    from megloc_kapture.mapping import kernels
-
-    wide = np.empty(len(observed.xyz), dtype=bool)
-    centers = np.array([pose.center() for pose in observed.cams_from_world]).reshape(-1, 3)
-    max_cosine = np.cos(np.radians(min_angle_deg))
-    kernels.seen_at_angle(
-        observed.starts(), observed.image_ids, observed.xyz, centers, max_cosine, wide
-    )
-    return wide
-
-
-def too_uncertain(deviations: Floats, depths: Floats, options: UncertaintyOptions) -> Mask:
-    """Mask (N,) of the points to reject by their uncertainty.
+def too_uncertain(deviations: Floats, depths: Floats, max_robust_sigmas: float) -> Mask:
+    """Mask (N,) of the points to reject by their uncertainty; see :class:`UncertaintyOptions`.
 
     Of deviations (N,), the largest of each point, in the map's unit, NaN where unknown, and the
     :func:`mean_depths`.
     """
-    rejected = np.zeros(len(deviations), dtype=bool)
     with np.errstate(invalid="ignore"):  # comparisons with NaN are false, as they should be
-        if options.max_deviation is not None:
-            rejected |= deviations > options.max_deviation
-        if options.max_relative_deviation is not None:
-            rejected |= deviations > options.max_relative_deviation * depths
-        if options.keep_quantile is not None:
-            known = np.sort(deviations[~np.isnan(deviations)])
-            if len(known):
-                kept = max(1, round(options.keep_quantile * len(known)))
-                rejected |= deviations > known[kept - 1]
-        if options.max_robust_sigmas is not None:
-            relative = deviations / depths
-            usual = relative[np.isfinite(relative) & (relative > 0)]
-            if len(usual):
-                logarithms = np.log(usual)
-                median = float(np.median(logarithms))
-                deviation = float(deviation_by_median(logarithms - median))
-                rejected |= relative > np.exp(median + options.max_robust_sigmas * deviation)
-    return rejected
+        relative = deviations / depths
+        usual = relative[np.isfinite(relative) & (relative > 0)]
+        if len(usual) == 0:
+            return np.zeros(len(deviations), dtype=bool)
+        logarithms = np.log(usual)
+        median = float(np.median(logarithms))
+        deviation = float(deviation_by_median(logarithms - median))
+        return np.asarray(relative > np.exp(median + max_robust_sigmas * deviation))
 
 
 def left_with_too_few(

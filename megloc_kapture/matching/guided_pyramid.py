@@ -2,9 +2,8 @@
 
 MegLoc, section "Guided pyramid matching". Where a pair has fewer than 100 matches, features are
 extracted from the image scaled and turned, and matched with the other image as it is. The paper
-counts the matcher's matches; counting those that verification leaves suits any matcher. An image's
-variants may be probed on a few of its pairs, and those that match nothing there are not tried on
-the rest. The matches are put together (``all``), or the richest variant's are kept (``max``).
+counts the matcher's matches; counting those that verification leaves suits any matcher. The matches
+are put together (``all``), or the richest variant's are kept (``max``).
 
 With verification each variant is verified by itself: most of them are turned the wrong way and
 have matches by chance only, in which a two-view model over all variants together would drown. But
@@ -158,20 +157,6 @@ class GuidedPyramidOptions(Options):
         gt=0,
         description="an image is not enlarged beyond this; memory grows with the pixels",
     )
-    probed_pairs: int | None = Field(
-        default=5,
-        gt=0,
-        description="pairs of an image that all variants are tried on: those with most matches; "
-        "on the rest only the variants that matched one of them; none: all variants on all pairs",
-    )
-    probe_matches: int = Field(
-        default=30, gt=0, description="matches with which a variant matched a probed pair"
-    )
-
-    def idle(self) -> dict[str, str]:
-        if self.mode != "off":
-            return {}
-        return dict.fromkeys(self.all_but("mode"), "guided_pyramid.mode is off")
 
     @field_validator("scales")
     @classmethod
@@ -191,10 +176,6 @@ class GuidedPyramidOptions(Options):
         """Whether a pair with so many matches, before and after verification, is tried again."""
         count = num_found if self.count == "matches" else num_verified
         return self.mode != "off" and count < self.min_matches
-
-    def num_probed(self, num_pairs: int) -> int:
-        """How many of an image's pairs all its variants are tried on."""
-        return num_pairs if self.probed_pairs is None else min(self.probed_pairs, num_pairs)
 
     def variants(self, width: int, height: int) -> list[ImageVariant]:
         """List the variants of an image of this size, sorted; not the image as it is.
@@ -373,32 +354,3 @@ def match_variants(
                     )
                 )
     return [judgement.agree(matches) for judgement, matches in zip(judgements, found, strict=True)]
-
-
-def match_probed(
-    variants: Sequence[VariantFeatures],
-    num_others: int,
-    match: Callable[[Sequence[VariantFeatures], range], Sequence[list[VariantMatches]]],
-    options: GuidedPyramidOptions,
-) -> tuple[list[list[VariantMatches]], int]:
-    """Match an image's variants with the first few of several images, what matched with the rest.
-
-    Parameters
-    ----------
-    num_others : images to match with, the most promising first.
-    match : of some of the variants with some of the images, as :func:`match_variants`.
-
-    Returns
-    -------
-    For each image the variants that match it, and the number that was tried on the last ones.
-    """
-    first = options.num_probed(num_others)
-    found = list(match(variants, range(first)))
-    matched = {
-        one.variant for of_pair in found for one in of_pair if len(one) >= options.probe_matches
-    }
-    left = [variant for variant in variants if variant.variant in matched]
-    if left and first < num_others:
-        found += match(left, range(first, num_others))
-    found += [[] for _ in range(num_others - len(found))]
-    return found, len(left)

@@ -14,12 +14,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
-from torch.nn.utils.rnn import pad_sequence
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.weights import WeightsFile
-from megloc_kapture.nets import lightglue
-from megloc_kapture.nets.lightglue import KeypointBatch, load_lighterglue, load_lightglue
+from megloc_kapture.nets.kornia_networks import (
+    load_lighterglue,
+    load_lightglue,
+    require_kornia,
+)
 from megloc_kapture.nets.runtime import Checkpointed, NetworkOptions, inference
 from megloc_kapture.nets.superglue import (
     ImageKeypoints,
@@ -137,45 +139,45 @@ class LightGlueKindOptions(NetworkOptions):
 
     weights: str
     threshold: float = Field(default=0.1, ge=0, lt=1, description="probability of a match")
+    depth_confidence: float = Field(
+        default=-1.0, ge=-1, le=1, description="stop early at this confidence; -1: all layers"
+    )
+    width_confidence: float = Field(
+        default=-1.0, ge=-1, le=1, description="drop keypoints at this confidence; -1: none"
+    )
 
 
 KindOptions = TypeVar("KindOptions", bound=LightGlueKindOptions)
 
 
 class _LightGlueKind(PairNetwork[KindOptions]):
-    """A matcher that is a network of LightGlue's kind.
+    """A matcher that is kornia's LightGlue; a pair at a time, so that none is padded."""
 
-    Raises
-    ------
-    OptionError : kornia is not installed.
-    MissingWeightsError : the checkpoint is not there.
-    """
-
-    _load: Any  # of a checkpoint's tensors and the file's name
+    _load: Any  # of a checkpoint's tensors, the file's name and the options
 
     def __init__(self, options: KindOptions | None = None) -> None:
-        lightglue.require_kornia()
+        require_kornia("LightGlue")
         super().__init__(options)
 
     def match_many(self, a: ImageFeatures, others: Sequence[ImageFeatures]) -> list[Matches]:
-        """As of the base; scores are the matches' probabilities.
-
-        Pairs are padded to the keypoints of the largest; what is padding is masked out of attention
-        and assignment, so that scores are as one by one but for rounding. Raises DataError where
-        the checkpoint or the descriptors do not fit, OptionError where the device is not there.
-        """
-        network, device = self.network(self._load)
+        """As of the base; scores are the matches' probabilities."""
+        options = self.options
+        confidences = options.depth_confidence, options.width_confidence
+        network, device = self.network(
+            self._load, options.threshold, *confidences, options.half_precision
+        )
         for image in (a, *others):
-            _check(image, network.descriptor_size, self._weights)
+            _check(image, network.conf.input_dim, self._weights)
         rows = [at for at, b in enumerate(others) if len(a.keypoints_px) and len(b.keypoints_px)]
-        if not rows:
-            return _matched(len(others), (), ())
-        with inference(device, self.options.half_precision):
-            assignment = network(
-                _batch([a] * len(rows), device), _batch([others[row] for row in rows], device)
-            )
-            found = lightglue.mutual_matches(assignment, self.options.threshold)
-            return _matched(len(others), rows, found)
+        found = []
+        with inference(device):
+            side = _kornia_input(a, device)
+            for row in rows:
+                result = network({"image0": side, "image1": _kornia_input(others[row], device)})
+                pairs, scores = result["matches"][0], result["scores"][0]
+                order = torch.argsort(pairs[:, 0])
+                found.append((pairs[order], scores[order].float()))
+        return _matched(len(others), rows, found)
 
 
 def _check(image: ImageFeatures, expected: int, file: WeightsFile) -> None:
@@ -187,30 +189,17 @@ def _check(image: ImageFeatures, expected: int, file: WeightsFile) -> None:
         )
 
 
-def normalised_points(image: ImageFeatures) -> NDArray[np.float32]:
-    """Keypoints (N, 2) float32 as the networks know them: the image's longer side is -1 to 1.
+def _kornia_input(image: ImageFeatures, device: torch.device) -> dict[str, torch.Tensor]:
+    """Return keypoints, descriptors and size of an image, each with a first axis of length 1.
 
-    They were trained with the first pixel's centre at (0, 0) and the middle at half the size. A
-    keypoint of the first row or column may then be less than -1, by half a pixel at most, and is
-    clamped: no position outside was seen in training.
+    The networks were trained with the first pixel's centre at (0, 0). A keypoint of the first row
+    or column is up to half a pixel outside then, and is clamped: kornia refuses it.
     """
-    size = np.array([image.width, image.height], np.float64)
-    xy = image.keypoints_px[:, :2].astype(np.float64) - 0.5
-    return np.clip((xy - size / 2) / (size.max() / 2), -1, 1).astype(np.float32)
-
-
-def _batch(images: Sequence[ImageFeatures], device: torch.device) -> KeypointBatch:
-    points = [torch.from_numpy(normalised_points(image)) for image in images]
-    descriptors = [
-        torch.from_numpy(np.ascontiguousarray(image.descriptors, np.float32)) for image in images
-    ]
-    lengths = torch.tensor([len(rows) for rows in points])
-    present = torch.arange(int(lengths.max()))[None] < lengths[:, None]
-    return KeypointBatch(
-        pad_sequence(points, batch_first=True).to(device),
-        pad_sequence(descriptors, batch_first=True).to(device),
-        None if bool(present.all()) else present[..., None].to(device),
-    )
+    xy = image.keypoints_px[:, :2].astype(np.float32) - np.float32(0.5)
+    size = np.array([image.width, image.height], np.float32)
+    descriptors = np.ascontiguousarray(image.descriptors, np.float32)
+    values = {"keypoints": np.clip(xy, 0, size), "descriptors": descriptors, "image_size": size}
+    return {name: torch.from_numpy(array)[None].to(device) for name, array in values.items()}
 
 
 class LightGlueOptions(LightGlueKindOptions):
@@ -218,12 +207,12 @@ class LightGlueOptions(LightGlueKindOptions):
 
     weights: str = Field(
         default="superpoint_lightglue",
-        description="superpoint_lightglue, aliked_lightglue, or a file: those of the features",
+        description="superpoint_lightglue, aliked_lightglue, disk_lightglue, or a file",
     )
 
 
 class LightGlue(_LightGlueKind[LightGlueOptions]):
-    """The matcher ``lightglue``, for SuperPoint's features or ALIKED's; needs kornia."""
+    """The matcher ``lightglue``, for the features that its weights are of; needs kornia."""
 
     Options = LightGlueOptions
     _load = staticmethod(load_lightglue)

@@ -1,7 +1,6 @@
 """DELG's global branch (Cao et al., ECCV 2020): a ResNet, generalized-mean pooling and a layer.
 
-Two forms of its ResNet exist in TensorFlow, and which one a checkpoint is of shows in the names of
-its variables:
+Two forms of its ResNet exist in TensorFlow; convolutions with a bias tell the first:
 
     keras   the authors' public training code: strides on the first 1x1 convolution of a stage and
             its shortcut, convolutions with bias, epsilon 1e-3, margins as TensorFlow's SAME, a
@@ -12,29 +11,14 @@ its variables:
 
 Both have stride 32 and 2048 channels at the end. What the training code calls ``block3_strides``
 moves a stride from two 1x1 convolutions to a subsampling before them and changes nothing here.
-The module's keys are those of torchvision's ResNet, and ``embedding`` for the last layer. Three
-ways of naming the variables are known, and any scope may stand before them:
-
-    objects   backbone/l2a/conv2a/kernel, backbone/l2a/bn_shortcut/gamma,
-              backbone/embedding_layer/kernel: attributes of the objects of the public training
-              code, each before ``/.ATTRIBUTES/VARIABLE_VALUE``. In an exported model the variables
-              of a block may have numbers: backbone/l2a/variables/0 to 17, or 23 with a shortcut
-    layers    res2a_branch2a/kernel, bn2a_branch1/gamma, embedding_layer/kernel: the same layers by
-              their names, as a graph of TF1 has them
-    slim      resnet_v1_50/block1/unit_1/bottleneck_v1/conv1/weights, ../BatchNorm/gamma: TF-Slim's
-
-What the local branch, a classifier or an optimiser keeps is left out. The files that the authors
-publish have not been at hand: they are models of TF1, of a network that is compatible with
-TF-Slim's, so names of the third kind are expected. Which scope the layer after the pooling has
-there is not public; it is known by its shape, which nothing else in the network has.
+The module's keys are those of torchvision's ResNet, and ``embedding`` for the last layer;
+``scripts/convert_weights.py`` knows the names of TensorFlow's variables.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from itertools import product
-from string import ascii_lowercase
 from typing import Literal
 
 import numpy as np
@@ -60,27 +44,6 @@ DESCRIPTOR_SIZE = 2048
 _POWER = 3.0  # section 3.2 of the paper: fixed
 _EPSILONS: dict[Form, float] = {"keras": 1e-3, "slim": 1e-5}
 _LEAST_PX = 5  # a smaller side leaves the pooling without margin nothing
-_ATTRIBUTE = "/.ATTRIBUTES/VARIABLE_VALUE"
-_CONVOLUTION = {"kernel": "weight", "bias": "bias"}
-_SLIM_CONVOLUTION = {"weights": "weight", "biases": "bias"}
-_NORM = {
-    "gamma": "weight",
-    "beta": "bias",
-    "moving_mean": "running_mean",
-    "moving_variance": "running_var",
-}
-# of a block, convolution and norm: the branch in Keras' names to torchvision's attributes
-_PARTS = {
-    "2a": ("conv1", "bn1"),
-    "2b": ("conv2", "bn2"),
-    "2c": ("conv3", "bn3"),
-    "1": ("downsample.0", "downsample.1"),
-}
-_STEM = (
-    ("conv1", "conv1", _CONVOLUTION),
-    ("bn_conv1", "bn1", _NORM),
-    ("embedding_layer", "embedding", _CONVOLUTION),
-)
 
 
 class DelgNet(nn.Module):
@@ -132,8 +95,7 @@ def describe(net: DelgNet, image: torch.Tensor, scales: Sequence[float]) -> torc
     """Unit vectors, float32 (B, 2048): the sum of those at several scales (section 4.1).
 
     ``image`` is RGB (B, 3, H, W) in 0 to 255; at each scale it is resized bilinearly, without
-    smoothing, to sides rounded to whole pixels, halves to even ones. Raises DataError for an image
-    that is too small for the network at the least scale.
+    smoothing, to sides rounded to whole pixels, halves to even ones.
     """
     normalised = (image - 128.0) / 128.0
     total = image.new_zeros(len(image), DESCRIPTOR_SIZE)
@@ -153,127 +115,13 @@ def describe(net: DelgNet, image: torch.Tensor, scales: Sequence[float]) -> torc
 
 
 def delg_from(tensors: Mapping[str, torch.Tensor], where: str) -> DelgNet:
-    """The network of a checkpoint's variables, name -> values, ready for inference.
-
-    Raises DataError that names the file ``where`` and what was found: names of no kind that is
-    known, or variables that are missing.
-    """
-    form, state = delg_state(tensors, where)
-    blocks = {key.split(".")[1] for key in state if key.startswith("layer3.")}
+    """Build the network from a converted checkpoint, ready for inference."""
+    blocks = {key.split(".")[1] for key in tensors if key.startswith("layer3.")}
     if len(blocks) not in RESNET_DEPTHS:
         raise DataError(
             f"no DELG: {len(blocks)} blocks in the third stage, not 6 (ResNet-50) or 23 "
-            f"(ResNet-101); {_found(tensors)}",
+            f"(ResNet-101); found: {first_few(sorted(tensors), 8)}",
             path=where,
         )
-    net = DelgNet(RESNET_DEPTHS[len(blocks)], form)
-    return load_strictly(net, state, where, may_lack=batch_counters(net)).eval()
-
-
-def delg_state(
-    tensors: Mapping[str, torch.Tensor], where: str
-) -> tuple[Form, dict[str, torch.Tensor]]:
-    """The form of the network, and a state dict for it, of a checkpoint's variables."""
-    variables = {name.removesuffix(_ATTRIBUTE): values for name, values in tensors.items()}
-    kinds: tuple[tuple[Form, Iterator[tuple[str, str]]], ...] = (
-        ("keras", _keras_names(layers=False)),
-        ("keras", _keras_names(layers=True)),
-        ("slim", _slim_names()),
-    )
-    for form, names in kinds:
-        keys = dict(names)
-        state: dict[str, torch.Tensor] = {}
-        for name, values in variables.items():
-            if "attention/" in name:  # the local branch, which has a bn_conv1 of its own
-                continue
-            parts = name.split("/")
-            scoped = ("/".join(parts[start:]) for start in range(len(parts)))
-            key = next((keys[inner] for inner in scoped if inner in keys), None)
-            if key is None:
-                continue
-            if key in state:
-                raise DataError(f"{key} is in it twice, once as {name}", path=where)
-            state[key] = _torch_layout(values)
-        if "layer1.0.conv1.weight" in state:
-            if form == "slim":
-                state |= _embedding_by_shape(variables, where)
-            return form, state
-    raise DataError(
-        "no DELG whose variables are named in a known way (backbone/l2a/conv2a/kernel, "
-        "res2a_branch2a/kernel or resnet_v1_101/block1/unit_1/bottleneck_v1/conv1/weights "
-        f"expected); {_found(tensors)}",
-        path=where,
-    )
-
-
-def _keras_names(*, layers: bool) -> Iterator[tuple[str, str]]:
-    """Names of the kind ``objects`` or ``layers``, without a scope, and the module's keys.
-
-    Of all blocks that there may be: a stage's are named by the letters.
-    """
-    above = "" if layers else "backbone/"
-    for layer, key, words in _STEM:
-        yield from ((f"{above}{layer}/{word}", f"{key}.{own}") for word, own in words.items())
-    for stage, (number, letter) in product(range(1, 5), enumerate(ascii_lowercase)):
-        block, place, count = f"{stage + 1}{letter}", f"layer{stage}.{number}", 0
-        for branch, keys in _PARTS.items():
-            part = "_shortcut" if branch == "1" else branch
-            names = f"backbone/l{block}/conv{part}", f"backbone/l{block}/bn{part}"
-            if layers:
-                names = f"res{block}_branch{branch}", f"bn{block}_branch{branch}"
-            for name, key, words in zip(names, keys, (_CONVOLUTION, _NORM), strict=True):
-                for word, own in words.items():
-                    yield f"{name}/{word}", f"{place}.{key}.{own}"
-                    if not layers:
-                        yield f"backbone/l{block}/variables/{count}", f"{place}.{key}.{own}"
-                    count += 1
-
-
-def _slim_names() -> Iterator[tuple[str, str]]:
-    """The same of the kind ``slim``."""
-    layers = list(zip(("conv1", "conv2", "conv3", "shortcut"), _PARTS.values(), strict=True))
-    places = [("", "", layers[:1])]
-    for stage, unit in product(range(1, 5), range(len(ascii_lowercase))):
-        scope = f"block{stage}/unit_{unit + 1}/bottleneck_v1/"
-        places.append((scope, f"layer{stage}.{unit}.", layers))
-    for depth, (scope, place, here) in product(RESNET_BLOCKS, places):
-        for layer, (convolution, norm) in here:
-            name = f"resnet_v1_{depth}/{scope}{layer}"
-            for word, own in _SLIM_CONVOLUTION.items():
-                yield f"{name}/{word}", f"{place}{convolution}.{own}"
-            for word, own in _NORM.items():
-                yield f"{name}/BatchNorm/{word}", f"{place}{norm}.{own}"
-
-
-def _embedding_by_shape(
-    variables: Mapping[str, torch.Tensor], where: str
-) -> dict[str, torch.Tensor]:
-    """The one layer 2048 -> 2048 with a bias, dense or as a 1x1 convolution."""
-    size = DESCRIPTOR_SIZE
-    found = []
-    for name, values in variables.items():
-        scope, _, word = name.rpartition("/")
-        biases = [variables.get(f"{scope}/{other}") for other in ("biases", "bias")]
-        bias = next((b for b in biases if b is not None), None)
-        is_square = tuple(values.shape) in ((size, size), (1, 1, size, size))
-        if word in ("weights", "kernel") and is_square and bias is not None:
-            found.append((scope, values.reshape(size, size).T.contiguous(), bias))
-    if len(found) != 1:
-        scopes = ", ".join(scope for scope, *_ in found) or "none"
-        raise DataError(
-            f"no DELG: one layer of {size} x {size} weights with a bias expected beside the "
-            f"ResNet; there is {scopes}; {_found(variables)}",
-            path=where,
-        )
-    return {"embedding.weight": found[0][1], "embedding.bias": found[0][2]}
-
-
-def _torch_layout(values: torch.Tensor) -> torch.Tensor:
-    """Inputs last of a convolution or a dense layer, which have them before the outputs."""
-    if values.ndim == 4:
-        return values.permute(3, 2, 0, 1).contiguous()
-    return values.T.contiguous() if values.ndim == 2 else values
-
-
-def _found(names: Iterable[str]) -> str:
-    return "found: " + first_few(sorted(names), 8)
+    net = DelgNet(RESNET_DEPTHS[len(blocks)], "keras" if "conv1.bias" in tensors else "slim")
+    return load_strictly(net, tensors, where, may_lack=batch_counters(net)).eval()

@@ -1,12 +1,11 @@
-"""Global descriptors of convolutional trunks: NetVLAD, OpenIBL, AP-GeM, EigenPlaces and CosPlace.
+"""Global descriptors of convolutional trunks: NetVLAD, OpenIBL and AP-GeM.
 
 NetVLAD (Arandjelovic et al., CVPR 2016) and OpenIBL (Ge et al., ECCV 2020) are one network on
 VGG-16, trained in two ways. Both end in a whitening that is part of the weights; they differ in the
-order of its inputs and in the colour that is subtracted. AP-GeM (Revaud et al., ICCV 2019),
-EigenPlaces (Berton et al., ICCV 2023) and CosPlace (Berton et al., CVPR 2022) are a ResNet,
-generalized-mean pooling with a learnt power, and a linear layer. All have the keys of the authors'
-checkpoints; what AP-GeM's hold beside them is read under names of our own
-(:mod:`megloc_kapture.io.weights.authors`).
+order of its inputs and in the colour that is subtracted. AP-GeM (Revaud et al., ICCV 2019) is a
+ResNet, generalized-mean pooling with a learnt power, and a linear layer. All have the keys of the
+authors' checkpoints; ``scripts/convert_weights.py`` adds what AP-GeM's and NetVLAD's hold beside
+them under names of our own.
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ from megloc_kapture.nets.trunks import (
     ResNet,
     Vgg16Features,
     generalized_mean,
-    imagenet_normalised,
 )
 
 Order = Literal["dk", "kd"]
@@ -37,15 +35,13 @@ STRIDE_PX = 16  # of the trunk: an image must have as many pixels a side
 _CONV5_3 = 28  # the last layer that is used, without its ReLU: features have either sign
 _CHANNELS = 512
 _NUM_CLUSTERS, _OUTPUT_SIZE = 64, 4096  # of all published weights
-# what the reader of MATLAB's files adds to the keys; OpenIBL's files have no such key
+# in converted files of NetVLAD's authors only; OpenIBL's have no such key
 _AVERAGE_IMAGE = "average_image"
 # 255 times the mean that OpenIBL subtracts of colours in [0, 1], before it divides by 1 / 255
 _OPENIBL_MEAN_RGB = (123.68, 116.779, 103.939)
 DESCRIPTOR_SIZE = 2048  # of AP-GeM, and the channels of a ResNet
 # what a checkpoint may hold beside the state dict; the names of scikit-learn's attributes
 PCA_PARTS = ("mean", "components", "explained_variance", "whiten")
-_DEEPER = "backbone.6.22.conv1.weight"  # a block that only ResNet-101 has
-_LINEAR = "aggregation.3.weight"
 
 
 class NetVladLayer(nn.Module):
@@ -121,10 +117,7 @@ class VggNetVlad(nn.Module):
 
 
 def netvlad(tensors: Mapping[str, torch.Tensor], where: str) -> VggNetVlad:
-    """The network of weights of NetVLAD's authors, as they are read out of MATLAB's file.
-
-    Raises DataError that names ``where`` and the keys that do not fit.
-    """
+    """The network of weights of NetVLAD's authors, as they are read out of MATLAB's file."""
     if _AVERAGE_IMAGE not in tensors:
         raise DataError(
             f"no weights of NetVLAD's authors: no {_AVERAGE_IMAGE} in it (OpenIBL's are for "
@@ -246,8 +239,7 @@ class Whitening(nn.Module):
 def apgem_from(tensors: Mapping[str, torch.Tensor], where: str) -> ApGemNet:
     """The network of a checkpoint's tensors, ready for inference.
 
-    ``tensors`` are as :func:`megloc_kapture.io.weights.containers.read_checkpoint` gives them.
-    Raises DataError that names the file ``where`` and the keys, if they are of another network.
+    ``tensors`` are as ``scripts/convert_weights.py`` writes them.
     """
     beside = ("preprocess.", "model_options.", "pca.")
     state = {key: value for key, value in tensors.items() if not key.startswith(beside)}
@@ -269,11 +261,7 @@ def apgem_from(tensors: Mapping[str, torch.Tensor], where: str) -> ApGemNet:
 def whitening_from(
     tensors: Mapping[str, torch.Tensor], name: str, where: str, *, power: float
 ) -> Whitening:
-    """The whitening that a checkpoint keeps under a name.
-
-    Raises OptionError: there is none of this name; says which there are; DataError: it is
-    incomplete, or of other sizes than the network's vectors.
-    """
+    """The whitening that a checkpoint keeps under a name."""
     known = sorted({key.split(".")[1] for key in tensors if key.startswith("pca.")})
     if name not in known:
         raise OptionError(
@@ -303,42 +291,3 @@ def _three(
     if len(values) != 3:
         raise DataError(f"{key} has {len(values)} values, not one for each of R, G, B", path=where)
     return values
-
-
-class EigenPlacesNet(nn.Module):
-    """An image to one vector of unit length, of ``descriptor_size`` components.
-
-    Under the keys of the published checkpoints, which number the layers of both sequences.
-    """
-
-    def __init__(self, depth: Depth = 50, descriptor_size: int = 2048) -> None:
-        super().__init__()
-        trunk = ResNet(depth)
-        self.backbone = nn.Sequential(
-            trunk.conv1,
-            trunk.bn1,
-            nn.ReLU(inplace=True),
-            nn.MaxPool2d(3, stride=2, padding=1),
-            *(trunk.get_submodule(f"layer{number}") for number in range(1, 5)),
-        )
-        # the layers between these have no weights
-        self.aggregation = nn.ModuleDict(
-            {"1": GeneralizedMean(), "3": nn.Linear(DESCRIPTOR_SIZE, descriptor_size)}
-        )
-
-    def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Vectors, float32 (B, D), of RGB images (B, 3, H, W) in [0, 1], of any size."""
-        features = functional.normalize(self.backbone(imagenet_normalised(image)).float(), dim=1)
-        pooled = self.aggregation["1"](features)
-        return functional.normalize(self.aggregation["3"](pooled).float(), dim=1)
-
-
-def eigenplaces_from(tensors: Mapping[str, torch.Tensor], where: str) -> EigenPlacesNet:
-    """The network of a checkpoint of ResNet-50 or ResNet-101, ready for inference.
-
-    Raises DataError that names the file ``where`` and what does not fit.
-    """
-    if _LINEAR not in tensors or tensors[_LINEAR].ndim != 2:
-        raise DataError(f"no EigenPlaces: a matrix {_LINEAR} expected", path=where)
-    network = EigenPlacesNet(101 if _DEEPER in tensors else 50, len(tensors[_LINEAR]))
-    return load_strictly(network, tensors, where, may_lack=batch_counters(network)).eval()

@@ -155,8 +155,7 @@ def lpips_from(
 ) -> Lpips:
     """LPIPS from a torchvision checkpoint of a trunk, and a published file of heads.
 
-    The trunk's classifier, and layers after the last one compared, are left out. Raises DataError
-    that names ``where``, the files, and a key that is missing, unexpected or of another shape.
+    The trunk's classifier, and layers after the last one compared, are left out.
     """
     module = Lpips(trunk)
     features = {key: value for key, value in of_trunk.items() if not key.startswith("classifier.")}

@@ -74,11 +74,7 @@ def squared(image: torch.Tensor, size_px: int) -> torch.Tensor:
 
 
 def megaloc_from(tensors: Mapping[str, torch.Tensor], where: str) -> MegaLocNet:
-    """The network of a checkpoint, ready to describe.
-
-    Raises DataError that names the file ``where``, and tensors that are missing, unexpected or of
-    another shape.
-    """
+    """The network of a checkpoint, ready to describe."""
     renamed = {
         key.replace(_OLDER_TRUNK, "backbone.", 1) if key.startswith(_OLDER_TRUNK) else key: value
         for key, value in tensors.items()
@@ -118,8 +114,7 @@ class Salad(nn.Module):
         """Vectors float32 (B, D) of patches (B, C, h, w) and of the whole (B, C): section 3.3.
 
         The image's own part first, then the clusters', the clusters running fastest; each of these
-        parts was normalised before, and at last all of it. Raises OptionError where there are no
-        more patches than clusters.
+        parts was normalised before, and at last all of it.
         """
         features = self.cluster_features(patches).flatten(2)
         # in half precision a share would keep two digits after the exponentials
@@ -135,7 +130,7 @@ def assignment(scores: torch.Tensor, dust_bin: torch.Tensor) -> torch.Tensor:
 
     Sinkhorn's algorithm in the logarithm, three times. A patch gives the mass 1; a cluster takes
     the mass 1, the dustbin, of score ``dust_bin`` (), takes what is left. Unlike in SuperGlue there
-    is no dustbin for clusters. Raises OptionError where nothing would be left for the dustbin.
+    is no dustbin for clusters.
     """
     batch, clusters, patches = scores.shape
     if patches <= clusters:

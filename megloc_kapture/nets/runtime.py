@@ -109,8 +109,7 @@ def load_strictly(
 ) -> Net:
     """The module, with a state dict loaded; every key and shape as the module has it.
 
-    Keys that ``may_lack`` names may be missing. Raises DataError that names the file ``where`` and
-    the keys that are missing, unexpected, or of another shape.
+    Keys that ``may_lack`` names may be missing.
     """
     expected = module.state_dict()
     missing = sorted(set(expected) - set(tensors) - set(may_lack))
@@ -182,9 +181,6 @@ class Checkpointed(Generic[AnyOptions]):
     ) -> tuple[Any, torch.device]:
         """The network, made once per process, and the device it is on.
 
-        Raises DataError for a checkpoint that does not fit, OptionError for a device that is not
-        there.
-
         Parameters
         ----------
         load : makes it of a checkpoint's tensors, the file's name, and the arguments.
@@ -219,10 +215,7 @@ def state_bytes(
 def load_state(
     state: bytes, path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer
 ) -> dict[str, Any]:
-    """Put a state into networks and optimizer; what else it has.
-
-    Raises DataError that names the path, for a file that is damaged or of another training.
-    """
+    """Put a state into networks and optimizer; what else it has."""
     try:
         content = torch.load(io.BytesIO(state), map_location="cpu", weights_only=True)
         model.load_state_dict(content.pop("model"))

@@ -180,10 +180,7 @@ class _GraphNetwork(nn.Module):
 
 
 def superglue(tensors: Mapping[str, torch.Tensor], where: str) -> SuperGlueNet:
-    """The network with the weights of a checkpoint, of the sizes that the checkpoint has.
-
-    Raises DataError that names the keys of ``where`` that do not fit.
-    """
+    """The network with the weights of a checkpoint, of the sizes that the checkpoint has."""
     encoder = _numbered(tensors, r"kenc\.encoder\.(\d+)\.weight", dimensions=3)
     layers = _numbered(tensors, r"gnn\.layers\.(\d+)\.attn\.merge\.weight", dimensions=3)
     net = SuperGlueNet(encoder, len(layers)) if encoder and layers else SuperGlueNet()

@@ -87,18 +87,13 @@ class DatasetChoice:
     def has_query_depth(self) -> bool:
         """Whether the queries come with depth maps, of a sensor that a rig joins to their camera;
         those of official datasets have none.
-
-        Raises DataError where the queries' folder is broken.
         """
         if self.root is None or self.adapter is not None:
             return False
         return _has_depth(self.root / QUERY)
 
     def has_map_depth(self) -> bool:
-        """Whether the map's images come with depth maps, as far as options and folders tell.
-
-        Raises DataError where the map's folder is broken.
-        """
+        """Whether the map's images come with depth maps, as far as options and folders tell."""
         if self.adapter is not None:
             return bool(getattr(getattr(self.adapter, "options", None), "depth", False))
         if self.root is None:
@@ -136,10 +131,6 @@ class DatasetChoice:
 
         Beside the kapture folders an official dataset leaves a summary of what was found and
         what is published, ``megloc/summary.txt``.
-
-        Raises
-        ------
-        DataError : something is missing or broken; names file and line.
         """
         if self.adapter is None:
             return import_kapture_folders(
@@ -186,7 +177,7 @@ def dataset_names() -> list[str]:
 
 
 def check_known(dataset: str) -> None:
-    """Refuse a dataset that nobody knows; raises OptionError with those that are known."""
+    """Refuse a dataset that nobody knows."""
     if dataset not in dataset_names():
         raise OptionError(f"unknown dataset {dataset!r}; {suggestion(dataset, dataset_names())}")
 
@@ -205,11 +196,6 @@ def choose_dataset(
     Parameters
     ----------
     find_root : false: an official dataset may be without a root; it cannot be imported then.
-
-    Raises
-    ------
-    OptionError : unknown name, no root where one is needed (says where the data is published), or
-        an option the dataset does not have.
     """
     check_known(name)
     layout = name.removeprefix(TWIN_PREFIX)
@@ -285,13 +271,7 @@ def _root_in_environment(name: str, adapter: DatasetAdapter | None) -> Path:
 
 
 def twin_of(layout: str, **options: Any) -> RenderedDataset:
-    """The rendered dataset in a layout, by the layout's name, with options other than the defaults.
-
-    Raises
-    ------
-    OptionError : no such twin, or no package that renders any.
-    PluginError : it refuses its options.
-    """
+    """Return the rendered dataset of a layout, by its name, with changed options."""
     known = plugin_names(RENDERED_DATASETS)
     if not known:
         raise OptionError(
@@ -390,10 +370,6 @@ def find_benchmark(dataset: str) -> BenchmarkFile:
     """The benchmark file of a dataset that comes with the package; defaults where there is none.
 
     A rendered twin runs as its dataset does, but nobody has published figures on it.
-
-    Raises
-    ------
-    DataError : the file is broken.
     """
     for name in (dataset, dataset.removeprefix(TWIN_PREFIX)):
         for place in _PLACES:
@@ -407,12 +383,7 @@ def find_benchmark(dataset: str) -> BenchmarkFile:
 
 
 def read_benchmark(path: Path) -> BenchmarkFile:
-    """Read a benchmark file.
-
-    Raises
-    ------
-    DataError : absent, not TOML, or a key or value that is not of it; names the file.
-    """
+    """Read a benchmark file."""
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
         return BenchmarkFile.model_validate(content)

@@ -3,9 +3,7 @@
 colmap      a model, as COLMAP writes it
 nerfstudio  ``transforms.json`` and ``sparse_pc.ply``
 tum         ``seconds tx ty tz qx qy qz qw``, as evo reads it
-kitti       twelve numbers, ``world_from_cam`` row by row, as evo reads it
 ply         points and camera frusta, which every viewer of meshes opens
-geojson     camera centres as points of WGS84 (RFC 7946)
 
 Trajectories hold ``world_from_cam`` in the camera axes of COLMAP and kapture: x right, y down, z
 ahead. nerfstudio's are OpenGL's: x right, y up, z back.
@@ -15,7 +13,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -31,9 +28,7 @@ from megloc_kapture.datasets.kapture_folders import cameras_of_folder, warn_of_s
 from megloc_kapture.errors import DataError, OptionError, OutputError, suggestion
 from megloc_kapture.evaluation.report.scene import corner_rays
 from megloc_kapture.geometry.cameras import principal_point_px
-from megloc_kapture.geometry.poses import earth_from_enu, geodetic
 from megloc_kapture.io.colmap import MapImage, undistort_model, write_model
-from megloc_kapture.io.dataset_tables import read_world, tables_of
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureFolder
@@ -92,23 +87,10 @@ class Scene:
     points: NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class GeoOrigin:
-    """Where on WGS84 the world's origin lies; its axes are East, North and Up there."""
-
-    latitude_deg: float  # geodetic
-    longitude_deg: float
-    height_m: float = 0.0  # above the ellipsoid
-
-
 def export_colmap(scene: Scene, output: Path) -> None:
     """Write a model: cameras, rigs, frames, images, points3D, in COLMAP's binary format.
 
     Every camera is a rig of its own. Queries bring no observations.
-
-    Raises
-    ------
-    DataError : map and queries share a name.
     """
     names = [image.name for image in scene.images]
     if len(set(names)) != len(names):
@@ -123,10 +105,6 @@ def export_undistorted(scene: Scene, output: Path) -> None:
     """Write PINHOLE cameras, ``images/`` and ``sparse/0``, as Gaussian splatting reads them.
 
     The original program ignores the folders in images' names, so ``/`` becomes ``_``.
-
-    Raises
-    ------
-    DataError : an image is missing or has another size than its camera, or two would have one name.
     """
     images = [replace(image, name=image.name.replace("/", "_")) for image in scene.images]
     for image in images:
@@ -148,10 +126,6 @@ def export_nerfstudio(scene: Scene, output: Path, *, beside: Path | None = None)
     Parameters
     ----------
     beside : folder that the images' paths are relative to, where it is not ``output``.
-
-    Raises
-    ------
-    DataError : an image without a file, or a camera model that nerfstudio has not.
     """
     frames = []
     for image in scene.images:
@@ -174,12 +148,7 @@ def export_nerfstudio(scene: Scene, output: Path, *, beside: Path | None = None)
 
 
 def export_tum(scene: Scene, output: Path) -> None:
-    """Write a TUM trajectory.
-
-    Raises
-    ------
-    DataError : images of two cameras have one timestamp, which such a file cannot tell apart.
-    """
+    """Write a TUM trajectory."""
     rows = []
     for image in sorted(scene.images, key=lambda one: one.timestamp):
         world_from_cam = image.cam_from_world.inverse()
@@ -207,18 +176,6 @@ def _exponent_of_seconds(timestamp: int) -> int:
     return next((exponent for limit, exponent in limits if timestamp >= limit), 0)
 
 
-def export_kitti(scene: Scene, output: Path) -> None:
-    """Write a KITTI trajectory in the order of the names, which ``OUTPUT.names.txt`` has."""
-    images = sorted(scene.images, key=lambda image: image.name)
-    lines = [
-        " ".join(f"{value:.17g}" for value in image.cam_from_world.inverse().matrix()[:3].ravel())
-        for image in images
-    ]
-    write_bytes(output, "".join(f"{line}\n" for line in lines).encode())
-    names = "".join(f"{image.name}\n" for image in images)
-    write_bytes(output.with_name(f"{output.name}.names.txt"), names.encode())
-
-
 def export_ply(scene: Scene, output: Path) -> None:
     """Write the points, and every camera as five vertices and eight edges.
 
@@ -241,37 +198,6 @@ def export_ply(scene: Scene, output: Path) -> None:
         edges += [(first, first + k) for k in (1, 2, 3, 4)]
         edges += [(first + k, first + k % 4 + 1) for k in (1, 2, 3, 4)]
     write_ply(output, np.concatenate(vertices), np.concatenate(colours), edges=edges)
-
-
-def export_geojson(scene: Scene, output: Path, origin: GeoOrigin) -> None:
-    """Write the camera centres as points, with name, heading and role.
-
-    Raises
-    ------
-    DataError : the origin is no place on earth.
-    """
-    if not (-90 <= origin.latitude_deg <= 90 and -180 <= origin.longitude_deg <= 180):
-        raise DataError(f"{origin.latitude_deg}, {origin.longitude_deg} is no latitude, longitude")
-    earth_from_world = earth_from_enu(origin.latitude_deg, origin.longitude_deg, origin.height_m)
-    features = []
-    for image in scene.images:
-        world_from_cam = image.cam_from_world.inverse()
-        east, north, _ = world_from_cam.rotation_matrix()[:, 2]
-        position = (earth_from_world @ world_from_cam).translation
-        latitude, longitude, height = geodetic(np.array(position))
-        features.append(
-            {
-                "type": "Feature",
-                "geometry": {"type": "Point", "coordinates": [longitude, latitude, height]},
-                "properties": {
-                    "name": image.name,
-                    "role": "query" if image.is_query else "map",
-                    "heading_deg": math.degrees(math.atan2(east, north)) % 360.0,
-                },
-            }
-        )
-    content = {"type": "FeatureCollection", "features": features}
-    write_bytes(output, (json.dumps(content, indent=1) + "\n").encode())
 
 
 def frustum(camera: Camera, cam_from_world: RigidTransform, depth: float) -> NDArray[np.float64]:
@@ -305,7 +231,7 @@ def _nerfstudio_camera(camera: Camera) -> Mapping[str, Any]:
     }
 
 
-ExportFormat = Literal["colmap", "nerfstudio", "tum", "kitti", "ply", "geojson"]
+ExportFormat = Literal["colmap", "nerfstudio", "tum", "ply"]
 _KIND = "export"
 _NO_ROWS = np.zeros(0, np.int64)
 
@@ -317,7 +243,6 @@ def export(
     map: KaptureMap | Path | str | None = None,
     query: Path | str | None = None,
     sensor: str | None = None,
-    origin: GeoOrigin | None = None,
     undistort: bool = False,
     force: bool = False,
 ) -> int:
@@ -325,41 +250,25 @@ def export(
 
     Parameters
     ----------
-    name : colmap and nerfstudio, which are folders; tum, kitti, ply and geojson, which are files.
+    name : colmap and nerfstudio write folders, tum and ply files.
     map : kapture map, or a kapture folder of images with poses.
-    query : kapture folder of localized queries, with the map's world. Trajectories are of the
-        queries alone where they are given.
+    query : kapture folder of localized queries in the map's world. With queries a trajectory has
+        these alone.
     sensor : images of this camera only.
-    origin : of geojson, where the world's origin lies on earth; a map of photographs whose
-        positions were known brings it.
-    undistort : of colmap: write undistorted images and their model, as programs for Gaussian
+    undistort : for colmap: write undistorted images and their model, as programs for Gaussian
         splatting read them: ``images/`` and ``sparse/0`` with PINHOLE cameras.
 
     Returns
     -------
     Number of images written.
-
-    Raises
-    ------
-    DataError : something is missing, broken, or cannot be said in the format.
-    OptionError : no such format, or what it needs was not given.
-    OutputError : the output is there already, unless ``force``, or cannot be written.
     """
     if name not in get_args(ExportFormat):
         raise OptionError(f"unknown format {name!r}; {suggestion(name, get_args(ExportFormat))}")
     if map is None and query is None:
         raise OptionError("nothing to export: give a map, or localized queries")
     if undistort and name != "colmap":
-        raise OptionError(f"--undistort is of colmap, not of {name}")
-    if name == "geojson" and origin is None:
-        origin = _origin_of(map)
-    if (name == "geojson") != (origin is not None):
-        raise OptionError(
-            "geojson needs to know where the world's origin lies, and nothing else does "
-            "(--geo-origin LATITUDE,LONGITUDE[,HEIGHT]; its axes are East, North, Up); a map of "
-            "`megloc map --scale gps` knows it"
-        )
-    scene = _scene(map, query, sensor, trajectory=name in ("tum", "kitti"))
+        raise OptionError(f"--undistort is an option of colmap, not of {name}")
+    scene = _scene(map, query, sensor, trajectory=name == "tum")
     if not scene.images:
         raise DataError("no image has a pose" + (f" of camera {sensor!r}" if sensor else ""))
     output = Path(output)
@@ -375,12 +284,8 @@ def export(
         return len(scene.images)
     if output.exists() and not force:
         raise OutputError(f"{output}: is there already; --force overwrites it")
-    if origin is not None:
-        export_geojson(scene, output, origin)
-    elif name == "tum":
+    if name == "tum":
         export_tum(scene, output)
-    elif name == "kitti":
-        export_kitti(scene, output)
     else:
         export_ply(scene, output)
     return len(scene.images)
@@ -394,15 +299,6 @@ def _hint_at_undistort(scene: Scene) -> None:
             "cameras and images/ for them",
             distorted[0],
         )
-
-
-def _origin_of(given: KaptureMap | Path | str | None) -> GeoOrigin | None:
-    """Where the origin of a map's world lies on earth; None where it does not say so."""
-    if given is None:
-        return None
-    tables = tables_of(given.folder.root if isinstance(given, KaptureMap) else kapture_of(given))
-    known = None if tables is None else read_world(tables).geo_origin
-    return None if known is None else GeoOrigin(*known)
 
 
 def _scene(

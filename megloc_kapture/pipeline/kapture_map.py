@@ -31,7 +31,7 @@ PixelOriginChoice = Literal["auto", "corner", "centre"]
 AS_ASKED = "as asked for"
 
 _SAMPLED_IMAGES = 50
-_NETWORKS = ("aliked", "aslfeat", "r2d2", "superpoint", "xfeat")
+_NETWORKS = ("aliked", "aslfeat", "disk", "r2d2", "superpoint", "xfeat")
 # extractor of SIFT by whether descriptors are bytes
 _SIFT_OF = {True: "sift", False: "rootsift"}
 
@@ -72,7 +72,7 @@ class MapKeypoints:
         return np.asarray(self._descriptors.read(image))
 
     def has_descriptors(self, images: Collection[str]) -> bool:
-        """Whether all of these images that have keypoints have descriptors too."""
+        """Return whether all of these images that have keypoints have descriptors too."""
         if self.name not in self.folder.types("descriptors"):
             return False
         return all(image in self._descriptors for image in images if image in self._keypoints)
@@ -90,12 +90,7 @@ class MapKeypoints:
         return found
 
     def check(self, images: Collection[str]) -> None:
-        """Compare the sizes of the images' feature files; reads none of them.
-
-        Raises
-        ------
-        DataError : a truncated file, or keypoints and descriptors of different length.
-        """
+        """Compare the sizes of the images' feature files; reads none of them."""
         if not self.has_descriptors(images):
             return
         for image in images:
@@ -139,23 +134,15 @@ class KaptureMap:
         features_dirs: Sequence[Path | str] = (),
         pixel_origin: PixelOriginChoice = "auto",
         allow_links_below: Sequence[Path | str] = (),
-        indices: Mapping[str, MapIndex] | None = None,
     ) -> KaptureMap:
         """Open a kapture map.
 
         Parameters
         ----------
         keypoints_types : those to localize with; all that have points unless given.
-        features_dirs : folders with features in the orphan layout beside the map's own.
+        features_dirs : folders with features in the orphan layout, in addition to the map's.
         pixel_origin : of the map's intrinsics; "auto" finds it out (see ``.pixel_origin``).
         allow_links_below : folders that links in the map may lead to.
-        indices : of its keypoints types, from another process that has opened it; points and
-            observations are not read then.
-
-        Raises
-        ------
-        DataError : no map, or broken: names the file.
-        OptionError : a type or pixel origin that is not there.
         """
         if pixel_origin not in ("auto", "corner", "centre"):
             raise OptionError(f"pixel_origin is {pixel_origin!r}; give auto, corner or centre")
@@ -169,8 +156,7 @@ class KaptureMap:
                 "missing; `megloc triangulate` makes one from images with poses",
                 path=folder.root,
             )
-        if indices is None:
-            indices = _read_indices(folder, keypoints_types)
+        indices = _read_indices(folder, keypoints_types)
         origins = _find_origins(folder, indices)
         if pixel_origin != "auto":
             origins = {
@@ -197,12 +183,7 @@ class KaptureMap:
         return next(iter(self.keypoints.values())).pixel_origin
 
     def keypoints_of(self, name: str) -> MapKeypoints:
-        """The keypoints of a type that the map stores, whether any of them has a point.
-
-        Raises
-        ------
-        DataError : the map has no keypoints of that type.
-        """
+        """The keypoints of a type that the map stores, whether any of them has a point."""
         if name in self.keypoints:
             return self.keypoints[name]
         index = index_map(self.folder, name)
@@ -213,7 +194,7 @@ class KaptureMap:
 
     @cached_property
     def unit(self) -> str:
-        """Of the map's points and poses: m, or units of its own where nobody knows its scale."""
+        """Unit of points and poses: ``m``, or ``units`` if the scale is unknown."""
         return unit_of(self.folder.root)
 
     def stored_types(self) -> list[str]:
@@ -244,7 +225,7 @@ class KaptureMap:
         return shift_principal_point(camera, shift) if shift else camera
 
     def has_images(self) -> bool:
-        """Whether the map's image files are there."""
+        """Return whether the map's image files are there."""
         try:
             return all(self.folder.image_path(image).is_file() for image in self.images)
         except DataError:
@@ -258,10 +239,6 @@ class KaptureMap:
         """Compare the sizes of all feature files that localizing reads; reads none of them.
 
         Observations are compared with keypoints when they are read, which :meth:`open` does.
-
-        Raises
-        ------
-        DataError : a truncated file, or keypoints and descriptors of different length.
         """
         for keypoints in self.keypoints.values():
             keypoints.check(self.images)
@@ -360,7 +337,7 @@ def _read_indices(folder: KaptureFolder, keypoints_types: Sequence[str]) -> dict
 
 
 def _is_ours(folder: KaptureFolder, local_type: str) -> bool:
-    """Whether the keypoints are surely in our convention.
+    """Return whether the keypoints are surely in our convention.
 
     Other toolkits write types named after the same networks, in the networks' own convention.
     """

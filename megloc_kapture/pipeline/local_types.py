@@ -23,7 +23,7 @@ from megloc_kapture.plugins import (
     Matcher,
     PluginChoice,
 )
-from megloc_kapture.stages.devices import BATCH, placed
+from megloc_kapture.stages.devices import BATCH, with_device
 from megloc_kapture.stages.given_map import rows_found_again
 from megloc_kapture.stages.guided_pyramid import PyramidMethod, retry_query
 from megloc_kapture.stages.local_features import extract_all, read_frame
@@ -52,7 +52,7 @@ class LocalType:
     points : keypoints of the map that observe its points.
     first : those that queries are matched with at first: of a guided pyramid's type, where pairs
         with few matches are tried again, the type that it is made of.
-    choice : what the options say of this type of features; None where they do not name it.
+    choice : the options' entry for this type of features; None if they do not name it.
     cache : of the map's features, shared with other types.
     """
 
@@ -71,12 +71,7 @@ class LocalType:
         self._again: dict[str, NDArray[Any]] | None = None
 
     def prepare(self) -> None:
-        """Extract the map's descriptors again where it has none.
-
-        Raises
-        ------
-        DataError, PluginError, MissingWeightsError : they cannot be.
-        """
+        """Extract the map's descriptors again where it has none."""
         if not self.first.has_descriptors(self._map.images):
             self._again = extract_again(self._map, self.first, self.extractor)
 
@@ -95,13 +90,7 @@ class LocalType:
 
     @cached_property
     def extractor(self) -> LocalFeatureExtractor:
-        """The extractor of the type.
-
-        Raises
-        ------
-        DataError : none is installed, or the options' makes features of another type.
-        PluginError, MissingWeightsError : it cannot be made.
-        """
+        """The extractor of the type."""
         found = self.brought()
         if found is None:
             raise DataError(
@@ -118,17 +107,12 @@ class LocalType:
         """The extractor, where one is known by the options or by the map's name of the type."""
         found = self.first.extractor()
         if self.choice is None or (found is not None and found.name != self.choice.name):
-            return placed(found, self._options.device, self._options.precision)
+            return with_device(found, self._options.device, self._options.precision)
         known = {} if found is None else found.options
         return PluginChoice(name=self.choice.name, options={**self.choice.options, **known})
 
     def of_query(self, image: QueryImage) -> Features:
-        """The features of a query: those that it brings, else extracted ones.
-
-        Raises
-        ------
-        DataError : it has neither features nor an image, or they cannot be extracted.
-        """
+        """The features of a query: those that it brings, else extracted ones."""
         brought = image.query.features
         local = next((brought[n] for n in equivalent_types(self.name) if n in brought), None)
         if local is None:
@@ -190,7 +174,7 @@ class LocalType:
 
     @cached_property
     def pyramid_obstacle(self) -> str:
-        """Why guided pyramid matching cannot extract features of this type; empty where it can."""
+        """The reason why guided pyramid matching cannot extract this type; empty if it can."""
         try:
             _ = self.extractor
         except MissingWeightsError:
@@ -245,7 +229,7 @@ def local_types_of(
 
 
 def _choices(options: PipelineOptions) -> list[LocalFeaturesChoice]:
-    """What the options say of types, ours first, then the given map's."""
+    """The options' entries for types of features, ours first, then the given map's."""
     own = list(options.local_features) if options.makes_points() else []
     if options.uses_given_map():
         given = options.given_features
@@ -254,33 +238,16 @@ def _choices(options: PipelineOptions) -> list[LocalFeaturesChoice]:
 
 
 def _rank(local_type: str, choices: Sequence[LocalFeaturesChoice]) -> int:
-    """Which choice makes a type, by name alone: no network is loaded for that.
-
-    Types are called as their plugin, or their weights, which begin with its name.
-    """
-    base = base_type(local_type)
-    plain = plain_name(base)
-    fitting = [rank for rank, one in enumerate(choices) if plain.startswith(plain_name(one.name))]
-
-    def distance(rank: int) -> int:
-        weights = str(choices[rank].options.get("weights", "")).removesuffix(".pth")
-        if plain_name(weights) == plain:
-            return 0
-        return 1 if plain_name(choices[rank].name) == plain else 2
-
-    return min(fitting, key=distance, default=len(choices))
+    """The position of the choice that makes a type, whose name begins with that of its plugin."""
+    plain = plain_name(base_type(local_type))
+    fitting = (rank for rank, one in enumerate(choices) if plain.startswith(plain_name(one.name)))
+    return next(fitting, len(choices))
 
 
 def extract_again(
     kapture_map: KaptureMap, keypoints: MapKeypoints, extractor: LocalFeatureExtractor
 ) -> dict[str, NDArray[Any]]:
-    """Descriptors of every map image, one row per stored keypoint; zero where it is not found.
-
-    Raises
-    ------
-    DataError : an image is missing, or most observed keypoints are not found again: then the map
-        was made with another extractor or other options.
-    """
+    """Descriptors of every map image, one row per stored keypoint; zero where it is not found."""
     if not kapture_map.has_images():
         raise DataError(
             f"the map has no descriptors of type {keypoints.name!r}, and no images to extract "

@@ -43,12 +43,6 @@ from megloc_kapture.stages.work import ordered_map
 from megloc_kapture.values import Camera, Device, Failure, Pose, RigidTransform
 
 _ALONE = RigidTransform.identity()
-# the options that localizing uses; the others are of maps that are made
-LOCALIZING = (
-    *("device", "precision", "preprocessing", "local_features", "mask_margin_px"),
-    *("global_features", "fusion", "query_pairs", "reranking", "matching", "verification"),
-    *("query_verification", "guided_pyramid", "localization", "pose_refinement"),
-)
 
 
 class Localizer:
@@ -64,11 +58,6 @@ class Localizer:
     kapture_map : the map.
     preset, device, precision : options by name, and where and how its networks compute: auto (a GPU
         where there is one), cpu, cuda, cuda:N; full or half. ``options`` gives all of it instead.
-
-    Raises
-    ------
-    DataError : the map has no descriptors, and they cannot be made again.
-    OptionError, PluginError : the options cannot be used.
 
     Examples
     --------
@@ -129,11 +118,6 @@ class Localizer:
         Returns
         -------
         Pose, or Failure, which is falsy and says why.
-
-        Raises
-        ------
-        DataError : the image cannot be read, is not of its camera's size, or its features cannot
-            be extracted because the map's type has no extractor.
         """
         permitted = None if prior is None else tuple(prior)
         return self.localize_query(replace(_query_of(image, camera), prior=permitted))
@@ -206,11 +190,6 @@ class Localizer:
         Returns
         -------
         Pose whose ``cam_from_world`` is ``rig_from_world``, or Failure.
-
-        Raises
-        ------
-        OptionError : the options have pose refiners, which refine cameras one by one:
-            :meth:`localize_units` gives the poses of the cameras.
         """
         if self.refiners.refiners:
             raise OptionError(
@@ -261,10 +240,10 @@ class Localizer:
         *,
         as_rig: bool = False,
     ) -> tuple[list[Pose | Failure], list[_Matching]]:
-        """What becomes of the matches of all cameras, see :func:`localize_unit`, and these.
+        """Match and localize all cameras; returns a result per camera, and the matches.
 
-        What orders candidates by their matches, and guided pyramids, need all matches at first;
-        else no more candidates are matched than are taken.
+        Reranking and guided pyramids need the matches with all candidates first; otherwise no more
+        candidates are matched than are used.
         """
         cameras = [self._begin(image, at) for image, (_, at) in zip(images, unit, strict=True)]
         whole = self.options.reranking.reranks() or self.options.matches_again()
@@ -390,10 +369,6 @@ class Localizer:
     def _known_images(self) -> frozenset[str]:
         return frozenset(self.map.folder.read().image_names())
 
-    def compares_as_asked(self, global_types: Collection[str]) -> bool:
-        """Whether queries that bring these global features are compared by the options' own."""
-        return self._retrieval.names_one_of(global_types)
-
     def describe_retrieval(self, global_types: Collection[str]) -> str:
         """How the candidates of queries that bring these global features are found, for people."""
         options = self.options.query_pairs
@@ -409,8 +384,8 @@ class _Matching:
     Attributes
     ----------
     of_types : of each keypoints type, the matches with as many of ``ranked`` as were asked for.
-    view, candidates, left_out : what these make, what reranking leaves of them, and the steps that
-        were left out, in words.
+    view, candidates : the matches for the solver, and the candidates that reranking keeps.
+    left_out : remarks on steps that were left out.
     """
 
     image: QueryImage

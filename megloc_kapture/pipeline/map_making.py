@@ -19,12 +19,10 @@ import logging
 import math
 import os
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-from pydantic import BaseModel
 
 from megloc_kapture.datasets.colmap_map import (
     ColmapFolders,
@@ -51,11 +49,10 @@ from megloc_kapture.io.dataset_tables import (
 from megloc_kapture.io.files import (
     clear_leftovers,
     output_error,
-    read_json_model,
     remove,
     temporary_name,
     user_cache,
-    write_json_model,
+    write_bytes,
 )
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.io.output_folders import replace_directory
@@ -85,10 +82,10 @@ from megloc_kapture.stages.stage import (
     MAPPING,
     QUERY,
     ROOT,
-    Hashes,
     PipelineStage,
     Stage,
     StageWork,
+    files_fingerprint,
     wanted_stages,
 )
 from megloc_kapture.stages.structure import FindPoses, MatchPhotographs, StructureOptions
@@ -127,12 +124,7 @@ _WITH_POSES: tuple[type[PipelineStage], ...] = (
 
 
 def plan_map(mapping: KaptureFolder, options: PipelineOptions) -> list[Stage]:
-    """The stages that make a map of images with poses, without queries.
-
-    Raises
-    ------
-    OptionError : the options need a model that a dataset comes with.
-    """
+    """The stages that make a map of images with poses, without queries."""
     check_weights(options)
     options.retrieval()
     if options.uses_given_map() or options.pairs_by_points():
@@ -151,21 +143,15 @@ class ImportMapping(Stage):
         super().__init__(Options())
         self._mapping, self.root = mapping, mapping.root
 
-    def external(self, hashes: Hashes) -> Mapping[str, str]:
+    def external(self) -> Mapping[str, str]:
         root = self._mapping.root.resolve()
-        return {"images": hashes.of_files(root, mapping_files(self._mapping)), ROOT: str(root)}
+        return {"images": files_fingerprint(root, mapping_files(self._mapping)), ROOT: str(root)}
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         return import_mapping(self._mapping, work.out)
 
 
 GPS = "gps"
-# the options that making a map of photographs uses
-MAPPING_OPTIONS = (
-    *("device", "precision", "preprocessing", "local_features", "mask_margin_px"),
-    *("global_features", "fusion", "mapping_pairs", "matching", "mapping_verification"),
-    *("query_verification", "guided_pyramid", "triangulation", "refinement"),
-)
 _BY_POSES = frozenset({"poses", "covisibility"})
 
 
@@ -179,17 +165,18 @@ class ImportPhotographs(Stage):
         super().__init__(Options())
         self._photographs, self.root = photographs, photographs.root
 
-    def external(self, hashes: Hashes) -> Mapping[str, str]:
+    def external(self) -> Mapping[str, str]:
         data, files = self._photographs.data(), self._photographs.files()
+        root = self._photographs.root.resolve()
         content = {
-            "files": {name: hashes.of_file(path.resolve()) for name, path in files.items()},
+            "files": [sorted(files), files_fingerprint(root, map(Path.resolve, files.values()))],
             "sensors": {name: sensor.params for name, sensor in data.sensors.items()},
             "images": [[sensor, name] for (_, sensor), name in data.records_camera.items()],
             "unreadable": self._photographs.unreadable,
         }
         text = json.dumps(content, sort_keys=True, default=str)
         fingerprint = hashlib.sha256(text.encode()).hexdigest()
-        return {"photographs": fingerprint, ROOT: str(self._photographs.root.resolve())}
+        return {"photographs": fingerprint, ROOT: str(root)}
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         write_sensors(work.out / MAPPING, self._photographs.data())
@@ -211,23 +198,15 @@ class ImportPhotographs(Stage):
 
 
 def options_of_photographs(
-    preset: str,
-    assignments: Sequence[str] | Mapping[str, Any] = (),
-    *,
-    used: Sequence[str] | None = None,
+    preset: str, assignments: Sequence[str] | Mapping[str, Any] = ()
 ) -> PipelineOptions:
-    """A preset's options, without those that would need poses or a known lens.
-
-    Raises
-    ------
-    OptionError : of :func:`options_of_preset`; or one that would need them was typed.
-    """
+    """Return a preset's options, without those that need poses or a known lens."""
     by = PRESETS[preset].mapping_pairs.by if preset in PRESETS else ()
     changes: list[dict[str, Any]] = [
         {"preprocessing": {"undistort": False}},
         {"mapping_pairs": {"by": [method for method in by if method not in _BY_POSES]}},
     ]
-    options = options_of_preset(preset, changes=changes, assignments=assignments, used=used)
+    options = options_of_preset(preset, changes=changes, assignments=assignments)
     if without := sorted(_BY_POSES.intersection(options.mapping_pairs.by)):
         raise OptionError(f"mapping_pairs.by {without[0]}: photographs have no poses yet")
     if options.preprocessing.undistort:
@@ -248,11 +227,6 @@ def structure_options(
     Parameters
     ----------
     scale : nothing; ``gps``; or two photographs and the metres between them.
-
-    Raises
-    ------
-    OptionError : the scale is none of these.
-    DataError : a photograph is not there, or none has a position.
     """
     gps, distance = None, None
     if tuple(scale) == (GPS,):
@@ -282,13 +256,7 @@ def structure_options(
 def plan_photographs(
     photographs: Photographs, options: PipelineOptions, structure: StructureOptions
 ) -> list[Stage]:
-    """The stages from photographs to a map.
-
-    Raises
-    ------
-    DataError : too few photographs.
-    MeglocError : the options cannot be used.
-    """
+    """The stages from photographs to a map."""
     check_weights(options)
     options.retrieval()
     if len(photographs.names) < MIN_IMAGES:
@@ -303,7 +271,7 @@ def plan_photographs(
 
 
 def describe_map(workspace: Path, photographs: Photographs) -> list[str]:
-    """What became of the photographs, in lines for people."""
+    """Lines about the map, and about photographs that are not in it."""
     tables = workspace / SIDE_TABLES
     missing = read_unreadable(tables, UNREGISTERED_FILE)
     everything = len(photographs.names) + len(photographs.unreadable)
@@ -333,16 +301,8 @@ def _too_few(number: int, unreadable: Mapping[str, str]) -> DataError:
     return DataError(told)
 
 
-_STAMP = "colmap.json"
-_VERSION = 2  # of the import: another one makes all maps anew
-
-
-class _Stamp(BaseModel):
-    """What a map was imported from: paths, and size and time of each file."""
-
-    version: int
-    images: str | None
-    files: dict[str, tuple[int, int]]
+_STAMP = "colmap.txt"
+_VERSION = 3  # of the import: another one makes all maps anew
 
 
 def colmap_maps_folder() -> Path:
@@ -364,10 +324,6 @@ def import_colmap(
     Returns
     -------
     Counts for the log.
-
-    Raises
-    ------
-    DataError : see :class:`~megloc_kapture.datasets.colmap_map.ColmapReconstruction`.
     """
     read = ColmapReconstruction.read(source)
     if unit != METRES:
@@ -411,22 +367,17 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
     path : kapture folder, workspace, or a COLMAP model or workspace, see
         :func:`~megloc_kapture.datasets.colmap_map.find_colmap`.
     work : where features are extracted, if they have to be.
-
-    Raises
-    ------
-    DataError : it is a COLMAP model that cannot be imported.
-    OutputError : the cache cannot be written.
     """
     path = map_of_workspace(Path(path))
     if not is_colmap(path):
         return path
     source = find_colmap(path)
-    stamp = _stamp(source.images, source.files())
+    stamp = _stamp(source).encode()
     place = Path(os.path.realpath(source.model))
     digest = hashlib.sha256(os.fsencode(place)).hexdigest()[:16]
     folder = colmap_maps_folder()
     kept = folder / f"{place.name[:40]}-{digest}"
-    if _read_stamp(kept) == stamp:
+    if (kept / _STAMP).is_file() and (kept / _STAMP).read_bytes() == stamp:
         return kept
     made = folder / temporary_name()
     try:
@@ -434,7 +385,7 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
         clear_leftovers(folder)
         made.mkdir()
         import_colmap(source, made, work=work)
-        write_json_model(made / _STAMP, stamp)
+        write_bytes(made / _STAMP, stamp)
         replace_directory(made, kept)
     except OSError as error:
         raise output_error(folder, error) from error
@@ -444,21 +395,13 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
     return kept
 
 
-def _stamp(images: Path | None, files: Iterable[Path]) -> _Stamp:
-    found = {}
-    for file in files:
+def _stamp(source: ColmapFolders) -> str:
+    """The sources of an imported map: image folder, and size and time of each file."""
+    lines = [f"import {_VERSION}", f"images {source.images and os.path.realpath(source.images)}"]
+    for file in source.files():
         try:
             status = file.stat()
         except OSError as error:
             raise DataError(f"cannot read: {error.strerror}", path=file) from error
-        found[os.path.realpath(file)] = (status.st_size, status.st_mtime_ns)
-    where = None if images is None else os.path.realpath(images)
-    return _Stamp(version=_VERSION, images=where, files=found)
-
-
-def _read_stamp(folder: Path) -> _Stamp | None:
-    """The stamp of an imported map; None where there is none that can be read."""
-    try:
-        return read_json_model(folder / _STAMP, _Stamp)
-    except DataError:
-        return None
+        lines.append(f"{os.path.realpath(file)} {status.st_size} {status.st_mtime_ns}")
+    return "\n".join(lines)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar, get_args
@@ -58,7 +58,7 @@ _MEGLOC = PipelineOptions(
     ),
     query_pairs=QueryPairsOptions(top_k=50),
     reranking=RerankingOptions(by="verified", local_type="superpoint"),
-    guided_pyramid=GuidedPyramidOptions(mode="all", count="matches", probed_pairs=None),
+    guided_pyramid=GuidedPyramidOptions(mode="all", count="matches"),
     refinement=MapRefinementOptions(uncertainty=UncertaintyOptions(max_robust_sigmas=2.5)),
     localization=LocalizationOptions(rank=PluginChoice(name="inliers")),
     pose_refinement=PoseRefinementOptions(references="cluster"),
@@ -98,33 +98,18 @@ def options_of_preset(
     *,
     changes: Sequence[dict[str, Any]] = (),
     assignments: Sequence[str] | Mapping[str, Any] = (),
-    used: Collection[str] | None = None,
 ) -> PipelineOptions:
-    """A preset's options with changes: nested tables in order, then what a user typed.
+    """Return a preset's options with changes: nested tables in order, then the user's.
 
-    Parameters
-    ----------
-    assignments : ``key.key=value`` texts, or ``key.key`` to values.
-    used : the options that a user may change, by their first key; None: all.
-
-    Raises
-    ------
-    OptionError : unknown preset or option, a value the option cannot have, or a text that changes
-        an option which nothing acts on.
+    ``assignments`` are ``key.key=value`` texts, or ``key.key`` to values.
     """
     if preset not in PRESETS:
         raise OptionError(f"unknown preset {preset!r}; {suggestion(preset, PRESETS)}")
     tree = PRESETS[preset].model_dump()
     for change in changes:
         _merge(tree, change)
-    typed = assigned(assignments)
-    _merge(tree, typed)
-    options = _validated(PipelineOptions, tree)
-    if used is not None and "localization" in used:
-        # a map may bring types of features that the options do not name
-        typed = {key: value for key, value in typed.items() if key not in ("device", "precision")}
-    check_assigned(options, typed, used=used)
-    return options
+    _merge(tree, assigned(assignments))
+    return _validated(PipelineOptions, tree)
 
 
 def options_with(
@@ -132,19 +117,11 @@ def options_with(
     assignments: Sequence[str] | Mapping[str, Any],
     changes: Mapping[str, Any] | None = None,
 ) -> OptionsT:
-    """A model's defaults with changes by ``key.key``, then with what a user typed.
-
-    Raises
-    ------
-    OptionError : see :func:`options_of_preset`.
-    """
+    """Return a model's defaults with changes by ``key.key``, then with the user's."""
     tree = model().model_dump()
-    typed = assigned(assignments)
     _merge(tree, assigned(changes or {}))
-    _merge(tree, typed)
-    options = _validated(model, tree)
-    check_assigned(options, typed)
-    return options
+    _merge(tree, assigned(assignments))
+    return _validated(model, tree)
 
 
 def _validated(model: type[OptionsT], tree: Mapping[str, Any]) -> OptionsT:
@@ -161,12 +138,7 @@ def _validated(model: type[OptionsT], tree: Mapping[str, Any]) -> OptionsT:
 def assigned(
     assignments: Sequence[str] | Mapping[str, Any], *, flag: str = "--set"
 ) -> dict[str, Any]:
-    """Nested tables of ``key.key=value`` texts, or of ``key.key`` to values.
-
-    Raises
-    ------
-    OptionError : a text that is none.
-    """
+    """Return nested tables of ``key.key=value`` texts, or of ``key.key`` to values."""
     tree: dict[str, Any] = {}
     typed = partial(_typed, flag=flag)
     pairs = assignments.items() if isinstance(assignments, Mapping) else map(typed, assignments)
@@ -193,7 +165,7 @@ def _typed(assignment: str, flag: str) -> tuple[str, Any]:
 
 
 def _known(path: str, root: type[Options]) -> str:
-    """A like option to one that does not exist, and those beside it."""
+    """Suggest an option similar to an unknown one."""
     model: Any = root
     *parents, name = path.split(".")
     for part in parents:
@@ -280,66 +252,11 @@ def _merged_choices(
     return merged
 
 
-def check_assigned(
-    options: Options, assigned: Mapping[str, Any], *, used: Collection[str] | None = None
-) -> None:
-    """Refuse options that were typed and change nothing.
-
-    Parameters
-    ----------
-    options : with all changes.
-    assigned : nested tables of what was typed.
-    used : options that the command acts on; None: all.
-
-    Raises
-    ------
-    OptionError : an option that the command does not use, or that another option makes idle.
-    """
-    for name in assigned:
-        if used is not None and name not in used:
-            raise OptionError(
-                f"--set {name}: nothing here uses it; used are: {', '.join(sorted(used))}"
-            )
-    for path, reason in _idle(options, assigned):
-        raise OptionError(f"--set {path} changes nothing: {reason}")
-
-
-def _idle(
-    model: Options, assigned: Mapping[str, Any], above: str = ""
-) -> Iterator[tuple[str, str]]:
-    """Paths of assigned options that change nothing, and why."""
-    idle = model.idle()
-    for name, value in assigned.items():
-        inner = getattr(model, name, None)
-        if name in idle:
-            yield above + name, idle[name]
-        elif isinstance(inner, Options) and isinstance(value, Mapping):
-            yield from _idle(inner, value, f"{above}{name}.")
-        elif isinstance(inner, tuple) and isinstance(value, Mapping):
-            yield from _idle_in_list(inner, value, f"{above}{name}.")
-
-
-def _idle_in_list(
-    choices: Sequence[Any], assigned: Mapping[str, Any], above: str
-) -> Iterator[tuple[str, str]]:
-    """The same in a list of plugins, of which the only one, or those that are named, change."""
-    for name, value in assigned.items():
-        named = [one for one in choices if getattr(one, "name", None) == name]
-        if named and isinstance(value, Mapping):
-            for one in named:
-                yield from _idle_in_list([one], value, f"{above}{name}.")
-        elif name == "weight" and len(choices) == 1:
-            yield above + name, "it is the share among several, and there is one"
-
-
 def check_weights(options: PipelineOptions) -> None:
     """Make every plugin that a run uses once.
 
-    Raises
-    ------
-    MissingWeightsError : names each checkpoint that is not there, and how to get it; and the
-        command that fetches those of a preset at once.
-    PluginError : a plugin is not there, or refuses its options.
+    Raises MissingWeightsError: names each missing checkpoint, how to get it, and the command that
+    fetches those of a preset at once.
     """
     if (error := _missing(options)) is None:
         return
@@ -359,7 +276,6 @@ def check_weights(options: PipelineOptions) -> None:
 
 
 def _missing(options: PipelineOptions) -> MissingWeightsError | None:
-    """What says of all missing checkpoints how to get them; None where none is missing."""
     missing = []
     for make in _makers(options):
         try:

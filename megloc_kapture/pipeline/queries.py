@@ -63,7 +63,7 @@ class Query:
     orientation: int = 1
 
     def read_mask(self) -> NDArray[np.bool_] | None:
-        """The mask, bool (H, W), True = use; None where there is none. Raises DataError."""
+        """The mask, bool (H, W), True = use; None where there is none."""
         shape = (self.camera.height, self.camera.width)
         if isinstance(self.mask, Path):
             return read_mask(self.mask, shape)
@@ -77,7 +77,7 @@ class Query:
         return mask
 
     def read_depth(self) -> DepthView | None:
-        """The depth map that was taken with the image; None without. Raises DataError."""
+        """The depth map that was taken with the image; None without."""
         if self.depth is None or isinstance(self.depth, DepthView):
             return self.depth
         return self.depth()
@@ -89,7 +89,7 @@ class Query:
         return self.image is not None
 
     def read_image(self) -> NDArray[np.uint8]:
-        """The image as uint8 (H, W, 3) RGB; raises DataError when there is none or it is broken."""
+        """The image as uint8 (H, W, 3) RGB."""
         if self.image is None:
             raise DataError(
                 f"query {self.name} has no image, and lacks features of the map's types or is to "
@@ -113,12 +113,7 @@ class Query:
 
 
 class Preprocessor:
-    """Pre-processes query images as the stage of :mod:`megloc_kapture.stages.preprocessing` does.
-
-    Raises
-    ------
-    OptionError : masks of cameras or files, which belong to folders; a query brings its own.
-    """
+    """Pre-processes query images like :mod:`megloc_kapture.stages.preprocessing`."""
 
     def __init__(self, options: PipelineOptions) -> None:
         self._options = options
@@ -134,10 +129,6 @@ class Preprocessor:
         """What becomes of a query's image; nothing is read yet.
 
         The image of a query that brings local features stays as it is, for they are in its pixels.
-
-        Raises
-        ------
-        OptionError : the image is too small for the options.
         """
         frame = FrameOptions() if query.features else self._options.preprocessing
         return QueryImage(query, plan_frame(query.camera, frame), self)
@@ -186,14 +177,14 @@ class QueryImage:
 
     @property
     def pixels(self) -> NDArray[np.uint8]:
-        """The image, uint8 (H, W, 3) RGB; raises DataError."""
+        """The image, uint8 (H, W, 3) RGB."""
         return self._frame.stored
 
     @cached_property
     def mask(self) -> NDArray[np.bool_] | None:
         """Its mask bool (H, W), True = use: its own, dynamic classes, what the original shows.
 
-        None where all of it is used. Raises DataError.
+        None where all of it is used.
         """
         return self._frame.mask
 
@@ -204,17 +195,11 @@ class QueryImage:
         return None if mask is None else with_margin(mask, self._preprocessor.mask_margin_px)
 
     def extract(self, extractor: LocalFeatureExtractor) -> LocalFeatures:
-        """Its local features.
-
-        Raises
-        ------
-        DataError : the image or its mask cannot be read, or is not of its camera's size.
-        PluginError : the extractor returns something else.
-        """
+        """Its local features."""
         return extract_all(extractor, [(self.pixels, self.feature_mask)], [self.query.name])[0]
 
     def describe(self, extractor: GlobalFeatureExtractor) -> NDArray[np.float32]:
-        """Its global feature, float32 (D,); raises as :meth:`extract`."""
+        """Its global feature, float32 (D,)."""
         return describe_images(extractor, [self.pixels], [self.query.name])[0]
 
 
@@ -225,7 +210,7 @@ class QueryImages:
         self._images = {image.query.name: image for image in images}
 
     def image(self, name: str) -> NDArray[np.uint8]:
-        """RGB pixels (H, W, 3); raises DataError."""
+        """RGB pixels (H, W, 3)."""
         return self._images[name].pixels
 
     def mask(self, name: str) -> NDArray[np.bool_] | None:
@@ -233,7 +218,7 @@ class QueryImages:
         return self._images[name].mask
 
     def depth(self, name: str) -> DepthView | None:
-        """Depth that was taken with the image; None without; raises DataError."""
+        """Depth that was taken with the image; None without."""
         return self._images[name].query.read_depth()
 
 

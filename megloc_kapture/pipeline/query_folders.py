@@ -76,7 +76,7 @@ class Queries(ABC):
 
     @abstractmethod
     def check(self) -> None:
-        """Check all that can be checked without reading features or pixels; raises DataError."""
+        """Check all that can be checked without reading features or pixels."""
 
     def lacking(self, local_type: str) -> str | None:
         """The first image without features that serve a type; None where all bring them."""
@@ -155,13 +155,7 @@ class KaptureQueries(Queries):
         )
 
     def check(self) -> None:
-        """See :meth:`Queries.check`.
-
-        Raises
-        ------
-        DataError : there are no images, or none that can be used; features are not as wide as the
-            map's, or would be taken for those of a map image.
-        """
+        """See :meth:`Queries.check`."""
         self._map.folder.check_features_apart(self._folder)
         if not self.names:
             raise DataError("there are no query images", path=self._folder.root)
@@ -266,7 +260,7 @@ class KaptureQueries(Queries):
 
     @cached_property
     def _priors(self) -> dict[str, tuple[str, ...]]:
-        """What the map's dataset permits; queries of one pool share their tuple."""
+        """Map images permitted by the dataset; queries of one pool share their tuple."""
         images = self._map.images
         found = {}
         for positions, permitted in self._map.restrictions.pools(self.names, images):
@@ -336,12 +330,6 @@ class Photographs(Queries):
     root : the first folder, or that of the first file.
     passed_over : files of the folders that are no images.
     without_row : images that the list of cameras does not have.
-
-    Raises
-    ------
-    DataError : a file or folder is not there, there is no image, two have the same name, or kapture
-        cannot hold a name.
-    OptionError : ``every`` is not positive, or there is no video.
     """
 
     def __init__(
@@ -361,8 +349,6 @@ class Photographs(Queries):
         self._calibrated = {k: v for root in roots for k, v in _calibrated(root).items()}
         self._scaled: list[tuple[Camera, Camera]] = []
         videos = [name for name in files if Path(name).suffix.lower() in VIDEO_SUFFIXES]
-        if every is not None and not videos:
-            raise OptionError("--every changes nothing: there is no video among the images")
         self._images: dict[str, _Image] = {}
         self._frames: tempfile.TemporaryDirectory[str] | None = None
         for name, path in files.items():
@@ -382,11 +368,11 @@ class Photographs(Queries):
             )
 
     def known_cameras(self) -> bool:
-        """Whether the cameras of all images are given."""
+        """Return whether the cameras of all images are given."""
         return all(image.camera.focal_deviation == 0 for image in self._images.values())
 
     def describe(self) -> list[str]:
-        """What is special about the files, in lines for people."""
+        """Lines about files that are left out or have no camera in the list."""
         lines = []
         if self.passed_over:
             said = f"{len(self.passed_over)} files that are no images are left out"
@@ -549,7 +535,7 @@ def _images_below(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def _check_name(name: str, path: Path) -> None:
-    """Refuse names that kapture's tables cannot hold; raises DataError."""
+    """Refuse names that kapture's tables cannot hold."""
     try:
         check_relative(name)
     except DataError as error:

@@ -42,11 +42,6 @@ class Results(Mapping[str, Pose | Failure]):
     workers : threads that localize.
     candidates : query name to the map images it is matched with, instead of retrieval.
     track : shows progress.
-
-    Raises
-    ------
-    DataError : the folder or the map is broken, or features can neither be read nor extracted.
-    OptionError : no worker.
     """
 
     def __init__(
@@ -107,10 +102,6 @@ class Results(Mapping[str, Pose | Failure]):
         Returns
         -------
         Counts: queries, localized, failed, fallbacks.
-
-        Raises
-        ------
-        OutputError : the folder has other things in it, unless ``force``.
         """
         with staged_output(Path(output), kind=LOCALIZED, force=force) as out:
             return self.write_to(out)
@@ -147,13 +138,7 @@ class Results(Mapping[str, Pose | Failure]):
             rows.append(row)
         return pd.DataFrame(rows).set_index("image")
 
-    def view(
-        self,
-        path: Path | str,
-        truth: Path | str | None = None,
-        *,
-        rendered: Path | str | None = None,
-    ) -> None:
+    def view(self, path: Path | str, truth: Path | str | None = None) -> None:
         """Write a page that shows the images in the map in 3D; see
         :func:`megloc_kapture.evaluation.view.write_view`."""
         from megloc_kapture.evaluation.view import write_view
@@ -163,7 +148,7 @@ class Results(Mapping[str, Pose | Failure]):
             with contextlib.suppress(DataError):  # of a photograph perhaps nobody knows it
                 cameras[name] = data.camera_of(name)
         folder = self.localizer.map.folder
-        write_view(path, folder, self, truth, cameras=cameras, rendered=rendered)
+        write_view(path, folder, self, truth, cameras=cameras)
 
     def _check_extractors(self) -> None:
         """Make the extractors that queries without features need.

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import logging
 import os
+import shutil
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain, count
+from itertools import count
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -38,7 +39,7 @@ from megloc_kapture.io.dataset_tables import (
     read_unreadable,
     read_world,
 )
-from megloc_kapture.io.files import safe_join, write_bytes, write_json
+from megloc_kapture.io.files import read_text, safe_join, temporary_name, write_bytes, write_json
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.io.tables import STATUS_FILE, QueryStatus, read_status
 from megloc_kapture.pipeline.datasets import (
@@ -85,11 +86,6 @@ def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> N
     Parameters
     ----------
     tables : where the protocol was read; None: nowhere, it is the default.
-
-    Raises
-    ------
-    OptionError : unknown, without side tables where the dataset has rules of its own, or another
-        dataset's.
     """
     check_known(dataset)
     plain = (KAPTURE, SYNTHETIC)
@@ -135,11 +131,6 @@ def write_submission(
     ``poses`` written for them, ``missing``, queries of these that are ``doubtful`` (a pose of too
     little confidence), and of the poses ``fallbacks`` (guesses) and ``from_rig``; ``dummies`` are
     rows that hold no pose.
-
-    Raises
-    ------
-    DataError : something is missing or broken, or two images would bear one name.
-    OutputError : a file cannot be written.
     """
     beside = None if tables is None else tables.parent
     rules = Protocol() if tables is None else read_protocol(tables)
@@ -182,7 +173,7 @@ def poses_through_rig(
 ) -> dict[str, RigidTransform]:
     """Poses of images that have none of their own, through the rig, from another of the moment.
 
-    A pose that is only a guess (a fallback) is none of its own, and gives none to others. Of
+    A fallback pose is only a guess: it is replaced, and not passed on to other images. Of
     several siblings the one with the most inliers counts; without status a pose is localized.
     """
     localized = {}
@@ -238,7 +229,7 @@ def _read_result(localized: Path, beside: Path | None, *, from_rig: bool) -> _Re
 def _ltvl(
     result: _Result, tables: Path | None, rules: Protocol, unreadable: Collection[str]
 ) -> _Content:
-    """What :func:`_mlad` gives, of one file without a name."""
+    """The same as :func:`_mlad`, for one file without a name."""
     names = {} if tables is None else read_names(tables)
     world = World() if tables is None else read_world(tables)
     images = list(names)
@@ -293,9 +284,9 @@ def _dataset_fingerprint(workspace: Path | None) -> str | None:
 
 
 def workspace_provenance(localized: Path) -> dict[str, Any]:
-    """What a workspace's manifests say of the result in it: preset and options; else nothing.
+    """Preset and options of a result, from the manifests of its workspace.
 
-    They are told only where they are those of this very result, and not of an older one.
+    Empty unless they belong to this very result, and not to an older one.
     """
     manifests = _manifests(localized)
     made = _maker(localized, manifests)
@@ -350,85 +341,42 @@ FOLDER = "submissions"
 def keep_submission(place: Path, folder: Path) -> Path:
     """Copy a submission and its provenance into a folder, beside those of other runs.
 
-    The same bytes are left as they are. Where another result bears the name already, it stays,
-    and the new one gets a number: ``Aachen_eval_METHOD-2.txt``.
+    A submission with the same content is not copied again. If another one has the name, the copy
+    gets a number: ``Aachen_eval_METHOD-2.txt``.
 
     Parameters
     ----------
     place : the pose file, or the folder of a challenge that takes several; its provenance lies
         beside it.
-    folder : where to; made where it is missing.
 
     Returns
     -------
-    Where the copy stands.
-
-    Raises
-    ------
-    DataError : the submission or its provenance is missing or cannot be read.
-    OutputError : the copy cannot be written.
+    Path of the copy.
     """
-    content = _content(place)
-    beside = _read(provenance_path(place))
-    # only a file's name has a type: that of a folder may hold a dot
-    end = place.suffix if place.is_file() else ""
-    stem = place.name.removesuffix(end)
-    numbered = (folder / f"{stem}-{number}{end}" for number in count(2))
-    places = chain([folder / place.name], numbered)
-    kept = next(other for other in places if _is_free(other, content))
-    there = _content(kept) if os.path.lexists(kept) else {}
-    for name in content.keys() - there.keys():
-        write_bytes(kept / name if name else kept, content[name])
-    # last: with its provenance a submission is whole
-    if there != content or not os.path.lexists(provenance_path(kept)):
-        _write_provenance(place, beside, kept)
+    for path in (place, provenance_path(place)):
+        if not path.exists():
+            raise DataError("no such file; --from submission writes it again", path=path)
+    provenance = json.loads(read_text(provenance_path(place)))
+    # only a file's name has a suffix: that of a folder may hold a dot
+    suffix = place.suffix if place.is_file() else ""
+    for number in count(1):
+        numbered = "" if number == 1 else f"-{number}"
+        kept = folder / f"{place.name.removesuffix(suffix)}{numbered}{suffix}"
+        if kept.exists() and _hashes(kept) == _hashes(place):
+            return kept
+        if not os.path.lexists(kept) and not os.path.lexists(provenance_path(kept)):
+            break
+    if place.is_file():  # the provenance has the file's name
+        provenance["files"] = {kept.name: provenance["files"][place.name]}
+    copied = folder / temporary_name()
+    folder.mkdir(parents=True, exist_ok=True)
+    (shutil.copytree if place.is_dir() else shutil.copyfile)(place, copied)
+    copied.rename(kept)
+    write_json(provenance_path(kept), provenance)
     return kept
 
 
-def _content(place: Path) -> dict[str, bytes]:
-    """Bytes by name below ``place``; the name is "" where it is a file itself."""
-    if not place.is_dir():
-        return {"": _read(place)}
-    try:
-        files = sorted(place.iterdir())
-    except OSError as error:
-        raise DataError(f"cannot read: {error.strerror or error}", path=place) from error
-    return {file.name: _read(file) for file in files}
-
-
-def _is_free(place: Path, content: dict[str, bytes]) -> bool:
-    """Whether nothing stands there but the same, or that part of it which a killed run wrote."""
-    if not os.path.lexists(place):
-        return True
-    try:
-        there = _content(place)
-    except DataError:  # a folder in it, a dangling link: whatever it is, it is not this
-        return False
-    if os.path.lexists(provenance_path(place)):
-        return there == content
-    return there.items() <= content.items()
-
-
-def _read(path: Path) -> bytes:
-    if not path.is_file():
-        raise DataError("no such file; --from submission writes it again", path=path)
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise DataError(f"cannot read: {error.strerror or error}", path=path) from error
-
-
-def _write_provenance(place: Path, beside: bytes, kept: Path) -> None:
-    if kept.name == place.name or place.is_dir():
-        write_bytes(provenance_path(kept), beside)
-        return
-    # it names the file it belongs to
-    try:
-        told = json.loads(beside)
-        told["files"] = {kept.name: told["files"][place.name]}
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(
-            f"not the provenance of {place.name}; --from submission writes it again",
-            path=provenance_path(place),
-        ) from error
-    write_json(provenance_path(kept), told)
+def _hashes(place: Path) -> list[str]:
+    """Hashes of a submission's pose files, by its provenance; empty where it has none."""
+    path = provenance_path(place)
+    return sorted(json.loads(read_text(path))["files"].values()) if path.is_file() else []

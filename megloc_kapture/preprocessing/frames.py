@@ -177,16 +177,6 @@ class FrameOptions(Options):
         description="undistorted images show, 0: no pixel that was not seen; 1: all that was seen",
     )
 
-    def idle(self) -> dict[str, str]:
-        idle = {}
-        if self.max_size_px is None:
-            idle["upscale"] = "max_size_px says to which size"
-            if not self.undistort:
-                idle["multiple_of"] = "images are neither resized (max_size_px) nor undistorted"
-        if not self.undistort:
-            idle["blank_pixels"] = "undistort is off"
-        return idle
-
 
 @dataclass(frozen=True, slots=True)
 class FramePlan:

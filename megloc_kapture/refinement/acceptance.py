@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.geometry.poses import movement
+from megloc_kapture.geometry.poses import movement, perturbed
 from megloc_kapture.plugins import PoseRefinement
 from megloc_kapture.refinement.photometric import (
     LOSS_SCALE,
@@ -22,7 +22,6 @@ from megloc_kapture.refinement.photometric import (
     Alignment,
     LevelProblem,
     NormalEquations,
-    perturbed,
 )
 from megloc_kapture.refinement.pyramid import Appearance, ChosenPoints
 from megloc_kapture.values import Options, RigidTransform
@@ -51,8 +50,7 @@ class RenderingOptions(Options):
     appearance: Appearance = Field(
         default="normalised",
         description="what is compared: brightness of locally normalised contrast (day and night), "
-        "the same of each colour (colours), plain brightness (intensity), or magnitudes of its "
-        "gradient (gradients)",
+        "or the same of each colour (colours)",
     )
     max_references: int = Field(
         default=4, gt=0, description="reference images with depth that are used, best first"
@@ -65,9 +63,6 @@ class RenderingOptions(Options):
     )
     levels: int = Field(
         default=3, ge=1, description="of the pyramids, each of half the size; begin at the coarsest"
-    )
-    search_deg: float = Field(
-        default=4.0, ge=0, description="turns of the camera that are tried at the coarsest level"
     )
     max_translation_m: float = Field(
         default=0.5, gt=0, description="a pose whose centre moves further is not accepted"

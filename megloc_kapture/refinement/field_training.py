@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.geometry.cameras import bearing_rays
-from megloc_kapture.nets.gaussians import DEFAULT_COUNT, Gaussians
 from megloc_kapture.nets.radiance import NerfW, Rays, nerf_w_loss
 from megloc_kapture.nets.runtime import NetworkOptions, load_state, pick_device, state_bytes
 from megloc_kapture.refinement.neural_field import (
@@ -41,7 +40,6 @@ from megloc_kapture.refinement.neural_field import (
 # Adam's rates at the beginning; at the end a thirtieth
 _PLANE_RATE, _RATE, _NERF_RATE = 2e-2, 5e-3, 5e-4
 _DECAY = 1 / 30
-_GAUSSIAN_RATES = {"means": 1e-3, "quats_wxyz": 2e-3, "opacity_logits": 2e-2, "colour_logits": 1e-2}
 _KEEP_EVERY = 200  # steps
 
 
@@ -50,7 +48,7 @@ class FieldTrainingOptions(NetworkOptions):
 
     kind: Kind = Field(
         default="triplane",
-        description="triplane: minutes on a processor; nerfw: needs a GPU; gaussians: needs depth",
+        description="triplane: minutes on a processor; nerfw: needs a GPU",
     )
     steps: int = Field(default=4000, gt=0, description="of the training")
     minutes: float | None = Field(
@@ -71,32 +69,19 @@ class FieldTrainingOptions(NetworkOptions):
     lights: Lights = Field(
         default="image", description="an appearance for each image, or for each folder of images"
     )
-    gaussians: int | None = Field(
-        default=None, ge=16, description=f"how many, of that kind; {DEFAULT_COUNT} unless given"
-    )
     compiled: bool = Field(
         default=False,
         description="by torch.compile, which takes minutes at first and needs a C compiler",
     )
     seed: int = Field(default=0, ge=0)
 
-    @model_validator(mode="after")
-    def _of_its_kind(self) -> FieldTrainingOptions:
-        if self.gaussians is not None and self.kind != "gaussians":
-            raise ValueError(f"gaussians changes nothing: the kind is {self.kind}")
-        if self.compiled and self.kind == "gaussians":
-            raise ValueError("compiled is of networks; gaussians are none")
-        return self
-
 
 class FieldTrainer:
     """A field, what it learns from, and its optimizer.
 
-    The random numbers of a step depend on the seed and the step alone, so that an interrupted
-    training goes on to the bytes of one that was not. Raises DataError for too few images, one that
-    does not fit its camera, masks that leave nothing, and Gaussians without depth to begin with.
-    ``views``: at least two, in order; of eight or more some are held out, as the options say;
-    ``module``: of as many images as are trained on; built as the options say unless given.
+    Raises DataError for too few images, for an image that does not fit its camera, and for masks
+    that leave nothing. Of eight or more ``views`` some are held out, as the options say;
+    ``module`` is built as the options say unless given.
     """
 
     def __init__(
@@ -119,10 +104,7 @@ class FieldTrainer:
         if module is None:
             with torch.random.fork_rng([]):
                 torch.manual_seed(options.seed)
-                sizes = len(images), max(rows) + 1, options.gaussians
-                module = build_field(options.kind, *sizes)
-            if isinstance(module, Gaussians):
-                module.place(*self._data.surface(frame, len(module.means), options.seed))
+                module = build_field(options.kind, len(images), max(rows) + 1)
         module = module.to(pick_device(options.device))
         self._field = NeuralField(module, frame, images, rows)
         self._render = torch.compile(module.render) if options.compiled else module.render
@@ -145,8 +127,7 @@ class FieldTrainer:
     @cached_property
     def _fingerprint(self) -> str:
         options = self.options.model_dump_json(exclude={"minutes"})
-        content = f"{options} {self._field.images}".encode() + self._data.digest()
-        return hashlib.sha256(content).hexdigest()
+        return hashlib.sha256(f"{options} {self._field.images}".encode()).hexdigest()
 
     def train(
         self,
@@ -226,11 +207,6 @@ def _compiling() -> Iterator[None]:
 def _groups(module: FieldModule) -> list[dict[str, object]]:
     if isinstance(module, NerfW):
         return [{"params": list(module.parameters()), "lr": _NERF_RATE}]
-    if isinstance(module, Gaussians):
-        return [
-            {"params": [value], "lr": _GAUSSIAN_RATES.get(name, _RATE)}
-            for name, value in module.named_parameters()
-        ]
     planes = list(module.planes)
     others = [value for name, value in module.named_parameters() if not name.startswith("planes")]
     return [{"params": planes, "lr": _PLANE_RATE}, {"params": others, "lr": _RATE}]
@@ -256,14 +232,6 @@ class _Pixels:
         self._rotations = np.stack([pose.rotation_matrix() for pose in self._poses])
         self._centres = np.stack([pose.center() for pose in self._poses])
 
-    def digest(self) -> bytes:
-        """Of all that is learned from."""
-        found = hashlib.sha256(repr(self._cameras).encode())
-        poses = self._camera_of, self._rotations, self._centres
-        for array in (self._rgb, self._usable, self._depth, *poses):
-            found.update(b"" if array is None else array.tobytes())
-        return found.digest()
-
     def frame(self) -> FieldFrame:
         """The frame about the cameras and what their depth shows; without, about the cameras."""
         low, high = self._centres.min(0), self._centres.max(0)
@@ -282,24 +250,6 @@ class _Pixels:
         scale = 0.5 * float((high - low).max())
         x, y, z = centre.tolist()
         return FieldFrame(centre=(x, y, z), scale=scale, near=near, far=far)
-
-    def surface(self, frame: FieldFrame, count: int, seed: int) -> tuple[Floats, Floats]:
-        """Points (K, 3) of the field that depth shows, drawn evenly, and their colours in 0 to 1.
-
-        Raises DataError where fewer pixels have depth than are asked for.
-        """
-        known = self._usable
-        if self._depth is not None:
-            known = known[self._depth[known] > 0]
-        if self._depth is None or len(known) < count:
-            found = 0 if self._depth is None else len(known)
-            raise DataError(
-                f"{count} Gaussians begin where depth says, and {found} pixels have any; "
-                "megloc densify gives a map depth"
-            )
-        rows = np.sort(np.random.default_rng(seed).choice(known, count, replace=False))
-        points = (self._points(rows, self._depth) - frame.centre) / frame.scale
-        return points.astype(np.float32), self._rgb[rows].astype(np.float32) / 255
 
     def _points(self, rows: NDArray[np.int64], depth: Floats) -> NDArray[np.float64]:
         """Points (N, 3) of the world that the depth of pixels shows."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from pathlib import PurePosixPath
 from typing import Literal
 
@@ -19,15 +18,14 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import PINHOLE_MODELS, pixel_rays, reduced_camera
+from megloc_kapture.geometry.cameras import pixel_rays, reduced_camera
 from megloc_kapture.geometry.warping import WarpSource, warp_to_view
-from megloc_kapture.nets.gaussians import DEFAULT_COUNT, Gaussians
 from megloc_kapture.nets.radiance import NerfW, Rays, Rendered, TriPlane
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, Options, RigidTransform
 
-Kind = Literal["triplane", "nerfw", "gaussians"]
-FieldModule = NerfW | TriPlane | Gaussians
+Kind = Literal["triplane", "nerfw"]
+FieldModule = NerfW | TriPlane
 Lights = Literal["image", "folder"]
 Floats = NDArray[np.float32]
 # rays that are rendered at once: a processor is fastest where their samples stay in its cache
@@ -79,16 +77,11 @@ class FieldRendering:
     camera: Camera
 
 
-def build_field(
-    kind: Kind, num_images: int, num_lights: int, num_gaussians: int | None = None
-) -> FieldModule:
-    """An untrained field, its parameters drawn by torch's own generator.
+def build_field(kind: Kind, num_images: int, num_lights: int) -> FieldModule:
+    """Build an untrained field; torch's global generator draws its parameters.
 
-    ``num_images`` and ``num_lights`` are rows of the transient and of the appearance embedding;
-    ``num_gaussians`` is of the kind of that name.
+    ``num_images`` and ``num_lights`` are rows of the transient and of the appearance embedding.
     """
-    if kind == "gaussians":
-        return Gaussians(num_images, num_lights, count=num_gaussians or DEFAULT_COUNT)
     return (NerfW if kind == "nerfw" else TriPlane)(num_images, num_lights)
 
 
@@ -155,36 +148,10 @@ class NeuralField:
         """
         camera = reduced_camera(camera, max_side_px or max(camera.width, camera.height))
         shape = camera.height, camera.width
-        if self._is_rasterized(camera):
-            colours, depths, opacity = self._rasterized(camera, cam_from_world, appearance)
-        else:
-            found = self.render_rays(self.rays(camera, cam_from_world), appearance)
-            colours, depths, opacity = found.rgb, found.depth, found.opacity
-        rgb = (colours * 255).round().clamp(0, 255).byte().cpu().numpy().reshape(*shape, 3)
-        depth = torch.where(opacity > 0.5, depths, 0.0).cpu().numpy().reshape(shape)
-        return FieldRendering(rgb, depth.astype(np.float32), camera)
-
-    def _is_rasterized(self, camera: Camera) -> bool:
-        """Whether gsplat renders a view of that camera; the same by rays takes longer."""
-        pinhole = camera.model in PINHOLE_MODELS
-        is_here = self.device.type == "cuda" and find_spec("gsplat") is not None
-        return pinhole and is_here and isinstance(self.module, Gaussians)
-
-    def _rasterized(
-        self, camera: Camera, cam_from_world: RigidTransform, appearance: torch.Tensor | None
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Colours (H, W, 3), depths (H, W) in the unit of the map, and opacities (H, W)."""
-        assert isinstance(self.module, Gaussians)
-        *focal, cx, cy = camera.params
-        calibration = np.array([[focal[0], 0, cx], [0, focal[-1], cy], [0, 0, 1]])
-        cam_from_field = np.eye(4)
-        cam_from_field[:3, :3] = cam_from_world.rotation_matrix()
-        centre = cam_from_world.apply(np.array([self.frame.centre]))[0]
-        cam_from_field[:3, 3] = centre / self.frame.scale
-        size = camera.width, camera.height
-        there = self._tensor(cam_from_field), self._tensor(calibration)
-        rgb, depth, opacity = self.module.rasterize(*there, size, appearance)
-        return rgb, depth * self.frame.scale, opacity
+        rendered = self.render_rays(self.rays(camera, cam_from_world), appearance)
+        rgb = (rendered.rgb * 255).round().clamp(0, 255).byte().cpu().numpy().reshape(*shape, 3)
+        depth_m = torch.where(rendered.opacity > 0.5, rendered.depth, 0.0).cpu().numpy()
+        return FieldRendering(rgb, depth_m.reshape(shape).astype(np.float32), camera)
 
     def render_rays(self, rays: Rays, appearance: torch.Tensor | None = None) -> Rendered:
         """Render rays in parts, all with one appearance (A,) or the mean; no transients."""

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import focal_px, project
-from megloc_kapture.geometry.poses import deviation_by_median
+from megloc_kapture.geometry.poses import deviation_by_median, perturbed
 from megloc_kapture.refinement.pyramid import ChosenPoints, Level
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -180,16 +180,6 @@ class LevelProblem:
         px = project(self.camera, cam_from_world, self.chosen.points[seen])
         row_column = (px // cell_px).astype(np.int64)
         return np.asarray(row_column[:, 1] * (_CELLS + 1) + row_column[:, 0])
-
-
-def perturbed(cam_from_world: RigidTransform, step: Float64) -> RigidTransform:
-    """``exp(omega) R`` and ``exp(omega) t + v`` of a step (omega, v), radians and metres."""
-    angle = float(np.linalg.norm(step[:3]))
-    # sin(x / 2) / x, through its limit
-    half_sinc = 0.5 * float(np.sinc(0.5 * angle / np.pi))
-    x, y, z = (half_sinc * step[:3]).tolist()
-    tx, ty, tz = step[3:].tolist()
-    return RigidTransform((float(np.cos(0.5 * angle)), x, y, z), (tx, ty, tz)) @ cam_from_world
 
 
 def _deviation(rows: Float64) -> float:

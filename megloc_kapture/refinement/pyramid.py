@@ -9,7 +9,7 @@ are used (normalised convolution, Knutsson and Westin, CVPR 1993).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Literal
@@ -32,9 +32,7 @@ _CELLS = 80
 # a point hides those that are further by more than this share: a cell of slanted ground has as much
 _HIDES = 0.15
 Float64 = NDArray[np.float64]
-Appearance = Literal["normalised", "colours", "intensity", "gradients"]
-FeatureMaps = Callable[[NDArray[np.uint8]], NDArray[np.floating[Any]]]
-"""A dense network: RGB image, uint8 (H, W, 3), to feature maps (C, h, w) over the same view."""
+Appearance = Literal["normalised", "colours"]
 _BLUR_PX = 0.8  # before each halving, and of the values: bilinear reading needs smooth ones
 _WINDOW_PX = 17  # in which contrast is normalised
 # of the mean local variance, which local variances are raised by: flat areas stay flat
@@ -184,7 +182,6 @@ def build_pyramid(
     levels: int = 5,
     max_side_px: int = 640,
     appearance: Appearance = "normalised",
-    features: FeatureMaps | None = None,
 ) -> list[Level]:
     """The levels of an image, finest first; raises DataError for what does not fit it.
 
@@ -193,22 +190,15 @@ def build_pyramid(
     image, mask : RGB, uint8 (H, W, 3), and bool (H, W), True = use.
     levels : at most; none is smaller than 16 px.
     max_side_px : longer side of the finest level; larger images are reduced.
-    appearance : ``intensity`` is brightness in [0, 1]; ``normalised`` is brightness of zero mean
-        and unit deviation in a window about each pixel, ``colours`` the same of red, green and
-        blue; ``gradients`` is the magnitude of the gradient of brightness.
-    features : compare these maps of the image instead; masked pixels are shown to it in the mean
-        colour of the others.
+    appearance : ``normalised`` is brightness of zero mean and unit deviation in a window about each
+        pixel, ``colours`` the same of red, green and blue.
     """
     height, width = image.shape[:2]
     if mask is not None and mask.shape != (height, width):
         raise DataError(f"a mask of {mask.shape} does not fit an image of {(height, width)}")
     used = np.ones((height, width), np.float32) if mask is None else mask.astype(np.float32)
-    if features is not None:
-        values = _feature_values(image, used, features)
-        used = _resized(used, values.shape[1], values.shape[0])
-    else:
-        seen = image if appearance == "colours" else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        values = (seen.astype(np.float32) * np.float32(1 / 255)).reshape(height, width, -1)
+    seen = image if appearance == "colours" else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    values = (seen.astype(np.float32) * np.float32(1 / 255)).reshape(height, width, -1)
     values = values * used[..., None]
     longer = max(values.shape[:2])
     if longer > max_side_px:
@@ -222,26 +212,11 @@ def build_pyramid(
         mean = np.where(
             known[..., None], values / np.where(known, smooth_used, 1.0)[..., None], 0.0
         ).astype(np.float32)
-        valid = used > _HALF
-        if features is None and appearance in ("normalised", "colours"):
-            mean = np.concatenate([_normalised(each, used) for each in np.moveaxis(mean, 2, 0)], 2)
-        elif features is None and appearance == "gradients":
-            mean, valid = _gradient_magnitude(mean, valid)
-        result.append(Level(np.ascontiguousarray(mean), valid, w / width, h / height))
+        mean = np.concatenate([_normalised(each, used) for each in np.moveaxis(mean, 2, 0)], 2)
+        result.append(Level(np.ascontiguousarray(mean), used > _HALF, w / width, h / height))
         if len(result) == levels or min(h, w) < 2 * _SMALLEST_SIDE_PX:
             return result
         values, used = (_resized(each, w // 2, h // 2) for each in (values, smooth_used))
-
-
-def _feature_values(image: NDArray[np.uint8], used: Float32, features: FeatureMaps) -> Float32:
-    if not used.all():
-        keep = used > 0
-        colour = image[keep].mean(0) if keep.any() else np.zeros(3)
-        image = np.where(keep[..., None], image, colour.round().astype(np.uint8))
-    maps = np.asarray(features(image), dtype=np.float32)
-    if maps.ndim != 3 or min(maps.shape) < 1 or not np.isfinite(maps).all():
-        raise DataError(f"feature maps must be finite and (C, h, w), got {maps.shape}")
-    return np.ascontiguousarray(maps.transpose(1, 2, 0))
 
 
 def _resized(values: Float32, width: int, height: int) -> Float32:
@@ -270,19 +245,6 @@ def _normalised(plane: Float32, used: Float32) -> Float32:
     floor = _FLAT * float(np.average(variance, weights=used)) if used.any() else 0.0
     result = centred / np.sqrt(variance + np.float32(max(floor, 1e-8)))
     return np.asarray(result, np.float32)[..., None]
-
-
-def _gradient_magnitude(
-    values: Float32, valid: NDArray[np.bool_]
-) -> tuple[Float32, NDArray[np.bool_]]:
-    plane = values[..., 0]
-    # a level has at least 8 rows and columns
-    down, across = np.gradient(plane)
-    magnitude = np.sqrt(down * down + across * across).astype(np.float32)
-    eroded = cv2.erode(
-        valid.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE
-    )
-    return magnitude[..., None], eroded.astype(bool)
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,10 +20,9 @@ all images share as one, and one finer than images see of each other, are not fo
 from __future__ import annotations
 
 import hashlib
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from threading import Lock
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -37,7 +36,6 @@ from megloc_kapture.refinement.acceptance import CHI2_OF_CHANCE
 from megloc_kapture.refinement.pyramid import (
     Appearance,
     DepthPoints,
-    FeatureMaps,
     Level,
     build_pyramid,
     lift_points,
@@ -46,8 +44,8 @@ from megloc_kapture.refinement.pyramid import (
 from megloc_kapture.values import Camera, RigidTransform
 
 _FORWARD = np.array([0.0, 0.0, 1.0])
-# of prepared references per process; one of 640x480 takes about 7 MB
-_KEPT_BYTES = 256 * 2**20
+# prepared references per process; one of 640x480 takes about 8 MB
+_KEPT_REFERENCES = 32
 # of a map: images whose displacement is known, after which there is no need of more; that many at
 # least (all of five on the wrong side of a median is chance once in 32 times); that are tried
 MAX_TESTED, MIN_TESTED, MAX_TRIED = 24, 5, 96
@@ -147,7 +145,6 @@ class PyramidKind:
     levels: int
     max_side_px: int
     appearance: Appearance
-    features: FeatureMaps | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,52 +154,23 @@ class PreparedReference:
     pyramid: list[Level]
     points: DepthPoints
 
-    @property
-    def nbytes(self) -> int:
-        """Memory that it takes, in bytes, gradients that are looked up later included."""
-        levels = sum(
-            each.values.nbytes + each.valid.nbytes + each.values[..., 0].nbytes
-            for each in self.pyramid
-        )
-        return self.points.points.nbytes + self.points.px.nbytes + levels
+
+def prepared(reference: RenderingReference, kind: PyramidKind) -> PreparedReference:
+    """The result of :func:`prepare`, kept for the references used last."""
+    return _prepared(_ByContent(_content(reference), reference), kind)
 
 
-class ReferenceCache:
-    """The prepared references used last, up to a number of bytes; threads may share it."""
+@dataclass(frozen=True)
+class _ByContent:
+    """A reference that equals any other of the same content."""
 
-    def __init__(self, max_bytes: int) -> None:
-        self._max_bytes = max_bytes
-        self._kept: OrderedDict[object, PreparedReference] = OrderedDict()
-        self._nbytes = 0
-        self._lock = Lock()
-
-    def prepared(self, reference: RenderingReference, kind: PyramidKind) -> PreparedReference:
-        """The result of :func:`prepare`; feature maps are not kept: they are large."""
-        if kind.features is not None:
-            return prepare(reference, kind)
-        key = (_content(reference), kind)
-        with self._lock:
-            found = self._kept.get(key)
-            if found is not None:
-                self._kept.move_to_end(key)
-                return found
-        made = prepare(reference, kind)
-        with self._lock:
-            if key not in self._kept:
-                self._kept[key] = made
-                self._nbytes += made.nbytes
-            while self._nbytes > self._max_bytes:
-                self._nbytes -= self._kept.popitem(last=False)[1].nbytes
-        return made
-
-    def clear(self) -> None:
-        """Keep nothing."""
-        with self._lock:
-            self._kept.clear()
-            self._nbytes = 0
+    content: tuple[Any, ...]
+    reference: RenderingReference = field(compare=False)
 
 
-REFERENCES = ReferenceCache(_KEPT_BYTES)
+@lru_cache(maxsize=_KEPT_REFERENCES)
+def _prepared(key: _ByContent, kind: PyramidKind) -> PreparedReference:
+    return prepare(key.reference, kind)
 
 
 def prepare(reference: RenderingReference, kind: PyramidKind) -> PreparedReference:

@@ -6,14 +6,13 @@ there was (:mod:`megloc_kapture.refinement.acceptance`); otherwise the old pose 
 reason.
 
 Gradients lead to the right pose from a few pixels only, of a level on which the light of day and
-night has not changed what is seen; coarser levels, which would lead there from further away, show
-the light more than the things. So rotations of the camera are tried one by one on that level: a
-small error of a pose is nearly a rotation, as far as the image goes.
+night has not changed what is seen; so the alignment begins at a coarse level, from several poses
+around the start that look much the same.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -21,7 +20,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.geometry.cameras import focal_px
 from megloc_kapture.plugins import PoseRefinement, RankingScene
 from megloc_kapture.refinement.acceptance import (
     Candidate,
@@ -32,48 +30,37 @@ from megloc_kapture.refinement.acceptance import (
 )
 from megloc_kapture.refinement.photometric import (
     MIN_POINTS,
-    Alignment,
     LevelProblem,
     minimise,
     unoccluded_points,
 )
 from megloc_kapture.refinement.pyramid import (
-    ChosenPoints,
-    FeatureMaps,
-    Level,
     Visibility,
     choose_points,
     usable_cells,
     visibility,
 )
 from megloc_kapture.refinement.references import (
-    REFERENCES,
     Displacement,
     PyramidKind,
     ReferenceImages,
     RenderingQuery,
     RenderingReference,
+    prepared,
     pyramid_of,
     reference_of,
     refine_held_out,
 )
 from megloc_kapture.values import Camera, RigidTransform
 
-# rotations of the camera, of those tried, from which the alignment begins
-_MAX_STARTS = 5
-# points by which rotations are tried, and from each of those the alignment
-_SEARCH_POINTS, _START_POINTS = 1500, 2500
+# poses beside the start from which the alignment begins, and points of each
+_MAX_STARTS, _START_POINTS = 5, 2500
 # of a level: an alignment is done when it moves points by less, the last of all, the others
 _LAST_STEP_PX, _COARSE_STEP_PX = 0.01, 0.2
 # of a level, for each point that is chosen there; of a reference on coarse levels
 _PX_PER_POINT, _COARSE_POINTS = 24, 3200
 # standard errors by which the cost falls where nobody need ask whether the start was as good
 _CLEAR = 4.0
-_STEP_PX = 2.0  # of the level, between rotations that are tried
-_MAX_ROTATIONS = 4000
-# rotations as near as this many steps are one
-_NEAR_STEPS = 2.0
-Float64 = NDArray[np.float64]
 
 
 def refine_by_rendering(
@@ -81,27 +68,23 @@ def refine_by_rendering(
     references: Sequence[RenderingReference],
     cam_from_world: RigidTransform,
     options: RenderingOptions | None = None,
-    *,
-    features: FeatureMaps | None = None,
 ) -> PoseRefinement:
     """Refine the pose of an image by what reference images show, lifted by their depth.
 
     Returns the new pose with its covariance, or the old one and the reason. ``measures``: cost (of
     the robust loss, 0 to 0.5), correlation and overlap before and after, by how many of its
     standard errors the cost falls, how far the pose moved in m and deg, the points and references
-    used. Raises DataError for images, masks, depth maps or feature maps that do not fit their
-    cameras.
+    used. Raises DataError for images, masks or depth maps that do not fit their cameras.
 
     Parameters
     ----------
     references : all of them are used; those that do not see the same cost time only.
     cam_from_world : of the query, in the frame of the references' poses, metres.
-    features : compare a dense network's feature maps instead of brightness.
     """
     options = options or RenderingOptions()
     # what is independent goes to two threads; the order of results is that of the work
     with ThreadPoolExecutor(2) as threads:
-        return _Refining(query, references, options, features, threads).refine(cam_from_world)
+        return _Refining(query, references, options, threads).refine(cam_from_world)
 
 
 def judge_by_rendering(
@@ -119,7 +102,7 @@ def judge_by_rendering(
     bool (H, W), pixels of the query by which it is accepted or not; all unless given.
     """
     with ThreadPoolExecutor(2) as threads:
-        return _Refining(query, references, options, None, threads).judge(start, found, judged)
+        return _Refining(query, references, options, threads).judge(start, found, judged)
 
 
 def displacement_by_rendering(
@@ -127,8 +110,6 @@ def displacement_by_rendering(
     references: Sequence[RenderingReference],
     cam_from_world: RigidTransform,
     options: RenderingOptions | None = None,
-    *,
-    features: FeatureMaps | None = None,
 ) -> Displacement | None:
     """Displacement by :func:`refine_by_rendering` of a pose that should be right; raises as there.
 
@@ -137,7 +118,7 @@ def displacement_by_rendering(
     """
     options = options or RenderingOptions()
     with ThreadPoolExecutor(2) as threads:
-        refining = _Refining(query, references, options, features, threads)
+        refining = _Refining(query, references, options, threads)
         refined = refining.refine(cam_from_world)
         if not refined.accepted:
             # the same at the finest level alone, without looking around
@@ -160,18 +141,17 @@ class _Refining:
         query: RenderingQuery,
         references: Sequence[RenderingReference],
         options: RenderingOptions,
-        features: FeatureMaps | None,
         threads: Executor,
     ) -> None:
         self.options, self.least_overlap = options, max(options.min_overlap, 1e-9)
         self.camera = query.camera
         self.threads = threads
-        kind = PyramidKind(options.levels, options.max_side_px, options.appearance, features)
+        kind = PyramidKind(options.levels, options.max_side_px, options.appearance)
         ours = threads.submit(pyramid_of, query, kind)
-        prepared = list(threads.map(lambda each: REFERENCES.prepared(each, kind), references))
+        theirs = list(threads.map(lambda each: prepared(each, kind), references))
         self.query_levels = ours.result()
-        self.levels = [each.pyramid for each in prepared]
-        self.points = [each.points for each in prepared]
+        self.levels = [each.pyramid for each in theirs]
+        self.points = [each.points for each in theirs]
 
     def refine(self, start: RigidTransform) -> PoseRefinement:
         """See :func:`refine_by_rendering`."""
@@ -214,7 +194,7 @@ class _Refining:
         problem = self._problem(coarsest, start, sight)
         if len(problem.chosen.points) < MIN_POINTS:
             return None
-        pose = self._best_perturbation(problem, self._best_rotation(problem, start))
+        pose = self._best_perturbation(problem, start)
         found = self._align(coarsest, pose, sight)
         for number in range(coarsest - 1, -1, -1):
             if found is None:
@@ -245,25 +225,17 @@ class _Refining:
         chosen = choose_points(self.points, levels, sight.seen, min(self.options.max_points, count))
         return LevelProblem(chosen, level, self.camera, pose)
 
-    def _best_rotation(self, problem: LevelProblem, pose: RigidTransform) -> RigidTransform:
-        """The rotation of the camera that leads to the best pose, of those that correlate best."""
-        chosen, max_deg = problem.chosen.thinned(_SEARCH_POINTS), self.options.search_deg
-        starts = best_rotations(
-            chosen, problem.level, self.camera, pose, max_deg=max_deg, count=_MAX_STARTS
-        )
-        fewer = problem.thinned(_START_POINTS)
-        return self._best(fewer, self.threads.map(fewer.nuisance_at, starts))
-
     def _best_perturbation(self, problem: LevelProblem, pose: RigidTransform) -> RigidTransform:
-        """The same of alignments beside it that look much the same, where it may have stopped."""
+        """The alignment that correlates best, from a pose and from others that look much the same.
+
+        The alignment may stop at any of these.
+        """
         fewer = problem.thinned(_START_POINTS)
         here = minimise(fewer, fewer.nuisance_at(pose), last_step_px=_COARSE_STEP_PX)
-        return self._best(fewer, [here, *perturbed_starts(fewer, here)[:_MAX_STARTS]])
-
-    def _best(self, problem: LevelProblem, starts: Iterable[Alignment]) -> RigidTransform:
-        align = partial(minimise, problem, last_step_px=_COARSE_STEP_PX, rounds=1)
+        starts = [here, *perturbed_starts(fewer, here)[:_MAX_STARTS]]
+        align = partial(minimise, fewer, last_step_px=_COARSE_STEP_PX, rounds=1)
         tried = list(self.threads.map(align, starts))
-        return max(tried, key=partial(correlation, problem)).cam_from_world
+        return max(tried, key=partial(correlation, fewer)).cam_from_world
 
     def _decide(
         self, start: RigidTransform, old_overlap: float, found: Candidate | None
@@ -281,19 +253,13 @@ def _uncovered(start: RigidTransform, overlap: float) -> PoseRefinement:
 
 
 class Rendering:
-    """Plugin ``rendering``: poses refined by warping the references into the query.
-
-    ``features`` compares a dense network's feature maps instead of brightness.
-    """
+    """Plugin ``rendering``: poses refined by warping the references into the query."""
 
     name = "rendering"
     Options = RenderingOptions
 
-    def __init__(
-        self, options: RenderingOptions | None = None, *, features: FeatureMaps | None = None
-    ) -> None:
+    def __init__(self, options: RenderingOptions | None = None) -> None:
         self.options = options or RenderingOptions()
-        self.features = features
         self.require_consistent_map = self.options.require_consistent_map
 
     def hold_out(
@@ -301,7 +267,7 @@ class Rendering:
     ) -> Displacement | None:
         """Displacement of a map image; see :func:`~.references.refine_held_out`."""
         options = self.options.model_copy(update={"accept_always": False})
-        displace = partial(displacement_by_rendering, options=options, features=self.features)
+        displace = partial(displacement_by_rendering, options=options)
         return refine_held_out(
             image, images, scene, displace, max_references=self.options.max_references
         )
@@ -324,76 +290,4 @@ class Rendering:
         if not used:
             return PoseRefinement(cam_from_world, "no reference image has depth")
         seen = RenderingQuery(scene.query_image(query), camera, scene.query_mask(query))
-        return refine_by_rendering(seen, used, cam_from_world, self.options, features=self.features)
-
-
-def best_rotations(
-    chosen: ChosenPoints,
-    level: Level,
-    camera: Camera,
-    cam_from_world: RigidTransform,
-    *,
-    max_deg: float,
-    count: int,
-) -> list[RigidTransform]:
-    """The poses, turned by up to ``max_deg``, under which references and query correlate best.
-
-    The given pose, then at most ``count`` turned ones that differ from each other, best first.
-    ``chosen`` and ``level``: the points of the references, and that level of the query; ``camera``
-    and ``cam_from_world``: of the query.
-    """
-    from megloc_kapture.refinement.photometric_kernels import camera_of, correlations
-
-    if max_deg <= 0 or len(chosen.points) == 0:
-        return [cam_from_world]
-    vectors = rotation_grid(level, camera, max_deg)
-    quats = _quats(vectors)
-    rotations = np.stack([_rotation(quat).rotation_matrix() for quat in quats])
-    in_camera = cam_from_world.apply(chosen.points), chosen.values, chosen.groups
-    scale_xy = np.array([level.scale_x, level.scale_y])
-    query = level.values, level.valid, scale_xy, camera_of(camera)
-    sums = np.empty((int(chosen.groups.max()) + 1, chosen.values.shape[1], 6))
-    score = np.empty(len(rotations))
-    correlations(in_camera, query, rotations, sums, score)
-    result = [cam_from_world]
-    taken: list[Float64] = []
-    apart = _NEAR_STEPS * _step_rad(level, camera)
-    for row in np.argsort(-score, kind="stable"):
-        if len(taken) == count or score[row] <= 0:
-            break
-        if all(np.linalg.norm(vectors[row] - other) > apart for other in taken):
-            taken.append(vectors[row])
-            result.append(_rotation(quats[row]) @ cam_from_world)
-    return result
-
-
-def rotation_grid(level: Level, camera: Camera, max_deg: float) -> Float64:
-    """Rotation vectors (K, 3) in radians of the turns that are tried, the shortest first."""
-    step = _step_rad(level, camera)
-    # about the optical axis a turn moves the image's sides less than one across it moves all
-    h, w = level.valid.shape
-    steps = np.array([step, step, _STEP_PX / (0.5 * max(h, w))])
-    limit = np.radians(max_deg)
-    # a finer grid than anyone has time for is made coarser
-    volume = 4.0 / 3.0 * np.pi * limit**3 / steps.prod()
-    steps *= max(1.0, (volume / _MAX_ROTATIONS) ** (1 / 3))
-    sides = [each * np.arange(-(n := int(limit / each)), n + 1) for each in steps]
-    vectors = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3)
-    lengths = np.linalg.norm(vectors, axis=1)
-    vectors, lengths = vectors[lengths <= limit], lengths[lengths <= limit]
-    return np.asarray(vectors[np.argsort(lengths, kind="stable")])
-
-
-def _step_rad(level: Level, camera: Camera) -> float:
-    return _STEP_PX / (focal_px(camera) * level.scale_x)
-
-
-def _quats(vectors: Float64) -> Float64:
-    """Quaternions (K, 4) of rotation vectors (K, 3)."""
-    half = 0.5 * np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * vectors], axis=1)
-
-
-def _rotation(quat: Float64) -> RigidTransform:
-    w, x, y, z = quat.tolist()
-    return RigidTransform((w, x, y, z), (0.0, 0.0, 0.0))
+        return refine_by_rendering(seen, used, cam_from_world, self.options)

@@ -1,1 +1,20 @@
 """Localization over HTTP: ``megloc serve``; needs the extra ``serve``."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from megloc_kapture.values import Options
+
+
+class Limits(Options):
+    """What a service accepts."""
+
+    threads: int | None = Field(
+        default=None, ge=1, description="Images that are localized at once; all cores unless given."
+    )
+    max_waiting: int = Field(
+        default=32, ge=1, description="Images that may wait for a thread; more are refused (503)."
+    )
+    max_mb: float = Field(default=20.0, gt=0, description="Size of a request.")
+    max_megapixels: float = Field(default=32.0, gt=0, description="Size of an image.")

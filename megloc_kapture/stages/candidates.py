@@ -17,18 +17,16 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import ImageGroup, read_groups, read_priors
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.io.kapture.vectors import KaptureVectors
-from megloc_kapture.retrieval.fusion import DiversityOptions, FusionOptions, diversify
+from megloc_kapture.retrieval.fusion import FusionOptions
 from megloc_kapture.retrieval.search import (
     Found,
     FusedSearch,
-    QuantizedRows,
     VectorBlocks,
     as_blocks,
     common_length,
-    short_lists,
 )
 from megloc_kapture.stages.work import HERE, Work
-from megloc_kapture.values import Options, RigidTransform
+from megloc_kapture.values import Options
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,10 +45,7 @@ class Restrictions:
 
     @classmethod
     def read(cls, side_tables: Path) -> Restrictions:
-        """From a workspace's ``megloc/`` folder; absent tables restrict nothing.
-
-        Raises DataError: a broken table.
-        """
+        """From a workspace's ``megloc/`` folder; absent tables restrict nothing."""
         return cls(read_groups(side_tables), read_priors(side_tables))
 
     def frame(self, image: str) -> str:
@@ -100,8 +95,6 @@ UNRESTRICTED = Restrictions()
 Vectors = KaptureVectors | NDArray[np.float32]  # unit rows
 _QUERY_ELEMENTS = 1 << 27  # of query vectors held at once: 512 MiB of float32
 _ROWS = 1 << 14  # of a database at most that a worker searches at once
-_CODED_ROWS = 1 << 20  # by product quantisation, each with a short list
-_POOL = 5  # images looked at for each that a diversified ranking keeps
 
 
 class QueryPairsOptions(Options):
@@ -111,20 +104,6 @@ class QueryPairsOptions(Options):
         default="retrieval", description="the most similar map images, or all"
     )
     top_k: int = Field(default=50, gt=0, description="most similar map images per query")
-    diversity: DiversityOptions | None = Field(
-        default=None, description="few views of one place; none: as similar as they are"
-    )
-    quantized_above: int = Field(
-        default=1_000_000,
-        gt=0,
-        description="more map images than that are searched by product quantisation (FAISS), the "
-        "1000 best of them exactly",
-    )
-
-    def idle(self) -> dict[str, str]:
-        if self.by == "retrieval":
-            return {}
-        return dict.fromkeys(self.all_but("by"), "all map images are taken (exhaustive)")
 
 
 @dataclass(frozen=True)
@@ -142,7 +121,7 @@ class Retrieval:
     fusion: FusionOptions = field(default_factory=FusionOptions)
 
     def readers(self, folder: KaptureFolder) -> list[FeatureReader]:
-        """Readers of a folder's vectors, by type; raises DataError where it has not one of them."""
+        """Readers of a folder's vectors, by type."""
         return [folder.global_features(name) for name in self.types]
 
     def rank(
@@ -151,7 +130,6 @@ class Retrieval:
         database: Sequence[Vectors],
         top_k: int,
         *,
-        codes: _Codes | None = None,
         work: Work = HERE,
     ) -> Found:
         """The most similar rows of the database: indices and scores (Q, at most ``top_k``).
@@ -161,17 +139,14 @@ class Retrieval:
         Parameters
         ----------
         queries, database : of each type, unit rows; neither is held in memory as a whole.
-        codes : those of parts that are made already, to which others are added in this process:
-            only short lists are compared exactly; None: all rows are.
         """
         search = FusedSearch(top_k, self.fusion, self.weights or None)
         asked = [as_blocks(source) for source in queries]
         total = common_length([as_blocks(source) for source in database])
-        most = _ROWS if codes is None else _CODED_ROWS
-        bounds = np.linspace(0, total, max(1, -(-total // most)) + 1).astype(int).tolist()
+        bounds = np.linspace(0, total, max(1, -(-total // _ROWS)) + 1).astype(int).tolist()
         parts = [(of[0], [_part(one, *of) for one in database]) for of in pairwise(bounds)]
         shared = work if len(parts) > 1 else HERE
-        search_part = partial(_search_part, search, asked, codes)
+        search_part = partial(_search_part, search, asked)
         return search.ranking(list(shared.map(search_part, parts, "retrieval")))
 
 
@@ -180,27 +155,17 @@ def _part(source: Vectors, start: int, stop: int) -> VectorBlocks:
     return as_blocks(rows)
 
 
-_Codes = dict[int, list[QuantizedRows]]  # of the part that begins at a row
-
-
 _Part = tuple[int, Sequence[VectorBlocks]]  # of a database: the row it begins at, and it by type
 
 
-def _search_part(
-    search: FusedSearch, queries: Sequence[VectorBlocks], codes: _Codes | None, part: _Part
-) -> list[Found]:
+def _search_part(search: FusedSearch, queries: Sequence[VectorBlocks], part: _Part) -> list[Found]:
     first_row, database = part
-    if codes is not None and first_row not in codes:
-        codes[first_row] = [QuantizedRows(source) for source in database]
     total, width = common_length(queries), sum(one.dimension for one in queries)
     step = max(1, _QUERY_ELEMENTS // max(width, 1))
     found = []
     for start in range(0, total, step) or (0,):
         rows = [source.read(start, min(start + step, total)) for source in queries]
-        if codes is None:
-            found.append(search.lists(rows, database))
-        else:
-            found.append(short_lists(search, rows, database, codes[first_row]))
+        found.append(search.lists(rows, database))
     lists = []
     for blocks in zip(*found, strict=True):
         indices, scores = (np.concatenate(arrays) for arrays in zip(*blocks, strict=True))
@@ -209,10 +174,7 @@ def _search_part(
 
 
 def vectors_of(readers: Sequence[FeatureReader], images: Sequence[str]) -> list[KaptureVectors]:
-    """Vectors of the images by type, unit rows, read when they are asked for.
-
-    Raises DataError: an image has none.
-    """
+    """Vectors of the images by type, unit rows, read when they are asked for."""
     for reader in readers:
         missing = [image for image in images if image not in reader]
         if missing:
@@ -226,20 +188,15 @@ def vectors_of(readers: Sequence[FeatureReader], images: Sequence[str]) -> list[
 class Candidates:
     """Ranks the images of a map.
 
-    Parameters
-    ----------
-    database : gives vectors of the images at some positions, by type.
-    poses : ``cam_from_world`` of the images.
+    ``database`` gives vectors of the images at some positions, by type.
     """
 
     def __init__(
         self,
         database: Callable[[NDArray[np.int64]], Sequence[Vectors]],
-        poses: Sequence[RigidTransform],
         retrieval: Retrieval,
     ) -> None:
-        self._database, self._poses, self._retrieval = database, poses, retrieval
-        self._coded: tuple[NDArray[np.int64], _Codes] = (np.zeros(0, np.int64), {})  # the last
+        self._database, self._retrieval = database, retrieval
 
     def of(
         self,
@@ -255,38 +212,6 @@ class Candidates:
         queries : vectors (Q, D) by type, unit rows.
         permitted : sorted positions of the images that these queries may have.
         """
-        few = options.diversity is None
-        wanted = options.top_k if few else options.top_k * _POOL
         database = self._database(permitted)
-        codes = self._codes(permitted) if len(permitted) > options.quantized_above else None
-        index, scores = self._retrieval.rank(queries, database, wanted, codes=codes, work=work)
-        if options.diversity is not None:
-            index, scores = self._spread(index, scores, permitted, options.top_k, options.diversity)
+        index, scores = self._retrieval.rank(queries, database, options.top_k, work=work)
         return np.where(index >= 0, permitted[np.maximum(index, 0)], -1), scores
-
-    def _codes(self, permitted: NDArray[np.int64]) -> _Codes:
-        if not np.array_equal(self._coded[0], permitted):
-            self._coded = (permitted, {})
-        return self._coded[1]
-
-    def _spread(
-        self,
-        index: NDArray[np.int64],
-        scores: NDArray[np.float32],
-        permitted: NDArray[np.int64],
-        top_k: int,
-        options: DiversityOptions,
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        poses = [self._poses[at] for at in permitted.tolist()]
-        centers = np.array([pose.center() for pose in poses])
-        directions = np.array([pose.rotation_matrix()[2] for pose in poses])
-        width = min(top_k, index.shape[1])
-        kept = np.full((len(index), width), -1, np.int64)
-        of_kept = np.full((len(index), width), -np.inf, np.float32)
-        for row, (ranking, row_scores) in enumerate(zip(index, scores, strict=True)):
-            there = ranking >= 0
-            chosen = diversify(ranking[there], centers, directions, top_k, options)
-            kept[row, : len(chosen)] = ranking[chosen]
-            # fillers stand behind what is kept, though they are more similar
-            of_kept[row, : len(chosen)] = np.minimum.accumulate(row_scores[chosen])
-        return kept, of_kept

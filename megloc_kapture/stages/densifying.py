@@ -81,18 +81,13 @@ class DensifyOptions(Options):
         "a point get one of it as well",
     )
     estimator: PluginChoice = Field(
-        default=PluginChoice(name="sweep"), description="sweep, patchmatchnet, colmap or a plugin"
+        default=PluginChoice(name="sweep"), description="sweep, colmap or a plugin"
     )
     num_sources: int = Field(
         default=4, ge=1, le=16, description="other map images that an image is compared with"
     )
     max_size_px: int = Field(default=800, ge=64, description="longer side of the depth maps")
     agreement: AgreementOptions = AgreementOptions()
-
-    def idle(self) -> dict[str, str]:
-        if self.mode == "off":
-            return dict.fromkeys(self.all_but("mode"), "mvs.mode is off")
-        return {}
 
     def make_estimator(self) -> DepthEstimator:
         """The estimator; raises PluginError, MissingWeightsError."""
@@ -378,6 +373,7 @@ class Densify(PipelineStage):
     name = "densify"
     version = 4
     uses = ("mvs",)
+    explained_by = ("mvs.mode",)
     inputs = (Layout.sparse_map, SIDE_TABLES)
     outputs = (MAP,)
 

@@ -3,7 +3,6 @@
 A published model names the keypoints that see its points; to match queries with them they need
 descriptors. Where these are published (a COLMAP database) they are taken as they are. Where not,
 the images' features are extracted again, and the observations move to those at the same places.
-Such a map is localized in alone, or beside one of our own.
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.io.kapture.features import SUFFIX, ArrayKind
-from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.stages.stage import FEATURES, MAP, REFERENCE, PipelineStage, StageWork
 
 # other implementations of a detector differ by some tenths of a pixel; by chance few are so near
@@ -39,10 +37,7 @@ _SAME_PLACE_PX = 0.1
 
 
 def given_type(reference: KaptureFolder) -> str:
-    """The keypoints type of a given map.
-
-    Raises DataError: no points, or no or several types that observe them.
-    """
+    """The keypoints type of a given map."""
     if not reference.has_points():
         raise DataError(
             "no given map: reconstruction/points3d.txt or observations.txt is missing "
@@ -59,10 +54,7 @@ def given_type(reference: KaptureFolder) -> str:
 
 
 def check_given_type(reference: KaptureFolder, expected: str) -> None:
-    """Check that a given map is of the keypoints type that is extracted for it.
-
-    Raises DataError: it is of another one, or no map.
-    """
+    """Check that a given map is of the keypoints type that is extracted for it."""
     found = given_type(reference)
     if found != expected:
         raise DataError(
@@ -74,8 +66,6 @@ def check_given_type(reference: KaptureFolder, expected: str) -> None:
 def has_descriptors(reference: KaptureFolder) -> bool:
     """Whether every image that sees a point of a given map has descriptors; else the images'
     features have to be extracted anew for :func:`given_map`.
-
-    Raises DataError: see :func:`given_type`.
     """
     local_type = given_type(reference)
     if local_type not in reference.types("descriptors"):
@@ -99,11 +89,6 @@ def given_map(reference: KaptureFolder, mapping: KaptureFolder, output: Path) ->
     Returns
     -------
     Counts for the log; ``share_found_again`` is the share of the observations whose keypoints were.
-
-    Raises
-    ------
-    DataError : no map; features of an image are missing; most observed keypoints are not found
-        again, so that the map was made of other features.
     """
     local_type = given_type(reference)
     seen = reference.observations()[local_type]
@@ -136,41 +121,6 @@ def given_map(reference: KaptureFolder, mapping: KaptureFolder, output: Path) ->
         "points": int(kept.sum()),
         "observations": len(seen),
         "share_found_again": round(found_again, 4),
-    }
-
-
-def join_maps(first: KaptureFolder, second: KaptureFolder, output: Path) -> dict[str, float]:
-    """Write two maps as one: the first's images, its points, then the second's.
-
-    The second's images are among the first's (a dataset's model may lack images that were added to
-    the map). Each keypoints type keeps its own points, observations and features. Global features
-    are those of the first, and types that only the second has. Returns counts for the log; raises
-    DataError: the maps share a keypoints type, the second has another image, or an image differs in
-    camera or pose.
-    """
-    types_of = [sorted(folder.observations()) for folder in (first, second)]
-    shared = sorted(set(types_of[0]).intersection(types_of[1]))
-    if shared:
-        raise DataError(
-            f"both maps have points of keypoints type {', '.join(shared)}; {first.root} has them "
-            "too, and one type has one set of features",
-            path=second.root,
-        )
-    _check_same_images(first, second)
-    shift = len(first.points3d())
-    observations = first.observations()
-    for local_type, seen in second.observations().items():
-        observations[local_type] = replace(seen, point_ids=seen.point_ids + shift)
-    write_sensors(output, first.read())
-    link_images(first.root, output)
-    for folder, types in zip((first, second), types_of, strict=True):
-        copy_features(folder, output, {*types, *map(base_type, types)})
-    write_points3d(output, np.concatenate([first.points3d(), second.points3d()]))
-    write_observations(output, observations)
-    return {
-        "images": len(first.read().poses()),
-        "points": shift + len(second.points3d()),
-        "observations": sum(len(seen) for seen in observations.values()),
     }
 
 
@@ -234,24 +184,6 @@ def _write_rows(
         with FeatureWriter(output, reader.kind, local_type, reader.config) as writer:
             for image in sorted(mapping.read().poses()):
                 writer.write(image, reader.read(image)[rows.get(image, none)])
-
-
-def _check_same_images(first: KaptureFolder, second: KaptureFolder) -> None:
-    data, other = first.read(), second.read()
-    poses, other_poses = data.poses(), other.poses()
-    unknown = set(other.image_names()) - set(data.image_names())
-    if unknown:
-        message = f"{min(unknown)} is no image of the map it is joined to, {first.root}"
-        raise DataError(message, path=second.root)
-    for image in sorted(other.image_names()):
-        same_camera = data.camera_of(image) == other.camera_of(image)
-        if not same_camera or poses.get(image) != other_poses.get(image):
-            what = "pose" if same_camera else "camera"
-            raise DataError(
-                f"{image} has another {what} than in {first.root}: points of the two maps do not "
-                "fit each other",
-                path=second.root,
-            )
 
 
 def rows_found_again(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -23,7 +22,7 @@ from megloc_kapture.features.vlad import (
 )
 from megloc_kapture.io.files import read_json_model, write_json_model
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
-from megloc_kapture.plugin_loading import load_plugin, option_fault, plugin_names
+from megloc_kapture.plugin_loading import checked_array, load_plugin, option_fault, plugin_names
 from megloc_kapture.plugins import GLOBAL_FEATURES as PLUGINS
 from megloc_kapture.plugins import GlobalFeatureExtractor, PluginChoice
 from megloc_kapture.stages.devices import in_batches
@@ -34,7 +33,7 @@ from megloc_kapture.stages.given_map import (
     VOCABULARY_FILE,
     described_images,
 )
-from megloc_kapture.stages.local_features import image_inputs, images_of, read_image_of
+from megloc_kapture.stages.local_features import images_of, read_image_of
 from megloc_kapture.stages.shared_index import write_array
 from megloc_kapture.stages.stage import (
     FEATURES,
@@ -44,7 +43,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, feature_inputs, ordered_map
+from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, ordered_map
 from megloc_kapture.values import Camera, Options
 
 
@@ -67,10 +66,7 @@ def vlad_type(local_type: str) -> str:
 def train_on_map(
     mapping: KaptureFolder, local_type: str, options: VladOptions, *, work: Work = HERE
 ) -> Vocabulary:
-    """Train on the descriptors of the map's images.
-
-    Raises DataError: they are missing, or too few.
-    """
+    """Train on the descriptors of the map's images."""
     images = mapping.read().image_names()
     descriptors = mapping.descriptors(local_type)
     if not any(descriptors.length(image) for image in images):
@@ -96,30 +92,15 @@ def extract_vlad(
     """
     type_name = vlad_type(local_type)
     place = output / "global_features" / type_name
-    described = mapping.descriptors(local_type)
-    trained = work.items(
-        f"vocabulary of {type_name}",
-        [type_name],
-        lambda _, digest: [
-            [image, feature_inputs(described, image, digest)]
-            for image in mapping.read().image_names()
-        ],
-    )
+    trained = work.items(f"vocabulary of {type_name}")
     if type_name not in trained.done:
         vocabulary = train_on_map(mapping, local_type, options, work=work)
-        files = write_vocabulary(place, vocabulary, local_type, options)
-        content = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
-        said = [vocabulary.centres.shape[1], vocabulary.size, content]
-        trained.add(type_name, files, said)
-    num_centres, size, content = trained.done[type_name]
+        write_vocabulary(place, vocabulary, local_type, options)
+        trained.add(type_name, [vocabulary.centres.shape[1], vocabulary.size])
+    num_centres, size = trained.done[type_name]
     config = FeatureConfig(type_name, np.dtype(np.float32), size, metric_type="L2")
     spec_of, folder_of = cache(FolderSpec), images_of(folders, "describe")
-    readers = {folder: folder.descriptors(local_type) for folder in folders}
-    items = work.items(
-        type_name,
-        list(folder_of),
-        lambda image, digest: [content, feature_inputs(readers[folder_of[image]], image, digest)],
-    )
+    items = work.items(type_name)
     todo = [
         (image, spec_of(folder)) for image, folder in folder_of.items() if image not in items.done
     ]
@@ -127,7 +108,8 @@ def extract_vlad(
     describe = partial(_aggregate, local_type, place, FolderSpec(mapping).key)
     results = work.map(describe, todo, items.label("VLAD"))
     for (image, _), vector in zip(todo, results, strict=True):
-        items.add(image, writer.write(image, vector))
+        writer.write(image, vector)
+        items.add(image)
     return {"images": len(folder_of), "clusters": num_centres, "dimensions": size}
 
 
@@ -150,8 +132,8 @@ def _read_once(folder: Path, run: tuple[object, ...]) -> tuple[Vocabulary, VladS
 
 def write_vocabulary(
     folder: Path, vocabulary: Vocabulary, local_type: str, options: VladOptions
-) -> list[Path]:
-    """Write what describes images into the folder of a global-features type; returns the files.
+) -> None:
+    """Write a vocabulary into the folder of a global-features type.
 
     ``vocabulary.npy`` and ``vlad.json``, and with whitening its mean and projection.
     """
@@ -160,15 +142,10 @@ def write_vocabulary(
         write_array(folder / MEAN_FILE, vocabulary.whitening.mean)
         write_array(folder / PROJECTION_FILE, vocabulary.whitening.projection)
     write_json_model(folder / SETTINGS_FILE, VladSettings(local_type=local_type, options=options))
-    whitening = () if vocabulary.whitening is None else (MEAN_FILE, PROJECTION_FILE)
-    return [folder / name for name in (VOCABULARY_FILE, *whitening, SETTINGS_FILE)]
 
 
 def read_vocabulary(folder: Path) -> tuple[Vocabulary, VladSettings] | None:
-    """The vocabulary stored in a type's folder, None where there is none.
-
-    Raises DataError: a file is broken, or they do not fit each other.
-    """
+    """The vocabulary stored in a type's folder, None where there is none."""
     path = folder / VOCABULARY_FILE
     if not path.is_file():
         return None
@@ -228,7 +205,7 @@ class GlobalFeaturesChoice(PluginChoice):
         return self.name == VLAD
 
     def vlad_options(self) -> VladChoiceOptions:
-        """The options of VLAD; raises OptionError."""
+        """The options of VLAD."""
         try:
             return VladChoiceOptions(**self.options)
         except ValidationError as error:
@@ -250,7 +227,7 @@ class GlobalFeaturesChoice(PluginChoice):
         return extractor
 
     def type_name(self, main_local_type: str) -> str:
-        """The kapture type name of the vectors; raises as :meth:`make` and :meth:`vlad_options`.
+        """The kapture type name of the vectors.
 
         ``main_local_type``: local features that VLAD takes where its options name none.
         """
@@ -271,16 +248,10 @@ def extract_global_features(
 ) -> dict[str, int]:
     """Describe all images of the folders, into ``output`` (orphan layout).
 
-    Returns counts for the log: images. Raises DataError: an image is absent, unreadable, or not of
-    its camera's size; two folders have an image of the same name; there are no images; PluginError:
-    the extractor breaks its protocol.
+    Returns counts for the log: images.
     """
     folder_of = images_of(folders, "describe")
-    items = work.items(
-        extractor.name,
-        list(folder_of),
-        lambda image, digest: image_inputs(folder_of[image], image, digest)[:3],
-    )
+    items = work.items(extractor.name)
     jobs = [
         (image, folder.image_path(image), folder.read().camera_of(image))
         for image, folder in folder_of.items()
@@ -304,7 +275,8 @@ def extract_global_features(
                 f"plugin {extractor.name!r} on image {image}: {len(vector)} "
                 f"values, {size} of the images before"
             )
-        items.add(image, writer.write(image, vector))
+        writer.write(image, vector)
+        items.add(image)
     return {"images": len(items.done)}
 
 
@@ -313,9 +285,7 @@ def describe_images(
 ) -> NDArray[np.float32]:
     """Vectors of RGB images of one size: float32 (B, D), unit length.
 
-    Images of more than 8 megapixels are reduced to that, whatever the extractor. Raises
-    PluginError: the extractor returns something else; DeviceMemoryError: there is no memory for one
-    image.
+    Images of more than 8 megapixels are reduced to that, whatever the extractor.
     """
     many: Any = extractor
 
@@ -330,7 +300,6 @@ def describe_images(
             "describe_many",
             describe,
             bounded,
-            size=lambda image: image.size,
             name=lambda k: f"image {names[k]}",
         )
     )
@@ -339,21 +308,14 @@ def describe_images(
 def _checked(
     extractor: GlobalFeatureExtractor, found: Any, count: int, label: str
 ) -> NDArray[np.float32]:
-    def refuse(what: str) -> PluginError:
-        return PluginError(f"plugin {extractor.name!r} on image {label}: {what}")
-
-    for vector in found:
-        if not isinstance(vector, np.ndarray) or vector.dtype != np.float32 or vector.ndim != 1:
-            what = getattr(vector, "shape", type(vector).__name__)
-            raise refuse(f"describe returned {what}, not float32 (D,)")
-    if len({len(vector) for vector in found}) != 1 or len(found) != count:
-        raise refuse(f"{len(found)} vectors for {count} images, or of different lengths")
-    vectors = np.stack(found)
-    if not np.isfinite(vectors).all():
-        raise refuse("values that are not finite")
+    who = f"plugin {extractor.name!r} on image {label}"
+    if len(found) != count:
+        raise PluginError(f"{who}: {len(found)} vectors for {count} images")
+    size = len(checked_array(who, found[0], (None,), "float32"))
+    vectors = np.stack([checked_array(who, vector, (size,), "float32") for vector in found])
     norms = np.linalg.norm(vectors, axis=1)
     if np.abs(norms - 1.0).max() > 1e-3:
-        raise refuse(f"a vector of length {norms[np.abs(norms - 1.0).argmax()]:.4g}, not 1")
+        raise PluginError(f"{who}: a vector of length {norms.max():.4g}, expected 1")
     return vectors
 
 
@@ -377,6 +339,7 @@ class ExtractGlobalFeatures(PipelineStage):
     name = "global_features"
     version = 2
     uses = ("global_features.name", "global_features.options", *LOCAL_TYPES)
+    explained_by = ("global_features",)
     outputs = (GLOBAL_FEATURES,)
 
     @property

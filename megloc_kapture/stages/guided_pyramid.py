@@ -14,29 +14,27 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import astuple, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import write_csv_table
-from megloc_kapture.io.files import hard_link, safe_join, write_bytes
-from megloc_kapture.io.kapture import FeatureReader, FeatureWriter, KaptureFolder
+from megloc_kapture.io.files import hard_link
+from megloc_kapture.io.kapture import FeatureWriter, KaptureFolder
 from megloc_kapture.io.kapture.features import SUFFIX, feature_folder
 from megloc_kapture.localization.map_index import ImageMatches
 from megloc_kapture.matching.guided_pyramid import (
     GuidedPyramidOptions,
     ImageVariant,
     PairVerifier,
-    VariantFeatures,
     VariantMatches,
     extract_variants,
-    match_probed,
     match_variants,
     pyramid_type,
 )
@@ -83,13 +81,13 @@ UNVERIFIED = PairVerifier(lambda _, matches: np.ones(len(matches), dtype=bool))
 
 @dataclass(frozen=True, eq=False)
 class MatchedVariants:
-    """What the variants of an image came to.
+    """Matches of an image's variants.
 
     Attributes
     ----------
     found : for each of the other images the variants that match it.
-    num_variants : that were tried with each of these, the skipped ones among them.
-    skipped : the variants that gave nothing, and why; those of one reason together.
+    num_variants : number of variants tried with each of these, skipped ones included.
+    skipped : the variants without features, grouped by reason.
     """
 
     found: list[list[VariantMatches]]
@@ -116,18 +114,11 @@ def match_image_again(
     ----------
     itself : features of the image as it is.
     pixels, mask : RGB (H, W, 3), and True = use (H, W) or None.
-    others : matched with all variants; those with most matches first, as they are probed first.
-    load : features of another image; not all are in memory at once.
-    judge : of the matches with another image, by its name and features.
-    only_scaled : matched with the variants of another scale only; in the same order.
-
-    Returns
-    -------
-    What was found with ``others``, then with ``only_scaled``.
-
-    Raises
-    ------
-    DataError : its features are of another size than the extractor's.
+    others : matched with all variants.
+    load : features of another image; a few at a time are in memory.
+    judge : the verifier of the matches with another image, by its name and features.
+    only_scaled : matched with the variants of another scale only. Their results follow those of
+        ``others``.
     """
     started = time.perf_counter()
     every = method.options.variants(itself.camera.width, itself.camera.height)
@@ -139,27 +130,15 @@ def match_image_again(
         lambda image, mask: extract_all(method.extractor, [(image, mask)], [name])[0],
         like=itself,
     )
-
-    def match(
-        names: Sequence[str], some: Sequence[VariantFeatures], which: range
-    ) -> list[list[VariantMatches]]:
-        found = []
-        for batch in batched(names[which.start : which.stop], BATCH):
+    of_scale = [one for one in variants if one.variant.scale != 1.0]
+    found: list[list[VariantMatches]] = []
+    for names, used in ((others, variants), (only_scaled, of_scale)):
+        for batch in batched(names, BATCH):
             loaded = [load(other) for other in batch]
-            judgements = list(map(judge, batch, loaded))
             pairs = [f"pair {name}, {other}" for other in batch]
             match_with = partial(match_all, method.matcher, names=pairs)
-            found += match_variants(some, loaded, match_with, judgements)
-        return found
-
-    found: list[list[VariantMatches]] = []
-    counts: list[int] = []
-    of_scale = [one for one in variants if one.variant.scale != 1.0]
-    for names, used, num in ((others, variants, every), (only_scaled, of_scale, scaled)):
-        matches, num_left = match_probed(used, len(names), partial(match, names), method.options)
-        probed = method.options.num_probed(len(names))
-        found += matches
-        counts += [len(num)] * probed + [num_left] * (len(names) - probed)
+            found += match_variants(used, loaded, match_with, list(map(judge, batch, loaded)))
+    counts = [len(every)] * len(others) + [len(scaled)] * len(only_scaled)
     return MatchedVariants(found, counts, _described(skipped), time.perf_counter() - started)
 
 
@@ -215,22 +194,18 @@ class PyramidFeatures:
 
     Files of images that nothing was added to are hard links to those of T where the file system
     has them, so that they take no space twice. Raises DataError where an image of ``folder`` has
-    more or fewer descriptors of ``local_type`` than keypoints; ``done`` are images that have been
-    written before.
+    more or fewer descriptors of ``local_type`` than keypoints.
     """
 
-    def __init__(
-        self, output: Path, folder: KaptureFolder, local_type: str, done: Iterable[str] = ()
-    ) -> None:
+    def __init__(self, output: Path, folder: KaptureFolder, local_type: str) -> None:
         name = pyramid_type(local_type)
         keypoints, descriptors = folder.keypoints(local_type), folder.descriptors(local_type)
-        images = set(folder.read().image_names()) - set(done)
-        self._left = [image for image in sorted(images) if image in keypoints]
+        self._left = [image for image in sorted(folder.read().image_names()) if image in keypoints]
         for image in self._left:
             lengths = descriptors.length(image), keypoints.length(image)
             if lengths[0] != lengths[1]:
-                told = f"{lengths[0]} descriptors for {lengths[1]} keypoints"
-                raise DataError(told, path=descriptors.where(image))
+                message = f"{lengths[0]} descriptors for {lengths[1]} keypoints"
+                raise DataError(message, path=descriptors.where(image))
         # the name in the files stays that of the method: by it the extractor is found again
         configs = keypoints.config, replace(descriptors.config, keypoints_type=name)
         self._kinds = [
@@ -244,100 +219,24 @@ class PyramidFeatures:
 
     def write(
         self, image: str, added_px: NDArray[np.float32], added_descriptors: NDArray[Any]
-    ) -> list[Path]:
-        """Write an image's features, with those added to it; the files. Raises OutputError."""
-        added, files = (added_px, added_descriptors), []
+    ) -> None:
+        """Write an image's features, with those added to it."""
         self._left.remove(image)
+        added = (added_px, added_descriptors)
         for (source, writer, folder), more in zip(self._kinds, added, strict=True):
-            stored, link = Path(source.where(image)), folder / f"{image}{SUFFIX[source.kind]}"
+            stored = Path(source.where(image))
             if len(more) == 0 and stored.is_file():  # else it is a member of a tar
-                hard_link(stored, link)
-                files.append(link)
+                hard_link(stored, folder / f"{image}{SUFFIX[source.kind]}")
             else:
-                files += writer.write(image, np.concatenate([source.read(image), more]))
-        return files
+                writer.write(image, np.concatenate([source.read(image), more]))
 
     def write_rest(self) -> None:
-        """Write the features of the images that nothing is added to; raises OutputError."""
+        """Write the features of the images that nothing is added to."""
         px, descriptors = (
             np.zeros((0, source.config.dsize), source.config.dtype) for source, *_ in self._kinds
         )
         for image in list(self._left):
             self.write(image, px, descriptors)
-
-
-class Spooled(NamedTuple):
-    """A variant's matches in the spool: the records of its image from one on, to another."""
-
-    variant: ImageVariant
-    begin: int
-    end: int
-
-
-class MatchSpool:
-    """Variants' matches on disk until all are there: a large map's are too many for memory.
-
-    A file per image below ``folder``, a record for each match.
-    """
-
-    def __init__(self, folder: Path, keypoints: FeatureReader, descriptors: FeatureReader) -> None:
-        self.folder = folder
-        described = descriptors.config
-        self._record = np.dtype(
-            [
-                ("keypoint_px", np.float32, (keypoints.config.dsize,)),
-                ("other_row", np.int64),
-                ("score", np.float32),
-                ("descriptor", described.dtype, (described.dsize,)),
-            ]
-        )
-
-    def write(
-        self, image: str, found: Sequence[Sequence[VariantMatches]]
-    ) -> tuple[Path, list[list[Any]]]:
-        """Keep the matches of an image's variants with each of the others.
-
-        Returns the file, and for ``found`` the fields of :class:`Spooled`, as plain values. Raises
-        OutputError: the disk is full.
-        """
-        path, parts, end = safe_join(self.folder, f"{image}.variants"), [b""], 0
-        told: list[list[Any]] = []
-        for of_other in found:
-            told.append([])
-            for matches in of_other:
-                records = np.empty(len(matches), self._record)
-                records["keypoint_px"] = matches.keypoints_px
-                records["other_row"] = matches.other_rows
-                records["score"] = matches.scores
-                records["descriptor"] = matches.descriptors
-                begin, end = end, end + len(records)
-                told[-1].append([astuple(matches.variant), begin, end])
-                parts.append(records.tobytes())
-        write_bytes(path, b"".join(parts))
-        return path, told
-
-    def get(self, image: str, kept: Spooled) -> VariantMatches:
-        """The matches that were put there."""
-        records = self._read(image, kept.begin, kept.end)
-        return VariantMatches(
-            kept.variant,
-            np.ascontiguousarray(records["keypoint_px"]),
-            records["descriptor"],
-            np.ascontiguousarray(records["other_row"]),
-            np.ascontiguousarray(records["score"]),
-        )
-
-    def descriptors(self, matches: Sequence[tuple[str, int]]) -> NDArray[Any]:
-        """Descriptors (N, D) by the image whose variant they are of, and the record."""
-        found = np.empty(len(matches), self._record)
-        for row, (image, at) in enumerate(matches):
-            found[row] = self._read(image, at, at + 1)[0]
-        return np.ascontiguousarray(found["descriptor"])
-
-    def _read(self, image: str, begin: int, end: int) -> NDArray[Any]:
-        path = safe_join(self.folder, f"{image}.variants")
-        offset = begin * self._record.itemsize
-        return np.fromfile(path, self._record, count=end - begin, offset=offset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -377,10 +276,6 @@ def retry_query(
     frame : pixels and mask of the query; called only where a candidate has few matches.
     num_found : matches of each candidate before verification; as many as in ``matches`` unless
         given.
-
-    Raises
-    ------
-    DataError : the image cannot be read, or its features are of another size than the query's.
     """
     base = {other: pairs for other, pairs, _ in matches}
     found = num_found or {}
@@ -389,7 +284,6 @@ def retry_query(
         for other, pairs in base.items()
         if method.options.is_hard(found.get(other, len(pairs)), len(pairs))
     ]
-    hard.sort(key=lambda other: -len(base[other]))
     mode, verification = method.options.mode, method.verification
     if mode == "off" or not hard:
         return RetriedQuery(

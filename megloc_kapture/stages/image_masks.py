@@ -18,6 +18,7 @@ from pydantic import Field
 from megloc_kapture.errors import DataError, OptionError, PluginError
 from megloc_kapture.io.images import image_as_read_back
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.plugin_loading import checked_array
 from megloc_kapture.plugins import PluginChoice, Segmenter
 from megloc_kapture.preprocessing.frames import (
     FramePlan,
@@ -65,17 +66,11 @@ class MaskOptions(Options):
         default=None, description="folder of masks IMAGE.png, 0 where the image is ignored"
     )
 
-    def idle(self) -> dict[str, str]:
-        return {} if self.segmenter else {"dynamic": "no segmenter tells classes apart"}
-
 
 def mask_files(
     folder: KaptureFolder, images: Iterable[str], user_masks: Path | None
 ) -> dict[str, dict[str, Path]]:
-    """The mask files that there are, by image and source (``own`` or ``user``).
-
-    Raises DataError: the user's folder is not there, or has a mask of none of the images.
-    """
+    """The mask files that there are, by image and source (``own`` or ``user``)."""
     if user_masks is not None and not user_masks.is_dir():
         raise DataError("no such folder of masks", path=user_masks)
     found = {}
@@ -94,10 +89,7 @@ def mask_files(
 
 
 def read_masks(files: Mapping[str, Path], shape: tuple[int, ...]) -> dict[str, Mask]:
-    """The masks of an image by source, bool (H, W), True = use.
-
-    Raises DataError: one is no image, or not of the image's size.
-    """
+    """The masks of an image by source, bool (H, W), True = use."""
     masks = {source: read_mask(path, shape) for source, path in files.items()}
     return {source: mask for source, mask in masks.items() if mask is not None}
 
@@ -112,10 +104,7 @@ class StandingMasks:
         self._combined: dict[tuple[object, ...], dict[str, Mask]] = {}
 
     def of(self, sensor_id: str, image: str, camera: Camera) -> dict[str, Mask]:
-        """The masks bool (H, W) of an image by source, in original pixels; shared, not to change.
-
-        Raises DataError: a drawn mask is absent, no image, or not of the camera's size.
-        """
+        """Return the masks bool (H, W) of an image by source, in original pixels; shared."""
         width, height = camera.width, camera.height
         region = self._regions.get(sensor_id)
         fitting = [one for one in self._fixed if one.is_for(sensor_id, image)]
@@ -160,10 +149,7 @@ class ClassMasks:
 
     @classmethod
     def of(cls, segmenter: Segmenter, dynamic: Sequence[str] | None = None) -> ClassMasks:
-        """Of the classes asked for; without, of those the segmenter names itself.
-
-        Raises OptionError: a class it does not have; lists those it has.
-        """
+        """Of the classes asked for; without, of those the segmenter names itself."""
         wanted = segmenter.dynamic if dynamic is None else dynamic
         unknown = sorted(set(wanted) - set(segmenter.classes))
         if unknown:
@@ -174,19 +160,13 @@ class ClassMasks:
         return cls(segmenter, tuple(name for name in segmenter.classes if name in wanted))
 
     def labels(self, image: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
-        """The label of each pixel, uint8 (H, W), of an image (H, W, 3) called ``name``.
-
-        Raises PluginError: the segmenter returns something else.
-        """
-        found = self.segmenter.segment(image)
-        shape, dtype = getattr(found, "shape", None), getattr(found, "dtype", None)
-        told = ""
-        if shape != image.shape[:2] or dtype != np.uint8:
-            told = f"segment returned {dtype} {shape}, not uint8 {image.shape[:2]}"
-        elif found.max() >= len(self.segmenter.classes):
-            told = f"label {found.max()}, but there are {len(self.segmenter.classes)} classes"
-        if told:
-            raise PluginError(f"plugin {self.segmenter.name!r} on image {name}: {told}")
+        """Return the label of each pixel, uint8 (H, W), of an image (H, W, 3) called ``name``."""
+        who = f"plugin {self.segmenter.name!r} on image {name}"
+        found = checked_array(who, self.segmenter.segment(image), image.shape[:2], "uint8")
+        if found.max() >= len(self.segmenter.classes):
+            raise PluginError(
+                f"{who}: label {found.max()}, but there are {len(self.segmenter.classes)} classes"
+            )
         return found
 
     def mask(self, labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -201,8 +181,7 @@ def find_unchanging_regions(
     """The region of every camera of a folder, by sensor id; falsy with a reason where none is.
 
     ``sequences``: folders whose images tell of its cameras as well, where they have a sensor of the
-    same id and image size: the map's, for queries. Raises DataError: an image is absent,
-    unreadable, or not of its camera's size.
+    same id and image size: the map's, for queries.
     """
     chosen: dict[str, list[tuple[Path, Camera]]] = {}
     regions: dict[str, UnchangingRegion] = {}

@@ -69,14 +69,6 @@ class MappingPairsOptions(Options):
     covisibility: PairsByCovisibilityOptions = PairsByCovisibilityOptions()
     sequence: PairsBySequenceOptions = PairsBySequenceOptions()
 
-    def idle(self) -> dict[str, str]:
-        of_method = {"retrieval": "top_k"}
-        return {
-            of_method.get(method, method): f"{method} is not in mapping_pairs.by"
-            for method in ("retrieval", "poses", "covisibility", "sequence")
-            if method not in self.by
-        }
-
     def needs_points(self) -> bool:
         """Whether a method looks at points that are there already."""
         overlap = "poses" in self.by and self.poses.min_overlap is not None
@@ -119,8 +111,7 @@ def pair_map_images(
     Where no image has a pose, of all of them, by methods that look at none. Images of different
     coordinate frames are never paired. The score is the cosine similarity where retrieval named the
     pair, else 1. ``covisible``: a map of the same images in the same frames, whose points
-    co-visibility and overlap look at; by default those of ``mapping`` itself. Raises DataError:
-    global features or points are needed and not there.
+    co-visibility and overlap look at; by default those of ``mapping`` itself.
     """
     data = mapping.read()
     poses = data.poses()
@@ -215,8 +206,7 @@ def pair_queries(
 ) -> list[ImagePair]:
     """Candidates of every query among the posed map images its prior permits, best first.
 
-    Sorted by query. A query that nothing is permitted to has no candidate. Raises DataError: global
-    features are needed and not there.
+    Sorted by query. A query that nothing is permitted to has no candidate.
     """
     poses = mapping.read().poses()
     images = sorted(poses)
@@ -233,7 +223,6 @@ def pair_queries(
     database, described = retrieval.readers(mapping), retrieval.readers(query)
     candidates = Candidates(
         lambda members: vectors_of(database, [images[member] for member in members.tolist()]),
-        [poses[image] for image in images],
         retrieval,
     )
     for positions, permitted in pools:
@@ -258,6 +247,7 @@ class PairMapping(PipelineStage):
     name = "mapping_pairs"
     version = 4
     uses = ("mapping_pairs", *RETRIEVAL_OPTIONS)
+    explained_by = ("map", "mapping_pairs.by")
     inputs = (Layout.mapping, SIDE_TABLES, GLOBAL_FEATURES, Layout.pairing_points)
     outputs = (MAPPING_PAIRS,)
 
@@ -282,6 +272,7 @@ class PairQueries(PipelineStage):
 
     version = 3
     uses = ("query_pairs", *RETRIEVAL_OPTIONS)
+    explained_by = ("query_pairs.by", "query_pairs.top_k")
     inputs = (Layout.mapping, Layout.query, SIDE_TABLES, GLOBAL_FEATURES, Layout.reference)
     outputs = (Layout.candidates,)
 
@@ -320,10 +311,6 @@ class RerankingOptions(Options):
     )
     keep: int = Field(default=20, gt=0, description="images that stay, N")
 
-    def idle(self) -> dict[str, str]:
-        reason = "reranking.by is none"
-        return {} if self.reranks() else dict.fromkeys(self.all_but("by"), reason)
-
     def reranks(self) -> bool:
         """Whether anything is done."""
         return self.by != "none"
@@ -338,7 +325,7 @@ class RerankingOptions(Options):
         return found or [one for one in local_types if one.startswith(name)]
 
     def counted_types(self, local_types: Sequence[str]) -> list[str]:
-        """The types whose matches count; raises OptionError where ``local_type`` names none."""
+        """The types whose matches count."""
         found = self.types_named(local_types)
         if not found:
             raise OptionError(
@@ -397,10 +384,6 @@ def reranked(
     ----------
     query : with matches of the types.
     matches : the features folder that the matches are in.
-
-    Raises
-    ------
-    DataError : matches, or the tables of their numbers, are missing or broken.
     """
     if not options.reranks():
         return list(pairs)
@@ -438,6 +421,7 @@ class RerankQueries(PipelineStage):
     name = "query_pairs"
     version = 4
     uses = ("reranking", *LOCAL_TYPES)
+    explained_by = ("reranking.by", "reranking.keep", "reranking.local_type")
     inputs = (Layout.query, LOCAL_FEATURES, QUERY_CANDIDATES, QUERY_MATCHES)
     outputs = (QUERY_PAIRS,)
 

@@ -23,6 +23,7 @@ from megloc_kapture.features.image_bound import (
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.io.tables import write_mask_counts
+from megloc_kapture.plugin_loading import checked_array
 from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages.devices import in_batches
@@ -35,7 +36,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, Batched, Digest, FolderSpec, Work
+from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work
 from megloc_kapture.values import Camera, LocalFeatures
 
 _SIZE = attrgetter("size")
@@ -58,33 +59,15 @@ def extract_local_features(
 ) -> dict[str, int]:
     """Extract from all images of the folders into ``output`` (orphan layout).
 
-    Masks are read from ``sensors/masks/<image>.png`` where there are any (0 = ignore).
-
-    Parameters
-    ----------
-    mask_margin_px : keypoints nearer than this to a masked pixel go too.
-
-    Returns
-    -------
-    Counts for the log: images, keypoints, where there are any the images that were reduced because
-    they are very large, and where there are masks the images that have one and the keypoints that
-    they removed.
-
-    Raises
-    ------
-    DataError : an image is absent, unreadable, or not of its camera's size; or two folders have
-        an image of the same name.
+    Masks are read from ``sensors/masks/<image>.png`` where there are any (0 = ignore); keypoints
+    nearer than ``mask_margin_px`` to a masked pixel are dropped as well. Returns counts for the
+    log.
     """
     spec_of, jobs = cache(FolderSpec), []
     for image, folder in images_of(folders, "extract features from").items():
         camera, has_mask = folder.read().camera_of(image), mask_path(folder, image).is_file()
         jobs.append(_Job(image, spec_of(folder), (camera.width, camera.height), has_mask))
-    folder_of = {job.image: job.folder for job in jobs}
-
-    def inputs(image: str, digest: Digest) -> object:
-        return [*image_inputs(folder_of[image].open(), image, digest), mask_margin_px]
-
-    items = work.items(extractor.name, list(folder_of), inputs)
+    items = work.items(extractor.name)
     todo = [job for job in jobs if job.image not in items.done]
     todo.sort(key=_SIZE)  # images of one size can be a batch
     steps: Batched[_Job, LocalFeatures] = Batched(
@@ -98,11 +81,9 @@ def extract_local_features(
     results = work.map(steps, todo, items.label(f"{extractor.name} features"))
     for job, features in zip(todo, results, strict=True):
         writers = writers or _writers(output, extractor, features)
-        files = (
-            *writers[0].write(job.image, features.keypoints_px),
-            *writers[1].write(job.image, features.descriptors),
-        )
-        items.add(job.image, files, [len(features.keypoints_px), features.num_masked])
+        writers[0].write(job.image, features.keypoints_px)
+        writers[1].write(job.image, features.descriptors)
+        items.add(job.image, [len(features.keypoints_px), features.num_masked])
     counts = {"images": len(jobs), "keypoints": sum(count for count, _ in items.done.values())}
     bound = max_megapixels_of(extractor)
     if reduced := sum(bounded_size(*job.size, bound) != job.size for job in jobs):
@@ -115,10 +96,7 @@ def extract_local_features(
 
 
 def images_of(folders: Sequence[KaptureFolder], purpose: str) -> dict[str, KaptureFolder]:
-    """All images in order of their names, with their folders.
-
-    Raises DataError: there is none, or two folders have an image of the same name.
-    """
+    """All images in order of their names, with their folders."""
     named = [(image, folder) for folder in folders for image in folder.read().image_names()]
     named.sort(key=itemgetter(0))
     for (image, _), (other, _) in pairwise(named):
@@ -154,16 +132,6 @@ def _extract(
     return extract_all(extractor, frames, [job.image for job in jobs])
 
 
-def image_inputs(folder: KaptureFolder, image: str, digest: Digest) -> list[object]:
-    """What features of an image are made of: its file, its camera's size, its mask if it has one.
-
-    Raises DataError: a file cannot be read.
-    """
-    camera, mask = folder.read().camera_of(image), mask_path(folder, image)
-    masked = digest(mask) if mask.is_file() else None
-    return [digest(folder.image_path(image)), camera.width, camera.height, masked]
-
-
 def mask_path(folder: KaptureFolder, image: str) -> Path:
     """Where the mask of an image lies, if it has one."""
     return folder.root / "sensors" / "masks" / f"{image}.png"
@@ -194,16 +162,9 @@ def check_size(size: tuple[int, ...], camera: Camera, name: Path | str) -> None:
 def read_mask(
     path: Path, shape: tuple[int, ...], *, margin_px: float = 0.0
 ) -> NDArray[np.bool_] | None:
-    """The mask beside an image, True = use; None where there is no such file.
+    """Read the mask of an image of ``shape`` (H, W), True = use; None where there is no file.
 
-    Parameters
-    ----------
-    shape : (H, W) of the image.
-    margin_px : pixels nearer than this to an ignored one are ignored as well.
-
-    Raises
-    ------
-    DataError : not an image, or not of that size.
+    Pixels nearer than ``margin_px`` to an ignored one are ignored as well.
     """
     if not path.is_file():
         return None
@@ -219,36 +180,23 @@ def read_mask(
 def extract_all(
     extractor: LocalFeatureExtractor, frames: Sequence[Frame], names: Sequence[str]
 ) -> list[LocalFeatures]:
-    """What a plugin makes of images of one size, very large ones reduced meanwhile.
-
-    Raises PluginError: it breaks the protocol; DeviceMemoryError: there is no memory for one image.
-    """
+    """Extract from images of one size, very large ones reduced meanwhile."""
     found = in_batches(
         extractor,
         "extract_many",
         partial(extract_bounded, extractor),
         frames,
-        size=lambda frame: frame[0].size,
         name=lambda k: f"image {names[k]}",
     )
     return [_checked(extractor, *each) for each in zip(found, names, strict=True)]
 
 
 def _checked(extractor: LocalFeatureExtractor, features: Any, image: str) -> LocalFeatures:
-    def refuse(what: str) -> PluginError:
-        return PluginError(f"plugin {extractor.name!r} on image {image}: {what}")
-
+    who = f"plugin {extractor.name!r} on image {image}"
     if not isinstance(features, LocalFeatures):
-        raise refuse(f"extract returned {type(features).__name__}, not LocalFeatures")
-    keypoints, descriptors = features.keypoints_px, features.descriptors
-    if keypoints.ndim != 2 or keypoints.shape[1] < 2 or keypoints.dtype != np.float32:
-        raise refuse(f"keypoints are {keypoints.dtype} {keypoints.shape}, not float32 (N, 2)")
-    if descriptors.ndim != 2 or len(descriptors) != len(keypoints):
-        raise refuse(f"{len(keypoints)} keypoints but descriptors of shape {descriptors.shape}")
-    if descriptors.dtype not in (np.float32, np.uint8):
-        raise refuse(f"descriptors are {descriptors.dtype}, not float32 or uint8")
-    if not (np.isfinite(keypoints).all() and np.isfinite(descriptors).all()):
-        raise refuse("values that are not finite")
+        raise PluginError(f"{who}: got {type(features).__name__}, expected LocalFeatures")
+    checked_array(who, features.keypoints_px, (None, None), "float32")
+    checked_array(who, features.descriptors, (len(features.keypoints_px), None), "float32", "uint8")
     return features
 
 
@@ -257,6 +205,7 @@ class ExtractLocalFeatures(PipelineStage):
 
     name = "local_features"
     uses = ("mask_margin_px", *LOCAL_TYPES)
+    explained_by = ("local_features",)
     inputs = (Layout.mapping, Layout.query, Layout.reference)
     outputs = (LOCAL_FEATURES,)
 

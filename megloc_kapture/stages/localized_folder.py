@@ -8,13 +8,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from pydantic import TypeAdapter
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import write_csv_table
@@ -38,7 +34,7 @@ from megloc_kapture.io.tables import (
 from megloc_kapture.stages.local_features import read_image_of
 from megloc_kapture.stages.scene import poses_through_rig
 from megloc_kapture.stages.work import FolderSpec, Work
-from megloc_kapture.values import Camera, ClusterPose, Failure, Pose, RefinementRow, RigidTransform
+from megloc_kapture.values import Failure, Pose, RigidTransform
 
 
 def write_localized(
@@ -137,39 +133,6 @@ def write_timing(path: Path, results: Iterable[tuple[str, Pose | Failure]]) -> N
     write_csv_table(path, ("image", "step", "seconds"), rows)
 
 
-# fields of a pose that JSON gives back as something else
-_PARTS: dict[str, TypeAdapter[Any]] = {
-    "cam_from_world": TypeAdapter(RigidTransform),
-    "camera": TypeAdapter(Camera | None),
-    "candidates": TypeAdapter(tuple[str, ...]),
-    "clusters": TypeAdapter(tuple[ClusterPose, ...]),
-    "refinements": TypeAdapter(tuple[RefinementRow, ...]),
-    "remarks": TypeAdapter(tuple[str, ...]),
-}
-
-
-def plain_result(found: Pose | Failure) -> dict[str, Any]:
-    """A result as JSON values: all that is written of it."""
-    if isinstance(found, Failure):
-        return asdict(found)
-    covariance = None if found.covariance is None else found.covariance.tolist()
-    return asdict(replace(found, covariance=None, evidence={})) | {"covariance": covariance}
-
-
-def result_of(plain: Mapping[str, Any]) -> Pose | Failure:
-    """The result that :func:`plain_result` made JSON values of."""
-    if "cam_from_world" not in plain:
-        return TypeAdapter(Failure).validate_python(plain)
-    return pose_of(plain)
-
-
-def pose_of(plain: Mapping[str, Any]) -> Pose:
-    """The pose that :func:`plain_result` made JSON values of."""
-    parts = {name: kind.validate_python(plain[name]) for name, kind in _PARTS.items()}
-    covariance = None if plain["covariance"] is None else np.array(plain["covariance"])
-    return Pose(**{**plain, **parts, "covariance": covariance})
-
-
 def query_status(image: str, result: Pose | Failure, fallback: Fallback = "none") -> QueryStatus:
     """The row of ``status.csv`` of a query."""
     return QueryStatus(
@@ -191,8 +154,7 @@ def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, 
     """Take images that cannot be read out of a workspace's queries; returns why, by name.
 
     Their names and reasons go to ``tables``; the image files stay as they are. ``query``: kapture
-    folder in the workspace, which is written anew where an image is taken out. Raises DataError: no
-    image can be read; names the first.
+    folder in the workspace, which is written anew where an image is taken out.
     """
     folder = KaptureFolder(query)
     data = folder.read()

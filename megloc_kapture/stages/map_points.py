@@ -29,7 +29,7 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.io.kapture.matches import MatchesReader
 from megloc_kapture.mapping.depth import LiftingOptions, lift_keypoints
 from megloc_kapture.matching.guided_pyramid import base_type
-from megloc_kapture.stages.given_map import check_given_type, copy_features, given_map, join_maps
+from megloc_kapture.stages.given_map import check_given_type, copy_features, given_map
 from megloc_kapture.stages.scene import DepthRecord, depth_records, read_depth
 from megloc_kapture.stages.stage import (
     FEATURES,
@@ -76,10 +76,6 @@ def triangulate_map(
     Returns
     -------
     Counts for the log; of several types also ``points_T`` and ``observations_T`` for each.
-
-    Raises
-    ------
-    DataError : no image has a pose, or a type is not there; or there is no point.
     """
     types = tuple(dict.fromkeys([local_types] if isinstance(local_types, str) else local_types))
     data = mapping.read()
@@ -241,7 +237,6 @@ def lift_map(
     """Lift the keypoints of the map's images through their depth maps, and write the map.
 
     Returns counts for the log. ``local_types``: keypoints types that get points, each its own.
-    Raises DataError: no image has a pose, or none has depth; a depth map is missing or broken.
     """
     data = mapping.read()
     poses = data.poses()
@@ -308,6 +303,7 @@ class GivenMap(PipelineStage):
 
     name = "points"
     uses = ("map", "given_features")
+    explained_by = ("map",)
     inputs = (REFERENCE, Layout.mapping, LOCAL_FEATURES, GLOBAL_FEATURES)
     outputs = (UNREFINED,)
 
@@ -315,14 +311,10 @@ class GivenMap(PipelineStage):
         return self.options.map == "given"
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        return write_given_map(work, self, work.out / UNREFINED)
-
-
-def write_given_map(work: StageWork, stage: PipelineStage, output: Path) -> dict[str, float]:
-    """Write the given map of a run; see :func:`given_map`."""
-    reference = work.folder(REFERENCE)
-    check_given_type(reference, stage.options.make_given_extractor().name)
-    return given_map(reference, work.folder(stage.layout.mapping(), FEATURES), output)
+        reference = work.folder(REFERENCE)
+        check_given_type(reference, self.options.make_given_extractor().name)
+        mapping = work.folder(self.layout.mapping(), FEATURES)
+        return given_map(reference, mapping, work.out / UNREFINED)
 
 
 class LiftPoints(PipelineStage):
@@ -330,6 +322,7 @@ class LiftPoints(PipelineStage):
 
     name = "points"
     uses = ("map", "lifting", "local_features.name", "local_features.options")
+    explained_by = ("map",)
     inputs = (Layout.mapping, LOCAL_FEATURES, GLOBAL_FEATURES)
     outputs = (UNREFINED,)
 
@@ -342,17 +335,17 @@ class LiftPoints(PipelineStage):
 
 
 class TriangulatePoints(PipelineStage):
-    """Triangulate the map's points, beside those of a given map where both are wanted."""
+    """Triangulate the map's points."""
 
     name = "points"
     version = 2
     uses = ("triangulation", "guided_pyramid.mode", *LOCAL_TYPES)
+    explained_by = ("map",)
     inputs = (
         Layout.mapping,
         LOCAL_FEATURES,
         GLOBAL_FEATURES,
         Layout.mapping_matches,
-        Layout.reference,
     )
     outputs = (UNREFINED,)
 
@@ -360,20 +353,13 @@ class TriangulatePoints(PipelineStage):
         return self.options.triangulates()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        joined, options = self.options.uses_given_map(), self.options
         mapping = work.folder(self.layout.mapping(), FEATURES, *self.layout.mapping_matches())
-        own, given = work.out / ("map_own" if joined else UNREFINED), work.out / "map_given"
-        counts = triangulate_map(
+        return triangulate_map(
             mapping,
             mapping,
-            options.point_types(),
-            own,
-            options.triangulation,
+            self.options.point_types(),
+            work.out / UNREFINED,
+            self.options.triangulation,
             num_threads=work.num_threads,
             work=work,
         )
-        if not joined:
-            return counts
-        write_given_map(work, self, given)
-        both = join_maps(KaptureFolder(own), KaptureFolder(given), work.out / UNREFINED)
-        return {**both, "points_triangulated": counts["points"]}

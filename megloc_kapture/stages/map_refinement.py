@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -24,12 +24,10 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.files import link_images, write_json_model
 from megloc_kapture.io.kapture import (
-    FeatureReader,
     KaptureData,
     KaptureFolder,
     Observations,
     write_observations,
-    write_ply,
     write_points3d,
     write_sensors,
 )
@@ -40,17 +38,13 @@ from megloc_kapture.mapping.depth import (
     contradicted_by_depth,
     depth_noise,
 )
-from megloc_kapture.mapping.map_check import ObservedKeypoints, find_pixel_origin
 from megloc_kapture.mapping.uncertainty import (
-    ConsistencyOptions,
     ObservedPoints,
     UncertaintyOptions,
     left_with_too_few,
     mean_depths,
     point_covariances,
     point_deviations,
-    reprojection_errors_px,
-    seen_at_angle,
     too_uncertain,
     track_lengths,
 )
@@ -61,7 +55,8 @@ from megloc_kapture.stages.stage import UNREFINED, Layout, PipelineStage, StageW
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Options, RigidTransform
 
-_SAMPLED_IMAGES = 50
+# a point that lost observations goes when fewer are left
+_MIN_OBSERVATIONS = 2
 # images with one centre are one scan; a lifted point is compared with the scans nearest to its own
 _SAME_CENTRE_M = 1e-3
 _NEIGHBOURING_SCANS = 10
@@ -84,12 +79,11 @@ class FilterReport(BaseModel):
 class MapSelection:
     """A map's points and observations, and which of them are still in."""
 
-    def __init__(self, source: KaptureFolder, min_observations: int) -> None:
+    def __init__(self, source: KaptureFolder) -> None:
         self.source = source
         self.data: KaptureData = source.read()
         self.xyz = np.ascontiguousarray(source.points3d()[:, :3])
         self._of_type = source.observations()
-        self._min_observations = min_observations
         types = list(self._of_type.values())
         self.images = sorted({image for seen in types for image in seen.image_names})
         poses = self.data.poses()
@@ -152,7 +146,7 @@ class MapSelection:
         """Take observations (O,) out, and the points that are left with too few."""
         dropped = dropped & self.kept
         ids = self.point_ids[self.kept]
-        gone = left_with_too_few(ids, dropped[self.kept], len(self.xyz), self._min_observations)
+        gone = left_with_too_few(ids, dropped[self.kept], len(self.xyz), _MIN_OBSERVATIONS)
         self._take_out(name, dropped, gone, checked)
 
     def drop_points(self, name: str, dropped: Mask, checked: int) -> None:
@@ -173,28 +167,6 @@ class MapSelection:
             self._covariances = None  # a point that loses some but not all is less sure
         self.kept &= ~gone
         self.kept_points &= ~points
-
-    def keypoints_px(self) -> NDArray[np.float32]:
-        """Keypoint (O, 2) of every observation, as the cameras have the pixel origin.
-
-        NaN where an image has no pose or no keypoints of the type.
-        """
-        found = []
-        cameras, poses = self._views
-        row_of = {image: row for row, image in enumerate(self.images)}
-        for name, seen in self._of_type.items():
-            rows = [row_of[image] for image in seen.image_names]
-            in_type = ObservedPoints(
-                self.xyz,
-                seen.point_ids,
-                seen.image_ids,
-                [cameras[row] for row in rows] if cameras else [],
-                [poses[row] for row in rows] if poses else [],
-            )
-            posed = [self._poses[row] is not None for row in rows]
-            reader = self.source.keypoints(name) if name in self.source.types("keypoints") else None
-            found.append(_keypoints_of(reader, seen, in_type, posed))
-        return _joined(found, np.float32).reshape(-1, 2)[self._order]
 
     def observations(self) -> dict[str, Observations]:
         """What is in, by type, points renumbered."""
@@ -218,60 +190,14 @@ def _joined(parts: Sequence[NDArray[Any]], dtype: type) -> NDArray[Any]:
     return np.concatenate([np.zeros(0, dtype), *(part.ravel() for part in parts)], dtype=dtype)
 
 
-def _keypoints_of(
-    reader: FeatureReader | None,
-    seen: Observations,
-    observed: ObservedPoints,
-    posed: Sequence[bool],
-) -> NDArray[np.float32]:
-    """Keypoints (O, 2) of one type's observations; see :meth:`MapSelection.keypoints_px`."""
-    keypoints = np.full((len(seen), 2), np.nan, dtype=np.float32)
-    if reader is None or not observed.cameras:
-        return keypoints
-    usable = [i for i, image in enumerate(seen.image_names) if posed[i] and image in reader]
-    sampled = set(usable[:: max(1, len(usable) // _SAMPLED_IMAGES)])
-    sample = []
-    for image, rows in observed.by_image():
-        if not posed[image] or seen.image_names[image] not in reader:
-            continue
-        keypoints[rows] = reader.read(seen.image_names[image])[seen.keypoint_ids[rows], :2]
-        if image in sampled:
-            sample.append(
-                ObservedKeypoints(
-                    seen.image_names[image],
-                    observed.cameras[image],
-                    observed.cams_from_world[image],
-                    keypoints[rows],
-                    np.arange(len(rows)),
-                    seen.point_ids[rows],
-                )
-            )
-    origin = find_pixel_origin(
-        sample, observed.xyz, cameras=[observed.cameras[image] for image in usable]
-    )
-    return keypoints + np.float32(origin.keypoints_shift_px - origin.intrinsics_shift_px)
-
-
 REPORT_FILE = "refinement.json"
-KEPT_FILE, REJECTED_FILE = "refinement_kept.ply", "refinement_rejected.ply"
-
-# from sure to unsure, as viewers show a temperature; and what is not known
-_RAMP = np.array([(49, 54, 149), (116, 173, 209), (255, 255, 191), (244, 109, 67), (165, 0, 38)])
-_UNKNOWN_COLOUR = (128, 128, 128)
 
 
 class MapRefinementOptions(Options):
     """What is taken out of a map; defaults: docs/experiments/map-refinement.md."""
 
     depth: DepthVerificationOptions = DepthVerificationOptions()
-    consistency: ConsistencyOptions = ConsistencyOptions()
     uncertainty: UncertaintyOptions = UncertaintyOptions()
-    min_observations: int = Field(
-        default=2, ge=1, description="a point that lost some goes when it has fewer left"
-    )
-    ply: bool = Field(
-        default=False, description="write the kept and the rejected points as PLY files"
-    )
 
 
 class RefinementReport(BaseModel):
@@ -284,7 +210,7 @@ class RefinementReport(BaseModel):
     points_after: int
     observations_after: int
     filters: tuple[FilterReport, ...]
-    options: MapRefinementOptions
+    options: dict[str, Any]
 
 
 def refine_map(
@@ -303,19 +229,17 @@ def refine_map(
     ``restrictions``: the coordinate frames of the images, which are never compared.
     ``link_features``: the features in the source's own folder may become hard links (they are a map
     of ours, not somebody's data); those beside it always do. Returns counts for the log: points and
-    observations after, and what each filter removed. Raises DataError: no points, or something
-    broken; names the file.
+    observations after, and what each filter removed.
     """
     if not source.has_points():
         raise DataError(
             "no map to refine: reconstruction/points3d.txt or observations.txt is missing",
             path=source.root,
         )
-    selection = MapSelection(source, options.min_observations)
-    before = selection.covariances() if options.ply else None
+    selection = MapSelection(source)
     _verify_depth(selection, options.depth, restrictions, work)
-    _check_consistency(selection, options.consistency)
-    _reject_uncertain(selection, options.uncertainty)
+    if options.uncertainty.max_robust_sigmas is not None:
+        _reject_uncertain(selection, options.uncertainty.max_robust_sigmas)
     kept = selection.kept_points
     report = RefinementReport(
         points_before=len(selection.xyz),
@@ -323,19 +247,15 @@ def refine_map(
         points_after=int(kept.sum()),
         observations_after=int(selection.kept.sum()),
         filters=tuple(selection.reports),
-        options=options,
+        options=options.model_dump(),
     )
     write_sensors(output, selection.data)
     link_images(source.root, output)
     copy_features(source, output, link_own=link_features)
     write_points3d(output, source.points3d()[kept])
     write_observations(output, selection.observations())
-    covariances = selection.covariances()
-    write_point_covariances(output, covariances[kept])
+    write_point_covariances(output, selection.covariances()[kept])
     write_json_model(output / "reconstruction" / REPORT_FILE, report)
-    if before is not None:
-        deviations = point_deviations(np.where(kept[:, None], covariances, before))[:, 2]
-        _write_pictures(output / "reconstruction", source.points3d(), deviations, kept)
     counts: dict[str, float] = {
         "points": report.points_after,
         "observations": report.observations_after,
@@ -528,50 +448,13 @@ def _compare(
     return contradicted, int(checked.sum())
 
 
-def _check_consistency(selection: MapSelection, options: ConsistencyOptions) -> None:
-    if options.max_reprojection_error_px is not None:
-        keypoints = selection.keypoints_px()
-        observed, rows = selection.observed()
-        known = np.isfinite(keypoints[rows]).all(axis=1)
-        errors = reprojection_errors_px(observed, keypoints[rows])
-        dropped = np.zeros(len(selection.kept), dtype=bool)
-        dropped[rows[known & (errors > options.max_reprojection_error_px)]] = True
-        selection.drop_observations("reprojection_error", dropped, int(known.sum()))
-    if options.min_angle_deg is not None:
-        observed, _ = selection.observed()
-        several = track_lengths(observed) > 1
-        narrow = several & ~seen_at_angle(observed, options.min_angle_deg)
-        selection.drop_points("triangulation_angle", narrow, int(several.sum()))
-    if options.min_track_length is not None:
-        lengths = np.bincount(selection.point_ids[selection.kept], minlength=len(selection.xyz))
-        inside = selection.kept_points
-        short = inside & (lengths < options.min_track_length)
-        selection.drop_points("track_length", short, int(inside.sum()))
-
-
-def _reject_uncertain(selection: MapSelection, options: UncertaintyOptions) -> None:
-    if not options.needs_deviations():
-        return
+def _reject_uncertain(selection: MapSelection, max_robust_sigmas: float) -> None:
     deviations = point_deviations(selection.covariances())[:, 2]
-    # who is out already has no share in a quantile of the map
+    # points that are out already do not count in the map's median
     deviations = np.where(selection.kept_points, deviations, np.nan)
-    rejected = too_uncertain(deviations, mean_depths(selection.observed()[0]), options)
+    depths = mean_depths(selection.observed()[0])
+    rejected = too_uncertain(deviations, depths, max_robust_sigmas)
     selection.drop_points("uncertainty", rejected, int(np.isfinite(deviations).sum()))
-
-
-def _write_pictures(folder: Path, points: Floats, deviations: Floats, kept: Mask) -> None:
-    """Kept and rejected points, coloured by their deviation on a logarithmic scale."""
-    known = np.isfinite(deviations) & (deviations > 0)
-    colours = np.empty((len(points), 3), dtype=np.uint8)
-    colours[:] = _UNKNOWN_COLOUR
-    if known.any():
-        logarithms = np.log(deviations[known])
-        low, high = np.quantile(logarithms, [0.05, 0.95])
-        place = np.clip((logarithms - low) / max(high - low, 1e-12), 0, 1) * (len(_RAMP) - 1)
-        steps = np.arange(len(_RAMP))
-        colours[known] = np.stack([np.interp(place, steps, c) for c in _RAMP.T], axis=1)
-    for name, chosen in ((KEPT_FILE, kept), (REJECTED_FILE, ~kept)):
-        write_ply(folder / name, points[chosen, :3], colours[chosen], deviation=deviations[chosen])
 
 
 class RefineMap(PipelineStage):
@@ -580,6 +463,7 @@ class RefineMap(PipelineStage):
     name = "map"
     version = 3
     uses = ("refinement",)
+    explained_by = ("refinement.depth.max_sigmas", "refinement.uncertainty.max_robust_sigmas")
     inputs = (UNREFINED, SIDE_TABLES)
     outputs = (Layout.sparse_map,)
 

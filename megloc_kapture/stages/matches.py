@@ -10,8 +10,8 @@ import math
 import threading
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass
-from functools import cache, cached_property, partial
+from dataclasses import dataclass
+from functools import cached_property, partial
 from itertools import combinations, groupby
 from operator import itemgetter
 from pathlib import Path
@@ -34,6 +34,7 @@ from megloc_kapture.matching.verification import (
     verify_two_view,
     verify_with_poses,
 )
+from megloc_kapture.plugin_loading import checked_array
 from megloc_kapture.plugins import Matcher
 from megloc_kapture.stages.devices import in_batches
 from megloc_kapture.stages.given_map import matched_images
@@ -47,15 +48,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import (
-    HERE,
-    Batched,
-    Digest,
-    FolderSpec,
-    Work,
-    batched,
-    feature_inputs,
-)
+from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, batched
 from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
 
 _log = logging.getLogger(__name__)
@@ -139,18 +132,7 @@ def match_pairs(
     # within a map (a, b) and (b, a) are one pair, kept in one file
     ordered = sorted({_one_way(pair) if within_one else (pair.query, pair.map) for pair in pairs})
     named = {f"{image}\0{other}": (image, other) for image, other in ordered}
-    posed = isinstance(verification, KnownPoseOptions)
-
-    @cache
-    def side(number: int, image: str, digest: Digest) -> object:
-        found = matched_inputs((first, second)[number], local_type, image, digest, posed=posed)
-        return found if posed else [*found, None]
-
-    items = work.items(
-        local_type,
-        list(named),
-        lambda name, digest: [side(k, image, digest) for k, image in enumerate(named[name])],
-    )
+    items = work.items(local_type)
     todo = [pair for name, pair in named.items() if name not in items.done]
     jobs: list[_Job] = []
     for image, group in groupby(todo, key=itemgetter(0)):
@@ -166,8 +148,8 @@ def match_pairs(
     results = work.map(steps, jobs, items.label("matching"))
     for (image, others), found in zip(jobs, results, strict=True):
         for other, pair in zip(others, found, strict=True):
-            file = writer.write(image, other, pair.matches, pair.scores)
-            items.add(f"{image}\0{other}", [file], [pair.num_found, len(pair.matches)])
+            writer.write(image, other, pair.matches, pair.scores)
+            items.add(f"{image}\0{other}", [pair.num_found, len(pair.matches)])
     counts = [PairCount(*pair, *items.done[name]) for name, pair in named.items()]
     write_match_counts(output, local_type, counts)
     return {
@@ -248,17 +230,6 @@ def _evidence(
     return evidence
 
 
-def matched_inputs(
-    folder: KaptureFolder, local_type: str, image: str, digest: Digest, *, posed: bool = False
-) -> list[object]:
-    """What matches of an image are made of: camera and features; where ``posed`` then the pose."""
-    readers = folder.keypoints(local_type), folder.descriptors(local_type)
-    found: list[object] = [astuple(folder.read().camera_of(image))]
-    found += [feature_inputs(reader, image, digest) for reader in readers]
-    pose = folder.read().cam_from_world(image)
-    return [*found, pose and astuple(pose)] if posed else found
-
-
 _Job = tuple[str, Sequence[str]]  # an image of the first folder, and some of the second
 
 
@@ -307,11 +278,7 @@ def _verify(
 def match_all(
     matcher: Matcher, a: ImageFeatures, others: Sequence[ImageFeatures], names: Sequence[str]
 ) -> list[_PairMatches]:
-    """Matches of one image with each of several, as many at once as there is memory for.
-
-    Raises DeviceMemoryError: there is no memory for one pair; PluginError: the matcher returns no
-    matches.
-    """
+    """Match one image with each of several, as many at once as there is memory for."""
     many: Any = matcher
 
     def match(batch: Sequence[ImageFeatures]) -> Sequence[_PairMatches]:
@@ -322,27 +289,18 @@ def match_all(
         "match_many",
         match,
         others,
-        size=lambda b: len(b.keypoints_px) * (len(a.keypoints_px) + 1),
         name=names.__getitem__,
     )
     for (matches, scores), other, name in zip(found, others, names, strict=True):
+        who = f"matcher {type(matcher).__name__} on {name}"
+        checked_array(who, matches, (None, 2), "int64", "int32", "uint64", "uint32")
+        checked_array(who, scores, (len(matches),), "float32", "float64")
         bounds = len(a.keypoints_px), len(other.keypoints_px)
-        if fault := _fault(matches, scores, bounds):
-            raise PluginError(f"matcher {type(matcher).__name__} on {name}: {fault}")
+        if ((matches < 0) | (matches >= bounds)).any():
+            raise PluginError(
+                f"{who}: a match is outside the {bounds[0]} and {bounds[1]} keypoints"
+            )
     return found
-
-
-def _fault(matches: Any, scores: Any, bounds: tuple[int, int]) -> str | None:
-    """What is wrong with what a matcher returned; None: nothing."""
-    if not (isinstance(matches, np.ndarray) and isinstance(scores, np.ndarray)):
-        return "it returns no two arrays"
-    if matches.ndim != 2 or matches.shape[1] != 2 or matches.dtype.kind not in "iu":
-        return f"matches are whole numbers (K, 2), not {matches.dtype} {matches.shape}"
-    if scores.shape != matches.shape[:1]:
-        return f"scores of {len(matches)} matches have the shape {scores.shape}"
-    if len(matches) and ((matches < 0) | (matches >= bounds)).any():
-        return f"a match is of no row of the {bounds[0]} and {bounds[1]} keypoints"
-    return None
 
 
 def verified(a: Features, b: Features, pair: _PairMatches, verify: Verify) -> VerifiedMatches:
@@ -412,10 +370,7 @@ _cache = FeatureCache()
 
 
 def cached_features(spec: FolderSpec, local_type: str, image: str) -> Features:
-    """The features of an image of a folder; kept in this process.
-
-    Raises DataError: features are missing, broken or not finite, or of different number.
-    """
+    """The features of an image of a folder; kept in this process."""
 
     def read() -> Features:
         folder = spec.open()
@@ -451,7 +406,16 @@ def mapping_pairs(work: StageWork, mapping: KaptureFolder) -> list[ImagePair]:
     return [p for p in read_pairs(work.path(MAPPING_PAIRS)) if {p.query, p.map} <= names]
 
 
-class MatchMapping(PipelineStage):
+class _MatchStage(PipelineStage):
+    def explain(self) -> str:
+        options = self.options
+        matched = (
+            f"{o.name} by {(o.matching or options.matching).name}" for o in options.local_features
+        )
+        return f"map = {options.map}, {', '.join(matched)}, verification = {options.verification}"
+
+
+class MatchMapping(_MatchStage):
     """Match and verify pairs of map images."""
 
     name = "mapping_matches"
@@ -484,7 +448,7 @@ class MatchMapping(PipelineStage):
         return counts
 
 
-class MatchQueries(PipelineStage):
+class MatchQueries(_MatchStage):
     """Match and verify queries with their candidates; where those are reranked, with all."""
 
     name = "query_matches"

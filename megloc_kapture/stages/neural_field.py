@@ -111,11 +111,6 @@ def train_field_of_map(
     Returns
     -------
     PSNR in dB of each held-out image by name.
-
-    Raises
-    ------
-    DataError : too few images, or one, its mask or its depth cannot be read; the state is damaged
-        or of another training.
     """
     from safetensors.torch import save
 
@@ -156,16 +151,12 @@ def views_of(mapping: KaptureFolder) -> list[FieldView]:
 
 
 def open_field(folder: Path, device: Device = "auto") -> NeuralField:
-    """A field out of its folder; one that has been opened stays in memory.
-
-    Raises DataError: missing, damaged, or the tensors are not those of the manifest; names the
-    file.
-    """
+    """A field out of its folder; one that has been opened stays in memory."""
     return _opened(weights_file(folder), device)
 
 
 def weights_file(folder: Path) -> WeightsFile:
-    """The tensors of a field; raises DataError where there is none."""
+    """The tensors of a field."""
     if not (folder / FIELD_FILE).is_file():
         raise DataError(f"no {FIELD_FILE} here; megloc train-field writes one", path=folder)
     return describe(FIELD_FILE, (folder / FIELD_FILE).absolute())
@@ -175,8 +166,7 @@ def weights_file(folder: Path) -> WeightsFile:
 def _opened(file: WeightsFile, device: Device) -> NeuralField:
     manifest = read_json_model(file.path.with_name(MANIFEST_FILE), FieldManifest)
     rows = light_rows(manifest.images, manifest.options.lights)
-    sizes = len(manifest.images), max(rows) + 1, manifest.options.gaussians
-    module = build_field(manifest.kind, *sizes)
+    module = build_field(manifest.kind, len(manifest.images), max(rows) + 1)
     load_strictly(module, read_weights(file), str(file.path))
     module.requires_grad_(False)
     return NeuralField(module.to(pick_device(device)), manifest.frame, manifest.images, rows)
@@ -186,8 +176,7 @@ def views_between(data: KaptureData) -> KaptureData:
     """Views that no camera took: halfway between each camera and the nearest that look its way.
 
     Poses, and cameras under sensors of their own, so that kapture merges the renderings with the
-    map; each has the camera of the first of its two images by name. Raises DataError: no two
-    cameras look the same way.
+    map; each has the camera of the first of its two images by name.
     """
     names, poses = data.image_names(), data.poses()
     names = [name for name in names if name in poses]
@@ -264,11 +253,6 @@ def render_along(
     Returns
     -------
     The number of renderings.
-
-    Raises
-    ------
-    DataError : no image has a pose, two are told apart by their endings alone, or the field is
-        damaged or does not know the appearance.
     """
     poses = data.poses()
     if not poses:
@@ -372,10 +356,7 @@ class FieldRefiner:
         references: Sequence[str],
         scene: RankingScene,
     ) -> PoseRefinement:
-        """Refine the pose of a query; the references are not looked at.
-
-        Raises DataError: the query's pixels or the field cannot be read.
-        """
+        """Refine the pose of a query; the references are not looked at."""
         field = open_field(Path(self.options.field), self.options.device)
         image, mask = scene.query_image(query), scene.query_mask(query)
         fitted = _checkers(image.shape[:2])

@@ -24,7 +24,7 @@ from megloc_kapture.plugins import (
 from megloc_kapture.retrieval.fusion import FusionOptions
 from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
 from megloc_kapture.stages.densifying import DensifyOptions
-from megloc_kapture.stages.devices import Precision, placed, unheeded
+from megloc_kapture.stages.devices import Precision, with_device
 from megloc_kapture.stages.global_features import GlobalFeaturesChoice
 from megloc_kapture.stages.image_pairs import MappingPairsOptions, RerankingOptions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
@@ -88,11 +88,10 @@ class PipelineOptions(Options):
     mapping_verification: KnownPoseOptions = KnownPoseOptions()
     query_verification: TwoViewOptions = TwoViewOptions()
     guided_pyramid: GuidedPyramidOptions = GuidedPyramidOptions()
-    map: Literal["triangulate", "lift", "given", "given+triangulate"] = Field(
+    map: Literal["triangulate", "lift", "given"] = Field(
         default="triangulate",
         description="points of the map: triangulated from matches; keypoints lifted through the "
-        "map images' depth maps; those of the model the dataset comes with; or the model's and "
-        "triangulated ones, of two keypoints types",
+        "map images' depth maps; or those of the model the dataset comes with",
     )
     given_features: PluginChoice = Field(
         default=PluginChoice(name="sift"), description="what a given model was made of"
@@ -110,31 +109,10 @@ class PipelineOptions(Options):
 
     @model_validator(mode="after")
     def _placed(self) -> PipelineOptions:
-        """Tell the networks; it is in their options that stages depend on it."""
+        """Put device and precision into the options of the networks that name none."""
         for name in type(self).model_fields:
-            self.__dict__[name] = placed(getattr(self, name), self.device, self.precision)
+            self.__dict__[name] = with_device(getattr(self, name), self.device, self.precision)
         return self
-
-    def idle(self) -> dict[str, str]:
-        lacking = unheeded(self, self.device, self.precision)
-        idle = dict.fromkeys(lacking, "no network is chosen that has it")
-        if len(self.global_features) == 1:
-            idle["fusion"] = "there is one type of global features (global_features)"
-        if not self.makes_points():
-            idle["local_features"] = f"map = {self.map}: the map's own features are used"
-        if not self.uses_given_map():
-            idle["given_features"] = f"map = {self.map} takes no given model"
-            if all(chosen.matching for chosen in self.local_features):
-                idle["matching"] = "each of local_features names its own matching"
-        if not self.triangulates():
-            of_pairs = ("mapping_pairs", "mapping_verification", "triangulation")
-            idle |= dict.fromkeys(of_pairs, f"map = {self.map}: map images are not matched")
-        if self.map != "lift":
-            idle["lifting"] = f"map = {self.map}: keypoints are not lifted"
-        if self.verification == "none":
-            verifications = ("mapping_verification", "query_verification")
-            idle |= dict.fromkeys(verifications, "verification is none")
-        return idle
 
     def make_extractors(self) -> list[LocalFeatureExtractor]:
         """The extractors of local features, in order; raises PluginError, MissingWeightsError."""
@@ -144,7 +122,7 @@ class PipelineOptions(Options):
         ]
 
     def make_given_extractor(self) -> LocalFeatureExtractor:
-        """The extractor of a given map's features; raises PluginError."""
+        """The extractor of a given map's features."""
         extractor: LocalFeatureExtractor = load_plugin(
             LOCAL_FEATURES, self.given_features.name, self.given_features.options
         )
@@ -161,7 +139,7 @@ class PipelineOptions(Options):
 
     def uses_given_map(self) -> bool:
         """Whether the model that the dataset comes with is localized in."""
-        return self.map.startswith("given")
+        return self.map == "given"
 
     def makes_points(self) -> bool:
         """Whether the map has points of features that are extracted here."""
@@ -173,7 +151,7 @@ class PipelineOptions(Options):
 
     def triangulates(self) -> bool:
         """Whether map images are matched with each other."""
-        return self.map in ("triangulate", "given+triangulate")
+        return self.map == "triangulate"
 
     def pairs_by_points(self) -> bool:
         """Whether map images are paired by the points of the model that the dataset comes with."""
@@ -205,10 +183,7 @@ class PipelineOptions(Options):
         return [extractor.name for extractor in self.own_extractors()]
 
     def local_types(self) -> list[str]:
-        """Keypoints types that queries are localized with, the one VLAD uses first.
-
-        Raises PluginError: an extractor cannot be made; OptionError: two types of one name.
-        """
+        """Keypoints types that queries are localized with, the one VLAD uses first."""
         types = [extractor.name for extractor in self.query_extractors()]
         if twice := _first_twice(types):
             raise OptionError(
@@ -243,7 +218,7 @@ class PipelineOptions(Options):
         return self.matching
 
     def make_matcher(self, local_type: str) -> Matcher:
-        """The matcher of a type; raises PluginError."""
+        """The matcher of a type."""
         chosen = self.matching_of(local_type)
         matcher: Matcher = load_plugin(MATCHERS, chosen.name, chosen.options)
         return matcher

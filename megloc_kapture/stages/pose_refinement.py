@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import shutil
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import astuple, fields, replace
-from functools import cache, cached_property, partial
+from dataclasses import fields, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, TypeAdapter
+from pydantic import Field
 
 from megloc_kapture.errors import OptionError, PluginError
 from megloc_kapture.geometry.poses import movement
@@ -55,8 +53,8 @@ from megloc_kapture.refinement.references import (
     spread_names,
 )
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.localized_folder import plain_result, pose_of, write_poses, write_timing
-from megloc_kapture.stages.scene import KaptureScene, image_inputs
+from megloc_kapture.stages.localized_folder import write_poses, write_timing
+from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.stage import (
     LOCALIZED,
     MAP,
@@ -66,7 +64,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, Digest, FolderSpec, Work, map_inputs, ordered_map
+from megloc_kapture.stages.work import HERE, FolderSpec, Work, ordered_map
 from megloc_kapture.values import Camera, Options, Pose, RefinementRow, RigidTransform
 
 # map images held out at once: of those, what comes behind the last that is needed is thrown away
@@ -90,10 +88,6 @@ class PoseRefinementOptions(Options):
         description="map images a refiner may choose from: that look the query's way, the nearest",
     )
 
-    def idle(self) -> dict[str, str]:
-        names = () if self.refines() else ("references", "max_references")
-        return dict.fromkeys(names, "pose_refinement.by is empty")
-
     def with_refiners(self, names: Sequence[str]) -> PoseRefinementOptions:
         """With these refiners, in this order, each with the options that it has here."""
         chosen = chosen_by_name(self.by, names)
@@ -108,17 +102,6 @@ class PoseRefinementOptions(Options):
         return [load_plugin(POSE_REFINERS, one.name, one.options) for one in self.by]
 
 
-def _map_content(mapping: KaptureFolder, digest: Digest) -> str:
-    """A hash of a whole map: a refiner may look at any image, whatever its references are."""
-    of_image = image_inputs(mapping)
-    images = [[name, of_image(name, digest)] for name in sorted(mapping.read().image_names())]
-    content = json.dumps([map_inputs(mapping, digest), images])
-    return hashlib.sha256(content.encode()).hexdigest()
-
-
-_VERDICTS: TypeAdapter[list[Consistency | None]] = TypeAdapter(list[Consistency | None])
-
-
 class MapRefiners:
     """The pose refiners of a map: the images they use, and the frames they are trusted in.
 
@@ -129,10 +112,6 @@ class MapRefiners:
     ----------
     mapping : kapture with poses, and whatever the refiners need: images, depth maps, points.
     restrictions : the coordinate frames of the map's images, which are never mixed.
-
-    Raises
-    ------
-    PluginError, MissingWeightsError : there is no such refiner, or it cannot be made.
     """
 
     def __init__(
@@ -149,7 +128,6 @@ class MapRefiners:
         self._mapping, self._restrictions, self._options = mapping, restrictions, options
         self._verdicts: dict[str, list[Consistency | None]] = {}
         self._lock = threading.Lock()
-        self.map_content = cache(partial(_map_content, mapping))
 
     @cached_property
     def _by_frame(self) -> dict[str, ReferenceImages]:
@@ -167,27 +145,15 @@ class MapRefiners:
         return self._restrictions.frame(pose.candidates[0]) if pose.candidates else ""
 
     def test(self, poses: Iterable[Pose], *, work: Work = HERE) -> None:
-        """Test the frames of these poses that have not been tested.
-
-        Raises DataError: an image or a depth map cannot be read.
-        """
-
-        def inputs(frame: str, digest: Digest) -> object:
-            return [self.map_content(digest), self._by_frame[frame].names]
-
+        """Test the frames of these poses that have not been tested."""
         with self._lock:
-            frames = sorted({self._frame(pose) for pose in poses} - set(self._verdicts))
-            items = work.items("consistency", frames, inputs)
-            for frame in frames:
-                if frame not in items.done:
-                    verdicts = [
-                        self._judge(refiner, self._by_frame[frame], work)
-                        if isinstance(refiner, HoldsOut) and refiner.require_consistent_map
-                        else None
-                        for refiner in self.refiners
-                    ]
-                    items.add(frame, (), _VERDICTS.dump_python(verdicts))
-                self._verdicts[frame] = _VERDICTS.validate_python(items.done[frame])
+            for frame in sorted({self._frame(pose) for pose in poses} - set(self._verdicts)):
+                self._verdicts[frame] = [
+                    self._judge(refiner, self._by_frame[frame], work)
+                    if isinstance(refiner, HoldsOut) and refiner.require_consistent_map
+                    else None
+                    for refiner in self.refiners
+                ]
 
     def _judge(self, refiner: HoldsOut, images: ReferenceImages, work: Work) -> Consistency:
         hold_out, spread = partial(_hold_out, self.map, refiner, images), spread_names(images.names)
@@ -217,7 +183,7 @@ class MapRefiners:
         return tuple(near), tuple(one.reason if one else "" for one in self._verdicts[frame])
 
     def refine(self, image: str, camera: Camera, pose: Pose, scene: RankingScene) -> Pose:
-        """Refine the pose of one query; raises DataError, PluginError."""
+        """Refine the pose of one query."""
         if not self.refiners:
             return pose
         self.test([pose])
@@ -256,10 +222,6 @@ def refine_pose(
     -------
     The pose that the last accepted refiner gave, with its covariance; what each made of it stands
     in its ``refinements``.
-
-    Raises
-    ------
-    PluginError : a refiner breaks its protocol.
     """
     rows, seconds = [], dict(pose.seconds)
     for refiner, reason in zip(refiners, distrusted, strict=True):
@@ -326,11 +288,6 @@ def refine_poses(
     localized : what localization wrote.
     restrictions : the coordinate frames of the map's images, which are never mixed.
     timing : where to write seconds per query and refiner.
-
-    Raises
-    ------
-    DataError : ``status.csv`` is absent or broken; images or depth maps cannot be read.
-    PluginError : there is no such refiner, or it breaks its protocol.
     """
     refiners = MapRefiners(map_folder, restrictions, options)
     statuses = read_status(localized.root / STATUS_FILE)
@@ -351,22 +308,9 @@ def refine_poses(
     }
     refiners.test(poses.values(), work=work)
     uses = {image: refiners.uses(pose) for image, pose in poses.items()}
-    of_query = image_inputs(query)
-
-    def inputs(image: str, digest: Digest) -> object:
-        camera = query.read().camera_of(image)
-        own = (plain_result(poses[image]), astuple(camera), of_query(image, digest), uses[image])
-        return [refiners.map_content(digest), *own]
-
-    items = work.items("refined", list(poses), inputs)
-    jobs = [(image, pose, *uses[image]) for image, pose in poses.items() if image not in items.done]
-    kept = {image: pose_of(plain) for image, plain in items.done.items()}
+    jobs = [(image, pose, *uses[image]) for image, pose in poses.items()]
     refine = partial(_refine, refiners.map, FolderSpec(query), refiners.refiners)
-    results = work.map(refine, jobs, items.label("refining"))
-    for (image, *_), refined in zip(jobs, results, strict=True):
-        kept[image] = refined
-        items.add(image, (), plain_result(refined))
-    found = {image: kept[image] for image in poses}
+    found = dict(zip(poses, work.map(refine, jobs, "refining"), strict=True))
     _write(output, data, localized, statuses, found)
     tested = refiners.tested()
     if tested:
@@ -431,6 +375,7 @@ class RefinePoses(PipelineStage):
     name = "refine_poses"
     version = 4
     uses = ("pose_refinement",)
+    explained_by = ("pose_refinement.by", "pose_refinement.references")
     inputs = (SIDE_TABLES, Layout.query, MAP, UNREFINED_POSES)
     outputs = (LOCALIZED, REFINEMENT_TIMING)
 

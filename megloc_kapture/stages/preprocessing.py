@@ -10,12 +10,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from megloc_kapture.errors import DataError, OptionError, OutputError
@@ -49,11 +48,11 @@ from megloc_kapture.stages.stage import (
     MAPPING,
     PREPROCESSED,
     QUERY,
-    Hashes,
     PipelineStage,
     StageWork,
+    files_fingerprint,
 )
-from megloc_kapture.stages.work import HERE, Digest, Work, content_of
+from megloc_kapture.stages.work import HERE, Work
 
 CLASSES, CLASSES_FILE = "classes", "classes.json"
 REPORT_FILE = "preprocessing.json"
@@ -69,22 +68,16 @@ def _process(
     output: Path,
     classes: ClassMasks | None,
     job: tuple[str, Path, FramePlan, bool, Mapping[str, Path], Mapping[str, Mask]],
-) -> tuple[list[Path], dict[str, float]]:
-    """Write what becomes of one image and its mask.
+) -> dict[str, float]:
+    """Write one image and its mask.
 
-    ``job``: the image and its file; what becomes of it; whether it is linked where it does not
-    change; its mask files, and the masks of its camera in original pixels. Returns the files, links
-    left out; and the share of its pixels masked by each source of masks, and by ``all`` of them,
-    empty where there is none.
+    ``job``: the image and its file; its frame; whether it is linked where it does not
+    change; its mask files, and the masks of its camera in original pixels. Returns the share of
+    its pixels masked by each source of masks, and by ``all`` of them; empty without masks.
     """
     image, source, plan, link, mask_paths, standing = job
     sensors, camera = output / "sensors", plan.original
-    files: list[Path] = []
-
-    def write(path: Path, pixels: NDArray[np.uint8]) -> None:
-        write_image(path, pixels, jpeg_quality=JPEG_QUALITY)
-        files.append(path)
-
+    write = partial(write_image, jpeg_quality=JPEG_QUALITY)
     frame = ProcessedFrame(
         image,
         plan,
@@ -101,11 +94,11 @@ def _process(
     if frame.labels is not None:
         write(sensors / CLASSES / f"{image}.png", frame.labels)
     if frame.mask is None:
-        return files, {}
+        return {}
     together = frame.mask
     write(sensors / "masks" / f"{image}.png", together.astype(np.uint8) * 255)
     masks = {**frame.masks, "all": together}
-    return files, {source: float((~mask).mean()) for source, mask in masks.items()}
+    return {source: float((~mask).mean()) for source, mask in masks.items()}
 
 
 class CameraReport(BaseModel):
@@ -136,10 +129,7 @@ class PreprocessingReport(BaseModel):
 
 
 def read_report(root: Path) -> PreprocessingReport | None:
-    """What was done to a kapture; None where nothing was.
-
-    Raises DataError: the report is broken.
-    """
+    """What was done to a kapture; None where nothing was."""
     path = root / "sensors" / REPORT_FILE
     return read_json_model(path, PreprocessingReport) if path.is_file() else None
 
@@ -169,13 +159,6 @@ def preprocess_images(
     -------
     Counts for the log: images, how many of them changed and have a mask, and the shares of
     pixels masked by each source.
-
-    Raises
-    ------
-    OptionError : a class that the segmenter does not have, an image too small to be cropped, or no
-        camera with enough images for its unchanging region.
-    DataError : an image or a mask is absent, broken, or not of its camera's size.
-    OutputError : the output lies in the folder it is made from, or cannot be written.
     """
     output = Path(output)
     if output.resolve().is_relative_to(folder.root.resolve()):
@@ -202,40 +185,26 @@ def preprocess_images(
         sensor_id = data.record_of(image)[1]
         return standing.of(sensor_id, image, plans[sensor_id].original)
 
-    def inputs(image: str, digest: Digest) -> object:
-        own = files[image]
-        given = [digest(own[one]) if one in own else None for one in ("own", "user")]
-        drawn = [[source, content_of([mask])] for source, mask in standing_of(image).items()]
-        plan = plans[data.record_of(image)[1]]
-        return [digest(folder.image_path(image)), astuple(plan), given, drawn]
-
-    items = work.items(f"images of {folder.root.name}", images, inputs)
-    todo = [image for image in images if image not in items.done]
-    for image in items.done:
-        standing_of(image)  # so that it is known which masks fit none
-        if not (linked or plans[data.record_of(image)[1]].changes_pixels):
-            link_file(folder.image_path(image), output / "sensors" / "records_data" / image)
-
     def jobs() -> Iterator[tuple[str, Path, FramePlan, bool, dict[str, Path], Mapping[str, Mask]]]:
-        for image in todo:
+        for image in images:
             plan = plans[data.record_of(image)[1]]
             link = not (linked or plan.changes_pixels)
             yield image, folder.image_path(image), plan, link, files[image], standing_of(image)
 
     plugins = () if classes is None else (classes.segmenter,)
-    process, label = partial(_process, output, classes), items.label("pre-processing")
-    results = work.map(process, jobs(), label, len(todo), plugins=plugins)
-    for image, (written, found) in zip(todo, results, strict=True):
-        items.add(image, written, found)
+    process = partial(_process, output, classes)
+    results = work.map(process, jobs(), "pre-processing", len(images), plugins=plugins)
     shares: Counter[str] = Counter()
-    for image in images:
-        shares.update(items.done[image])
+    num_masked = 0
+    for found in results:
+        num_masked += bool(found)
+        shares.update(found)
     remarks += [f"a fixed mask fits no image: {one.camera}" for one in standing.unused()]
     taken = Counter(sensor_id for _, sensor_id in data.records_camera)
     report = PreprocessingReport(
         images=len(images),
         images_changed=sum(plans[s].changes_pixels for _, s in data.records_camera),
-        images_masked=sum(bool(items.done[image]) for image in images),
+        images_masked=num_masked,
         cameras={
             sensor_id: CameraReport(
                 images=taken[sensor_id],
@@ -329,6 +298,11 @@ class Preprocess(PipelineStage):
 
     name = "preprocess"
     uses = ("preprocessing",)
+    explained_by = (
+        "preprocessing.max_size_px",
+        "preprocessing.undistort",
+        "preprocessing.masks.segmenter",
+    )
     inputs = (MAPPING, QUERY)
     outputs = (PREPROCESSED,)
 
@@ -339,13 +313,13 @@ class Preprocess(PipelineStage):
         chosen = self.options.preprocessing.masks.segmenter
         return () if chosen is None else (load_plugin(SEGMENTERS, chosen.name, chosen.options),)
 
-    def external(self, hashes: Hashes) -> Mapping[str, str]:
+    def external(self) -> Mapping[str, str]:
         masks = self.options.preprocessing.masks
         drawn = [fixed.file for fixed in masks.fixed if fixed.file is not None]
-        found = {f"mask {path}": hashes.of_file(path.resolve()) for path in drawn}
+        found = {f"mask {path}": files_fingerprint(Path("/"), [path.resolve()]) for path in drawn}
         if masks.user_masks is not None:
             root = masks.user_masks.resolve()
-            found["user masks"] = hashes.of_files(root, root.rglob("*.png"))
+            found["user masks"] = files_fingerprint(root, root.rglob("*.png"))
         return found
 
     def run(self, work: StageWork) -> Mapping[str, float]:

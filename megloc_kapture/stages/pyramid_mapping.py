@@ -1,8 +1,8 @@
 """Stages: guided pyramid matching of map images, and of queries; which add keypoints to images.
 
-What variants of map images give lies in a spool until all is there; then the pairs are gone through
-in order, so that the rows of added keypoints do not depend on the workers. Map images whose poses
-leave them no view in common are not tried.
+The matches of all map images' variants are collected first; then the pairs are combined in order,
+so that the rows of added keypoints do not depend on the workers. Map images whose poses leave them
+no view in common are not tried.
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import partial
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import remove
 from megloc_kapture.io.kapture import (
     FeatureReader,
     ImagePair,
@@ -29,7 +29,7 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.mapping.pairs import views_can_overlap
-from megloc_kapture.matching.guided_pyramid import ImageVariant, PairVerifier, pyramid_type
+from megloc_kapture.matching.guided_pyramid import PairVerifier, VariantMatches, pyramid_type
 from megloc_kapture.matching.pyramid_combination import Combined, KeypointUnion, combine
 from megloc_kapture.matching.verification import KnownPoseOptions, known_pose_of_variants
 from megloc_kapture.plugins import LocalFeatureExtractor
@@ -37,17 +37,15 @@ from megloc_kapture.stages.given_map import matched_images
 from megloc_kapture.stages.guided_pyramid import (
     UNVERIFIED,
     MatchedVariants,
-    MatchSpool,
     PyramidFeatures,
     PyramidMethod,
     RetriedQuery,
-    Spooled,
     match_image_again,
     retry_query,
     tried_row,
     write_tried,
 )
-from megloc_kapture.stages.local_features import image_inputs, read_frame
+from megloc_kapture.stages.local_features import read_frame
 from megloc_kapture.stages.matches import (
     MATCHING_OPTIONS,
     Features,
@@ -55,7 +53,6 @@ from megloc_kapture.stages.matches import (
     Verification,
     cached_features,
     mapping_pairs,
-    matched_inputs,
 )
 from megloc_kapture.stages.stage import (
     FEATURES,
@@ -71,7 +68,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, Digest, FolderSpec, Work, content_of
+from megloc_kapture.stages.work import HERE, FolderSpec, Work
 
 _Pair = tuple[str, str]
 
@@ -99,11 +96,6 @@ def pyramid_mapping(
     Returns
     -------
     Counts for the log, and ``seconds_per_tried_pair``, of one worker.
-
-    Raises
-    ------
-    DataError : features or matches are missing, or an image; or the extractor's features are not
-        like those of ``local_type``.
     """
     data, poses = mapping.read(), mapping.read().poses()
 
@@ -119,38 +111,20 @@ def pyramid_mapping(
     found = num_found or {}
     is_hard = method.options.is_hard
     hard = [p for p in named if is_hard(found.get(p, counts[p]), counts[p]) and can_gain(*p)]
-    hard.sort(key=lambda pair: -counts[pair])
     others: dict[str, tuple[list[str], list[str]]] = defaultdict(lambda: ([], []))
     for a, b in hard:
         others[a][0].append(b)
-        # turning one image is turning the other: b is turned only where it is scaled
+        # rotating one image is rotating the other: b is rotated only where it is scaled
         others[b][1].append(a)
 
-    @cache
-    def side(image: str, digest: Digest) -> list[object]:
-        camera, *read, pose = matched_inputs(mapping, local_type, image, digest, posed=True)
-        return [[camera, pose], *read]
-
-    def inputs(image: str, digest: Digest) -> object:
-        beside = [[other, side(other, digest)] for names in others[image] for other in names]
-        frame = [method.mask_margin_px, image_inputs(mapping, image, digest)]
-        return [frame, side(image, digest), len(others[image][0]), beside]
-
     features = PyramidFeatures(output, mapping, local_type)
-    spool = MatchSpool(output / ".variants", keypoints, mapping.descriptors(local_type))
-    images = sorted(others)
-    items = work.items(f"matched variants of {local_type}", images, inputs)
-    todo = [(image, *others[image]) for image in images if image not in items.done]
     again = partial(_match_again, FolderSpec(mapping), local_type, method)
+    jobs = [(image, *others[image]) for image in sorted(others)]
     plugins = method.extractor, method.matcher
-    results = work.map(again, todo, items.label("guided pyramid"), plugins=plugins)
-    for (image, *_), matched in zip(todo, results, strict=True):
-        file, spooled = spool.write(image, matched.found)
-        told = [spooled, matched.num_variants, matched.skipped, matched.seconds]
-        items.add(image, [file], told)
-    variants = _AllMatched(spool, keypoints)
-    for image in images:
-        variants.put(image, [*others[image][0], *others[image][1]], *items.done[image])
+    results = work.map(again, jobs, "guided pyramid", plugins=plugins)
+    variants = _VariantsOfMap(keypoints)
+    for (image, *names), matched in zip(jobs, results, strict=True):
+        variants.put(image, list(chain(*names)), matched)
     rows, hard_pairs = [], set(hard)
     with MatchesWriter(output, pyramid_type(local_type), orphan=True) as writer:
         for pair in named:
@@ -160,14 +134,12 @@ def pyramid_mapping(
                 rows.append(row)
                 matches, scores = combined.matches, combined.scores
             writer.write(*pair, matches, scores)
-    extended = {image: own for image, own in sorted(variants.added.items()) if own.px is not None}
+    extended = {image: own for image, own in sorted(variants.added.items()) if own.descriptors}
     for image, own in extended.items():
-        assert own.px is not None
-        features.write(image, own.px, spool.descriptors(own.descriptors_at))
+        features.write(image, own.keypoints_px, np.stack(own.descriptors))
     features.write_rest()
-    remove(spool.folder)  # a run that is stopped leaves it to the next
     return {
-        "images_extracted_again": len(images),
+        "images_extracted_again": len(jobs),
         "images_extended": len(extended),
         "pairs": len(named),
         **write_tried(output, local_type, rows, variants.seconds),
@@ -212,43 +184,35 @@ def _match_again(
 
 @dataclass(eq=False)
 class _Added:
-    """What was added to an image: keypoints (A, C), and the records of their descriptors."""
+    """Keypoints (A, C) added to an image, and a descriptor (D,) of each."""
 
-    px: NDArray[np.float32] | None = None
-    descriptors_at: list[tuple[str, int]] = field(default_factory=list)
+    keypoints_px: NDArray[np.float32]
+    descriptors: list[NDArray[Any]] = field(default_factory=list)
 
 
-class _Directed(NamedTuple):
-    """What the variants of an image found in another one, how many were tried, and not at all."""
+@dataclass(frozen=True, eq=False)
+class _Directed:
+    """Matches of an image's variants with one other image."""
 
-    spooled: list[Spooled]
+    found: list[VariantMatches]
     num_variants: int
     skipped: str
 
 
-class _AllMatched:
-    """What the images' variants found, by image and the other one, and what it adds to images."""
+class _VariantsOfMap:
+    """The matches of all images' variants, by image and other image, and the added keypoints."""
 
-    def __init__(self, spool: MatchSpool, keypoints: FeatureReader) -> None:
-        self._spool, self._keypoints = spool, keypoints
+    def __init__(self, keypoints: FeatureReader) -> None:
+        self._keypoints = keypoints
         self._found: dict[_Pair, _Directed] = {}
-        self.added: dict[str, _Added] = defaultdict(_Added)
+        self.added: dict[str, _Added] = {}
         self.seconds = 0.0
 
-    def put(
-        self,
-        image: str,
-        others: Sequence[str],
-        found: Sequence[Sequence[Sequence[Any]]],
-        num_variants: Sequence[int],
-        skipped: str,
-        seconds: float,
-    ) -> None:
-        """Keep what the variants of one image came to; ``found`` as :meth:`MatchSpool.write`."""
-        self.seconds += seconds
-        for other, of_other, count in zip(others, found, num_variants, strict=True):
-            spooled = [Spooled(ImageVariant(*variant), *rows) for variant, *rows in of_other]
-            self._found[image, other] = _Directed(spooled, count, skipped)
+    def put(self, image: str, others: Sequence[str], matched: MatchedVariants) -> None:
+        """Keep the matches of one image's variants with ``others``."""
+        self.seconds += matched.seconds
+        for other, own, count in zip(others, matched.found, matched.num_variants, strict=True):
+            self._found[image, other] = _Directed(own, count, matched.skipped)
 
     def combine(
         self, pair: _Pair, base: tuple[NDArray[np.int64], NDArray[Any]], method: PyramidMethod
@@ -256,30 +220,28 @@ class _AllMatched:
         """The matches of a pair with those of the variants of both its images, and its row."""
         if method.options.mode == "off":
             raise ValueError("only pairs that are tried again are combined")
-        names, found = ("image", "other"), dict[Literal[0, 1], _Directed]()
-        if pair in self._found:
-            found[0] = self._found[pair]
-        if pair[::-1] in self._found:
-            found[1] = self._found[pair[::-1]]
-        spooled = [(side, one) for side, own in found.items() for one in own.spooled]
-        tried = [(side, self._spool.get(pair[side], one)) for side, one in spooled]
-        first, second = (
-            KeypointUnion(self._keypoints.read(one), self.added[one].px) for one in pair
-        )
-        combined = combine(base, tried, method.options.mode, (first, second))
-        for image, union, new in zip(pair, (first, second), combined.added, strict=True):
-            if len(new):
-                self.added[image].px = union.added()
-            for number, match in new.tolist():
-                side, one = spooled[number]
-                self.added[image].descriptors_at.append((pair[side], one.begin + match))
-        best = ""
+        directed = self._found[pair], self._found[pair[::-1]]
+        tried = [(side, one) for side, own in enumerate(directed) for one in own.found]
+        unions = []
+        for image in pair:
+            stored = self._keypoints.read(image)
+            if image not in self.added:
+                self.added[image] = _Added(stored[:0])
+            unions.append(KeypointUnion(stored, self.added[image].keypoints_px))
+        combined = combine(base, tried, method.options.mode, (unions[0], unions[1]))
+        for image, union, new in zip(pair, unions, combined.added, strict=True):
+            added = self.added[image]
+            added.keypoints_px = union.added()
+            added.descriptors += [tried[number][1].descriptors[row] for number, row in new.tolist()]
+        names, best = ("image", "other"), ""
         if combined.best is not None:
-            side, one = spooled[combined.best]
+            side, one = tried[combined.best]
             best = f"{names[side]} {one.variant}"
-        count = sum(own.num_variants for own in found.values())
-        why = [f"{names[side]} {own.skipped}" for side, own in found.items() if own.skipped]
-        return combined, tried_row(pair, len(base[0]), combined, count, best, " | ".join(why))
+        skipped = [
+            f"{names[side]} {own.skipped}" for side, own in enumerate(directed) if own.skipped
+        ]
+        count = sum(own.num_variants for own in directed)
+        return combined, tried_row(pair, len(base[0]), combined, count, best, " | ".join(skipped))
 
 
 def pyramid_queries(
@@ -312,50 +274,29 @@ def pyramid_queries(
     both = dict.fromkeys((pair.query, pair.map) for pair in pairs)
     for image, other in sorted(both, key=itemgetter(0)):
         candidates.setdefault(image, []).append(other)
-    stored = query.matches(local_type)
-
-    @cache
-    def side(number: int, image: str, digest: Digest) -> list[object]:
-        return matched_inputs((query, mapping)[number], types[number], image, digest)
-
-    def inputs(image: str, digest: Digest) -> object:
-        of_pairs = [
-            [
-                other,
-                side(1, other, digest),
-                content_of(stored.read(image, other)),
-                before.get((image, other)),
-            ]
-            for other in candidates[image]
-        ]
-        read = image_inputs(query, image, digest)
-        return [method.mask_margin_px, read, side(0, image, digest), of_pairs]
-
-    items = work.items(local_type, list(candidates), inputs)
     jobs = [
         (image, others, {one: before[image, one] for one in others if (image, one) in before})
         for image, others in candidates.items()
-        if image not in items.done
     ]
-    features = PyramidFeatures(output, query, local_type, items.done)
+    features = PyramidFeatures(output, query, local_type)
     retry = partial(_retry, FolderSpec(query), FolderSpec(mapping), types, method)
     plugins = method.extractor, method.matcher
+    rows, seconds, extended = [], 0.0, 0
     with MatchesWriter(output, larger, orphan=True) as writer:
-        results = work.map(retry, jobs, items.label("guided pyramid"), plugins=plugins)
+        results = work.map(retry, jobs, "guided pyramid", plugins=plugins)
         for (image, *_), found in zip(jobs, results, strict=True):
-            files = [writer.write(image, *one) for one in found.matches]
-            files += features.write(image, found.added_px, found.added_descriptors)
-            tried = {"rows": found.rows, "seconds": found.seconds}
-            items.add(image, files, [len(found.added_px) > 0, tried])
+            for one in found.matches:
+                writer.write(image, *one)
+            features.write(image, found.added_px, found.added_descriptors)
+            rows += found.rows
+            seconds += found.seconds
+            extended += len(found.added_px) > 0
     features.write_rest()
-    done = [items.done[image] for image in candidates]
-    rows = [row for _, tried in done for row in tried["rows"]]
-    counts = write_tried(output, local_type, rows, sum(tried["seconds"] for _, tried in done))
     return {
         "images_extracted_again": len({row[0] for row in rows}),
-        "images_extended": sum(extended for extended, _ in done),
+        "images_extended": extended,
         "pairs": sum(map(len, candidates.values())),
-        **counts,
+        **write_tried(output, local_type, rows, seconds),
     }
 
 
@@ -412,6 +353,7 @@ class PyramidMapping(_PyramidStage):
     name = "mapping_pyramid"
     version = 2
     uses = (*MATCHING_OPTIONS, "mapping_verification", "guided_pyramid", "mask_margin_px")
+    explained_by = ("guided_pyramid.mode", "guided_pyramid.min_matches")
     inputs = (Layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS, MAPPING_MATCHES)
     outputs = (MAPPING_PYRAMID,)
 
@@ -438,6 +380,7 @@ class PyramidQueries(_PyramidStage):
     name = "query_pyramid"
     version = 2
     uses = (*MATCHING_OPTIONS, "query_verification", "guided_pyramid", "mask_margin_px")
+    explained_by = ("guided_pyramid.mode", "guided_pyramid.min_matches")
     inputs = (Layout.mapping, Layout.query, LOCAL_FEATURES, MAP, QUERY_PAIRS, QUERY_MATCHES)
     outputs = (QUERY_PYRAMID,)
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, replace
-from functools import cache, lru_cache, partial
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import chain
 from pathlib import Path
 
@@ -34,13 +34,11 @@ from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, PoseRanker, RankingScene
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.localized_folder import (
-    plain_result,
-    result_of,
     unreadable_queries,
     write_localized,
 )
 from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.stages.scene import KaptureScene, Unit, image_inputs, query_units
+from megloc_kapture.stages.scene import KaptureScene, Unit, query_units
 from megloc_kapture.stages.shared_index import index_map, open_index, shared_index, with_noise
 from megloc_kapture.stages.stage import (
     FEATURES,
@@ -57,12 +55,8 @@ from megloc_kapture.stages.stage import (
 )
 from megloc_kapture.stages.work import (
     HERE,
-    Digest,
     FolderSpec,
     Work,
-    content_of,
-    feature_inputs,
-    map_inputs,
 )
 from megloc_kapture.values import MIN_CONFIDENCE, Failure, Options, Pose, RigidTransform
 
@@ -102,7 +96,7 @@ class LocalizationOptions(Options):
     )
 
     def make_ranker(self) -> PoseRanker:
-        """The ranker of candidate poses; raises PluginError."""
+        """The ranker of candidate poses."""
         ranker: PoseRanker = load_plugin(POSE_RANKERS, self.rank.name, self.rank.options)
         return ranker
 
@@ -278,55 +272,21 @@ def localize_from_matches(
         pyramid's type by the type it was made of, whose keypoints come first in it.
     restrictions : the coordinate frames of the map's images, which are never mixed.
     scratch : folder for the map's index meanwhile, the system's unless given.
-
-    Raises
-    ------
-    DataError : the map does not know a type.
-    PluginError : there is no such ranker, or it refuses its options.
     """
     ranker = options.make_ranker()
     candidates = {name: tuple(images) for name, images in iterate_candidates(pairs)}
     units = query_units(query.read(), rigs=options.rigs)
     read = {name: index_map(map_folder, type_in_map(map_folder, name)) for name in local_types}
     measured = {name: with_noise(map_folder, index) for name, index in read.items()}
-    unit_of = {"\0".join(image for image, _ in unit): unit for unit in units}
-    of_query, of_map = image_inputs(query), image_inputs(map_folder)
-    points_of = cache(partial(map_inputs, map_folder))
-
-    def inputs(name: str, digest: Digest) -> object:
-        found: list[object] = [points_of(digest)]
-        for image, cam_from_rig in unit_of[name]:
-            own = candidates.get(image, ())
-            found += [astuple(cam_from_rig), astuple(query.read().camera_of(image))]
-            found += [of_query(image, digest), [restrictions.frame(other) for other in own]]
-            found.append([[other, of_map(other, digest)] for other in own])
-            for local_type in local_types:
-                reader = matches.matches(local_type)
-                pairs = [(image, other) for other in own if (image, other) in reader]
-                found.append(feature_inputs(query.keypoints(local_type), image, digest))
-                found.append([[pair[1], content_of(reader.read(*pair))] for pair in pairs])
-        return found
-
-    items = work.items("poses", list(unit_of), inputs)
     jobs: list[_Job] = []
-    for name, unit in unit_of.items():
-        if name not in items.done:
-            own = [candidates.get(image, ()) for image, _ in unit]
-            jobs.append((unit, own, {one: restrictions.frame(one) for one in chain(*own)}))
+    for unit in units:
+        own = [candidates.get(image, ()) for image, _ in unit]
+        jobs.append((unit, own, {one: restrictions.frame(one) for one in chain(*own)}))
     specs = FolderSpec(map_folder), FolderSpec(query), FolderSpec(matches)
     with shared_index(measured, scratch) as indices:
         localizer = _Localizer(*specs, indices, options, ranker)
-        kept = dict(items.done)
-        fresh = iter(work.map(localizer, jobs, items.label("localizing")))
-        for name in unit_of:
-            if name in kept:
-                yield from ((image, result_of(found)) for image, found in kept[name])
-                continue
-            results = next(fresh)
-            items.add(name, (), [[image, plain_result(found)] for image, found in results])
+        for results in work.map(localizer, jobs, "localizing"):
             yield from results
-        for _ in fresh:  # lets a progress bar see its end
-            pass
 
 
 def type_in_map(map_folder: KaptureFolder, local_type: str) -> str:
@@ -342,6 +302,11 @@ class LocalizeQueries(PipelineStage):
     name = "localization"
     version = 10
     uses = ("localization", "guided_pyramid.mode", *LOCAL_TYPES)
+    explained_by = (
+        "localization.clusters.by",
+        "localization.rank",
+        "localization.min_confidence",
+    )
     inputs = (
         MAPPING,
         QUERY,

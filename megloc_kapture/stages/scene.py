@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
+from functools import cached_property, lru_cache
 from operator import itemgetter
 from typing import Protocol
 
@@ -22,7 +22,6 @@ from megloc_kapture.localization.map_index import MapIndex
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.stages.local_features import mask_path, read_image_of, read_mask
 from megloc_kapture.stages.shared_index import index_map
-from megloc_kapture.stages.work import Digest
 from megloc_kapture.values import Camera, Pose, RigidTransform
 
 Unit = tuple[tuple[str, RigidTransform], ...]
@@ -129,7 +128,7 @@ def depth_records(data: KaptureData) -> dict[str, DepthRecord]:
 
 
 def read_depth(folder: KaptureFolder, record: DepthRecord) -> NDArray[np.float32]:
-    """Depth (H, W) of a record, 0 where nothing is known; raises DataError."""
+    """Depth (H, W) of a record, 0 where nothing is known."""
     size = {"width": record.camera.width, "height": record.camera.height}
     return read_depth_map(folder.depth_path(record.path), **size)
 
@@ -227,7 +226,7 @@ class QueryScene(Protocol):
     """Pixels, mask and depth of query images by their names; see :class:`KaptureScene`."""
 
     def image(self, name: str) -> NDArray[np.uint8]:
-        """RGB pixels (H, W, 3); raises DataError."""
+        """RGB pixels (H, W, 3)."""
         ...
 
     def mask(self, name: str) -> NDArray[np.bool_] | None:
@@ -235,12 +234,12 @@ class QueryScene(Protocol):
         ...
 
     def depth(self, name: str) -> DepthView | None:
-        """Depth that was taken with the image; None without; raises DataError."""
+        """Depth that was taken with the image; None without."""
         ...
 
 
 def depth_of(folder: KaptureFolder, name: str) -> DepthView | None:
-    """Depth that was taken with an image of a folder; None without; raises DataError."""
+    """Depth that was taken with an image of a folder; None without."""
     return _images_of(folder).depth(name)
 
 
@@ -297,19 +296,3 @@ class KaptureScene:
         if pose is None:
             raise DataError(f"map image {name} has no pose", path=self._map.folder.root)
         return pose
-
-
-def image_inputs(folder: KaptureFolder) -> Callable[[str, Digest], list[str | None]]:
-    """What a ranker may look at: an image's file, its mask and its depth."""
-    names, records = set(folder.read().image_names()), depth_records(folder.read())
-
-    @cache
-    def of_image(image: str, digest: Digest) -> list[str | None]:
-        if image not in names:
-            return []
-        files = [folder.image_path(image), mask_path(folder, image)]
-        if image in records:
-            files.append(folder.depth_path(records[image].path))
-        return [digest(file) if file.is_file() else None for file in files]
-
-    return of_image

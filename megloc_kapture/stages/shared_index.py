@@ -34,8 +34,7 @@ def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
     """Read the points, their uncertainty and the observations of one keypoints type.
 
     A type whose keypoints the map has, but none with a point, has an index without points: nothing
-    of it could be triangulated. Raises DataError: the map does not know the type, or has
-    covariances of another map's points.
+    of it could be triangulated.
     """
     observations = folder.observations().get(local_type)
     if observations is None:
@@ -103,10 +102,7 @@ def _finite_median(parts: Sequence[NDArray[np.float64]]) -> float:
 
 
 def write_index(index: MapIndex, folder: Path) -> None:
-    """Write an index as files in a folder, which is made where it is missing.
-
-    Raises OutputError: cannot be written.
-    """
+    """Write an index as files in a folder, which is made where it is missing."""
     arrays = [name for name in _ARRAYS if getattr(index, name) is not None]
     for name in arrays:
         write_array(folder / f"{name}.npy", getattr(index, name))
@@ -117,10 +113,7 @@ def write_index(index: MapIndex, folder: Path) -> None:
 
 
 def open_index(folder: Path) -> MapIndex:
-    """Open what :func:`write_index` wrote: arrays are mapped, not read, and cannot be written to.
-
-    Raises DataError: a file is missing or cut.
-    """
+    """Open an index of :func:`write_index`: read-only memory-mapped arrays."""
     try:
         names, images, others = json.loads((folder / "index.json").read_bytes())
         files = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in names}
@@ -139,7 +132,7 @@ def shared_index(
     """Indices by keypoints type as folders for :func:`open_index`; gone after the block.
 
     Who has one open by then may go on using it. ``scratch``: folder for them meanwhile, the
-    system's unless given. Raises OutputError: the folder cannot be written to.
+    system's unless given.
     """
     where = tempfile.gettempdir() if scratch is None else scratch
     try:

@@ -7,14 +7,17 @@ stage of another package, its command. ``docs/plugins.md`` has an example.
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
+from typing import TYPE_CHECKING, Any, ClassVar
 
+from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugin_loading import code_of, is_ours, weights_of
 from megloc_kapture.stages.work import Work
@@ -134,16 +137,17 @@ LayoutPath = str | Callable[[Layout], str | tuple[str, ...]]
 """A path in the workspace, or the method of :class:`Layout` that gives it, or several."""
 
 
-class Hashes(Protocol):
-    """Fingerprints of files outside the workspace."""
-
-    def of_file(self, path: Path) -> str:
-        """Hash of one file's content; raises DataError when it cannot be read."""
-        ...
-
-    def of_files(self, root: Path, files: Iterable[Path]) -> str:
-        """One hash of many files: their names relative to ``root`` and their contents."""
-        ...
+def files_fingerprint(root: Path, files: Iterable[Path]) -> str:
+    """Return a hash of the files' names relative to ``root``, their sizes and times."""
+    digest = hashlib.sha256()
+    for file in sorted(files):
+        try:
+            state = os.stat(file)
+        except OSError as error:
+            raise DataError(f"cannot be read: {error.strerror}", path=file) from error
+        name = os.path.relpath(file, root)
+        digest.update(f"{name}\0{state.st_size}\0{state.st_mtime_ns}\0".encode())
+    return digest.hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,7 +177,8 @@ class StageWork(Work):
 
 
 CODE_OF = "code of "
-ROOT = "root"  # name of that folder among what an import has read
+ROOT = "root"  # the imported folder, among the inputs of an import
+PROTOCOL = "protocol"  # of the evaluation, among the options of an import
 
 
 def is_below(path: str, folder: str) -> bool:
@@ -207,8 +212,8 @@ class Stage(ABC):
         chosen: dict[str, Any] = self.options.model_dump(mode="json")
         return chosen
 
-    def external(self, hashes: Hashes) -> Mapping[str, str]:
-        """Fingerprints of what is read from outside the workspace, by what they are of."""
+    def external(self) -> Mapping[str, str]:
+        """Return fingerprints of inputs outside the workspace; see :func:`files_fingerprint`."""
         return {}
 
     def plugins(self) -> Sequence[object]:
@@ -230,10 +235,7 @@ class Stage(ABC):
 
     @abstractmethod
     def run(self, work: StageWork) -> Mapping[str, float]:
-        """Write the outputs; returns counts for the log, see :func:`count_text`.
-
-        Raises MeglocError: the data or the options cannot be used; the workspace stays as it was.
-        """
+        """Write the outputs; returns counts for the log, see :func:`count_text`."""
 
 
 # the options that decide which types of local features there are
@@ -241,26 +243,24 @@ LOCAL_TYPES = ("map", "local_features.name", "local_features.options", "given_fe
 
 
 class PipelineStage(Stage):
-    """A stage of ours: it has the options of the pipeline that it declares, and no others.
+    """A stage of the pipeline.
 
     Attributes
     ----------
-    uses : the keys of the options that determine the output; ``local_features.name`` is the
-        names of all choices, when all else about them does not matter. What a stage does not
-        declare it cannot read, so that none of it can be forgotten.
-    inputs, outputs : what is read and written, some of it as the options lead to.
+    uses : keys of the options that determine the output; ``local_features.name`` means the
+        names of all choices.
+    explained_by : keys of the options that say best whether and how the stage runs.
+    inputs, outputs : paths that are read and written; some depend on the options.
     """
 
     uses: ClassVar[tuple[str, ...]] = ()
+    explained_by: ClassVar[tuple[str, ...]] = ()
     inputs: ClassVar[tuple[LayoutPath, ...]] = ()
     outputs: ClassVar[tuple[LayoutPath, ...]] = ()
 
     def __init__(self, options: PipelineOptions) -> None:
-        self.options: PipelineOptions = cast(
-            "PipelineOptions", _Declared(options, type(self).__name__, self.uses)
-        )
+        self.options: PipelineOptions = options
         self.layout = Layout(options)
-        self._all = options
 
     @property
     def reads(self) -> Sequence[str]:  # type: ignore[override]
@@ -271,13 +271,17 @@ class PipelineStage(Stage):
         return self.layout.paths(self.outputs)
 
     def is_wanted(self) -> bool:
-        """Whether the options ask for what the stage does."""
+        """Return whether the options ask for the stage."""
         return True
+
+    def explain(self) -> str:
+        """Return the values of the options in :attr:`explained_by`."""
+        return ", ".join(f"{key} = {_option_text(self.options, key)}" for key in self.explained_by)
 
     def settings(self) -> dict[str, Any]:
         # where networks compute is no part: what is done stays done when it goes on elsewhere
         dump = json.loads(
-            json.dumps(self._all.model_dump(mode="json")),
+            json.dumps(self.options.model_dump(mode="json")),
             object_hook=lambda table: {k: v for k, v in table.items() if k != "device"},
         )
         chosen: dict[str, Any] = _selected(dump, [key.split(".") for key in self.uses])
@@ -294,19 +298,12 @@ def wanted_stages(
     return [stage for kind in kinds if (stage := kind(options)).is_wanted()]
 
 
-class _Declared:
-    """Options of which only some may be read; methods see what those that call them see."""
-
-    def __init__(self, options: PipelineOptions, stage: str, uses: Sequence[str]) -> None:
-        self._options, self._stage = options, stage
-        self._allowed = {key.split(".")[0] for key in uses}
-
-    def __getattr__(self, name: str) -> Any:
-        if name not in type(self._options).model_fields:
-            return getattr(type(self._options), name).__get__(self)
-        if name not in self._allowed:
-            raise AttributeError(f"{self._stage} reads option {name}, which it does not declare")
-        return getattr(self._options, name)
+def _option_text(options: Any, key: str) -> str:
+    value = options
+    for name in key.split("."):
+        value = getattr(value, name)
+    several = value if isinstance(value, tuple) else (value,)
+    return " + ".join(str(getattr(one, "name", one)) for one in several) or "none"
 
 
 def _selected(dump: Any, paths: Sequence[Sequence[str]]) -> Any:

@@ -63,7 +63,7 @@ class LiftedPoints:
 def stereo_images(folder: KaptureFolder) -> dict[str, tuple[str, ...]]:
     """The images that have depth by stereo, by name, each with those it was compared with.
 
-    Empty where there is no densified map; raises DataError where its table is broken.
+    Empty where there is no densified map.
     """
     path = folder.root / DEPTH_FILE
     rows = read_depth_rows(path) if path.is_file() else []
@@ -84,7 +84,8 @@ def read_beside(
     root: Path, image: str, kind: Literal["sigma", "normals"]
 ) -> NDArray[np.float32] | None:
     """Standard deviations (H, W) or normals (H, W, 3) of an image's depth by stereo, float32, 0
-    where nothing is known; None without; raises DataError."""
+    where nothing is known; None without.
+    """
     path = side_file(root, image, kind)
     if not path.is_file():
         return None
@@ -197,10 +198,6 @@ def fused_cloud(
     ----------
     images : some of :func:`stereo_images`.
     max_points : about so many pixels are looked at, the same ones each time; None: all.
-
-    Raises
-    ------
-    DataError : something is broken; names the file.
     """
     records = depth_records(densified.read())
     cameras = [records[image].camera for image in images if image in records]
@@ -221,8 +218,7 @@ def fuse_depth(
 ) -> int:
     """Write the depth maps of :mod:`.densifying` as a PLY cloud with normals and deviations.
 
-    Returns number of points. Raises DataError: no densified map, or something broken; names the
-    file.
+    Returns number of points.
     """
     path = densified.root / DEPTH_FILE
     if not path.is_file():

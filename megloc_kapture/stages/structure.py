@@ -178,10 +178,7 @@ def write_posed(output: Path, data: KaptureData, model: Model) -> None:
 
 
 def _scaled(model: Model, structure: StructureOptions) -> tuple[World, Model, dict[str, float]]:
-    """The model in metres where they are known, its world, and counts for the log.
-
-    Raises DataError: what should tell the scale does not.
-    """
+    """The model in metres where they are known, its world, and counts for the log."""
     if structure.distance is not None:
         first, second, metres = structure.distance
         for name in (first, second):

@@ -1,193 +1,92 @@
-"""Per-image and per-pair work: in order, with bounded memory, a progress bar and a journal.
+"""Per-image and per-pair work: in order, with bounded memory and a progress bar.
 
-It runs on an executor, whose processes have a processor each. What computes on a GPU of this
-machine runs in this process, the only one that has it: threads read ahead, one computes batches,
-and the executor has what follows.
-
-A stage that is at work lists what it has done in the journal, a line per item: a hash of all that
-the item is made of (the stage's settings, the code of its plugins, the content of what is read),
-the files it became, and what the stage wants to know of it later. The next run takes over the
-items whose hash is the same and whose files are as they were written, from what stopped runs have
-left and from the finished output, by links; so it ends in the bytes that it would have made. A line
-follows its files, and half a line is none: whenever a run is killed, what is taken over is whole.
+It runs on an executor, whose processes have a processor each. Networks on a GPU of this machine
+run in this process, the only one that has it: threads read ahead, one computes batches, and the
+executor does what follows.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from itertools import chain, groupby, islice
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 from uuid import uuid4
 
-import numpy as np
-from numpy.typing import NDArray
-
-from megloc_kapture.errors import DataError, OutputError
-from megloc_kapture.io.files import check_relative, hard_link, output_error
-from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
-from megloc_kapture.io.output_folders import FileState, state_if_unchanged, state_of
+from megloc_kapture.io.files import output_error
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.stages.devices import most_at_once, on_gpu
 
-Digest = Callable[[Path], str]
-"""Hash of a file's content; raises DataError where it cannot be read."""
-Inputs = Callable[[str, Digest], object]
-"""What an item of a name is made of, as plain JSON values."""
 
+class FinishedItems:
+    """The finished items of a stage, which a stopped run leaves for the next one.
 
-def feature_inputs(reader: FeatureReader, image: str, digest: Digest) -> list[object]:
-    """What is read of an image's features: how they are stored, and their content."""
-    if image not in reader:
-        return []
-    file = Path(reader.where(image))
-    in_tar = not file.is_file()
-    content = content_of([reader.read(image)]) if in_tar else digest(file)
-    return [reader.config.dtype.name, reader.config.dsize, content]
-
-
-def map_inputs(mapping: KaptureFolder, digest: Digest) -> list[list[str]]:
-    """What every query reads of the map: points, observations, cameras, poses."""
-    root = mapping.root
-    files = [*(root / "reconstruction").rglob("*"), *(root / "sensors").glob("*.txt")]
-    return [[str(f.relative_to(root)), digest(f)] for f in sorted(files) if f.is_file()]
-
-
-def content_of(arrays: Iterable[NDArray[Any]]) -> str:
-    """A hash of arrays."""
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(f"{array.dtype} {array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()
-
-
-class _Entry(NamedTuple):
-    files: dict[str, FileState]  # by path below the folder
-    said: Any
-
-
-@dataclass(eq=False)
-class KeptItems:
-    """What a stage has done of its items, in this run and in those before.
-
-    Parameters
-    ----------
-    settings : hash of all that determines the output beside what items read.
-    out : the folder that the stage writes into.
-    journal : lines are added as items are done.
-    sources : folders that may have items, and their journals; the first that has one counts.
-    verify : hash all files that are taken over, see
-        :func:`~megloc_kapture.io.output_folders.state_if_unchanged`.
-    states : of the files of items that are done, by path below the folder.
+    The first line of the file is the stage's fingerprint. A line of JSON per item follows,
+    appended once the item's files are written.
     """
 
-    settings: str
-    out: Path
-    journal: Path
-    sources: Sequence[tuple[Path, Path]]
-    digest: Digest
-    verify: bool = False
-    states: dict[str, FileState] = field(default_factory=dict, init=False)
-    num_kept: int = field(default=0, init=False)
-    num_items: int = field(default=0, init=False)
+    def __init__(self, path: Path, fingerprint: str) -> None:
+        self._path, self._fingerprint = path, fingerprint
+        self._found: dict[tuple[str, str], Any] = {}
+        for line in self._lines():
+            try:
+                kind, name, values = json.loads(line)
+            except ValueError:  # cut when the run was killed
+                continue
+            self._found[kind, name] = values
+        self.num_kept = len(self._found)
 
-    def key(self, kind: str, name: str, inputs: Inputs) -> str:
-        """The hash that an item is known by."""
-        content = [self.settings, kind, name, inputs(name, self.digest)]
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    def _lines(self) -> list[str]:
+        if not is_resumable(self._path, self._fingerprint):
+            return []
+        return self._path.read_text(encoding="utf-8", errors="replace").splitlines()[1:]
 
-    def take(self, key: str) -> _Entry | None:
-        """Take over the item of a hash, if it is there."""
-        self.num_items += 1
-        for root, entries in self._entries:
-            entry = entries.get(key)
-            if entry is not None and self._link(root, entry.files):
-                self._note(key, entry)
-                self.num_kept += 1
-                return entry
-        return None
+    def of(self, kind: str) -> dict[str, Any]:
+        """Return the items of one kind: name to the values that were noted."""
+        return {name: values for (of, name), values in self._found.items() if of == kind}
 
-    def add(self, key: str, files: Iterable[Path], said: Any) -> None:
-        """Note that an item is done: its files below the folder, and what is said of it."""
-        paths = {file.relative_to(self.out).as_posix(): file for file in files}
+    def add(self, kind: str, name: str, values: Any) -> None:
+        """Note a finished item with plain JSON values."""
         try:
-            found = {path: self.states.get(path) or state_of(file) for path, file in paths.items()}
+            with open(self._path, "a", encoding="utf-8") as file:
+                if file.tell() == 0:
+                    file.write(f"{self._fingerprint}\n")
+                file.write(json.dumps([kind, name, values]) + "\n")
         except OSError as error:
-            raise output_error(self.out, error) from error
-        self._note(key, _Entry(found, said))
-
-    @cached_property
-    def _entries(self) -> list[tuple[Path, dict[str, _Entry]]]:
-        return [(root, _read_journal(path)) for root, path in self.sources]
-
-    def _link(self, root: Path, files: Mapping[str, FileState]) -> bool:
-        """Link an item's files where all are as they were written."""
-        for path, state in files.items():
-            there = self.states.get(path)  # a file that items share
-            if there not in (None, state):
-                return False
-            if there is None and not state_if_unchanged(root / path, state, verify=self.verify):
-                return False
-        try:
-            for path in files.keys() - self.states.keys():
-                hard_link(root / path, self.out / path)
-        except OutputError:
-            return False
-        return True
-
-    def _note(self, key: str, entry: _Entry) -> None:
-        self.states.update(entry.files)
-        try:
-            with open(self.journal, "ab") as file:
-                file.write(f"{json.dumps([key, *entry], separators=(',', ':'))}\n".encode())
-        except OSError as error:
-            raise output_error(self.journal, error) from error
+            raise output_error(self._path, error) from error
 
 
-def _read_journal(path: Path) -> dict[str, _Entry]:
-    """The items of a journal by their hashes; lines that are cut or spoilt are left out."""
-    try:
-        lines = path.read_bytes().splitlines()
-    except OSError:
-        return {}
-    found = {}
-    for line in lines:
-        try:
-            key, files, said = json.loads(line)
-            states = {check_relative(name): FileState(*state) for name, state in files.items()}
-            found[str(key)] = _Entry(states, said)
-        except (DataError, ValueError, TypeError, AttributeError):
-            continue
-    return found
+def is_resumable(path: Path, fingerprint: str) -> bool:
+    """Return whether a file of finished items belongs to a stage with this fingerprint."""
+    if not path.is_file():
+        return False
+    with open(path, encoding="utf-8", errors="replace") as file:
+        return file.readline() == f"{fingerprint}\n"
 
 
 @dataclass
 class Items:
-    """Items of one kind: those that are done, and how more of them get so.
+    """Items of one kind: the finished ones, with the values noted for each."""
 
-    ``done``: what is said of each item, by its name; grows as items are added.
-    """
-
+    kind: str = ""
     done: dict[str, Any] = field(default_factory=dict)
-    _kept: KeptItems | None = None
-    _keys: Mapping[str, str] = field(default_factory=dict)
+    finished: FinishedItems | None = None
 
     def label(self, text: str) -> str:
-        """The label of a progress bar, with the number of items that need not be done."""
-        return f"{text}, {len(self.done)} of {len(self._keys)} kept" if self.done else text
+        """Return the label of a progress bar, with the number of items that are kept."""
+        return f"{text}, {len(self.done)} kept" if self.done else text
 
-    def add(self, name: str, files: Iterable[Path], said: Any = None) -> None:
-        """An item is done: the files it became, and what is said of it, as plain JSON values."""
-        self.done[name] = said
-        if self._kept is not None:
-            self._kept.add(self._keys[name], files, said)
+    def add(self, name: str, values: Any = None) -> None:
+        """Note that an item is finished; its files must be written."""
+        self.done[name] = values
+        if self.finished is not None:
+            self.finished.add(self.kind, name, values)
 
 
 Item = TypeVar("Item")
@@ -202,7 +101,7 @@ class Track(Protocol):
 
 
 def untracked(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
-    """A :class:`Track` that shows nothing."""
+    """Show nothing; see :class:`Track`."""
     return iter(items)
 
 
@@ -279,20 +178,20 @@ class Batched(Generic[Item, Result]):
 
 @dataclass(frozen=True)
 class Work:
-    """Where the work of a stage is done, and who is told how far it is.
+    """Where the work of a stage runs, and how its progress is shown.
 
     Attributes
     ----------
     executor : None stands for this process.
     num_threads : for what has threads of its own, as COLMAP's triangulation.
-    kept : what runs before have done of it; None where nothing is kept.
+    finished : items that a stopped run has finished; None outside a workspace.
     force : go on where the given data contradict themselves.
     """
 
     executor: Executor | None = None
     track: Track = untracked
     num_threads: int = 1
-    kept: KeptItems | None = None
+    finished: FinishedItems | None = None
     force: bool = False
 
     def map(
@@ -351,20 +250,11 @@ class Work:
             else:
                 yield from ordered_map(steps.finish, found, self.executor)
 
-    def items(self, kind: str, names: Sequence[str], inputs: Inputs) -> Items:
-        """Items that do not depend on each other: those that are done, and what notes new ones.
-
-        Parameters
-        ----------
-        kind : of the items, where a stage has several.
-        inputs : what an item is made of beside the stage's settings and its own name; asked for
-            only where something may be kept.
-        """
-        if self.kept is None:
+    def items(self, kind: str) -> Items:
+        """Return the items of a kind that a stopped run of the stage has finished."""
+        if self.finished is None:
             return Items()
-        keys = {name: self.kept.key(kind, name, inputs) for name in names}
-        found = {name: self.kept.take(key) for name, key in keys.items()}
-        return Items({name: one.said for name, one in found.items() if one}, self.kept, keys)
+        return Items(kind, self.finished.of(kind), self.finished)
 
 
 def _alike(
@@ -378,7 +268,7 @@ HERE = Work()
 
 
 class FolderSpec:
-    """A kapture folder as work items name it: cheap to send, opened once per process and run."""
+    """A kapture folder that is cheap to send and opened once per process and run."""
 
     def __init__(self, folder: KaptureFolder) -> None:
         self.key = (folder.root, folder.features_dirs, folder.allow_links_below, uuid4().hex)

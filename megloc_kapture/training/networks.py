@@ -18,19 +18,20 @@ from numpy.typing import NDArray
 from torch import nn
 
 from megloc_kapture.errors import OptionError
+from megloc_kapture.features.kornia_features import XFeat, xfeat_offset_px
 from megloc_kapture.features.superpoint import (
     SuperPoint,
     SuperPointNet,
     gray_tensor,
     sample_descriptors,
 )
-from megloc_kapture.features.xfeat import XFeat, descriptors_at, load_xfeat, network_image
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px
 from megloc_kapture.geometry.poses import rotation_angles_deg
 from megloc_kapture.io.weights import find_weights, read_weights
 from megloc_kapture.matching.networks import network_input
 from megloc_kapture.matching.verification import TwoViewOptions, relative_pose
-from megloc_kapture.nets.runtime import load_strictly
+from megloc_kapture.nets.kornia_networks import load_xfeat, xfeat_descriptors
+from megloc_kapture.nets.runtime import image_tensor, load_strictly
 from megloc_kapture.nets.superglue import (
     ImageKeypoints,
     SuperGlueNet,
@@ -96,10 +97,7 @@ class FrozenFeatures:
 
 
 class SuperPointDescriber(nn.Module):
-    """SuperPoint's backbone and descriptor head; its file is an option ``descriptor_weights``.
-
-    Raises DataError for weights of the extractor that do not fit.
-    """
+    """SuperPoint's backbone and descriptor head; its file is an option ``descriptor_weights``."""
 
     def __init__(self, extractor: SuperPoint) -> None:
         super().__init__()
@@ -124,21 +122,20 @@ class XFeatDescriber(nn.Module):
     def __init__(self, extractor: XFeat) -> None:
         super().__init__()
         name = extractor.options.descriptor_weights or extractor.options.weights
-        net = load_xfeat(read_weights(find_weights(name)), name)
+        network: Any = load_xfeat(read_weights(find_weights(name)), name)
         # as in inference, faster on a processor
-        self.net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        for head in (self.net.heatmap_head, self.net.keypoint_head):
-            head.requires_grad_(False)
+        self._network = network.to(memory_format=torch.channels_last)
+        self.net = network.net
+        for part in (self.net.heatmap_head, self.net.keypoint_head, self.net.fine_matcher):
+            part.requires_grad_(False)
 
     def train(self, mode: bool = True) -> XFeatDescriber:
         super().train(False)
         return self
 
     def forward(self, image: Image, xy_px: torch.Tensor) -> torch.Tensor:
-        tensor = network_image(image, xy_px.device)
-        size = tensor.shape[-2], tensor.shape[-1]
-        ratio = xy_px.new_tensor([size[1] / image.shape[1], size[0] / image.shape[0]])
-        return descriptors_at(self.net(tensor)[0], xy_px * ratio - 0.5, size)
+        xy = xy_px - torch.from_numpy(xfeat_offset_px(image.shape)).to(xy_px)
+        return xfeat_descriptors(self._network, image_tensor(image, xy_px.device), xy)
 
 
 def describer_of(extractor: LocalFeatureExtractor) -> SuperPointDescriber | XFeatDescriber:
@@ -191,10 +188,7 @@ def begin_at_products(net: SuperGlueNet) -> None:
 
 
 def encoder_sizes(descriptor_size: int) -> tuple[int, ...]:
-    """Sizes of SuperGlue's keypoint encoder, in the proportions of the official network.
-
-    Raises OptionError for a size that is not one that four heads share.
-    """
+    """Sizes of SuperGlue's keypoint encoder, in the proportions of the official network."""
     if descriptor_size % 8:
         raise OptionError(
             f"SuperGlue takes descriptors of a multiple of 8 dimensions, not {descriptor_size}"

@@ -1,7 +1,7 @@
 """Pairs of images to train on: of a kapture with depth and poses, or views of photographs.
 
 A source draws pairs at random from a generator that it is given, and keeps no state of its own: the
-pair of a step depends on the seed and the step, so that training goes on where it was interrupted.
+pair of a step depends on the seed and the step alone.
 Views of a photograph are under random homographies and random light, as SuperPoint and the open
 matchers are pretrained (DeTone et al., CVPR workshops 2018, section 5): any folder of photographs
 will do.
@@ -9,8 +9,7 @@ will do.
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import pairwise
@@ -23,7 +22,6 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import read_content
 from megloc_kapture.io.images import is_image, read_depth_map, read_image_rgb
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.mapping.pairs import PairsByPosesOptions, pairs_by_poses
@@ -108,8 +106,7 @@ class PosedPairs:
     """Pairs of a kapture's images that have poses and depth, by the overlap of what they show.
 
     ``measured`` is a file of pairs with their overlap as score; it is read where it is there, else
-    made. Raises DataError where fewer than two images have a pose and depth, or no two overlap as
-    asked for, and for a file of overlaps that is of other images.
+    made.
     """
 
     def __init__(
@@ -167,12 +164,6 @@ class PosedPairs:
         label = partial(labels_of_views, a=a, b=b, options=self._options.labels)
         return TrainingPair((images[0], images[1]), keys, label, (a, b))
 
-    def files(self) -> list[Path]:
-        sensors = sorted((self.folder / "sensors").glob("*.txt"))
-        images = [self._kapture.image_path(name) for name in self._names]
-        depth = [self._kapture.depth_path(self._records[name].path) for name in self._names]
-        return [*sensors, *images, *depth]
-
     def counts(self) -> dict[str, int]:
         return {"images": len(self._names), "pairs": sum(map(len, self._bins))}
 
@@ -199,10 +190,7 @@ class PosedPairs:
 
 
 class Photographs:
-    """Pairs of views of single photographs, of all image files below a folder.
-
-    Raises DataError where there is no such folder, or no image in it.
-    """
+    """Pairs of views of single photographs, of all image files below a folder."""
 
     def __init__(self, folder: Path, options: PairOptions) -> None:
         self.folder, self._options = Path(folder), options
@@ -224,9 +212,6 @@ class Photographs:
         label = partial(labels_of_homography, b_from_a=b_from_a, size_a=size, size_b=size)
         return TrainingPair(lit, None, partial(label, options=self._options.labels))
 
-    def files(self) -> list[Path]:
-        return self._paths
-
     def counts(self) -> dict[str, int]:
         return {"images": len(self._paths)}
 
@@ -238,15 +223,6 @@ def reduced_size(width: int, height: int, max_size_px: int) -> tuple[int, int]:
     """Width and height of an image that is reduced to a longer side; itself where it is smaller."""
     scale = min(1.0, max_size_px / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
-
-
-def sha256_of_files(root: Path, paths: Sequence[Path]) -> str:
-    """One checksum of the names below a folder and the contents of files."""
-    digest = hashlib.sha256()
-    for path in paths:
-        content = hashlib.sha256(read_content(path)).hexdigest()
-        digest.update(f"{path.relative_to(root).as_posix()} {content}\n".encode())
-    return digest.hexdigest()
 
 
 def _size(view: PosedView) -> tuple[int, int]:

@@ -1,25 +1,21 @@
-"""The training loop: seeded, interrupted and resumed without a trace, on one or several devices.
+"""The training loop: seeded, and resumed from its last evaluation.
 
 The pairs of a step and all that is random in them depend on the seed and the step alone, so the
-state is the networks, the optimizer and the number of the step. On a processor the files of a
-training that was interrupted are, byte for byte, those of one that was not.
+state is the networks, the optimizer and the number of the step.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
-from datetime import timedelta
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
 from pydantic import Field
-from torch import distributed
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.files import read_content
@@ -49,7 +45,6 @@ COLUMNS = (
 )
 _LAST_RATE = 0.01  # of the first
 _MAX_GRADIENT = 1.0  # norm; a single pair may have one that is far off
-_PATIENCE = timedelta(hours=2)  # of processes for the first, which reads the data
 
 
 class TrainingOptions(NetworkOptions):
@@ -62,7 +57,7 @@ class TrainingOptions(NetworkOptions):
     max_keypoints: int = Field(default=512, gt=0, description="best kept of each image")
     pairs: PairOptions = PairOptions()
     steps: int = Field(default=100_000, gt=0)
-    pairs_per_step: int = Field(default=16, gt=0, description="of all devices together")
+    pairs_per_step: int = Field(default=16, gt=0, description="pairs of a batch")
     learning_rate: float = Field(
         default=1e-4, gt=0, description="Adam's, for half of the steps; then down to 1 % of it"
     )
@@ -82,11 +77,6 @@ class TrainingOptions(NetworkOptions):
     held_out_pairs: int = Field(default=100, gt=0, description="of each held-out kapture")
     seed: int = Field(default=0, ge=0)
 
-    def idle(self) -> dict[str, str]:
-        if self.matcher_weights is None:
-            return {}
-        return {"layers": "it is that of matcher_weights"}
-
 
 class DescriptorOptions(TrainingOptions):
     """Options of training the descriptors of a frozen detector's keypoints."""
@@ -95,12 +85,6 @@ class DescriptorOptions(TrainingOptions):
         default="superglue",
         description="superglue: trained with it, as MegLoc; products: for nearest neighbours",
     )
-
-    def idle(self) -> dict[str, str]:
-        if self.through == "superglue":
-            return super().idle()
-        reason = "through=products trains no SuperGlue"
-        return dict.fromkeys(("layers", "deep_supervision", "matcher_weights"), reason)
 
 
 @dataclass
@@ -114,56 +98,15 @@ class TrainingState:
     def resume(
         cls, path: Path, model: PairModel, optimizer: torch.optim.Optimizer
     ) -> TrainingState:
-        """Where a training was left; the beginning without a file; raises DataError."""
+        """Load where a training was left; the beginning without a file."""
         if not path.is_file():
             return cls(0, [])
         content = load_state(read_content(path), path, model, optimizer)
         return cls(content["step"], [list(map(float, row)) for row in content["rows"]])
 
 
-@dataclass(frozen=True)
-class ProcessGroup:
-    """The processes that train together, one for each device; started by torchrun."""
-
-    rank: int = 0
-    size: int = 1
-
-    @classmethod
-    @contextmanager
-    def join(cls, device: torch.device) -> Iterator[ProcessGroup]:
-        """Of torchrun's environment; alone without it."""
-        size = int(os.environ.get("WORLD_SIZE", "1"))
-        if size == 1:
-            yield cls()
-            return
-        if device.type == "cuda":
-            torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
-        backend = "nccl" if device.type == "cuda" else "gloo"
-        distributed.init_process_group(backend, timeout=_PATIENCE)
-        try:
-            yield cls(distributed.get_rank(), distributed.get_world_size())
-        finally:
-            distributed.destroy_process_group()
-
-    def wait(self) -> None:
-        """Until all are here."""
-        if self.size > 1:
-            distributed.barrier()
-
-    def average(self, model: PairModel) -> None:
-        """Make the gradients of all processes their mean."""
-        if self.size == 1:
-            return
-        for parameter in model.parameters():
-            if parameter.requires_grad:
-                if parameter.grad is None:
-                    parameter.grad = torch.zeros_like(parameter)
-                distributed.all_reduce(parameter.grad)
-                parameter.grad /= self.size
-
-
 def model_of(options: TrainingOptions, extractor: LocalFeatureExtractor) -> PairModel:
-    """The networks as training begins; raises for what cannot be trained."""
+    """Build the networks as training begins."""
     # plugins need not say it
     noise = np.random.default_rng(0).integers(0, 256, (128, 128, 3), np.uint8)
     size = extractor.extract(noise).descriptors.shape[1]
@@ -189,7 +132,7 @@ def model_of(options: TrainingOptions, extractor: LocalFeatureExtractor) -> Pair
 
 
 class Trainer:
-    """A model and its optimizer; raises MeglocError for options or weights that cannot be used."""
+    """A model and its optimizer."""
 
     def __init__(self, options: TrainingOptions) -> None:
         self.options = options
@@ -208,36 +151,29 @@ class Trainer:
         self,
         sources: Sequence[PairSource],
         state: TrainingState,
-        group: ProcessGroup,
         work: Work = HERE,
         *,
         threads: int = 1,
     ) -> Iterator[TrainingState]:
-        """Train to the last step; the state at each evaluation, in the process of rank 0.
+        """Train to the last step on pairs drawn from each source alike; yield at evaluations.
 
-        ``sources``: where pairs are drawn from, from each alike; ``threads``: that prepare pairs;
-        one: those of a step are prepared when it comes. Raises OptionError for a loss that is not
-        finite any more, DataError for a broken image or depth map.
+        With one thread the pairs of a step are prepared when it comes.
         """
         options, losses = self.options, []
         steps = range(state.step, options.steps)
-        label = f"training {options.steps} steps"
         with ThreadPoolExecutor(threads) if threads > 1 else nullcontext() as pool:
             prepared = ordered_map(
-                lambda step: self._pairs(sources, step, group), steps, pool, window=2 * threads
+                lambda step: self._pairs(sources, step), steps, pool, window=2 * threads
             )
-            batches = work.track(prepared, len(steps), label) if group.rank == 0 else prepared
+            batches = work.track(prepared, len(steps), f"training {options.steps} steps")
             for step, batch in zip(steps, batches, strict=True):
-                losses.append(self._step(step, batch, group))
+                losses.append(self._step(step, batch))
                 if (step + 1) % options.check_every and step + 1 < options.steps:
                     continue
-                if group.rank == 0:
-                    row = [float(step + 1), self._rate(step), float(np.mean(losses))]
-                    row += self.evaluate()
-                    state = TrainingState(step + 1, [*state.rows, row])
-                    yield state
+                row = [float(step + 1), self._rate(step), float(np.mean(losses))]
+                state = TrainingState(step + 1, [*state.rows, [*row, *self.evaluate()]])
                 losses = []
-                group.wait()
+                yield state
 
     def hold_out(self, sources: Mapping[str, PairSource]) -> None:
         """Draw the pairs that are evaluated on, by the names of their sources."""
@@ -250,7 +186,7 @@ class Trainer:
         }
 
     def evaluate(self) -> list[float]:
-        """Means over the held-out sources, COLUMNS from the fourth on; NaN without any."""
+        """Return means over the held-out sources, COLUMNS from the fourth on; NaN without any."""
         self.model.eval()
         self.results = {
             name: held_out_result(self.model, pairs) for name, pairs in self._held_out.items()
@@ -260,7 +196,7 @@ class Trainer:
         rows = [(one.loss, one.precision, one.recall, *one.auc) for one in self.results.values()]
         return [float(value) for value in np.mean(rows, axis=0)]
 
-    def _step(self, step: int, batch: Sequence[PreparedPair], group: ProcessGroup) -> float:
+    def _step(self, step: int, batch: Sequence[PreparedPair]) -> float:
         options = self.options
         for parameters in self.optimizer.param_groups:
             parameters["lr"] = self._rate(step)
@@ -276,7 +212,6 @@ class Trainer:
                 f"the loss of step {step + 1} is {value}; begin again with a smaller learning_rate"
             )
         loss.backward()
-        group.average(self.model)
         torch.nn.utils.clip_grad_norm_(self.model.parameters(), _MAX_GRADIENT)
         self.optimizer.step()
         return value
@@ -285,11 +220,9 @@ class Trainer:
         half = self.options.steps / 2
         return self.options.learning_rate * _LAST_RATE ** max(0.0, (step - half) / half)
 
-    def _pairs(
-        self, sources: Sequence[PairSource], step: int, group: ProcessGroup
-    ) -> list[PreparedPair]:
+    def _pairs(self, sources: Sequence[PairSource], step: int) -> list[PreparedPair]:
         found = []
-        for number in range(group.rank, self.options.pairs_per_step, group.size):
+        for number in range(self.options.pairs_per_step):
             rng = np.random.default_rng([self.options.seed, step, number])
             source = sources[int(rng.integers(len(sources)))]
             found.append(self._frozen.prepare(source.draw(rng)))

@@ -56,9 +56,8 @@ def test_colmap_reads_the_model(megloc: Any, finished: Path, tmp_path: Path) -> 
 
 def test_evo_formats(megloc: Any, finished: Path, tmp_path: Path) -> None:
     truth = poses(finished / "localized")
-    tum, kitti = tmp_path / "a.tum", tmp_path / "a.kitti"
+    tum = tmp_path / "a.tum"
     megloc("export", "tum", *sources(finished), "-o", tum)
-    megloc("export", "kitti", *sources(finished), "-o", kitti)
     rows = np.loadtxt(tum, ndmin=2)
     assert rows.shape == (len(truth), 8)
     by_time = dict(zip(rows[:, 0].astype(int).tolist(), rows[:, 1:], strict=True))
@@ -69,11 +68,6 @@ def test_evo_formats(megloc: Any, finished: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(row[:3], centre, atol=1e-12)
         own = Rotation.from_quat(row[3:]).as_matrix()
         np.testing.assert_allclose(own, rotation, atol=1e-12)
-    names = Path(f"{kitti}.names.txt").read_text().split()
-    for name, row in zip(names, np.loadtxt(kitti, ndmin=2), strict=True):
-        rotation, centre = truth[name]
-        np.testing.assert_allclose(row.reshape(3, 4)[:, :3], rotation, atol=1e-12)
-        np.testing.assert_allclose(row.reshape(3, 4)[:, 3], centre, atol=1e-12)
 
 
 def test_nerfstudio_has_opengl_axes_and_finds_the_images(
@@ -121,13 +115,6 @@ def test_what_cannot_be_is_refused(megloc: Any, finished: Path, tmp_path: Path) 
     out, query = tmp_path / "out", ("--query", finished / "localized")
     for name, arguments, words in (
         ("tum", (), "give a map, or localized queries"),
-        ("geojson", query, "--geo-origin"),
-        *(
-            ("geojson", (*query, "--geo-origin", text), "latitude")
-            for text in ("48", "48,2,3,4", "north")
-        ),
-        ("geojson", (*query, "--geo-origin", "99,2"), "no latitude"),
-        ("tum", (*query, "--geo-origin", "48,2"), "nothing else does"),
         ("tum", (*query, "--sensor", "back"), "of camera 'back'"),
         ("colmap", (*query, "-i", finished / "localized"), "both have"),
     ):
@@ -136,7 +123,7 @@ def test_what_cannot_be_is_refused(megloc: Any, finished: Path, tmp_path: Path) 
     out.write_text("mine")
     megloc("export", "tum", *query, "-o", out).refused("is there already; --force")
     assert out.read_text() == "mine"
-    with pytest.raises(OptionError, match="did you mean 'kitti'"):
-        export("kiti", out, query=finished / "localized")  # type: ignore[arg-type]
+    with pytest.raises(OptionError, match="did you mean 'nerfstudio'"):
+        export("nerfstudo", out, query=finished / "localized")  # type: ignore[arg-type]
     with pytest.raises(DataError, match="no such"):
         export("tum", tmp_path / "a", query=tmp_path / "nothing")

@@ -2,99 +2,44 @@
 
 from __future__ import annotations
 
-import json
-import os
 import re
 import shlex
-import signal
 import subprocess
 import sys
-from collections import Counter
-from functools import partial
 from importlib.metadata import EntryPoints, version
 from pathlib import Path
 from typing import Any
 
 import pytest
-import tyro
 
 import megloc_kapture
 from megloc_kapture import plugin_loading
 from megloc_kapture.cli.common import Console
 from megloc_kapture.cli.info import shown
-from megloc_kapture.cli.main import (
-    COMMANDS,
-    EXAMPLES,
-    _parser,
-    command_class,
-    main,
-    summary,
-)
+from megloc_kapture.cli.main import COMMANDS, command_class, main
 from megloc_kapture.pipeline.presets import PRESETS, options_of, options_of_preset
 from megloc_kapture.stages.options import PipelineOptions
 
 PROGRAM = str(Path(sys.executable).with_name("megloc"))
 BAD_ARGUMENTS = {
-    "no command": ([], r"Missing subcommand: Expected one of \{eval, import"),
-    "unknown command": (["evil"], r"Unrecognized options: evil; Available subcommands: eval, "),
-    "missing flags": (
-        ["refine-poses", "-i", "map", "--poses", "p", "-o", "out"],
-        r"Missing from megloc refine-poses: --query PATH; see megloc refine-poses",
-    ),
-    "unknown flag": (["eval", "kapture", "--roots", "x"], r"Unrecognized options: --roots, x; see"),
-    "unknown long flag": (["eval", "--" + 100 * "x"], r"Unrecognized options: --x{100}; see"),
-    "no value": (["eval", "--set"], r"Missing value for argument '--set'"),
-    "not a number": (["eval", "--workers", "two"], r"Error parsing --workers: .*'two'.*; see"),
-    "not a choice": (["eval", "-v", "loud"], r"invalid choice 'loud' .*'debug', 'info'"),
-    "too many": (["info", "a", "b"], r"Unrecognized options: b; see megloc"),
+    "no command": ([], "Missing subcommand"),
+    "unknown command": (["localise"], "unknown command 'localise'; did you mean 'localize'"),
+    "missing flags": (["refine-poses", "-i", "map", "--poses", "p", "-o", "out"], "--query PATH"),
+    "unknown flag": (["eval", "kapture", "--roots", "x"], "Perhaps you meant: --root "),
+    "no value": (["eval", "--set"], "Missing value for argument '--set'"),
+    "not a number": (["eval", "--workers", "two"], "Error parsing --workers: "),
+    "not a choice": (["eval", "-v", "loud"], "invalid choice 'loud'"),
+    "too many": (["info", "a", "b"], "Unrecognized options: b"),
+    "value out of range": (["serve", "map", "--max-mb", "0"], "--max-mb: it should be greater"),
 }
 
 
 @pytest.mark.parametrize(("arguments", "message"), BAD_ARGUMENTS.values(), ids=BAD_ARGUMENTS)
-def test_argument_errors_are_one_line(
-    megloc: Any, arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "40")
-    line = megloc(*arguments).refused(message)
-    assert "megloc" in line and "--help" in line
-    assert not set("│╭╰─") & set(line)
-
-
-COLOURED = (
-    "\x1b[31m╭─\x1b[0m \x1b[31m\x1b[1mRequired options\x1b[0m ──────╮\n"
-    "│ Missing from megloc submit: │\n"
-    "│     -i PATH, --input PATH   │\n"
-    "│         Localized kapture   │\n"
-    "│         folder. (required)  │\n"
-    "│     -o PATH, --output PATH  │\n"
-    "│         Pose file.          │\n"
-    "│ ─────────────────────────── │\n"
-    "│ For full helptext, run:     │\n"
-    "│     megloc submit --help    │\n"
-    "╰─────────────────────────────╯\n"
-)
-
-
-def test_a_drawn_box_becomes_one_line() -> None:
-    assert summary(COLOURED) == (
-        "Missing from megloc submit: -i PATH, --input PATH, -o PATH, --output PATH; "
-        "see megloc submit --help"
-    )
-    # what is no box is told as it is
-    assert summary("something\n\nelse entirely\n") == "something else entirely"
-    assert summary("") == "the arguments cannot be used"
-
-
-@pytest.mark.parametrize("encoding", ["ascii", pytest.param("utf-8", marks=pytest.mark.slow)])
-def test_argument_errors_are_one_line_in_a_terminal_of_any_encoding(encoding: str) -> None:
-    done = subprocess.run(
-        [PROGRAM, "triangulate", "--input", "x"],
-        env=os.environ | {"PYTHONIOENCODING": encoding, "COLUMNS": "40"},
-        capture_output=True,
-        text=True,
-    )
-    told = "megloc: Missing from megloc triangulate: -o PATH, --output PATH; see megloc "
-    assert (done.returncode, done.stdout, done.stderr) == (2, "", told + "triangulate --help\n")
+def test_wrong_arguments_are_refused(megloc: Any, arguments: list[str], message: str) -> None:
+    done = megloc(*arguments)
+    assert (done.status, done.out) == (2, "")
+    assert message in " ".join(done.err.replace("│", " ").split())
+    assert "Traceback" not in done.err and "pydantic" not in done.err
 
 
 @pytest.mark.parametrize("flag", ["-h", "--help"])
@@ -164,125 +109,9 @@ def test_progress_says_how_many_how_fast_and_how_long(
     assert len(lines) == 2
 
 
-# what a signal's exception meets on its way: a compiled module that is being imported makes an
-# error of its own of it (pycolmap, poselib), a callback of the interpreter drops it, and so does
-# who catches all
-MEETINGS = {
-    "made another error": """
-        try:
-            signal.raise_signal(NUMBER)
-        except BaseException as error:
-            raise RuntimeError("cannot import the C++ backend") from error
-    """,
-    "made an error of the user's": """
-        try:
-            signal.raise_signal(NUMBER)
-        except BaseException as error:
-            raise MeglocError("cannot be loaded") from error
-    """,
-    "dropped by the interpreter": """
-        class Dropping:
-            def __del__(self):
-                signal.raise_signal(NUMBER)
-        Dropping()
-        time.sleep(60.0)
-    """,
-    "dropped by who catches all": """
-        try:
-            signal.raise_signal(NUMBER)
-        except BaseException:
-            signal.raise_signal(NUMBER)  # pressed twice
-        time.sleep(60.0)
-    """,
-    "dropped by a compiled module": """
-        class Meddling:
-            def __hash__(self):
-                signal.raise_signal(NUMBER)
-                return 1
-        ctypes.pythonapi.PyDict_GetItem(ctypes.py_object({}), ctypes.py_object(Meddling()))
-        time.sleep(60.0)
-    """,
-    "kept by who clears up for long": """
-        try:
-            signal.raise_signal(NUMBER)
-        except BaseException as error:
-            main._ONE_END_S = 0.0
-            signal.raise_signal(NUMBER)
-            time.sleep(60.0)
-    """,
-}
-
-
-# forks a process for each meeting, so that what all need is imported once
-EVERY_MEETING = """
-import ctypes, json, os, signal, sys, time
-import tyro
-from megloc_kapture.cli import main
-from megloc_kapture.cli.weights import Doctor
-from megloc_kapture.errors import MeglocError
-ends = {}
-for name, body in json.loads(sys.argv[1]).items():
-    reading, writing = os.pipe()
-    if (child := os.fork()) == 0:
-        os.dup2(writing, sys.stderr.fileno())
-        exec("def run(self, console):" + body)
-        Doctor.run = run
-        sys.argv = ["megloc", "doctor"]
-        main.main()
-    os.close(writing)
-    with open(reading) as told:
-        err = told.read()
-    ends[name] = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), err
-print(json.dumps(ends))
-"""
-
-
-def test_a_signal_ends_a_run_whatever_it_meets() -> None:
-    numbers = {"SIGINT": (130, "interrupted"), "SIGTERM": (143, "terminated")}
-    bodies, expected = {}, {}
-    for number, (status, told) in numbers.items():
-        for meeting, body in MEETINGS.items():
-            name = f"{number} {meeting}"
-            bodies[name] = body.replace("NUMBER", f"signal.{number}")
-            expected[name] = [status, f"megloc: {told}; run the same command again to go on\n"]
-    run = subprocess.run(
-        [sys.executable, "-c", EVERY_MEETING, json.dumps(bodies)],
-        stdout=subprocess.PIPE,
-        text=True,
-        # a shell ignores SIGINT for what it starts in the background, and that is inherited
-        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
-    )
-    assert json.loads(run.stdout) == expected
-
-
-@pytest.mark.parametrize("example", EXAMPLES)
-def test_an_example_is_taken_by_the_command(example: str) -> None:
-    program, *arguments = shlex.split(example)
-    assert program == "megloc" and arguments[0] in COMMANDS
-    parsed: Any = tyro.cli(
-        _parser(arguments), args=arguments, prog="megloc", config=(tyro.conf.OmitArgPrefixes,)
-    )
-    if getattr(parsed, "preset", None) or getattr(parsed, "set", ()):
-        options_of_preset(parsed.preset or "classic", assignments=getattr(parsed, "set", ()))
-    if hasattr(parsed, "uses"):
-        parsed.options()  # refuses what the command does not act on
-
-
-def test_every_command_has_its_own_first_line_and_one_to_three_examples() -> None:
-    for name, (_, told) in COMMANDS.items():
-        assert " ".join((command_class(name).__doc__ or "").split()).startswith(told)
-    counts = Counter(example.split()[1] for example in EXAMPLES)
-    assert set(counts) == set(COMMANDS) and max(counts.values()) <= 3
-
-
-@pytest.mark.parametrize("command", ["", "match", "weights", "weights fetch"])
-def test_a_help_page_ends_with_its_examples(megloc: Any, command: str) -> None:
-    done = megloc(*command.split(), "--help")
-    assert done.status == 0
-    *_, last = done.out.splitlines()
-    assert last.startswith(f"  megloc {command}")
-    head = done.out.rpartition("examples:\n")[0]
-    assert head.startswith("usage: ")
+def test_every_command_has_its_own_first_line() -> None:
+    for name, (_, text) in COMMANDS.items():
+        assert " ".join((command_class(name).__doc__ or "").split()).startswith(text)
 
 
 def completed(script: str, *words: str) -> list[str]:
@@ -326,12 +155,7 @@ def test_a_value_is_shown_as_set_takes_it(preset: str) -> None:
         text = f"{option.key}={shown(option.value)}"
         if isinstance(option.value, tuple) or option.key == "stages" or "none" in text:
             continue
-        try:
-            changed = options_of_preset(preset, assignments=[text])
-        except megloc_kapture.OptionError as refused:
-            # options that change nothing there are refused for that, not for their value
-            assert "changes nothing" in str(refused), text
-            continue
+        changed = options_of_preset(preset, assignments=[text])
         found = {one.key: one.value for one in options_of(changed)}[option.key]
         if isinstance(found, float):
             assert found == pytest.approx(option.value, rel=1e-3)

@@ -126,9 +126,6 @@ def test_refused(megloc: Any, finished: Path, scene: Path, tmp_path: Path) -> No
     for arguments, words in (
         ((), "either --query, .*, or --images"),
         ((*query, *images), "either --query"),
-        ((*query, "--every", "2"), "--every changes nothing"),
-        ((*query, "--camera", "x"), "--camera changes nothing"),
-        ((*images, "--every", "2"), "there is no video"),
         (("--images", tmp_path / "nowhere"), "nowhere: no such file or folder"),
         *(
             ((*images, "--camera", text), "give MODEL,WIDTH,HEIGHT")

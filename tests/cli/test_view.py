@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import subprocess
-import sys
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import cv2
 import kapture
 import numpy as np
 import pycolmap
@@ -21,7 +17,6 @@ from PIL import Image
 import megloc_kapture as megloc_package
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.evaluation.report.queries import StoredInliers, shown_queries
-from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import read_status
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -79,16 +74,11 @@ def test_a_report_has_the_view_beside_it(
     assert 'href="view.html"' in (finished / "evaluation/report.html").read_text()
     view = data_of(finished / "evaluation/view.html")
     assert sum(query["drawn"] for query in view["queries"]) > 20
-    # a run's own report has no seconds, so that two runs give the same bytes
-    assert "How long it took" not in (finished / "evaluation/report.html").read_text()
     result = ("-i", finished / "localized")
     for name, truth in (("known", ("--gt", finished / "query_gt")), ("unknown", ())):
         out = tmp_path / name
         assert megloc("evaluate", *result, *truth, "-o", out).status == 0
-        page = (out / "report.html").read_text()
-        assert "How long it took" in page and 'class="gallery"' in page
-        read = [json.loads(path.read_text()) for path in (finished / "stages").glob("*.json")]
-        assert f"{sum(one.get('seconds', 0.0) for one in read):.1f}" in page
+        assert "The worst queries" in (out / "report.html").read_text()
         assert (out / "view.html").is_file()
 
 
@@ -221,71 +211,3 @@ def test_pages_fit_a_phone(finished: Path, tmp_path: Path, width: int) -> None:
     )
     for name in ("report.html", "view.html"):
         browse(finished / "evaluation" / name, width, 900, tmp_path, script=script)
-
-
-needs_rerun = pytest.mark.skipif(find_spec("rerun") is None, reason="rerun-sdk is not installed")
-
-
-def contents(path: Path) -> dict[str, dict[str, Any]]:
-    """Of each entity the values of its columns, as numpy arrays."""
-    from rerun.chunk import RrdReader
-
-    found: dict[str, dict[str, Any]] = {}
-    for chunk in RrdReader(path).stream().to_chunks():
-        assert chunk.is_static
-        batch = chunk.to_record_batch()
-        for name in batch.schema.names[1:]:
-            values = batch.column(name)[0].values.to_numpy(zero_copy_only=False)
-            found.setdefault(chunk.entity_path, {})[name.partition(":")[2]] = values
-    return found
-
-
-@needs_rerun
-def test_a_recording_has_the_map_and_the_queries(
-    megloc: Any, finished: Path, tmp_path: Path
-) -> None:
-    out, page = tmp_path / "new/view.rrd", tmp_path / "view.html"
-    asked = ("view", finished / "map", finished / "localized", "--gt", finished / "query_gt")
-    done = megloc(*asked, "-o", page, "--rerun", out)
-    assert done.status == 0 and f"recording: {out}\n" in done.out and page.is_file()
-    for command in ("verify", "stats"):
-        subprocess.run([sys.executable, "-m", "rerun", "rrd", command, out], check=True)
-    found = contents(out)
-    told = bytes(found["/origin"]["text"][0], "ascii").split()[-3:]
-    origin = np.array([float(value) for value in told])
-    points = np.stack(found["/map/points"]["positions"])
-    own = KaptureFolder(finished / "map").points3d()[:, :3]
-    np.testing.assert_allclose(points + origin, own, atol=1e-4)
-    poses = KaptureFolder(finished / "mapping").read().poses()
-    for name, pose in poses.items():
-        camera = next(v for key, v in found.items() if key.startswith("/map/cam") and name in key)
-        np.testing.assert_allclose(camera["translation"][0] + origin, pose.center(), atol=1e-4)
-        # rerun's matrices go by columns: of world_from_cam these are rows of cam_from_world
-        turned = camera["mat3x3"][0].reshape(3, 3)
-        np.testing.assert_allclose(turned, pose.rotation_matrix(), atol=1e-6)
-        assert camera["image_from_camera"][0].reshape(3, 3)[0, 0] > 0
-        assert cv2.imdecode(camera["blob"][0].astype(np.uint8), 1) is not None
-    localized = KaptureFolder(finished / "localized").read().poses()
-    statuses = read_status(finished / "localized/status.csv")
-    for name in statuses:
-        of_query = (key for key in found if key.startswith("/quer") and name in key)
-        parts = {key.rpartition("/")[2]: found[key] for key in of_query}
-        assert {"truth", "estimate"} <= parts.keys()
-        center = parts["estimate"]["translation"][0] + origin
-        np.testing.assert_allclose(center, localized[name].center(), atol=1e-4)
-        strips = np.stack([np.stack(strip) for strip in parts["inliers"]["strips"]])
-        starts = np.tile(center, (len(strips), 1))
-        np.testing.assert_allclose(strips[:, 0] + origin, starts, atol=1e-4)
-    # again: a recording may be overwritten, another file may not
-    assert megloc(*asked, "-o", page, "--rerun", out).status == 0
-    megloc(*asked, "-o", tmp_path / "b.html", "--rerun", page).refused("is no view; -f overwrites")
-
-
-def test_without_rerun_the_extra_is_named(
-    megloc: Any, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    out = tmp_path / "view.html"
-    done = megloc("view", finished / "map", "-o", out, "--rerun", tmp_path / "v.rrd")
-    done.refused("rerun is not installed", "megloc-kapture.rerun.")
-    assert not out.exists() and not (tmp_path / "v.rrd").exists()

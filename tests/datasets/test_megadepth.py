@@ -166,7 +166,7 @@ def test_depth_that_is_none_of_its_own(tmp_path: Path) -> None:
     assert read_megadepth_depth(path) is None
 
 
-def test_what_is_missing_is_named(tmp_path: Path, capsys: Any) -> None:
+def test_what_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="neither Undistorted_SfM/SCENE nor scene_info/SCENE.npz"):
         import_megadepth(tmp_path, tmp_path / "out")
     with pytest.raises(DataError, match=r"neither .*0001 nor .*0001\.npz is there"):
@@ -178,7 +178,3 @@ def test_what_is_missing_is_named(tmp_path: Path, capsys: Any) -> None:
         import_megadepth(tmp_path / "empty", tmp_path / "out")
     with pytest.raises(DataError, match="'..'"):
         import_megadepth(tmp_path, tmp_path / "out", MegaDepthOptions(scenes=("..",)))
-    with pytest.raises(SystemExit) as end:
-        main(["import", "megadepth", str(tmp_path), "-o", str(tmp_path / "o"), "--images", "x"])
-    assert end.value.code == 2
-    assert "--images changes nothing of MegaDepth" in capsys.readouterr().err

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,9 @@ import numpy as np
 import pytest
 from kapture.converter.colmap.database import COLMAPDatabase
 
-from megloc_kapture.datasets.formats.sparse_models import SparsePoints
 from megloc_kapture.datasets.reference_map import write_reference_map
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -97,28 +96,6 @@ def test_another_type_and_a_model_without_points(tmp_path: Path) -> None:
     KaptureFolder(tmp_path / "b").validate()
 
 
-def test_the_order_of_observations_in_memory_does_not_matter(tmp_path: Path) -> None:
-    model = points()
-    # by image, as a format might have them; the order within a point is the same
-    order = np.argsort(-model.point_ids, kind="stable")
-    rows = ("point_ids", "image_ids", "feature_ids", "xy_px")
-    mixed = replace(model, **{name: getattr(model, name)[order] for name in rows})
-    content = []
-    for folder, written in ((tmp_path / "sorted", model), (tmp_path / "mixed", mixed)):
-        write_reference_map(folder, data(), {}, NAMES, written)
-        files = sorted(path for path in folder.rglob("*") if path.is_file())
-        content.append({path.relative_to(folder): path.read_bytes() for path in files})
-    assert content[0] == content[1]
-
-
-def test_names_and_ids_must_fit(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="not unique"):
-        write_reference_map(tmp_path / "m", data(), {}, ("a", "a", "b", "c"), points())
-    with pytest.raises(ValueError, match="out of range"):
-        write_reference_map(tmp_path / "m", data(), {}, NAMES[:2], points())
-    assert not (tmp_path / "m").exists()
-
-
 def write_database(
     path: Path, names: dict[str, int], *, shift: float = 0.0, descriptors: int | None = None
 ) -> dict[str, tuple[Any, Any]]:
@@ -177,7 +154,7 @@ def test_a_database_gives_all_features_under_its_numbers(tmp_path: Path) -> None
         ({**FEATURES, "db/a.jpeg": 10}, {}, "several images for 'db/a.jpg': db/a.jpeg, db/a.png"),
         ({**FEATURES, "db/b.png": 900}, {}, "not of this model: .*'db/b.png' has 900 keypoints"),
         (FEATURES, {"shift": 1.5}, r"feature 7 of 'db/a.png' is at \(4.5, 4.0\), .*\(3.0, 4.0\)"),
-        (FEATURES, {"descriptors": 9}, r"descriptors of 'db/a.png' have the shape \(9, 128\)"),
+        (FEATURES, {"descriptors": 9}, r"descriptors of 'db/a.jpg' have the shape \(9, 128\)"),
     ],
 )
 def test_another_model_s_database_is_refused(

@@ -159,14 +159,3 @@ def test_rows_by_condition_pool_and_all() -> None:
     for condition, pools in (("all", {}), ("day", {"day": ("day",)}), ("x", {"all": ("x",)})):
         with pytest.raises(OptionError, match="rename one"):
             row_members([condition], pools=pools)
-
-
-@given(st.lists(st.tuples(st.floats(0, 10), st.floats(0, 180)), max_size=20), st.integers(0, 5))
-def test_wider_thresholds_never_lose_queries(pairs: list, num_missing: int) -> None:
-    errors = errors_of(*pairs, *[(INF, INF)] * num_missing)
-    wider = [Threshold(position_m=p, angle_deg=20 * p) for p in (0.1, 1.0, 5.0, 10.0)]
-    row = recall_row("x", errors, wider)
-    counts = [at.num_within for at in row.recall]
-    assert counts == sorted(counts)
-    assert counts[-1] <= len(pairs)
-    assert row.num_localized + row.num_fallback + row.num_missing == row.num_queries

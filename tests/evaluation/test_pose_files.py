@@ -229,34 +229,6 @@ def test_a_file_that_is_no_text(tmp_path: Path) -> None:
         read_pose_file(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("read", "good"),
-    [
-        (read_pose_file, 2 * GOOD),
-        (read_mlad_file, GOOD_PAIR + GOOD_PAIR.replace("205", "206")),
-    ],
-)
-@given(st.binary(max_size=60), st.integers(0, 2 * len(GOOD_PAIR)))
-def test_random_damage_never_crashes(
-    tmp_path_factory: pytest.TempPathFactory,
-    read: Callable[..., Any],
-    good: str,
-    junk: bytes,
-    place: int,
-) -> None:
-    path = tmp_path_factory.getbasetemp() / "damaged.txt"
-    path.write_bytes(good.encode()[:place] + junk + good.encode()[place:])
-    try:
-        found = read(path)
-    except DataError as error:
-        assert str(path) in str(error) and "\n" not in str(error)
-        return
-    rows = (
-        found.values() if isinstance(found, dict) else [row.query_from_reference for row in found]
-    )
-    assert all(np.isfinite(pose.translation).all() for pose in rows if pose is not None)
-
-
 def test_short_names_find_their_images() -> None:
     images = ["q/day/1.jpg", "q/day/2.jpg", "q/night/2.jpg"]
     found = poses_by_image({"1.jpg": HERE, "q/day/2.jpg": HERE, "9.jpg": HERE}, images)

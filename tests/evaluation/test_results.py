@@ -21,14 +21,12 @@ from megloc_kapture.evaluation.pose_files import write_pose_file
 from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of, protocol_of
 from megloc_kapture.evaluation.report.reports import report_text, write_report
 from megloc_kapture.evaluation.results import (
-    are_ranked,
     context_of,
     distinct_labels,
     read_result,
     side_tables_near,
     workspace_of,
 )
-from megloc_kapture.evaluation.statistics import over_seeds
 from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,
@@ -240,15 +238,6 @@ def test_absent_results_are_named(truth: Path, tmp_path: Path) -> None:
             evaluate(*paths)
 
 
-def test_lists_in_the_order_of_names_are_no_ranking() -> None:
-    names = [f"map/{k}.jpg" for k in range(6)]
-    assert not are_ranked([names, names[1:]])
-    assert are_ranked([names, names[::-1]])
-    # of few candidates the order may be chance
-    assert are_ranked([names[:2], names[:3]]) and are_ranked([]) and are_ranked([()])
-    assert not are_ranked([names[:2]] * 7)
-
-
 def test_it_prints_as_the_recall_table(world: Any, result: Path, tmp_path: Path) -> None:
     found = megloc.evaluate(result, truth=world.truth)
     in_memory = evaluate(world.estimated, world.truth)
@@ -286,7 +275,6 @@ def test_two_results_are_compared(world: Any, tmp_path: Path) -> None:
     # those without a label are told apart
     first, second = evaluate_results([world.estimated, {}], world.truth, Benchmark())
     assert (first.label, second.label) == ("result 1", "result 2")
-    assert "+-" in str(over_seeds([first, second]))
 
 
 def test_tables_in_python_are_those_of_the_files(world: Any, result: Path, tmp_path: Path) -> None:

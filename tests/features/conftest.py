@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
+from convert_weights import aslfeat_state
 from images import Image
 from published import random_tensors
+from safetensors.torch import save_file
 from torch import nn
 
 from megloc_kapture.features.superpoint import SuperPointNet
@@ -38,7 +39,7 @@ def other_superpoint() -> dict[str, torch.Tensor]:
 
 @pytest.fixture(scope="session")
 def aslfeat_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Random ones that answer to texture, under TensorFlow's names and in its layouts."""
+    """Random ones that answer to texture, converted from TensorFlow's names and layouts."""
     arrays = {}
     for name, values in random_tensors("aslfeat").items():
         values = torch.randn(values.shape, generator=torch.Generator().manual_seed(len(arrays)))
@@ -51,8 +52,8 @@ def aslfeat_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
         else:
             values = values.abs() * 0.5 + (0.5 if values.ndim else 2)
         arrays[name] = values.numpy()
-    path = tmp_path_factory.mktemp("aslfeat") / "aslfeat.npz"
-    np.savez(path, **arrays, global_step=np.array(380_000))
+    path = tmp_path_factory.mktemp("aslfeat") / "aslfeat.safetensors"
+    save_file(aslfeat_state(arrays), path)
     return path
 
 

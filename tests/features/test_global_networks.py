@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import pickle
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,20 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from convert_weights import delg_state
 from images import Image, random_image, texture
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 from published import delg_variables
 from pydantic import ValidationError
 from safetensors.torch import save_file
-from scipy.io import savemat
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.features import global_networks
 from megloc_kapture.features.global_networks import (
     ApGem,
     Delg,
-    EigenPlaces,
     GlobalNetwork,
     MegaLoc,
     MegaLocOptions,
@@ -35,16 +33,11 @@ from megloc_kapture.features.global_networks import (
     official_size,
 )
 from megloc_kapture.io.weights import MissingWeightsError
-from megloc_kapture.io.weights.adding import convert_weights
 from megloc_kapture.nets import delg as nets_delg
 from megloc_kapture.nets import megaloc as nets_megaloc
-from megloc_kapture.nets.global_descriptors import ApGemNet, EigenPlacesNet, VggNetVlad
+from megloc_kapture.nets.global_descriptors import ApGemNet, VggNetVlad
 from megloc_kapture.nets.megaloc import DinoV2, MegaLocNet
-from megloc_kapture.nets.trunks import Vgg16Features
 from megloc_kapture.plugins import GlobalFeatureExtractor
-
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-from tensorflow_checkpoints import write_saved_model  # noqa: E402
 
 DELG_REFERENCE = Path(__file__).parents[1] / "nets" / "data" / "delg" / "reference.npz"
 CLUSTERS = 2
@@ -53,7 +46,6 @@ KINDS: dict[str, Any] = {
     "openibl": OpenIbl,
     "apgem": ApGem,
     "delg": Delg,
-    "eigenplaces": EigenPlaces,
     "megaloc": MegaLoc,
 }
 # components, and by how much vectors of two images differ at least
@@ -62,7 +54,6 @@ SIZES = {
     "openibl": (12, 0.03),
     "apgem": (2048, 1e-4),
     "delg": (2048, 1e-4),
-    "eigenplaces": (128, 1e-5),
     "megaloc": (10, 1e-3),
 }
 # that keep the tests short
@@ -75,8 +66,7 @@ REFUSALS = {
     "netvlad": "no average_image",
     "openibl": "this file does not fit VggNetVlad",
     "apgem": "no AP-GeM",
-    "delg": r"no DELG .*resnet_v1_101.*found: conv1\.weight$",
-    "eigenplaces": "no EigenPlaces",
+    "delg": r"no DELG: 0 blocks .*found: conv1\.weight$",
     "megaloc": r".*unexpected keys: conv1\.weight",
 }
 
@@ -88,37 +78,13 @@ def around_zero(features: Callable[[torch.Tensor], torch.Tensor], bias: torch.Te
         bias -= features(planes).mean((0, 2, 3))
 
 
-def cell(values: list[Any]) -> Any:
-    found = np.empty((1, len(values)), object)
-    for column, value in enumerate(values):
-        found[0, column] = value
-    return found
-
-
 def write_netvlad(folder: Path) -> Path:
-    """A network of few clusters, as MATLAB wrote Tokyo's."""
-    trunk = Vgg16Features(last=28).requires_grad_(False)
-    for value in trunk.state_dict().values():
-        value.normal_(0, 1.0 if value.ndim < 2 else (2 / value[0].numel()) ** 0.5)
-    around_zero(lambda planes: trunk(planes - 110.0), trunk[28].bias)
-    layers: list[Any] = [{"type": "relu"}] * 34
-    for number, layer in enumerate(trunk):
-        if isinstance(layer, torch.nn.Conv2d) and layer.bias is not None:
-            weight = layer.weight.permute(2, 3, 1, 0).numpy()
-            layers[number] = {"type": "conv", "weights": cell([weight, layer.bias[None].numpy()])}
-    rng = np.random.default_rng(0)
-
-    def floats(*shape: int, scale: float = 1.0) -> Any:
-        return rng.standard_normal(shape, dtype=np.float32) * np.float32(scale)
-
-    core = [floats(512, CLUSTERS, scale=20), floats(512, CLUSTERS, scale=0.02)]
-    layers[30] = {"type": "custom", "weights": cell(core)}
-    whitening = [floats(1, 1, 512 * CLUSTERS, 12), floats(1, 12, scale=0.1)]
-    layers[33] = {"type": "conv", "weights": cell(whitening)}
-    mean = np.tile(np.array((120.0, 110.0, 100.0), np.float32), (2, 2, 1))
-    net = {"layers": cell(layers), "meta": {"normalization": {"averageImage": mean}}}
-    savemat(folder / "TokyoTM_struct.mat", {"net": net})
-    return folder / "TokyoTM_struct.mat"
+    """A network of few clusters, as the script converts Tokyo's."""
+    path = write_openibl(folder)
+    state = torch.load(path, weights_only=True)
+    state["average_image"] = torch.tensor([120.0, 110.0, 100.0])
+    save_file(state, folder / "netvlad-tokyotm.safetensors")
+    return folder / "netvlad-tokyotm.safetensors"
 
 
 def write_openibl(folder: Path) -> Path:
@@ -150,13 +116,8 @@ def write_apgem(folder: Path) -> Path:
 
 
 def write_delg(folder: Path) -> Path:
-    write_saved_model(folder / "r50delg_mine.tar.gz", "r50delg", delg_variables("slim"))
-    return folder / "r50delg_mine.tar.gz"
-
-
-def write_eigenplaces(folder: Path) -> Path:
-    torch.save(EigenPlacesNet(50, 128).state_dict(), folder / "ResNet50_128_eigenplaces.pth")
-    return folder / "ResNet50_128_eigenplaces.pth"
+    save_file(delg_state(delg_variables("slim")), folder / "r50delg_mine.safetensors")
+    return folder / "r50delg_mine.safetensors"
 
 
 def small_megaloc() -> MegaLocNet:
@@ -176,7 +137,6 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
     "openibl": write_openibl,
     "apgem": write_apgem,
     "delg": write_delg,
-    "eigenplaces": write_eigenplaces,
     "megaloc": write_megaloc,
 }
 FILES: dict[str, Path] = {}
@@ -241,7 +201,6 @@ def test_vectors_are_the_networks_of_what_it_sees(name: str, make: Make) -> None
 @pytest.mark.parametrize(
     ("name", "size"),
     [
-        *(("eigenplaces", size) for size in [(64, 64), (101, 33), (1, 1), (7, 130)]),
         *(("megaloc", size) for size in [(322, 322), (480, 3), (1, 1), (15, 14), (700, 501)]),
     ],
 )
@@ -280,13 +239,12 @@ def test_weights_that_are_missing_or_of_another_network(
 @pytest.mark.parametrize(
     ("name", "options", "expected"),
     [
-        ("netvlad", {}, "netvlad-TokyoTM_struct"),
+        ("netvlad", {}, "netvlad-tokyotm"),
         ("openibl", {}, "openibl-vgg16_netvlad"),
         ("apgem", {"whitening": "Landmarks_clean"}, "apgem-mine-Landmarks_clean-0.25"),
         ("apgem", {"whitening": "other", "whitening_power": 0.5}, "apgem-mine-other-0.5"),
         ("apgem", {}, "apgem-mine"),
         ("delg", {}, "r50delg_mine"),
-        ("eigenplaces", {}, "ResNet50_128_eigenplaces"),
         ("megaloc", {}, "megaloc-small"),
         ("megaloc", {"size_px": 448}, "megaloc-small-448px"),
     ],
@@ -300,10 +258,10 @@ def test_names_tell_what_vectors_must_have_in_common(
 @pytest.mark.parametrize(
     ("name", "weights", "file", "expected"),
     [
-        ("netvlad", "netvlad-tokyotm", "TokyoTM_struct.mat", "netvlad-tokyotm"),
+        ("netvlad", "netvlad-tokyotm", "netvlad-tokyotm.safetensors", "netvlad-tokyotm"),
         ("openibl", "openibl", "vgg16_netvlad.pth", "openibl"),
-        ("apgem", "apgem-resnet101-lm18", "Resnet101-AP-GeM-LM18.pt", "apgem-resnet101-lm18"),
-        ("delg", "delg-r50-gld", "r50delg_gld_20200814.tar.gz", "delg-r50-gld"),
+        ("apgem", "apgem-resnet101", "apgem-resnet101.safetensors", "apgem-resnet101"),
+        ("delg", "delg-r50-gld", "delg-r50-gld.safetensors", "delg-r50-gld"),
         ("megaloc", "megaloc", "MegaLoc/model.safetensors", "megaloc"),
     ],
 )
@@ -326,22 +284,13 @@ def test_published_files_are_found_in_the_folder_of_weights(
             plugin.describe(random_image(20, 20))
 
 
-def test_converted_weights_give_the_same_vectors(make: Make, tmp_path: Path) -> None:
-    expected = make("netvlad").describe(texture(32, 48))
-    converted = tmp_path / "netvlad-tokyotm.safetensors"
-    convert_weights(FILES["netvlad"], converted)
-    plugin = make("netvlad", weights=str(converted))
-    assert plugin.name == "netvlad-tokyotm"
-    np.testing.assert_array_equal(plugin.describe(texture(32, 48)), expected)
-
-
 def means_of_four(image: Image) -> NDArray[np.float64]:
     height, width, _ = image.shape
     parts = image.astype(np.float64).reshape(height // 2, 2, width // 2, 2, 3)
     return parts.mean(axis=(1, 3)) / 255
 
 
-@pytest.mark.parametrize("name", ["netvlad", "openibl", "apgem", "eigenplaces"])
+@pytest.mark.parametrize("name", ["netvlad", "openibl", "apgem"])
 def test_a_large_image_is_shrunk_to_means_and_a_small_one_stays(make: Make, name: str) -> None:
     image = random_image(64, 96)
     for most, expected in ((48, means_of_four(image)), (96, image / 255), (200, image / 255)):

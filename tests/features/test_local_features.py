@@ -17,11 +17,11 @@ from images import Image, texture
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.aliked import Aliked
 from megloc_kapture.features.aslfeat import AslFeat
+from megloc_kapture.features.kornia_features import XFeat
 from megloc_kapture.features.network import LocalNetwork
 from megloc_kapture.features.r2d2 import R2D2
 from megloc_kapture.features.rootsift import ColmapSift, RootSift
 from megloc_kapture.features.superpoint import SuperPoint
-from megloc_kapture.features.xfeat import XFeat
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.values import LocalFeatures
 
@@ -39,7 +39,7 @@ KINDS: dict[str, Any] = {
 # those with published weights see a part of a photograph, x, y, width and height
 PUBLISHED = {
     "aliked": ("aliked/aliked-n16.pth", (400, 300, 320, 240)),
-    "xfeat": ("xfeat/xfeat.onnx", (0, 0, 320, 256)),
+    "xfeat": ("xfeat/xfeat.pt", (0, 0, 320, 256)),
     "r2d2": ("r2d2/r2d2_WASF_N16.pt", (600, 300, 240, 160)),
 }
 NETWORKS = [name for name in KINDS if "sift" not in name]
@@ -63,7 +63,7 @@ REFUSALS = {
     "superpoint": "23 missing keys",
     "aslfeat": "missing keys",
     "aliked": "no ALIKED",
-    "xfeat": "does not fit XFeatNetwork",
+    "xfeat": "does not fit XFeatModel",
     "r2d2": "does not fit R2D2Network",
 }
 

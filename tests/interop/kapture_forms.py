@@ -9,7 +9,6 @@ import numpy as np
 from kapture.converter.colmap.import_colmap import import_colmap
 from kapture.io.csv import kapture_from_dir, kapture_to_dir
 from kapture.io.records import TransferAction
-from tools.kapture_import_4seasons import import_4seasons_sequence
 from tools.kapture_import_image_list import import_image_list
 from tools.kapture_import_RobotCar_Seasons import import_robotcar_seasons
 
@@ -54,19 +53,6 @@ def robotcar_with_kapture(official: Path, place: Path, size_px: tuple[int, int])
             params = [*size_px, *camera.camera_params[2:]]
             data.sensors[name] = kapture.Camera(camera.camera_type, params)
         kapture_to_dir(str(part), data)
-    return place
-
-
-def fourseasons_with_kapture(official: Path, place: Path) -> Path:
-    """Import every recording of 4Seasons, as kapture-localization's run_4seasons.sh does."""
-    for recording in official.glob("recording_*"):
-        import_4seasons_sequence(
-            str(official / "calibration"),
-            str(recording),
-            str(place / "records" / recording.name),
-            TransferAction.link_absolute,
-            False,
-        )
     return place
 
 

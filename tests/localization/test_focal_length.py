@@ -21,7 +21,6 @@ from megloc_kapture.localization.absolute_pose import (
 )
 from megloc_kapture.localization.focal_length import (
     FocalMisfit,
-    estimate_remark,
     estimate_with_intrinsics,
     focal_misfit,
     misfits_text,
@@ -140,35 +139,6 @@ def test_an_uncertain_camera_is_estimated(given_px: float, deviation: float, see
     assert np.linalg.norm(found.cam_from_world.center() - pose.center()) < 0.06
 
 
-# what is left of 1600 x 1200 px: left, top, width, height
-CROPS = {"left": (0, 0, 800, 1200), "corner": (900, 500, 700, 700), "square": (100, 0, 1200, 1200)}
-
-
-@pytest.mark.parametrize("crop", CROPS)
-@pytest.mark.parametrize("exif", [False, True])
-def test_a_cropped_photograph_is_told(crop: str, exif: bool) -> None:
-    """Its principal point is not in the middle, which nobody says."""
-    rng = np.random.default_rng(3)
-    left, top, width, height = CROPS[crop]
-    true = Camera.pinhole(1600, 1200, 1400.0)
-    turn = Rotation.from_euler("xyz", [5, 10, 2], degrees=True).as_matrix()
-    pose = RigidTransform.from_matrix(turn, np.array([0.3, -0.2, 0.5]))
-    points = rng.uniform((-9, -7, 8.0), (9, 7, 20.0), (3000, 3))
-    pixels = project(true, pose, points) + rng.normal(0, 1, (3000, 2)) - (left, top)
-    inside = ((pixels > 0) & (pixels < (width, height))).all(axis=1)
-    pixels, points = pixels[inside], points[inside]
-    pixels[:40] = rng.uniform((0, 0), (width, height), (40, 2))
-    given = guessed_camera(width, height)
-    if exif:  # of the larger side of another image
-        given = replace(given, params=(1400 * width / 1600, *given.params[1:]), focal_deviation=0.1)
-    found = solved(given, pixels, points)
-    assert isinstance(found, Pose) and found.camera is not None
-    assert np.linalg.norm(found.cam_from_world.center() - pose.center()) < 0.1
-    assert found.camera.params[0] == pytest.approx(1400, rel=0.02)
-    np.testing.assert_allclose(found.camera.params[1:3], (800 - left, 600 - top), atol=25)
-    assert "the photograph was cropped" in estimate_remark(found.camera, given)
-
-
 @pytest.mark.parametrize("exif_px", [350.0, 2600.0, 90000.0])
 def test_exif_of_another_lens_is_not_believed(exif_px: float) -> None:
     pixels, points, pose = seen_by(Camera.pinhole(1600, 1200, 1400.0))
@@ -182,17 +152,6 @@ def test_exif_of_another_lens_is_not_believed(exif_px: float) -> None:
     found = solved(known, pixels, points)
     assert isinstance(found, Pose) and found.camera is not None
     assert found.camera.params[0] > 1430
-
-
-@pytest.mark.parametrize("count", [20, 40, 80, 300])
-@pytest.mark.parametrize("seed", range(4))
-def test_a_whole_photograph_is_not_taken_for_a_crop(count: int, seed: int) -> None:
-    pixels, points, _ = seen_by(Camera.pinhole(1600, 1200, 1400.0), count, seed, noise_px=2.0)
-    given = guessed_camera(1600, 1200)
-    problem = PoseProblem.of([View(given, ALONE, pixels, points)])
-    problem, _ = estimate_with_intrinsics(problem, OPTIONS)
-    shift = np.subtract(problem.views[0].camera.params[1:3], (800, 600))
-    assert np.abs(shift).max() < 0.03 * 1600
 
 
 def seen_by(

@@ -7,12 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import project
-from megloc_kapture.localization.ranking import (
-    DistinctiveInliers,
-    InlierCount,
-    InlierSpread,
-    ReprojectionScore,
-)
+from megloc_kapture.localization.ranking import DistinctiveInliers, InlierCount
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import POSE_RANKERS, HypothesisView, PoseHypothesis, PoseRanker
 from megloc_kapture.values import Camera, RigidTransform
@@ -54,7 +49,7 @@ def everywhere(count: int) -> NDArray[np.float64]:
     return np.stack([640 * at, 480 * ((at * 7) % 1)], axis=1)
 
 
-@pytest.mark.parametrize("name", ["inliers", "spread", "reprojection", "distinctive"])
+@pytest.mark.parametrize("name", ["inliers", "distinctive"])
 def test_they_are_registered(name: str) -> None:
     ranker = load_plugin(POSE_RANKERS, name)
     assert isinstance(ranker, PoseRanker)
@@ -68,28 +63,6 @@ def test_inliers_are_counted_over_all_views() -> None:
         [hypothesis(view(three, good)), hypothesis(view(three, good), view(three, bad))], NoScene()
     )
     assert found.tolist() == [2.0, 3.0]
-
-
-def test_spread_counts_cells_and_breaks_ties_by_inliers() -> None:
-    cell = np.array([[5.0, 5.0], [35.0, 5.0], [45.0, 5.0]])  # cells of 40 px
-    two, three = view(cell[:2], np.zeros(2)), view(cell, np.zeros(3))
-    one_cell, two_cells = InlierSpread().score([hypothesis(two), hypothesis(three)], NoScene())
-    assert int(one_cell) == 1 and int(two_cells) == 2
-    fewer = view(cell[[0, 2]], np.zeros(2))
-    a, b = InlierSpread().score([hypothesis(fewer), hypothesis(three)], NoScene())
-    assert a < b < a + 1
-    # many in one place, few all over the image
-    heap = hypothesis(view(100.0 + 0.01 * np.arange(400.0).reshape(200, 2), np.zeros(200)))
-    few = hypothesis(view(everywhere(20), np.zeros(20)))
-    assert InlierCount().score([heap, few], NoScene()).argmax() == 0
-    assert InlierSpread().score([heap, few], NoScene()).argmax() == 1
-
-
-def test_reprojection_prefers_the_better_fit() -> None:
-    many = hypothesis(view(everywhere(30), np.full(30, 9.0)))
-    exact = hypothesis(view(everywhere(10), np.full(10, 1.0)))
-    scores = ReprojectionScore().score([many, exact], NoScene())
-    np.testing.assert_allclose(scores, [30 * 0.19, 10 * 0.99])
 
 
 def room(count: int, seed: int = 0) -> NDArray[np.float64]:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
-
 import numpy as np
 import pycolmap
 import pytest
@@ -15,16 +12,12 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import median_abs_deviation
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import project
 from megloc_kapture.mapping.uncertainty import (
     ObservedPoints,
-    UncertaintyOptions,
     left_with_too_few,
     mean_depths,
     point_covariances,
     point_deviations,
-    reprojection_errors_px,
-    seen_at_angle,
     too_uncertain,
 )
 from megloc_kapture.values import Camera, RigidTransform
@@ -236,80 +229,6 @@ CAMERAS = (
 )
 
 
-def scene(seed: int) -> tuple[ObservedPoints, np.ndarray]:
-    """Points seen by two or more of twelve images, many at small angles, some keypoints far off."""
-    rng = np.random.default_rng(seed)
-    poses = []
-    for _ in range(12):
-        rotation = Rotation.from_rotvec(rng.normal(0, 0.1, 3)).as_matrix()
-        center = rng.normal(0, [0.3, 0.2, 0.1])
-        poses.append(RigidTransform.from_matrix(rotation, -rotation @ center))
-    depths = rng.uniform(2, 30, 400)
-    xyz = np.column_stack([rng.uniform(-0.3, 0.3, (400, 2)), np.ones(400)]) * depths[:, None]
-    seen = rng.random((400, 12)) < rng.uniform(0.15, 0.6, (400, 1))
-    seen[np.arange(400), rng.integers(0, 6, 400)] = True
-    seen[np.arange(400), rng.integers(6, 12, 400)] = True
-    point_ids, image_ids = np.nonzero(seen)
-    cameras = [CAMERAS[i % 2] for i in range(12)]
-    observed = ObservedPoints(xyz, point_ids, image_ids.astype(np.int32), cameras, poses)
-    pixels = np.stack([project(c, pose, xyz) for c, pose in zip(cameras, poses, strict=True)])
-    keypoints = pixels[image_ids, point_ids] + rng.normal(0, 1.0, (len(point_ids), 2))
-    off = rng.random(len(keypoints)) < 0.25
-    keypoints[off] += rng.normal(0, 4.0, (int(off.sum()), 2))
-    return observed, keypoints
-
-
-def colmap_filter(
-    observed: ObservedPoints, keypoints: np.ndarray, max_error: float, min_angle: float
-) -> dict[int, set[int]]:
-    """Images that observe each point after COLMAP's filter; points that are gone are missing."""
-    reconstruction = pycolmap.Reconstruction()
-    for number, own in enumerate(CAMERAS, 1):
-        how = {"model": own.model, "width": own.width, "height": own.height}
-        camera = pycolmap.Camera(params=list(own.params), camera_id=number, **how)
-        reconstruction.add_camera_with_trivial_rig(camera)
-    tracks: list[list[Any]] = [[] for _ in observed.xyz]
-    for number, pose in enumerate(observed.cams_from_world):
-        rows = np.flatnonzero(observed.image_ids == number)
-        image = pycolmap.Image(
-            image_id=number + 1,
-            name=f"{number}.png",
-            camera_id=number % 2 + 1,
-            keypoints=keypoints[rows],
-        )
-        turn = pycolmap.Rotation3d(pose.rotation_matrix())
-        rigid = pycolmap.Rigid3d(turn, np.array(pose.translation))
-        reconstruction.add_image_with_trivial_frame(image, rigid)
-        for at, point in enumerate(observed.point_ids[rows].tolist()):
-            tracks[point].append(pycolmap.TrackElement(number + 1, at))
-    ids = {
-        reconstruction.add_point3D(xyz, pycolmap.Track(elements)): point
-        for point, (xyz, elements) in enumerate(zip(observed.xyz, tracks, strict=True))
-    }
-    manager = pycolmap.ObservationManager(reconstruction)
-    manager.filter_all_points3D(max_error, min_angle)
-    return {
-        ids[number]: {element.image_id - 1 for element in point.track.elements}
-        for number, point in reconstruction.points3D.items()
-    }
-
-
-@pytest.mark.parametrize(("max_error", "min_angle"), [(4.0, 1.5), (1.5, 0.5), (50.0, 4.0)])
-def test_what_is_left_is_what_colmap_leaves(max_error: float, min_angle: float) -> None:
-    observed, keypoints = scene(3)
-    dropped = reprojection_errors_px(observed, keypoints) > max_error
-    gone = left_with_too_few(observed.point_ids, dropped, 400, 2)
-    kept = ~dropped & ~gone[observed.point_ids]
-    ids = {"point_ids": observed.point_ids[kept], "image_ids": observed.image_ids[kept]}
-    left = replace(observed, **ids)
-    wide = seen_at_angle(left, min_angle)
-    expected = colmap_filter(observed, keypoints, max_error, min_angle)
-    assert set(np.flatnonzero(wide).tolist()) == set(expected)
-    assert 0 < len(expected) < 400
-    for point, images in expected.items():
-        assert set(left.image_ids[left.point_ids == point].tolist()) == images
-
-
 def observed_at(xyz: list[list[float]], point_ids: list[int], centers: Floats) -> ObservedPoints:
     """Points, each observed by the next of images that look along z from these centres."""
     poses = [RigidTransform((1.0, 0.0, 0.0, 0.0), tuple((-c).tolist())) for c in centers]
@@ -319,46 +238,10 @@ def observed_at(xyz: list[list[float]], point_ids: list[int], centers: Floats) -
     )
 
 
-def test_angles_of_long_tracks_compare_all_pairs() -> None:
-    # seven images on a line: only the outermost two see the point at more than 11 degrees
-    observed = observed_at([[0.3, 0.0, 3.0]], 7 * [0], np.arange(7)[:, None] * [0.1, 0.0, 0.0])
-    widest = 2 * np.degrees(np.arctan(0.1))
-    assert seen_at_angle(observed, widest - 0.01).all()
-    assert not seen_at_angle(observed, widest + 0.01).any()
-
-
-def test_points_behind_a_camera_are_infinitely_wrong() -> None:
-    observed = observed_at([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], [0, 1], np.zeros((2, 3)))
-    errors = reprojection_errors_px(observed, np.array([[320.0, 240.0], [323.0, 244.0]]))
-    np.testing.assert_allclose(errors, [np.inf, 5.0])
-
-
 def test_mean_depths() -> None:
     centers = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, -1.0]])
     observed = observed_at([[1.0, 2.0, 3.0], [0.0, 0.0, 5.0], [0.0, 0.0, 1.0]], [0, 0, 1], centers)
     np.testing.assert_allclose(mean_depths(observed), [3.5, 6.0, np.nan])
-
-
-@pytest.mark.parametrize(
-    ("limits", "expected"),
-    [
-        ({}, [0, 0, 0, 0, 0, 0]),
-        ({"max_deviation": 0.02}, [0, 0, 1, 1, 0, 0]),
-        ({"max_relative_deviation": 0.01}, [0, 1, 0, 0, 0, 0]),
-        ({"keep_quantile": 0.8}, [0, 0, 0, 1, 0, 0]),
-        ({"keep_quantile": 0.2}, [0, 1, 1, 1, 0, 1]),
-        ({"max_deviation": 0.02, "max_relative_deviation": 0.01}, [0, 1, 1, 1, 0, 0]),
-        # above a limit it goes, at it it stays
-        ({"max_relative_deviation": 0.005}, [0, 1, 1, 0, 0, 0]),
-        ({"max_robust_sigmas": 0.5}, [0, 1, 1, 0, 0, 0]),
-    ],
-)
-def test_uncertain_points(limits: dict[str, Any], expected: list[int]) -> None:
-    deviations = np.array([0.005, 0.015, 0.03, 0.05, np.nan, 0.02])
-    depths = np.array([1.0, 1.0, 5.0, 10.0, 1.0, 5.0])
-    options = UncertaintyOptions.model_validate(limits)
-    assert options.needs_deviations() == bool(limits)
-    assert too_uncertain(deviations, depths, options).tolist() == [bool(e) for e in expected]
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(1e-3, 1e3), st.floats(0.5, 4.0))
@@ -369,8 +252,7 @@ def test_a_limit_of_the_scenes_own_follows_its_scale(
     depths = rng.uniform(1.0, 50.0, 200)
     relative = np.exp(rng.normal(-6.0, 0.7, 200))
     relative[::10] = np.nan
-    options = UncertaintyOptions(max_robust_sigmas=num_sigmas)
-    found = too_uncertain(relative * depths, depths, options)
+    found = too_uncertain(relative * depths, depths, num_sigmas)
     logarithms = np.log(relative[~np.isnan(relative)])
     spread = median_abs_deviation(logarithms, scale="normal")
     expected = np.log(relative) > np.median(logarithms) + num_sigmas * spread
@@ -378,17 +260,16 @@ def test_a_limit_of_the_scenes_own_follows_its_scale(
     np.testing.assert_array_equal(found[~near], expected[~near])
     # images ten times as noisy, or a world in another unit, change nothing
     for deviations, other in ((relative * depths * scale, depths), (relative * depths, depths)):
-        again = too_uncertain(deviations * scale, other * scale, options)
+        again = too_uncertain(deviations * scale, other * scale, num_sigmas)
         np.testing.assert_array_equal(again[~near], found[~near])
 
 
 def test_a_limit_of_the_scenes_own_bears_what_is_unknown() -> None:
-    options = UncertaintyOptions(max_robust_sigmas=2.0)
     unknown = np.array([np.nan, np.nan])
-    assert not too_uncertain(unknown, np.ones(2), options).any()
-    assert not too_uncertain(np.full(5, 0.1), np.ones(5), options).any()  # all alike
+    assert not too_uncertain(unknown, np.ones(2), 2.0).any()
+    assert not too_uncertain(np.full(5, 0.1), np.ones(5), 2.0).any()  # all alike
     infinite = np.array([0.1, 0.11, 0.12, np.inf])
-    assert too_uncertain(infinite, np.ones(4), options).tolist() == [False, False, False, True]
+    assert too_uncertain(infinite, np.ones(4), 2.0).tolist() == [False, False, False, True]
 
 
 def test_who_loses_nothing_stays() -> None:

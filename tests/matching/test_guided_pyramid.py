@@ -21,7 +21,6 @@ from megloc_kapture.matching.guided_pyramid import (
     VariantMatches,
     base_type,
     extract_variants,
-    match_probed,
     match_variants,
     pyramid_type,
 )
@@ -285,45 +284,6 @@ def test_variants_that_agree_with_the_richest_remain(rich: str) -> None:
     assert sizes[:-1] == [*map(len, most), 20] and 15 <= sizes[-1] <= 18
     assert set(range(25, 40)) <= set(kept[-1].other_rows.tolist())
     assert judgement.agree([]) == []
-
-
-def matched_by(variant: VariantFeatures, count: int) -> VariantMatches:
-    zeros = np.zeros((count, 2), np.float32)
-    return VariantMatches(
-        variant.variant, zeros, zeros, np.arange(count), np.ones(count, np.float32)
-    )
-
-
-@pytest.mark.parametrize(("enough", "left"), [(29, 0), (30, 1), (31, 1)])
-def test_on_the_rest_only_what_matched_a_probed_pair_is_tried(enough: int, left: int) -> None:
-    empty = ImageFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32), 8, 8)
-    variants = [
-        VariantFeatures(variant, empty, np.zeros((0, 2), np.float32)) for variant in ALL_VARIANTS
-    ]
-    asked: list[tuple[int, range]] = []
-
-    def match(some: Any, which: range) -> list[list[VariantMatches]]:
-        asked.append((len(some), which))
-        # the third of them matches the second image, all the rest by chance
-        return [
-            [matched_by(one, enough if one is variants[2] and at == 1 else 20) for one in some]
-            for at in which
-        ]
-
-    options = GuidedPyramidOptions(mode="all", probed_pairs=3)
-    found, num_left = match_probed(variants, 10, match, options)
-    assert num_left == left
-    assert asked == [(len(variants), range(3)), *([(1, range(3, 10))] if left else [])]
-    assert [len(of_pair) for of_pair in found] == [len(variants)] * 3 + [left] * 7
-    # fewer pairs than are probed, and none
-    assert len(match_probed(variants, 2, match, options)[0]) == 2
-    assert match_probed(variants, 0, match, options)[0] == []
-    # without probing, all variants are tried on all
-    asked.clear()
-    unprobed = GuidedPyramidOptions(mode="all", probed_pairs=None)
-    found, num_tried = match_probed(variants, 10, match, unprobed)
-    assert [len(of_pair) for of_pair in found] == [len(variants)] * 10
-    assert asked == [(len(variants), range(10))]
 
 
 SIZES = st.tuples(st.integers(1, 900), st.integers(1, 900))

@@ -12,8 +12,7 @@ from kornia.feature import LightGlue as KorniaLightGlue
 from transformers import LightGlueConfig, LightGlueForKeypointMatching, SuperPointConfig
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.matching.networks import LightGlue, LightGlueOptions, _batch
-from megloc_kapture.nets.lightglue import KeypointBatch, load_lightglue
+from megloc_kapture.matching.networks import LightGlue, LightGlueOptions
 from megloc_kapture.values import ImageFeatures
 
 SIZES = [256, 128]  # SuperPoint's descriptors, ALIKED's
@@ -180,28 +179,6 @@ def test_matches_are_kornias(checkpoint: Path, size: int) -> None:
     assert len(matches) > 50
     np.testing.assert_array_equal(matches, found["matches"][0].numpy())
     np.testing.assert_allclose(scores, found["scores"][0].numpy(), atol=1e-4)
-
-
-def in_double(*images: ImageFeatures) -> KeypointBatch:
-    """A batch of the matcher's own, in double precision: what padding adds is not lost."""
-    batch = _batch(images, torch.device("cpu"))
-    return replace(batch, points=batch.points.double(), descriptors=batch.descriptors.double())
-
-
-def test_padding_changes_nothing(size: int) -> None:
-    network = load_lightglue(official(random_network(size)), "it.pth").double()
-    left = [random_image(number, size, seed=number) for number in (60, 25)]
-    right = [noisy(image, seed=1) for image in left]
-    with torch.inference_mode():
-        together = network(in_double(*left), in_double(*right))
-        for row, (a, b) in enumerate(zip(left, right, strict=True)):
-            (alone,) = network(in_double(a), in_double(b))
-            rows, columns = alone.shape
-            torch.testing.assert_close(
-                together[row, :rows, :columns], alone, rtol=1e-12, atol=1e-12
-            )
-            assert (together[row, rows:] == -torch.inf).all()
-            assert (together[row, :, columns:] == -torch.inf).all()
 
 
 def test_a_file_may_lack_what_is_not_used(checkpoint: Path, size: int, tmp_path: Path) -> None:

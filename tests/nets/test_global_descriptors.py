@@ -1,4 +1,4 @@
-"""NetVLAD, AP-GeM and EigenPlaces: layers against equations, weights that do not fit."""
+"""NetVLAD and AP-GeM: layers against equations, weights that do not fit."""
 
 from __future__ import annotations
 
@@ -12,24 +12,20 @@ from published import Tensors, published_shapes, randomised
 from torch.nn import functional as F
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.weights.authors import AVERAGE_IMAGE
 from megloc_kapture.nets.global_descriptors import (
     ApGemNet,
-    EigenPlacesNet,
     NetVladLayer,
     Order,
     apgem_from,
-    eigenplaces_from,
     netvlad,
     openibl,
     whitening_from,
 )
-from megloc_kapture.nets.trunks import Depth, ResNet
+from megloc_kapture.nets.trunks import ResNet
 
 CLUSTERS, OUTPUT = 3, 10
 MEAN = (123.0, 116.5, 104.25)
-# place in the published sequence -> torchvision's name
-NAMES = {"0": "conv1", "1": "bn1", "4": "layer1", "5": "layer2", "6": "layer3", "7": "layer4"}
+AVERAGE_IMAGE = "average_image"
 
 
 def random_layer(order: Order, seed: int = 0, *, clusters: int = 4, size: int = 5) -> NetVladLayer:
@@ -236,47 +232,3 @@ def test_whitenings_that_are_not_there_or_not_whole(
 ) -> None:
     with pytest.raises(OptionError if "no whitening" in message else DataError, match=message):
         whitening_from(parts, name, "w.pt", power=0.25)
-
-
-def test_eigenplaces_vector_is_the_papers() -> None:
-    network = randomised(EigenPlacesNet(50, 12))
-    network.aggregation["1"].p.fill_(2.6)
-    trunk = ResNet(50).eval()
-    trunk.load_state_dict(
-        {
-            f"{NAMES[key.split('.')[1]]}.{key.split('.', 2)[2]}": value
-            for key, value in network.state_dict().items()
-            if key.startswith("backbone.")
-        },
-        strict=True,
-    )
-    image = torch.rand(2, 3, 75, 98, generator=torch.Generator().manual_seed(1))
-    mean, deviation = torch.tensor([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]])
-    with torch.inference_mode():
-        found = network(image).numpy()
-        features = trunk((image - mean[:, None, None]) / deviation[:, None, None])[-1]
-    assert found.shape == (2, 12) and found.dtype == np.float32
-    linear = network.aggregation["3"]
-    weight, bias = (p.detach().double().numpy() for p in (linear.weight, linear.bias))
-    for one, planes in zip(found, features.double().numpy(), strict=True):
-        at_place = planes.reshape(2048, -1)
-        at_place = at_place / np.sqrt((at_place**2).sum(0))
-        pooled = (np.maximum(at_place, 1e-6) ** 2.6).mean(1) ** (1 / 2.6)
-        expected = weight @ pooled + bias
-        np.testing.assert_allclose(one, expected / np.linalg.norm(expected), atol=1e-5)
-
-
-@pytest.mark.parametrize(("depth", "size"), [(50, 128), (101, 512)])
-def test_depth_and_size_follow_from_the_file(depth: Depth, size: int) -> None:
-    # numbers do not matter, and are many: one is seen as all of them
-    with torch.device("meta"):
-        shapes = EigenPlacesNet(depth, size).state_dict()
-    tensors = {key: torch.zeros(()).expand(value.shape) for key, value in shapes.items()}
-    found = eigenplaces_from(tensors, "w.pth")
-    assert not found.training
-    assert {k: v.shape for k, v in found.state_dict().items()} == {
-        k: v.shape for k, v in shapes.items()
-    }
-    del tensors["aggregation.3.weight"]
-    with pytest.raises(DataError, match=r"w\.pth: no EigenPlaces: .*aggregation\.3\.weight"):
-        eigenplaces_from(tensors, "w.pth")

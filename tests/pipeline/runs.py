@@ -85,5 +85,6 @@ def manifest(stage: str, **changes: Any) -> Manifest:
     """What a finished stage leaves."""
     content: dict[str, Any] = {"options": {}, "inputs": {}, "outputs": (), "versions": {}}
     content |= {"seconds": 1.5, "started": "2024-01-01T00:00:00"}
-    content |= {"version": 1, "fingerprint": f"print of {stage}", **changes}
+    mark = f"print of {stage}"
+    content |= {"version": 1, "fingerprint": mark, "output": mark, **changes}
     return Manifest(stage=stage, **content)

@@ -12,7 +12,6 @@ from corner import write_scene
 from megloc_kapture import KaptureMap, Localizer, Pose
 from megloc_kapture.cli.main import main
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.io.kapture import (
     KaptureData,
     KaptureFolder,
@@ -20,7 +19,6 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_refinement, read_status
-from megloc_kapture.localization import confidence
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.pipeline.workspace import Workspace
@@ -109,7 +107,7 @@ def with_rig(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
                 "pyramid of unverified matches": [
                     *(*TWO_TYPES, "reranking.by=verified", "reranking.local_type=rootsift"),
                     *("reranking.keep=4", "verification=mapping", "guided_pyramid.mode=max"),
-                    *("guided_pyramid.count=matches", "guided_pyramid.probed_pairs=null"),
+                    "guided_pyramid.count=matches",
                     "guided_pyramid.scales=[0.5,1.0]",
                     "guided_pyramid.min_matches=100",
                 ],
@@ -120,26 +118,6 @@ def with_rig(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_the_same_poses(scene: Path, tmp_path: Path, assignments: tuple[str, ...]) -> None:
     assert len(same_poses(*both(scene, tmp_path / "workspace", *assignments))) == 4
-
-
-def test_a_mirrored_query_is_told_by_both(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    copy = tmp_path / "scene"
-    shutil.copytree(scene, copy, copy_function=shutil.copyfile)
-    query = KaptureFolder(copy / "query")
-    name = query.read().image_names()[0]
-    pixels = read_image_rgb(query.image_path(name))
-    write_image(query.image_path(name), np.ascontiguousarray(pixels[:, ::-1]))
-    # a rendered corner is not symmetric enough to be doubted by its confidence alone
-    monkeypatch.setattr(confidence, "MIRROR_ASKED", (0.0, 2.0))
-    sets = [*FEW, "localization.min_confidence=0", "localization.pose.min_inliers=4"]
-    workspace, localizer = both(copy, tmp_path / "workspace", *sets)
-    assert len(same_poses(workspace, localizer)) == 4
-    found = dict(localizer.localize_kapture(workspace.path("query")))
-    mirrored = {one for one, pose in found.items() if confidence.MIRRORED in pose.evidence}
-    assert mirrored == {name}
-    assert found[name].confidence < 1e-6
 
 
 def test_a_fallback_is_the_pose_of_the_first_candidate_after_reranking(

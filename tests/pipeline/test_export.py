@@ -1,27 +1,22 @@
-"""Exports of cameras and places on earth, against formulas and COLMAP."""
+"""Exports of cameras, against formulas and COLMAP."""
 
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from megloc_kapture.cli.info import describe_sizes
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.images import image_size, write_image
 from megloc_kapture.pipeline.export import (
-    GeoOrigin,
     PosedImage,
     Scene,
     export,
-    export_geojson,
     export_nerfstudio,
     export_tum,
     export_undistorted,
@@ -52,45 +47,6 @@ def centred_at(centre: tuple[float, float, float]) -> RigidTransform:
     """A camera at a centre that looks north, its y axis down."""
     world_from_cam = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     return RigidTransform.from_matrix(world_from_cam, np.array(centre)).inverse()
-
-
-def ecef(latitude_deg: float, longitude_deg: float, height_m: float) -> np.ndarray:
-    """The textbook's formula, with WGS84's semi-axes."""
-    a, b = 6378137.0, 6356752.314245179
-    phi, lam = math.radians(latitude_deg), math.radians(longitude_deg)
-    n = a * a / math.hypot(a * math.cos(phi), b * math.sin(phi))
-    flat = (n + height_m) * math.cos(phi)
-    up = (b * b / (a * a) * n + height_m) * math.sin(phi)
-    return np.array([flat * math.cos(lam), flat * math.sin(lam), up])
-
-
-@given(
-    st.floats(-89, 89),
-    st.floats(-179, 179),
-    st.floats(-100, 5000),
-    st.tuples(*[st.floats(-5000, 5000)] * 3),
-)
-def test_places_on_earth_are_as_far_from_the_origin_as_in_the_world(
-    tmp_path_factory: pytest.TempPathFactory,
-    latitude: float,
-    longitude: float,
-    height: float,
-    centre: tuple[float, float, float],
-) -> None:
-    out = tmp_path_factory.getbasetemp() / "a.geojson"
-    camera = Camera.pinhole(640, 480, 500)
-    export_geojson(
-        scene(image(camera, centred_at(centre))), out, GeoOrigin(latitude, longitude, height)
-    )
-    feature = json.loads(out.read_text())["features"][0]
-    found_longitude, found_latitude, found_height = feature["geometry"]["coordinates"]
-    moved = ecef(found_latitude, found_longitude, found_height) - ecef(latitude, longitude, height)
-    phi, lam = math.radians(latitude), math.radians(longitude)
-    east = np.array([-math.sin(lam), math.cos(lam), 0.0])
-    up = np.array([math.cos(phi) * math.cos(lam), math.cos(phi) * math.sin(lam), math.sin(phi)])
-    north = np.cross(up, east)
-    np.testing.assert_allclose([moved @ east, moved @ north, moved @ up], centre, atol=1e-5)
-    assert feature["properties"]["heading_deg"] % 360 == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Runs that localize in the model a dataset comes with, alone and beside points of our own."""
+"""Runs that localize in the model a dataset comes with."""
 
 from __future__ import annotations
 
@@ -61,18 +61,6 @@ def test_the_model_alone(run: Callable[..., Workspace]) -> None:
     assert len(found.points3d()) == len(workspace.folder("reference").points3d())
 
 
-def test_the_model_and_points_of_our_own(run: Callable[..., Workspace]) -> None:
-    workspace = run("map=given+triangulate", 'mapping_pairs.by=["covisibility"]')
-    assert recall(workspace, "day")[1] == 1.0
-    found = workspace.folder("map")
-    observations = found.observations()
-    assert sorted(observations) == ["rootsift", "sift"]
-    given, own = (set(observations[name].point_ids.tolist()) for name in ("sift", "rootsift"))
-    assert given and own and not given & own  # every point is of one type
-    assert len(given | own) == len(found.points3d())
-    assert covisible_pairs(workspace)
-
-
 def covisible_pairs(workspace: Workspace) -> int:
     """How many pairs there are; every pair sees points of the model in common."""
     seen = KaptureFolder(workspace.path("reference")).observations()["sift"]
@@ -96,12 +84,7 @@ COVISIBLE = 'mapping_pairs.by=["covisibility"]'
         ("kapture", ["map=given"], "map = given"),
         (
             "synthetic-aachen",
-            ["map=given+triangulate", "local_features.name=sift"],
-            "'sift' is asked for twice",
-        ),
-        (
-            "synthetic-aachen",
-            ["map=given+triangulate", "preprocessing.max_size_px=320"],
+            ["map=given", "preprocessing.max_size_px=320"],
             "keypoints are in the original images",
         ),
         ("synthetic", [COVISIBLE], "synthetic comes with no model: .*by covisibility"),

@@ -28,7 +28,7 @@ TURNED_FROM_UPRIGHT = RigidTransform.from_matrix(
 @pytest.fixture(scope="module")
 def options(shared_data: Path) -> PipelineOptions:
     """XFeat, which knows no other orientation than upright, on small images."""
-    weights = shared_data / "weights" / "xfeat" / "xfeat.onnx"
+    weights = shared_data / "weights" / "xfeat" / "xfeat.pt"
     return options_of_preset(
         assignments=[
             "local_features=xfeat",

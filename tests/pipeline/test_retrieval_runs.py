@@ -13,7 +13,7 @@ from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.io.weights import MissingWeightsError
-from megloc_kapture.nets.global_descriptors import EigenPlacesNet
+from megloc_kapture.nets.global_descriptors import VggNetVlad
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import Query
 from megloc_kapture.pipeline.query_folders import KaptureQueries
@@ -29,13 +29,14 @@ def options(tmp_path_factory: pytest.TempPathFactory) -> PipelineOptions:
     """VLAD and a network of random weights, which ranks at random, of small images."""
     torch.manual_seed(0)
     file = tmp_path_factory.mktemp("weights") / "random.pth"
-    torch.save(EigenPlacesNet(50, 32).state_dict(), file)
+    net = VggNetVlad(order="kd", mean_rgb=(0, 0, 0), num_clusters=2, output_size=32)
+    torch.save(net.state_dict(), file)
     return options_of_preset(
         assignments=[
             "local_features.options.max_keypoints=500",
             "preprocessing.max_size_px=400",
-            'global_features=["vlad","eigenplaces"]',
-            f"global_features.eigenplaces.options.weights={file}",
+            'global_features=["vlad","openibl"]',
+            f"global_features.openibl.options.weights={file}",
             "global_features.vlad.options.num_clusters=8",
             "global_features.vlad.options.dimensions=6",
             "global_features.vlad.weight=3",
@@ -65,7 +66,7 @@ def test_all_candidates_are_matched_once_and_the_best_are_localized_with(
     assert {(p.query, p.map) for p in kept} < {(p.query, p.map) for p in candidates}
     assert not finished.path("matches/query_candidates").exists()
     types = finished.folder("mapping", "").types("global_features")
-    assert types == ["eigenplaces-random", "vlad_rootsift"]
+    assert types == ["openibl-random", "vlad_rootsift"]
 
 
 def test_another_number_to_keep_matches_nothing_again(
@@ -89,7 +90,7 @@ def test_the_localizer_ranks_and_keeps_the_same_images(
     localizer = Localizer(opened, options=options)
     queries = KaptureFolder(finished.path("preprocessed/query"), features_dirs=[finished.root])
     for query in KaptureQueries(queries, opened):
-        assert query.global_features.keys() == {"vlad_rootsift", "eigenplaces-random"}
+        assert query.global_features.keys() == {"vlad_rootsift", "openibl-random"}
         found = localizer.localize_query(query)
         assert found, found
         assert set(found.candidates) <= set(kept[query.name])
@@ -110,7 +111,7 @@ def test_vectors_that_the_map_lacks_are_made_from_its_images(
 ) -> None:
     only = options.model_copy(update={"global_features": options.global_features[1:]})
     bare = Path(shutil.copytree(finished.path("map"), tmp_path / "map", symlinks=True))
-    shutil.rmtree(bare / "reconstruction" / "global_features" / "eigenplaces-random")
+    shutil.rmtree(bare / "reconstruction" / "global_features" / "openibl-random")
     opened = KaptureMap.open(bare)
     assert opened.global_types() == ["vlad_rootsift"]
     localizer = Localizer(opened, options=only)

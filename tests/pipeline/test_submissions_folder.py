@@ -75,29 +75,6 @@ def test_a_challenge_of_several_files_is_a_folder(tmp_path: Path) -> None:
         assert (folder / f"{name}.json").read_bytes() == Path(f"{place}.json").read_bytes()
 
 
-def test_what_a_killed_run_left_is_completed(tmp_path: Path) -> None:
-    place = pose_files(tmp_path / "run", {"a.txt": "1 2\n", "b.txt": "3 4\n"})
-    kept = tmp_path / "kept" / place.name
-    kept.mkdir(parents=True)
-    (kept / "a.txt").write_text("1 2\n")
-    assert keep_submission(place, kept.parent) == kept
-    assert contents(kept.parent) == contents(place.parent)
-    # a provenance without its poses is replaced
-    place = pose_file(tmp_path / "new", "new\n")
-    keep_submission(pose_file(tmp_path / "old", "old\n"), tmp_path / "other").unlink()
-    keep_submission(place, tmp_path / "other")
-    assert contents(tmp_path / "other") == contents(place.parent)
-
-
-def test_what_is_no_pose_file_is_left_alone(tmp_path: Path) -> None:
-    folder = tmp_path / "kept"
-    (folder / f"{NAME}.txt" / "deep").mkdir(parents=True)
-    (folder / f"{NAME}-2.txt").symlink_to(tmp_path / "nowhere")
-    kept = keep_submission(pose_file(tmp_path / "run", "a\n"), folder)
-    assert kept.name == f"{NAME}-3.txt"
-    assert not (tmp_path / "nowhere").exists()
-
-
 @pytest.mark.parametrize("gone", [f"{NAME}.txt", f"{NAME}.txt.json"])
 def test_a_lost_pose_file_is_said_to_be_lost(tmp_path: Path, gone: str) -> None:
     place = pose_file(tmp_path / "run", "a\n")

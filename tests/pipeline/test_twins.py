@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from megloc_kapture.evaluation.check.reading import read_reference
-from megloc_kapture.evaluation.check.submission import check_submission
+from megloc_kapture.evaluation.check import check_submission, read_reference
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX
 from megloc_kapture.pipeline.evaluation_plan import recall_rows
 from megloc_kapture.pipeline.plan import all_kept

@@ -15,20 +15,21 @@ from hypothesis import strategies as st
 
 from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.io.files import write_json_model
-from megloc_kapture.pipeline.workspace import FileHashes, Workspace, fingerprint, read_manifest
+from megloc_kapture.pipeline.workspace import Workspace, fingerprint, read_manifest
+from megloc_kapture.stages.stage import files_fingerprint
 from tests.pipeline.runs import manifest
 
 
 def use(workspace: Workspace) -> None:
     """Leave what a finished stage leaves."""
-    with workspace.lock(), workspace.staging("a") as out:
+    with workspace.lock(), workspace.staging("a", "1") as out:
         (out / "a.txt").write_text("a")
         workspace.publish(out, ("a.txt",))
 
 
 def test_a_used_workspace_is_known_again_and_an_unused_one_is_taken_away(tmp_path: Path) -> None:
     workspace = Workspace(tmp_path / "runs" / "w")
-    with workspace.lock(), workspace.staging("a") as out:
+    with workspace.lock(), workspace.staging("a", "1") as out:
         (out / "a.txt").write_text("a")
     assert list(tmp_path.iterdir()) == []
     use(Workspace(tmp_path / "w"))
@@ -74,7 +75,7 @@ def test_publishing_replaces_and_takes_away_but_no_link_of_the_users(tmp_path: P
     workspace = Workspace(tmp_path / "w")
     outputs = ("sub/folder", "file.txt", "other.txt")
     for number in "12":
-        with workspace.lock(), workspace.staging("a") as out:
+        with workspace.lock(), workspace.staging("a", "1") as out:
             (out / "sub" / "folder").mkdir(parents=True)
             (out / "sub" / "folder" / number).touch()
             (out / ("file.txt" if number == "1" else "other.txt")).write_text(number)
@@ -90,7 +91,7 @@ def test_publishing_replaces_and_takes_away_but_no_link_of_the_users(tmp_path: P
     with (
         pytest.raises(OutputError, match="folder: is a link or a file"),
         workspace.lock(),
-        workspace.staging("a") as out,
+        workspace.staging("a", "1") as out,
     ):
         (out / "folder").mkdir()
         workspace.publish(out, ("folder",))
@@ -136,44 +137,13 @@ def test_a_broken_manifest_is_none(tmp_path: Path, content: bytes) -> None:
     assert read_manifest(tmp_path / "s.json") is None
 
 
-def test_hashes_follow_names_and_contents(tmp_path: Path) -> None:
-    (tmp_path / "a").write_text("1")
-    (tmp_path / "b").write_text("2")
-
-    def of(*names: str) -> str:
-        return FileHashes(tmp_path / "none").of_files(tmp_path, [tmp_path / n for n in names])
-
-    both = of("a", "b")
-    assert of("b", "a") == both != of("a")
-    (tmp_path / "b").write_text("3")
-    assert of("a", "b") != both
-    (tmp_path / "b").write_text("2")
-    assert of("a", "b") == both
-    (tmp_path / "b").rename(tmp_path / "c")
-    assert of("a", "c") != both
-    with pytest.raises(DataError, match="b: cannot be read: No such file"):
-        of("a", "b")
-
-
-def test_what_is_remembered_is_read_again_when_it_has_changed(tmp_path: Path) -> None:
-    file, memory = tmp_path / "a", tmp_path / "memory.json"
-    file.write_text("1")
-    hashes = FileHashes(memory)
-    old = hashes.of_file(file)
-    content = hashes.content()
-    content[str(file)][4] = "remembered"
-    memory.write_text(json.dumps(content))
-    assert FileHashes(memory).of_file(file) == "remembered"
-    # changed in place, whatever its times say
-    before = file.stat()
-    file.write_text("2")
-    os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
-    assert FileHashes(memory).of_file(file) not in ("remembered", old)
-
-
-@pytest.mark.parametrize("content", ["", "[]", "nonsense", '{"x": 1}'])
-def test_a_broken_memory_is_forgotten(tmp_path: Path, content: str) -> None:
-    (tmp_path / "a").write_text("1")
-    (tmp_path / "memory.json").write_text(content)
-    hashes = FileHashes(tmp_path / "memory.json")
-    assert hashes.of_file(tmp_path / "a") == FileHashes(tmp_path / "none").of_file(tmp_path / "a")
+def test_a_fingerprint_of_files_follows_names_sizes_and_times(tmp_path: Path) -> None:
+    for name in "ab":
+        (tmp_path / name).write_text(name)
+    before = files_fingerprint(tmp_path, [tmp_path / "a", tmp_path / "b"])
+    assert files_fingerprint(tmp_path, [tmp_path / "b", tmp_path / "a"]) == before
+    assert files_fingerprint(tmp_path, [tmp_path / "a"]) != before
+    os.utime(tmp_path / "b", ns=(1, 1))
+    assert files_fingerprint(tmp_path, [tmp_path / "a", tmp_path / "b"]) != before
+    with pytest.raises(DataError, match="gone: cannot be read"):
+        files_fingerprint(tmp_path, [tmp_path / "gone"])

@@ -93,19 +93,6 @@ def test_a_small_field_learns_the_room_and_the_same_bytes_twice() -> None:
     assert not torch.equal(changed.module.state_dict()["planes.0"], one["planes.0"])
 
 
-def test_gaussians_learn_the_room_and_begin_with_its_depth() -> None:
-    options = FieldTrainingOptions(
-        kind="gaussians", gaussians=1500, steps=80, rays_per_step=256, device="cpu"
-    )
-    field, psnr = train_field(views(8), options)
-    assert min(psnr.values()) > 16 and depth_error(field, views(4)) < 0.08
-    brief = options.model_copy(update={"steps": 8})
-    one, other = (train_field(views(5), brief)[0].module.state_dict() for _ in range(2))
-    assert all(torch.equal(one[name], other[name]) for name in one)
-    with pytest.raises(DataError, match="and 0 pixels have any; megloc densify"):
-        train_field(views(5, depth=False), brief)
-
-
 def test_half_precision_learns_nearly_the_same() -> None:
     half = QUICK.model_copy(update={"half_precision": True})
     fields = [train_field(views(5), each)[0] for each in (QUICK, half)]

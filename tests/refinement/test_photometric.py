@@ -15,6 +15,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import project
+from megloc_kapture.geometry.poses import perturbed
 from megloc_kapture.refinement.acceptance import (
     compare_poses,
     correlation,
@@ -27,7 +28,6 @@ from megloc_kapture.refinement.photometric import (
     Alignment,
     LevelProblem,
     minimise,
-    perturbed,
     unoccluded_points,
 )
 from megloc_kapture.refinement.pyramid import ChosenPoints, Level

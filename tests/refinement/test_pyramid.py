@@ -21,7 +21,7 @@ from megloc_kapture.refinement.pyramid import (
 )
 from megloc_kapture.values import Camera, RigidTransform
 
-APPEARANCES: tuple[Appearance, ...] = ("normalised", "colours", "intensity", "gradients")
+APPEARANCES: tuple[Appearance, ...] = ("normalised", "colours")
 CAMERA = Camera("SIMPLE_RADIAL", 320, 240, (250.0, 161.0, 118.5, -0.05))
 DEPTH_CAMERA = Camera("PINHOLE", 160, 120, (130.0, 131.0, 80.0, 60.5))
 HERE = RigidTransform.identity()
@@ -46,19 +46,6 @@ def test_levels_halve_and_know_their_scale(appearance: Appearance) -> None:
     assert levels[1].scale_y == 37 / 150
     assert all(level.values.dtype == np.float32 for level in levels)
     assert len(build_pyramid(picture(), levels=9)) == 4  # none is smaller than 16 px
-
-
-def test_a_ramp_keeps_its_brightness_where_it_stands() -> None:
-    x = np.arange(160) + 0.5
-    image = np.broadcast_to(x[None, :, None], (120, 160, 3)).astype(np.uint8)
-    for level in build_pyramid(image, levels=3, appearance="intensity"):
-        h, w = level.valid.shape
-        there = (np.arange(w) + 0.5) / level.scale_x
-        middle = slice(w // 4, -w // 4)
-        expected = np.broadcast_to((there - 0.5)[middle] / 255, (h, len(there[middle])))
-        np.testing.assert_allclose(level.values[:, middle, 0], expected, atol=2e-4)
-    finest = build_pyramid(image, levels=1, appearance="gradients")[0]
-    np.testing.assert_allclose(finest.values[20:100, 20:140], 1 / 255, rtol=1e-3)
 
 
 @pytest.mark.parametrize("appearance", APPEARANCES)
@@ -98,7 +85,7 @@ def test_colours_are_normalised_each_as_brightness_is_whatever_the_exposure() ->
 def test_gradient_energy_is_that_of_central_differences() -> None:
     mask = np.ones((150, 200), bool)
     mask[70, 100] = False
-    level = build_pyramid(picture(), mask, levels=1, appearance="intensity")[0]
+    level = build_pyramid(picture(), mask, levels=1)[0]
     energy = level.gradient_energy
     values = level.values[..., 0]
     expected = (values[50, 81] - values[50, 79]) ** 2 + (values[51, 80] - values[49, 80]) ** 2
@@ -106,29 +93,9 @@ def test_gradient_energy_is_that_of_central_differences() -> None:
     assert not energy[0].any() and not energy[:, -1].any() and not energy[70, 99:102].any()
 
 
-def test_feature_maps_are_compared_as_they_are() -> None:
-    def maps(image: NDArray[np.uint8]) -> NDArray[np.float64]:
-        return np.stack([image[::4, ::4].mean(2), image[::4, ::4, 0] * 1.0]) / 255
-
-    levels = build_pyramid(picture(), levels=2, features=maps)
-    assert [level.values.shape for level in levels] == [(38, 50, 2), (19, 25, 2)]
-    assert levels[0].scale_x == 0.25
-    mask = np.ones((150, 200), bool)
-    mask[40:80, 40:80] = False
-    hidden = picture()
-    hidden[~mask] = 255
-    first, second = (build_pyramid(each, mask, features=maps)[0] for each in (picture(), hidden))
-    np.testing.assert_array_equal(first.values, second.values)
-    assert not first.valid[12:18, 12:18].any() and first.valid[25:].all()
-
-
 def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(DataError, match="mask"):
         build_pyramid(picture(), np.ones((10, 10), bool))
-    with pytest.raises(DataError, match="feature maps"):
-        build_pyramid(picture(), features=lambda image: np.zeros((3, 4)))
-    with pytest.raises(DataError, match="finite"):
-        build_pyramid(picture(), features=lambda image: np.full((1, 40, 40), np.nan))
     with pytest.raises(DataError, match="depth map"):
         lift_points(CAMERA, HERE, DepthView(CAMERA, np.ones((10, 10), np.float32), HERE))
 

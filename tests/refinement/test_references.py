@@ -26,11 +26,10 @@ from megloc_kapture.refinement.references import (
     Displacement,
     HoldsOut,
     PyramidKind,
-    ReferenceCache,
     ReferenceImages,
     RenderingReference,
     judge_consistency,
-    prepare,
+    prepared,
     refine_held_out,
     spread_names,
 )
@@ -39,7 +38,7 @@ from megloc_kapture.values import Camera, RigidTransform
 
 SMALL_CAMERA = Camera("PINHOLE", 80, 60, (70.0, 70.0, 40.0, 30.0))
 HERE = RigidTransform.identity()
-KIND = PyramidKind(levels=2, max_side_px=640, appearance="intensity")
+KIND = PyramidKind(levels=2, max_side_px=640, appearance="normalised")
 Map = Mapping[str, RenderingReference]
 Verdict = Callable[[Map], Consistency]
 
@@ -47,7 +46,7 @@ CAMERA = Camera("PINHOLE", 240, 180, (195.0, 197.0, 120.0, 90.0))
 PX_PER_M = 60
 SLOW = pytest.mark.slow
 # two threads on small images wait for each other most of the time
-QUICK = RenderingOptions(max_references=3, search_deg=2.0)
+QUICK = RenderingOptions(max_references=3)
 # origin, unit vectors of the texture's columns and rows, metres along them
 WALLS = (
     ((-4.0, -3.0, 4.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), 6, 6),
@@ -63,28 +62,10 @@ def reference(seed: int) -> RenderingReference:
     return RenderingReference(image, SMALL_CAMERA, HERE, DepthView(SMALL_CAMERA, depth_m, HERE))
 
 
-def test_the_same_content_is_prepared_once() -> None:
-    cache = ReferenceCache(2**24)
-    first = cache.prepared(reference(0), KIND)
-    assert cache.prepared(reference(0), KIND) is first
-    expected = prepare(reference(0), KIND)
-    np.testing.assert_array_equal(first.points.points, expected.points.points)
-    np.testing.assert_array_equal(first.pyramid[1].values, expected.pyramid[1].values)
-    cache.clear()
-    assert cache.prepared(reference(0), KIND) is not first
-    # those used longest ago go first
-    cache = ReferenceCache(int(2.5 * expected.nbytes))
-    first, second = (cache.prepared(reference(seed), KIND) for seed in (0, 1))
-    assert cache.prepared(reference(0), KIND) is first
-    cache.prepared(reference(2), KIND)
-    assert cache.prepared(reference(0), KIND) is first
-    assert cache.prepared(reference(1), KIND) is not second
-
-
-def test_any_other_content_is_prepared_anew() -> None:
-    cache = ReferenceCache(2**24)
+def test_a_reference_is_prepared_once_and_any_other_content_anew() -> None:
     one = reference(0)
-    first = cache.prepared(one, KIND)
+    first = prepared(one, KIND)
+    assert prepared(reference(0), KIND) is first
     pixel = one.image.copy()
     pixel[30, 40, 1] ^= 1
     further = replace(one.depth, depth_m=one.depth.depth_m + np.float32(1e-3))
@@ -99,22 +80,12 @@ def test_any_other_content_is_prepared_anew() -> None:
         replace(one, camera=wider),
         replace(one, cam_from_world=there),
     ]
-    found = [cache.prepared(each, KIND) for each in others]
-    found += [cache.prepared(one, replace(KIND, levels=1))]
+    found = [prepared(each, KIND) for each in others]
+    found += [prepared(one, replace(KIND, levels=1))]
     assert len({id(each) for each in (first, *found)}) == 9
-    assert cache.prepared(one, KIND) is first
-    # feature maps are not kept
-    calls = []
-
-    def maps(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        calls.append(image)
-        return np.ones((2, 30, 40), np.float32)
-
-    for _ in range(2):
-        cache.prepared(one, replace(KIND, features=maps))
-    assert len(calls) == 2
+    assert prepared(one, KIND) is first
     with pytest.raises(DataError, match="does not fit a camera"):
-        cache.prepared(replace(one, image=one.image[:50]), KIND)
+        prepared(replace(one, image=one.image[:50]), KIND)
 
 
 def texture(width: int, height: int, seed: int) -> NDArray[np.uint8]:

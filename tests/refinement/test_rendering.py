@@ -20,19 +20,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.geometry.poses import rotation_angles_deg
 from megloc_kapture.plugins import DepthView, PoseRefinement, PoseRefiner
 from megloc_kapture.refinement.acceptance import RenderingOptions
-from megloc_kapture.refinement.photometric import perturbed
-from megloc_kapture.refinement.pyramid import ChosenPoints, Level
 from megloc_kapture.refinement.references import RenderingQuery, RenderingReference
 from megloc_kapture.refinement.rendering import (
     Rendering,
     _Refining,
-    best_rotations,
     refine_by_rendering,
-    rotation_grid,
 )
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -288,29 +283,6 @@ def test_a_depth_camera_beside_the_image_is_honoured(
     assert not wrong.accepted or errors(wrong.cam_from_world, case.truth)[0] > 0.03
 
 
-@pytest.mark.parametrize("appearance", ["intensity", "gradients"])
-def test_other_appearances_find_a_day_query(
-    case: Case, painter: PlaceRenderer, shots: tuple[Frame, list[Frame]], appearance: str
-) -> None:
-    day = showing(case, painter.render(shots[0]).image)
-    refined = run(day, start_from(case.truth, 6), appearance=appearance)
-    assert_found(refined, case.truth, 0.02, 0.1)
-
-
-def test_feature_maps_take_the_place_of_brightness(case: Case) -> None:
-    def maps(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-        smooth = cv2.resize(cv2.GaussianBlur(grey, (0, 0), 2.0), (320, 240))
-        down, across = np.gradient(smooth)
-        size = np.sqrt(cv2.blur(down**2 + across**2, (15, 15))) + 0.5
-        return np.stack([down / size, across / size]).astype(np.float32)
-
-    refined = refine_by_rendering(
-        case.query, case.references, start_from(case.truth, 7), features=maps
-    )
-    assert_found(refined, case.truth, 0.03, 0.15)
-
-
 def test_the_plugin_takes_the_first_references_that_have_depth(
     case: Case, new_scene: Callable[..., Any]
 ) -> None:
@@ -332,40 +304,3 @@ def test_the_plugin_takes_the_first_references_that_have_depth(
     assert refined.cam_from_world == direct.cam_from_world and refined.accepted
     with pytest.raises(DataError, match="does not fit a camera"):
         run(showing(case, case.query.image[:100]), start)
-
-
-def textured_points() -> tuple[ChosenPoints, Level]:
-    rng = np.random.default_rng(0)
-    image = cv2.GaussianBlur(rng.normal(size=(120, 160)), (0, 0), 2.5).astype(np.float32)
-    rows, columns = rng.integers(5, 115, 1500), rng.integers(5, 155, 1500)
-    rays = bearing_rays(CAMERA, 4.0 * np.stack([columns + 0.5, rows + 0.5], axis=1))
-    points = TURNED.inverse().apply(rays * rng.uniform(3.0, 8.0, (1500, 1)))
-    values = 3.0 * image[rows, columns][:, None].astype(np.float64) + 1.0
-    chosen = ChosenPoints(points, values, np.zeros(1500, np.int64))
-    return chosen, Level(image[..., None], np.ones((120, 160), bool), 0.25, 0.25)
-
-
-@pytest.mark.parametrize(
-    "turn_deg", [(2.0, 0.0, 0.0), (0.0, -3.0, 0.0), (1.5, 2.0, 1.0), (0.0, 0.0, -3.0)]
-)
-def test_the_turn_is_found(turn_deg: tuple[float, float, float]) -> None:
-    chosen, level = textured_points()
-    start = perturbed(TURNED, np.radians([*turn_deg, 0.0, 0.0, 0.0]))
-    found = best_rotations(chosen, level, CAMERA, start, max_deg=4.0, count=3)
-    assert found[0] is start and 2 <= len(found) <= 4
-    left = found[1] @ TURNED.inverse()
-    # within a step of the grid in each direction
-    assert np.degrees(2 * np.linalg.norm(left.quat_wxyz[1:])) < 1.3
-    np.testing.assert_allclose(found[1].center(), start.center(), atol=1e-9)
-    again = best_rotations(chosen, level, CAMERA, start, max_deg=4.0, count=3)
-    assert again == found
-    assert best_rotations(chosen, level, CAMERA, TURNED, max_deg=0.0, count=3) == [TURNED]
-
-
-def test_the_grid_has_no_turn_beyond_the_limit_and_none_at_all() -> None:
-    _, level = textured_points()
-    for limit in (1.0, 4.0, 20.0):
-        grid = rotation_grid(level, CAMERA, limit)
-        lengths = np.degrees(np.linalg.norm(grid, axis=1))
-        assert lengths[0] == 0.0 and lengths[-1] <= limit + 1e-9
-        assert (np.diff(lengths) >= 0).all() and len(grid) < 6000

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import numpy as np
@@ -14,15 +13,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.retrieval import search
 from megloc_kapture.retrieval.fusion import FusionOptions, fuse
-from megloc_kapture.retrieval.search import (
-    BestRows,
-    Found,
-    FusedSearch,
-    QuantizedRows,
-    short_lists,
-)
-from megloc_kapture.stages.candidates import Candidates, QueryPairsOptions, Retrieval
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.retrieval.search import Found, FusedSearch
 
 
 def rank_fused(
@@ -125,27 +116,7 @@ def test_a_source_is_read_once_in_blocks_and_gives_what_the_array_gives() -> Non
         np.testing.assert_array_equal(ours, expected)
 
 
-def by_ranks(matrices: Any, options: FusionOptions, weights: list[float]) -> NDArray[np.float64]:
-    """Scores (M,) of one query by the ranks of all images."""
-    fused = np.full(matrices[0].shape[1], -np.inf if options.method == "round_robin" else 0.0)
-    for feature, ((row,), weight) in enumerate(zip(matrices, weights, strict=True)):
-        ranks, share = np.argsort(np.argsort(-row, kind="stable")), weight / sum(weights)
-        if options.method == "round_robin":
-            fused = np.maximum(fused, -(ranks * len(matrices) + feature))
-        elif options.method == "reciprocal_rank":
-            fused += share / (options.rank_constant + 1 + ranks)
-        else:
-            fused += share * (len(row) - ranks)
-    return fused
-
-
-METHODS = [
-    *("mean", "power", "maximum", "minimum", "mean_and_power", "mean_and_min", "min_and_max"),
-    *("villena_roman", "harmonic_mean", "ghm", "round_robin", "reciprocal_rank", "borda"),
-]
-
-
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["ghm", "mean", "early", "reciprocal_rank"])
 def test_fused_ranking_is_that_of_the_whole_matrices(method: str) -> None:
     rng = np.random.default_rng(4)
     queries = [rng.normal(size=(7, d)) / 4 for d in (5, 9, 3)]
@@ -159,14 +130,15 @@ def test_fused_ranking_is_that_of_the_whole_matrices(method: str) -> None:
     assert indices.shape == scores.shape == (7, 10)
     for row in range(7):
         matrices = [q[row : row + 1] @ m.T for q, m in zip(queries, database, strict=True)]
-        fused = by_ranks(matrices, options, weights) if options.fuses_ranks() else None
-        fused = fuse(matrices, options, weights)[0] if fused is None else fused
-        expected = np.argsort(-fused, kind="stable")[:10]
-        if method in ("power", "harmonic_mean", "villena_roman", "borda", "reciprocal_rank"):
-            # of equal scores, which these have, rounding may turn the order
-            np.testing.assert_allclose(fused[indices[row]], np.sort(fused)[::-1][:10], atol=1e-6)
+        if options.fuses_ranks():
+            ranks = [np.argsort(np.argsort(-m[0], kind="stable")) for m in matrices]
+            shares = np.array(weights) / sum(weights)
+            fused = sum(share / (61 + own) for share, own in zip(shares, ranks, strict=True))
         else:
-            assert indices[row].tolist() == expected.tolist()
+            fused = fuse(matrices, options, weights)[0]
+        # of equal scores rounding may change the order
+        np.testing.assert_allclose(fused[indices[row]], np.sort(fused)[::-1][:10], atol=1e-6)
+        np.testing.assert_allclose(scores[row], np.sort(fused)[::-1][:10], atol=1e-6)
 
 
 def test_features_that_do_not_fit_are_refused() -> None:
@@ -188,119 +160,10 @@ def test_features_that_do_not_fit_are_refused() -> None:
     [
         (np.zeros((2, 4)), np.zeros((3, 5)), "different dimensions"),
         (np.zeros(4), np.zeros((3, 4)), "different dimensions"),
-        (np.full((2, 4), np.nan), np.zeros((3, 4)), "not finite"),
-        (np.full((2, 4), np.inf), np.zeros((3, 4)), "not finite"),
-        (np.zeros((2, 4)), np.diag([0, np.nan, 0, 0]), "not finite, the first in row 1"),
-        (np.zeros((2, 4)), np.diag([0, 0, np.inf, 0]), "not finite, the first in row 2"),
     ],
 )
-def test_descriptors_that_are_none_are_refused(queries: Any, database: Any, match: str) -> None:
+def test_descriptors_of_different_dimensions_are_refused(
+    queries: Any, database: Any, match: str
+) -> None:
     with pytest.raises(DataError, match=match):
         rank_by_similarity(queries, database, 1)
-
-
-@given(
-    st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(0, 300), st.integers(0, 6), st.data()
-)
-def test_equal_to_a_stable_sort(
-    seed: int, queries: int, rows: int, top_k: int, data: st.DataObject
-) -> None:
-    rng = np.random.default_rng(seed)
-    kind = data.draw(st.sampled_from(["few", "many", "masked", "zeros", "tiny"]))
-    scores = rng.normal(size=(queries, rows)).astype(np.float32)
-    if kind == "few":
-        scores = scores.round()
-    elif kind == "masked":
-        scores[rng.uniform(size=scores.shape) < 0.7] = -np.inf
-    elif kind == "zeros":
-        scores = np.where(rng.uniform(size=scores.shape) < 0.5, np.float32(0), np.float32(-0.0))
-    elif kind == "tiny":
-        scores *= np.float32(1e-40)  # below the least normal number
-    best = BestRows(queries, top_k)
-    left = 0
-    while left < rows:
-        right = min(rows, left + data.draw(st.integers(1, 250)))
-        best.add(0, left, scores[:, left:right])
-        left = right
-    indices, found = best.result()
-    order = np.argsort(-scores, axis=1, kind="stable")[:, :top_k]
-    expected = np.full((queries, top_k), -np.inf, dtype=np.float32)
-    expected[:, : order.shape[1]] = np.take_along_axis(scores, order, axis=1)
-    np.testing.assert_array_equal(found, expected)
-    there = np.full((queries, top_k), -1)
-    there[:, : order.shape[1]] = order
-    np.testing.assert_array_equal(indices, np.where(expected == -np.inf, -1, there))
-
-
-TOP = 10
-
-
-def unit(rows: NDArray[np.floating]) -> NDArray[np.float32]:
-    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), np.float32)
-
-
-def planted(seed: int, dimension: int = 64) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """20 queries, and 3,000 rows of which each query has 30 near itself."""
-    random = np.random.default_rng(seed)
-    queries = unit(random.normal(size=(20, dimension)))
-    rows = random.normal(size=(3000, dimension))
-    near = np.repeat(queries, 30, axis=0) * dimension**0.5 + 0.8 * rows[:600]
-    return queries, unit(random.permutation(np.concatenate([near, rows[600:]])))
-
-
-@pytest.fixture
-def quantized() -> type[QuantizedRows]:
-    """The codes, where FAISS is installed."""
-    pytest.importorskip("faiss")
-    return QuantizedRows
-
-
-@pytest.mark.parametrize("method", ["ghm", "early", "borda"])
-def test_rankings_are_those_of_exact_search(quantized: type[QuantizedRows], method: str) -> None:
-    fusion = FusionOptions(method=method)  # type: ignore[arg-type]
-    queries, database = zip(planted(0), planted(1, 48), strict=True)
-    codes = [quantized(rows) for rows in database]
-    exact, exact_scores = rank_fused(queries, database, TOP, fusion=fusion)
-    # all rows of the list: what every method must rank as the exact search does
-    search = FusedSearch(TOP, fusion)
-    lists = short_lists(search, queries, database, codes, length=3000)
-    found, scores = search.ranking([lists])
-    np.testing.assert_array_equal(found, exact)
-    np.testing.assert_allclose(scores, exact_scores, rtol=1e-5)
-
-
-def test_a_short_list_holds_planted_neighbours(quantized: type[QuantizedRows]) -> None:
-    queries, rows = planted(2)
-    exact, _ = rank_fused([queries], [rows], TOP, fusion=FusionOptions())
-    codes = [quantized(rows)]
-    search = FusedSearch(TOP, FusionOptions())
-    found, scores = search.ranking([short_lists(search, [queries], [rows], codes, length=150)])
-    np.testing.assert_array_equal(found, exact)
-    assert (np.diff(scores) <= 0).all()
-    coarse = codes[0].nearest(queries, TOP)  # it is the exact scores that make it right
-    assert np.mean([len(set(a) & set(b)) for a, b in zip(coarse, exact, strict=True)]) < TOP
-
-
-@pytest.mark.usefixtures("quantized")
-def test_more_images_than_the_option_are_searched_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    queries, rows = planted(3)
-    here = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    candidates = Candidates(lambda members: [rows[members]], [here] * 3000, Retrieval(("a",)))
-    members = np.arange(100, 2900)
-    quantized_found, exact = (
-        candidates.of([queries], members, QueryPairsOptions(top_k=TOP, quantized_above=above))
-        for above in (2799, 2800)
-    )
-    np.testing.assert_array_equal(quantized_found[0], exact[0])
-    with monkeypatch.context() as without:
-        without.setitem(sys.modules, "faiss", None)
-        candidates.of([queries], members, QueryPairsOptions(top_k=TOP, quantized_above=2800))
-        candidates.of([queries], members, QueryPairsOptions(top_k=TOP, quantized_above=2799))
-        with pytest.raises(OptionError, match="faiss"):  # other images need other codes
-            candidates.of([queries], members[1:], QueryPairsOptions(quantized_above=2798))
-
-
-def test_without_faiss_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "faiss", None)
-    with pytest.raises(OptionError, match=r"faiss is not installed: .*megloc-kapture\[faiss\]"):
-        QuantizedRows(planted(0)[1])

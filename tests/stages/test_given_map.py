@@ -12,12 +12,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.rootsift import (
-    ColmapSift,
-    ColmapSiftOptions,
     RootSift,
     RootSiftOptions,
 )
@@ -37,13 +34,11 @@ from megloc_kapture.stages.given_map import (
     given_map,
     given_type,
     has_descriptors,
-    join_maps,
     rows_at_their_places,
     rows_found_again,
 )
 from megloc_kapture.stages.global_features import extract_vlad, read_vocabulary
 from megloc_kapture.stages.local_features import extract_local_features
-from megloc_kapture.values import RigidTransform
 
 TYPE = "rootsift"
 
@@ -221,79 +216,6 @@ def test_what_is_no_map_to_localize_in_is_refused(world: Any, tmp_path: Path) ->
     )
     with pytest.raises(DataError, match="of one keypoints type, found: other, rootsift"):
         given_type(KaptureFolder(tmp_path / "two"))
-
-
-@pytest.fixture(scope="module")
-def sift_map(world: Any, make_map: Any, tmp_path_factory: pytest.TempPathFactory) -> KaptureFolder:
-    """A map of the same images by COLMAP's SIFT."""
-    extractor = ColmapSift(ColmapSiftOptions(first_octave=0))
-    return make_map(world.mapping(), extractor, tmp_path_factory.mktemp("sift"))
-
-
-# ---------------------------------------------------------------------------------- two maps in one
-
-
-def test_two_maps_become_one(
-    world, sift_map: KaptureFolder, tmp_path: Path, folder_bytes: Any, distance_to_walls: Any
-) -> None:
-    own = world.map()
-    counts = join_maps(sift_map, own, tmp_path / "both")
-    both = KaptureFolder(tmp_path / "both")
-    both.validate(deep=True)
-    num_first, num_second = len(sift_map.points3d()), len(own.points3d())
-    assert num_first > 100
-    assert counts == {
-        "images": 5,
-        "points": num_first + num_second,
-        "observations": len(sift_map.observations()["sift"]) + len(own.observations()[TYPE]),
-    }
-    # read by kapture: each type sees its own points, where they were
-    theirs = kapture_from_dir(str(both.root))
-    points = theirs.points3d.as_array()[:, :3]
-    np.testing.assert_array_equal(points[:num_first], sift_map.points3d()[:, :3])
-    np.testing.assert_array_equal(points[num_first:], own.points3d()[:, :3])
-    assert np.median(distance_to_walls(points)) < 0.02
-    assert set(theirs.keypoints) == set(theirs.descriptors) == {TYPE, "sift"}
-    for point in theirs.observations:
-        assert list(theirs.observations[point]) == ["sift" if point < num_first else TYPE]
-    assert {(p - num_first, *rest) for p, *rest in triples(both)} == triples(own)
-    assert triples(both, "sift") == triples(sift_map, "sift")
-    for source, local_type in ((sift_map, "sift"), (own, TYPE)):
-        for kind in ("keypoints", "descriptors"):
-            files = Path("reconstruction") / kind / local_type
-            assert folder_bytes(both.root / files) == folder_bytes(source.root / files)
-    # global features of either
-    assert both.types("global_features") == own.types("global_features") != []
-    # the order of the maps is that of the points
-    join_maps(own, sift_map, tmp_path / "other order")
-    other = KaptureFolder(tmp_path / "other order")
-    np.testing.assert_array_equal(other.points3d()[:num_second], own.points3d())
-    assert triples(other) == triples(own)
-
-
-def test_maps_that_do_not_fit_are_refused(world, sift_map: KaptureFolder, tmp_path: Path) -> None:
-    own = world.map()
-    with pytest.raises(DataError, match="both maps have points of keypoints type rootsift"):
-        join_maps(own, own, tmp_path / "both")
-    data = sift_map.read()
-
-    def changed(name: str) -> KaptureFolder:
-        place = tmp_path / name
-        shutil.copytree(sift_map.root / "reconstruction", place / "reconstruction")
-        write_sensors(place, data)
-        return KaptureFolder(place)
-
-    key = data.record_of("left/1.png")
-    pose = data.trajectories[key]
-    data.trajectories[key] = RigidTransform(pose.quat_wxyz, (0.0, 0.0, 0.1))
-    with pytest.raises(DataError, match=r"left/1.png has another pose than in"):
-        join_maps(own, changed("pose"), tmp_path / "both")
-    del data.trajectories[key], data.records_camera[key]
-    # a model may lack images that the map has, not the other way round
-    join_maps(own, changed("image"), tmp_path / "fewer")
-    with pytest.raises(DataError, match=r"both maps have points|no image of the map it is joined"):
-        join_maps(changed("again"), own, tmp_path / "both")
-    assert not (tmp_path / "both").exists()
 
 
 # ---------------------------------------------------------------------------- keypoints by place

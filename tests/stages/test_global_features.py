@@ -83,12 +83,8 @@ def test_every_image_of_map_and_queries_is_described_alone_or_in_batches(
 @pytest.mark.parametrize(
     ("returned", "what"),
     [
-        ([1.0, 0.0], "not float32"),
-        (np.array([1.0, 0.0]), "not float32"),
-        (np.ones((1, 2), np.float32), "not float32"),
-        (np.array([np.nan, 1], np.float32), "not finite"),
-        (np.array([3, 4], np.float32), "a vector of length 5, not 1"),
-        (np.zeros(2, np.float32), "a vector of length 0, not 1"),
+        ([1.0, 0.0], "got list, expected float32"),
+        (np.array([3, 4], np.float32), "a vector of length 5, expected 1"),
     ],
 )
 def test_what_a_plugin_may_not_return(returned: Any, what: str) -> None:

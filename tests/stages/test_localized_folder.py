@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from megloc_kapture.io.tables import (
     read_covariances,
     read_status,
 )
-from megloc_kapture.stages.localized_folder import plain_result, result_of, write_localized
+from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.values import Failure, Pose
 
 
@@ -74,15 +73,6 @@ def test_a_covariance_that_is_none_is_refused_by_its_line(world: Any, tmp_path: 
         path.write_text(f"{header}\n{image},{wrong},{rest}\n")
         with pytest.raises(DataError, match="covariance.csv:2: 'query/b.png' has no positive def"):
             read_covariances(path)
-
-
-def test_a_result_in_a_journal_keeps_its_covariance(world: Any) -> None:
-    for _, found in world.localized():
-        again = result_of(json.loads(json.dumps(plain_result(found))))
-        assert isinstance(again, Pose) and again.cam_from_world == found.cam_from_world
-        np.testing.assert_array_equal(again.covariance, found.covariance)
-    failed = Failure("dark")
-    assert result_of(json.loads(json.dumps(plain_result(failed)))) == failed
 
 
 def half_failed(world: Any) -> list[tuple[str, Pose | Failure]]:

@@ -156,12 +156,10 @@ def test_verified_matches_agree_with_the_true_poses(
 @pytest.mark.parametrize(
     ("returned", "words"),
     [
-        (([[0, 0]], [1.0]), "no two arrays"),
-        ((np.zeros((1, 2)), np.ones(1)), r"whole numbers \(K, 2\), not float64"),
-        ((np.zeros(4, int), np.ones(4)), r"whole numbers \(K, 2\)"),
-        ((np.zeros((2, 2), int), np.ones(3)), "scores of 2 matches"),
-        ((np.array([[0, 5]]), np.ones(1)), "no row of the 3 and 5 keypoints"),
-        ((np.array([[-1, 0]]), np.ones(1)), "no row"),
+        (([[0, 0]], [1.0]), "got list, expected int64"),
+        ((np.zeros((2, 2), int), np.ones(3)), r"got float64 \(3,\), expected .*\(2\)"),
+        ((np.array([[0, 5]]), np.ones(1)), "outside the 3 and 5 keypoints"),
+        ((np.array([[-1, 0]]), np.ones(1)), "outside the 3 and 5"),
     ],
 )
 def test_what_a_matcher_returns_is_checked(returned: Any, words: str) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import PluginError
-from megloc_kapture.evaluation.report.refinement import consistency_sentence
+from megloc_kapture.evaluation.report.wording import consistency_sentence
 from megloc_kapture.io.dataset_tables import ImageGroup
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
@@ -29,7 +29,7 @@ from megloc_kapture.refinement.references import Displacement
 from megloc_kapture.stages.candidates import Restrictions
 from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_poses
-from megloc_kapture.stages.work import KeptItems, Work
+from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 COVARIANCE = np.diag([1e-6, 2e-6, 3e-6, 1e-4, 2e-4, 1 / 3])
@@ -136,23 +136,6 @@ def test_a_pose_that_stays_keeps_its_covariance(
         kept[name] = read_covariances(tmp_path / name / "covariance.csv")
     np.testing.assert_array_equal(kept["stays"][first], COVARIANCE)
     assert kept["moved"] == {}  # this refiner does not know that of its poses
-
-
-def test_queries_of_an_interrupted_run_are_counted_too(
-    world: Any, localized: KaptureFolder, tmp_path: Path
-) -> None:
-    sources: list[tuple[Path, Path]] = []
-    asked = []
-    for name in ("first", "again"):
-        out, journal = tmp_path / name, tmp_path / f"{name}.items"
-        work = Work(kept=KeptItems("", out, journal, tuple(sources), lambda path: ""))
-        refiner = Shift()
-        options = Chosen(refiners=(refiner,))
-        counts = refine_poses(world.mapping(), world.query(), localized, out, options, work=work)
-        assert counts["queries"] == counts["accepted_by_shift"] == 1
-        asked.append(len(refiner.asked))
-        sources.append((out, journal))
-    assert asked == [1, 0]
 
 
 def test_references_look_the_same_way_and_are_of_one_frame(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -17,9 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from megloc_kapture.errors import DataError, OptionError, OutputError, PluginError
-from megloc_kapture.evaluation.report.pictures import SegmentedClasses
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
-from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.images import (
     image_size,
     read_depth_map,
@@ -292,8 +291,8 @@ def test_classes_are_kept_for_reports(street: KaptureFolder, tmp_path: Path) -> 
     np.testing.assert_array_equal(labels, Halves().segment(cloudy(0)))
     mask = mask_of(new, "side/1.jpg")
     np.testing.assert_array_equal(mask, labels != 1)
-    named = read_json_model(folder / "classes.json", SegmentedClasses)
-    assert named == SegmentedClasses(classes=Halves.classes, dynamic=frozenset({"sky"}))
+    named = json.loads((folder / "classes.json").read_text())
+    assert tuple(named["classes"]) == Halves.classes and named["dynamic"] == ["sky"]
 
 
 def test_a_bonnet_is_found_with_the_maps_images(tmp_path: Path) -> None:
@@ -402,9 +401,7 @@ def test_broken_inputs_are_named(street: KaptureFolder, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("labels", "message"),
     [
-        (None, "segment returned None None"),
-        (np.zeros((4, 4), np.uint8), r"uint8 \(4, 4\), not uint8 \(200, 320\)"),
-        (np.zeros((200, 320), np.int64), r"segment returned int64"),
+        (np.zeros((4, 4), np.uint8), r"got uint8 \(4, 4\), expected uint8 \(200, 320\)"),
         (np.full((200, 320), 3, np.uint8), "label 3, but there are 3 classes"),
     ],
 )

@@ -1,8 +1,7 @@
-"""The spool of variants' matches, and the files of the type ``T-pyramid``."""
+"""The files of the type ``T-pyramid``."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from megloc_kapture.errors import DataError, OutputError
+from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import (
     KaptureData,
     KaptureFolder,
@@ -18,9 +17,7 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.io.kapture.features import FeatureReader
-from megloc_kapture.matching.guided_pyramid import ImageVariant, VariantMatches
 from megloc_kapture.stages.guided_pyramid import PyramidFeatures
-from megloc_kapture.stages.pyramid_mapping import MatchSpool, Spooled
 from megloc_kapture.values import Camera
 
 IMAGE = "a/1.png"
@@ -49,36 +46,6 @@ def opened(folder: KaptureFolder, name: str = "toy") -> tuple[FeatureReader, Fea
     return folder.keypoints(name), folder.descriptors(name)
 
 
-def test_what_is_spooled_comes_back(toy: Any, tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-    many = [
-        VariantMatches(
-            ImageVariant(0.5, 90),
-            rng.random((count, 3)).astype(np.float32),
-            rng.integers(0, 255, (count, 5)).astype(np.uint8),
-            rng.integers(0, 2**40, count),
-            rng.random(count).astype(np.float32),
-        )
-        for count in (3, 0, 5)
-    ]
-    spool = MatchSpool(tmp_path / "new", *opened(toy()))
-    file, told = spool.write(IMAGE, [many[:1], [], many[1:]])
-    assert file.is_relative_to(tmp_path / "new") and [len(one) for one in told] == [1, 0, 2]
-    # as a journal keeps them
-    plain = [place for one in json.loads(json.dumps(told)) for place in one]
-    places = [Spooled(ImageVariant(*variant), *rest) for variant, *rest in plain]
-    for matches, place in reversed(list(zip(many, places, strict=True))):
-        found = spool.get(IMAGE, place)
-        assert found.variant == matches.variant and len(found) == len(matches)
-        np.testing.assert_array_equal(found.keypoints_px, matches.keypoints_px)
-        np.testing.assert_array_equal(found.other_rows, matches.other_rows)
-        np.testing.assert_array_equal(found.scores, matches.scores)
-    asked = [(2, 4), (0, 1), (2, 0)]
-    found = spool.descriptors([(IMAGE, places[number].begin + match) for number, match in asked])
-    expected = [many[number].descriptors[match] for number, match in asked]
-    np.testing.assert_array_equal(found, expected)
-
-
 @pytest.mark.parametrize("tar", [False, True])
 @pytest.mark.parametrize("added", [0, 2])
 def test_what_was_added_comes_behind_and_the_source_stays_as_it_is(
@@ -100,9 +67,6 @@ def test_what_was_added_comes_behind_and_the_source_stays_as_it_is(
     assert written[1].config.keypoints_type == "toy-pyramid"
 
 
-def test_what_cannot_be_written_or_read_is_named(toy: Any, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="file"):
-        MatchSpool(tmp_path / "file", *opened(toy())).write("a.png", [])
+def test_unequal_numbers_of_keypoints_and_descriptors_are_named(toy: Any, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"1\.png.*: 3 descriptors for 4 keypoints"):
         PyramidFeatures(tmp_path / "out", toy(num_descriptors=3), "toy")

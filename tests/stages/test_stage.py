@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import pytest
-
 from megloc_kapture.pipeline.evaluation_plan import PIPELINE
-from megloc_kapture.stages.matches import MatchQueries
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.query_poses import LocalizeQueries
 from megloc_kapture.stages.stage import PipelineStage, StageWork
@@ -30,16 +27,6 @@ def test_settings_are_the_declared_options_and_no_more() -> None:
         "mask_margin_px": 4.0,
         "triangulation": {"min_angle_deg": options.triangulation.min_angle_deg},
     }
-
-
-def test_what_is_not_declared_cannot_be_read_by_methods_either() -> None:
-    stage = Declares(PipelineOptions())
-    assert stage.options.mask_margin_px == 4.0
-    with pytest.raises(AttributeError, match="Declares reads option matching"):
-        _ = stage.options.matching
-    with pytest.raises(AttributeError, match="Declares reads option map, which it does not"):
-        stage.options.uses_given_map()
-    assert MatchQueries(PipelineOptions()).options.local_types() == ["rootsift"]
 
 
 def test_the_matcher_does_not_concern_extraction_and_localization() -> None:

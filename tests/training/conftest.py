@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 from corner import pose_at, render, write_kapture
+from kornia.feature import XFeat
 from safetensors.torch import save_file
 from torch import nn
 
 from megloc_kapture.features.superpoint import SuperPointNet
-from megloc_kapture.features.xfeat import XFeatNetwork
 from megloc_kapture.io.images import write_image
 
 POSES = {f"{k}.png": pose_at((-2.4 + 0.8 * k, 0, 0), 24.0 - 12.0 * k, 0) for k in range(5)}
@@ -47,7 +47,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     folder = tmp_path_factory.mktemp("weights")
     return {
         "superpoint": _random_file(folder / "superpoint_v1.safetensors", SuperPointNet(), 0),
-        "xfeat": _random_file(folder / "xfeat.safetensors", XFeatNetwork(), 1),
+        "xfeat": _random_file(folder / "xfeat.safetensors", XFeat().net, 1),
     }
 
 

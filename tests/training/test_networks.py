@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.features.kornia_features import XFeat, XFeatOptions
 from megloc_kapture.features.rootsift import RootSift
 from megloc_kapture.features.superpoint import SuperPoint, SuperPointOptions
-from megloc_kapture.features.xfeat import XFeat, XFeatOptions
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.nets.superglue import ImageKeypoints, SuperGlueNet, log_optimal_transport

@@ -22,7 +22,6 @@ from megloc_kapture.training.pairs import (
     PosedPairs,
     random_view,
     relit,
-    sha256_of_files,
 )
 
 # as conftest.py has them
@@ -122,18 +121,6 @@ def test_views_of_one_photograph(tmp_path: Path) -> None:
     a, b = (grid[rows] for rows in matches.T)
     there = cv2.perspectiveTransform(a[None], cv2.findHomography(a, b)[0])[0]
     assert np.linalg.norm(there - b, axis=1).mean() < 3
-
-
-def test_a_checksum_of_names_and_contents(tmp_path: Path) -> None:
-    paths = [tmp_path / "a.jpg", tmp_path / "b.jpg"]
-
-    def checksum(second: str, count: int = 2) -> str:
-        for path, content in zip(paths, ("1", second), strict=True):
-            path.write_text(content)
-        return sha256_of_files(tmp_path, paths[:count])
-
-    assert len(checksum("2")) == 64 and checksum("2") == checksum("2")
-    assert len({checksum("2"), checksum("3"), checksum("2", count=1)}) == 3
 
 
 def smooth_image() -> NDArray[np.uint8]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.datasets.aachen import Layout
-from megloc_kapture.datasets.formats.colmap_model import ColmapImage, ColmapModel
+from megloc_kapture.io.colmap_model import ColmapImage, ColmapModel
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera
 from megloc_twins.frames import (

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.datasets.formats.sparse_models import SparsePoints
 from megloc_kapture.geometry.poses import earth_from_enu, geodetic
+from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.images import write_image
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform

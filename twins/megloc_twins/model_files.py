@@ -12,19 +12,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.formats.colmap_model import (
-    BINARY_FEATURE,
+from megloc_kapture.datasets.formats.nvm import NvmModel
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.colmap_model import (
     BINARY_FILES,
     TEXT_FILES,
     ColmapImage,
     ColmapModel,
+    SparsePoints,
 )
-from megloc_kapture.datasets.formats.sparse_models import NvmModel, SparsePoints
-from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import check_relative, write_bytes
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 from megloc_twins.options import write_lines
 
+# a feature of an image in the binary file
+BINARY_FEATURE = np.dtype([("xy", "<f8", (2,)), ("point", "<i8")])
 _NO_POINT = -1
 _UNKNOWN_ERROR_PX = -1.0
 

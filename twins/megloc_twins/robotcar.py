@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.datasets.formats.colmap_model import ColmapImage, ColmapModel
-from megloc_kapture.datasets.formats.sparse_models import SparsePoints
 from megloc_kapture.datasets.robotcar import Layout
 from megloc_kapture.datasets.robotcar.images import RIG_ID
+from megloc_kapture.io.colmap_model import ColmapImage, ColmapModel, SparsePoints
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform
 from megloc_twins.frames import (

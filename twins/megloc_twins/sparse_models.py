@@ -18,11 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.formats.sparse_models import NvmModel, SparsePoints
+from megloc_kapture.datasets.formats.nvm import NvmModel
 from megloc_kapture.features.rootsift import ColmapSift
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.colmap import MapImage, px_from_cam, triangulate
 from megloc_kapture.io.colmap_mapping import DatabaseFeatures, write_feature_database
+from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbourOptions, match_nearest
 from megloc_kapture.stages.work import Work

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 
 from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
 from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
-from megloc_kapture.datasets.formats.sparse_models import SparsePoints
 from megloc_kapture.datasets.official import write_official
 from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
 from megloc_kapture.io.colmap import px_from_cam
+from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.stages.given_map import has_descriptors
 from megloc_kapture.values import Camera, RigidTransform

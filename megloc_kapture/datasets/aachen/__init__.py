@@ -11,20 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from megloc_kapture.datasets.formats.colmap_reading import colmap_model_files, read_colmap_model
-from megloc_kapture.datasets.formats.sparse_models import NvmModel, SparsePoints, read_single_nvm
+from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm
 from megloc_kapture.datasets.formats.text_lines import Line, read_lines
-from megloc_kapture.datasets.kapture_folders import (
-    MAPPING,
-    QUERY,
-    KaptureImage,
-    is_kapture,
-    kapture_parent,
-    read_images,
-    tables_and_images,
-)
+from megloc_kapture.datasets.kapture_form import KaptureForm, KaptureImage
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.io.colmap_model import SparsePoints, colmap_model_files, read_colmap_model
 from megloc_kapture.io.files import check_relative, named
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureData, Sensor
@@ -43,22 +35,14 @@ _FIRST_TIMESTAMP = {DAY: 100_000, NIGHT: 200_000}
 _IMAGE_FOLDERS = ("images_upright", "images/images_upright")
 # the archive's name and the folder's swap an underscore; both are met
 _MODEL_FOLDERS = ("aachen_v_1_1", "aachen_v1_1")
-_SIZE_END = 10**9
 
-_QUERY_PARTS = {DAY: "query_day", NIGHT: "query_night"}
 # in the folder kapture's archives unpack to
 _NAME_OF_V1_1 = ("v1.1", "v1_1", "v11")
 
 
 @dataclass
 class AachenImages:
-    """The images of an import.
-
-    Parameters
-    ----------
-    mapping, query : their sensors and records; poses of the map.
-    conditions : query -> ``day`` or ``night``, in the order of the lists, day first.
-    """
+    """The images of an import; ``conditions`` are by query in the order of the lists, day first."""
 
     version: Version
     mapping: KaptureData = field(default_factory=KaptureData)
@@ -68,14 +52,12 @@ class AachenImages:
     def add_map_image(
         self, name: str, position: int, camera_id: int, camera: Camera, pose: RigidTransform
     ) -> None:
-        """Add an image by its position in the model and the id of its camera there."""
         record = position, f"camera_{camera_id:05d}"
         self.mapping.sensors[record[1]] = Sensor.from_camera(camera)
         self.mapping.records_camera[record] = name
         self.mapping.trajectories[record] = pose
 
     def add_query(self, name: str, condition: str, position: int, camera: Camera) -> None:
-        """Add a query by its position in the list of its condition."""
         record = _FIRST_TIMESTAMP[condition] + position, f"{condition}_{position:05d}"
         self.query.sensors[record[1]] = Sensor.from_camera(camera)
         self.query.records_camera[record] = name
@@ -83,16 +65,7 @@ class AachenImages:
 
 
 class Layout:
-    """The dataset's official files below ``root``.
-
-    Attributes
-    ----------
-    images : the folder image names are relative to.
-    nvm : the model of v1.0.
-    database_intrinsics : the cameras of v1.0's database images.
-    colmap_model : the folder of v1.1's model.
-    feature_database : COLMAP's database with the features of v1.0's model; large, seldom there.
-    """
+    """The dataset's official files below ``root``; the feature database is that of v1.0's model."""
 
     def __init__(self, root: Path) -> None:
         self.root = Path(root)
@@ -104,11 +77,10 @@ class Layout:
         self.feature_database = self.root / "aachen.db"
 
     def query_list(self, condition: str) -> Path:
-        """The list of the queries of ``day`` or ``night``, with their cameras."""
         return self.root / "queries" / f"{condition}_time_queries_with_intrinsics.txt"
 
     def absent(self) -> list[str]:
-        """Names of the layout's folders that are not there."""
+        """Return the names of the layout's folders that are not there."""
         wanted = (self.images, self.query_list(DAY).parent, self.nvm.parent)
         return [folder.name for folder in wanted if not folder.is_dir()]
 
@@ -138,12 +110,7 @@ class Layout:
             yield from sorted(path for path in (self.images / folder).rglob("*") if path.is_file())
 
     def read(self, version: Version, missing: Missing) -> tuple[AachenImages, int]:
-        """Read the images that are on disk, and how many of v1.1's queries a v1.0 leaves out.
-
-        Raises
-        ------
-        DataError : a broken model or list, an image without a camera or in both lists.
-        """
+        """Read the images that are on disk, and how many of v1.1's queries a v1.0 leaves out."""
         images = AachenImages(version)
         if version == "1.1":
             model = read_colmap_model(self.colmap_model, with_points=False)
@@ -161,12 +128,12 @@ class Layout:
         if version == "1.1":
             model = read_colmap_model(self.colmap_model)
             return tuple(image.name for image in model.images), model.points
-        nvm = read_single_nvm(self.nvm, with_points=True)
+        nvm = read_nvm(self.nvm, with_points=True)
         return nvm.names, nvm.points
 
     def _add_nvm(self, images: AachenImages, missing: Missing) -> None:
         """Each image has a camera of its own, with the image's position as its id."""
-        nvm = read_single_nvm(self.nvm, with_points=False)
+        nvm = read_nvm(self.nvm, with_points=False)
         listed = None
         if missing.require(self.database_intrinsics):
             listed = read_query_list(self.database_intrinsics)
@@ -220,15 +187,7 @@ def _first(folders: Iterable[Path]) -> Path:
 
 
 def read_query_list(path: Path) -> dict[str, Camera]:
-    """Read a list of images and their cameras, in its order.
-
-    Lines are ``name MODEL WIDTH HEIGHT PARAMS...``, with COLMAP's camera models.
-
-    Raises
-    ------
-    DataError : missing or not text, a line that is no image with a camera, a name that is no
-        plain relative path or is given twice, or no image at all; names file and line.
-    """
+    """Read lines of ``name MODEL WIDTH HEIGHT PARAMS...``, with COLMAP's camera models."""
     cameras: dict[str, Camera] = {}
     for line in read_lines(path):
         name, camera = _listed(line)
@@ -246,83 +205,51 @@ def _listed(line: Line) -> tuple[str, Camera]:
             f"expected 'name MODEL WIDTH HEIGHT PARAMS...', got {len(line.fields)} fields"
         )
     name, model, *texts = line.fields
-    width, height = (line.count_of(text, "image size", _SIZE_END) for text in texts[:2])
+    width, height = (line.count_of(text, "image size") for text in texts[:2])
     params = tuple(line.numbers_of(texts[2:], "camera parameter"))
     with line.named():
         return check_relative(name), Camera(model, width, height, params)
 
 
-@dataclass(frozen=True, slots=True)
-class KaptureLayout:
-    """Aachen's kapture folders below ``root``."""
+def from_kapture(
+    form: KaptureForm, wanted: Wanted, missing: Missing
+) -> tuple[AachenImages, dict[str, Path]]:
+    """Return the images of kapture folders, and the file of each.
 
-    root: Path
-
-    @classmethod
-    def find(cls, root: Path) -> KaptureLayout | None:
-        """The folders that are there instead of the official files; None where these are."""
-        parent = kapture_parent(root) if Layout(root).absent() else None
-        return None if parent is None else cls(parent)
-
-    def input_files(self) -> Iterator[Path]:
-        """Every file an import may depend on."""
-        folders = (self.root / MAPPING, *self._queries())
-        yield from tables_and_images(folder for folder in folders if is_kapture(folder))
-
-    def read(self, wanted: Wanted, missing: Missing) -> tuple[AachenImages, dict[str, Path]]:
-        """Read the images, and the file of each.
-
-        Map images count as their times do, which is their order in the model; queries of each
-        condition likewise, which is the order of the official list.
-
-        Raises
-        ------
-        DataError : a broken kapture folder, a query whose name says neither day nor night.
-        OptionError : v1.0 is wanted, and this is v1.1, whose poses are others.
-        """
-        mapping = read_images(self.root / MAPPING, missing.require)
-        queries: list[KaptureImage] = []
-        for folder in self._queries():
-            if missing.require(folder / "sensors" / "sensors.txt"):
-                queries += read_images(folder, missing.require)
-        images = AachenImages(self._version(wanted, [*mapping, *queries]))
-        by_condition: dict[str, list[KaptureImage]] = {DAY: [], NIGHT: []}
-        for image in queries:
-            folders = image.name.split("/")[:-1]
-            condition = next((part for part in folders if part in by_condition), None)
-            if condition is None:
-                raise DataError(
-                    f"query {image.name!r} has neither {DAY}/ nor {NIGHT}/ in its name",
-                    path=self.root,
-                )
-            by_condition[condition].append(image)
-        for condition, of_condition in by_condition.items():
-            for position, image in enumerate(of_condition):
-                images.add_query(image.name, condition, position, image.camera)
-        cameras: dict[str, int] = {}
-        for position, image in enumerate(mapping):
-            if (pose := image.cam_from_world) is not None:
-                camera_id = cameras.setdefault(image.sensor_id, len(cameras))
-                images.add_map_image(image.name, position, camera_id, image.camera, pose)
-        return images, {image.name: image.file for image in [*mapping, *queries]}
-
-    def _queries(self) -> list[Path]:
-        parts = [self.root / name for name in _QUERY_PARTS.values()]
-        whole = self.root / QUERY
-        # kapture's own scripts merge the two and leave them there
-        return [whole] if is_kapture(whole) or not any(map(is_kapture, parts)) else parts
-
-    def _version(self, wanted: Wanted, images: Sequence[KaptureImage]) -> Version:
-        is_newer = any(
-            image.name.startswith((f"{SEQUENCES_FOLDER}/", ADDITIONAL_NIGHT)) for image in images
-        )
-        if wanted == "1.0" and is_newer:
-            raise OptionError(
-                f"version=1.0 is wanted, and {self.root} is v1.1, whose poses are others"
+    Map images are in the order of their times, which is that of the model; queries of each
+    condition likewise, which is the order of the official list.
+    """
+    found = form.read(missing)
+    images = AachenImages(_version_of(form, wanted, found))
+    cameras: dict[str, int] = {}
+    for image in found:
+        if not image.is_query and image.cam_from_world is not None:
+            position = len(images.mapping.records_camera)
+            camera_id = cameras.setdefault(image.sensor_id, len(cameras))
+            images.add_map_image(
+                image.name, position, camera_id, image.camera, image.cam_from_world
             )
-        if wanted != "auto":
-            return wanted
-        path = self.root.resolve()
-        folders = (path.name.lower(), path.parent.name.lower())
-        named = any(text in name for text in _NAME_OF_V1_1 for name in folders)
-        return "1.1" if is_newer or named else "1.0"
+    for condition in (DAY, NIGHT):
+        queries = [i for i in found if i.is_query and condition in i.name.split("/")[:-1]]
+        for position, image in enumerate(queries):
+            images.add_query(image.name, condition, position, image.camera)
+    for image in found:
+        if image.is_query and image.name not in images.conditions:
+            raise DataError(
+                f"query {image.name!r} has neither {DAY}/ nor {NIGHT}/ in its name", path=form.root
+            )
+    return images, {image.name: image.file for image in found}
+
+
+def _version_of(form: KaptureForm, wanted: Wanted, images: Sequence[KaptureImage]) -> Version:
+    is_newer = any(
+        image.name.startswith((f"{SEQUENCES_FOLDER}/", ADDITIONAL_NIGHT)) for image in images
+    )
+    if wanted == "1.0" and is_newer:
+        raise OptionError(f"version=1.0 is wanted, and {form.root} is v1.1, whose poses are others")
+    if wanted != "auto":
+        return wanted
+    path = form.root.resolve()
+    folders = (path.name.lower(), path.parent.name.lower())
+    named = any(text in name for text in _NAME_OF_V1_1 for name in folders)
+    return "1.1" if is_newer or named else "1.0"

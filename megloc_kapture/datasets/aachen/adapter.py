@@ -16,11 +16,11 @@ from megloc_kapture.datasets.aachen import (
     NIGHT,
     SEQUENCES_FOLDER,
     AachenImages,
-    KaptureLayout,
     Layout,
     Version,
+    from_kapture,
 )
-from megloc_kapture.datasets.kapture_folders import without_model
+from megloc_kapture.datasets.kapture_form import KaptureForm
 from megloc_kapture.datasets.official import (
     Count,
     DatasetCard,
@@ -89,9 +89,9 @@ class Aachen:
 
     def check(self, root: Path) -> None:
         """Raise MeglocError, quickly, when ``root`` cannot be what is wanted of Aachen."""
-        if KaptureLayout.find(root) is not None:
+        if (form := _kapture_form(root)) is not None:
             if self.options.reference_model:
-                raise without_model(root)
+                raise form.without_model()
             return
         layout = Layout(root)
         if absent := layout.absent():
@@ -103,8 +103,8 @@ class Aachen:
 
     def input_files(self, root: Path) -> Iterator[Path]:
         """Every file an import may depend on, images included."""
-        if (folders := KaptureLayout.find(root)) is not None:
-            yield from folders.input_files()
+        if (form := _kapture_form(root)) is not None:
+            yield from form.input_files()
         else:
             layout, reference = Layout(root), self.options.reference_model
             version = layout.version(self.options.version)
@@ -117,21 +117,13 @@ class Aachen:
         yield from ground_truth_files(Path(root))
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
-        """Read the dataset.
-
-        Raises
-        ------
-        DataError : something is broken, or ``root`` is not the dataset; names file and line.
-        OptionError : an option that kapture folders cannot fulfil.
-        """
+        """Read the dataset."""
         self.check(root)
         missing = Missing(Path(root))
-        if (folders := KaptureLayout.find(root)) is not None:
-            images, files = folders.read(self.options.version, missing)
+        if (form := _kapture_form(root)) is not None:
+            images, files = from_kapture(form, self.options.version, missing)
             remarks = [f"Read from kapture folders, as v{images.version}."]
-            return self._dataset(
-                images, lambda _: folders.root, missing, remarks, image_files=files
-            )
+            return self._dataset(images, lambda _: form.root, missing, remarks, image_files=files)
         layout = Layout(root)
         images, left_out = layout.read(layout.version(self.options.version), missing)
         reference = None
@@ -202,6 +194,11 @@ class Aachen:
                 "With map = given they are extracted again from the images."
             )
         return remarks
+
+
+def _kapture_form(root: Path) -> KaptureForm | None:
+    """The kapture folders, where the official files are not there."""
+    return KaptureForm.find(root) if Layout(root).absent() else None
 
 
 def _descriptors(layout: Layout, version: Version) -> Path | None:

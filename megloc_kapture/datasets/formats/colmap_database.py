@@ -1,7 +1,8 @@
-"""COLMAP's databases (sqlite): images, keypoints and descriptors; never written to.
+"""COLMAP's databases: images, keypoints and descriptors, read by sqlite.
 
-The file is opened as one that nobody changes (``immutable``): sqlite would otherwise put files of
-its own beside a database in WAL mode, which is what COLMAP's are, or fail in a read-only folder.
+pycolmap opens a database to write: it adds the tables of its own version to the user's file, and
+fails in a read-only folder. Here the file is opened as ``immutable``, so that sqlite does not put
+files next to a database in WAL mode either.
 """
 
 from __future__ import annotations
@@ -16,24 +17,19 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.formats.text_lines import check_plain, image_name
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import named
-
-_SIZE_END = 2**31
-# x y; x y scale orientation; x y and an affine shape
-_KEYPOINT_COLUMNS = (2, 4, 6)
+from megloc_kapture.io.files import check_relative
 
 
 class FeatureType(NamedTuple):
-    """A type of features in a database: what kapture calls it, and the numbers of descriptors."""
+    """A type of features: its name in kapture, and the dtype of its descriptors."""
 
     name: str
     dtype: str
 
 
-# COLMAP's feature/types.h; names are those of our extractors, of their weights where these differ.
-# COLMAP keeps all descriptors as bytes, those of networks are float32 behind one another.
+# COLMAP's feature/types.h; names are those of our extractors, or of their weights.
+# COLMAP stores all descriptors as bytes, those of networks are float32.
 _SIFT, _UNDEFINED = 0, -1
 _TYPES = {
     _UNDEFINED: FeatureType("colmap-undefined", "u1"),
@@ -51,174 +47,90 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
 
     Attributes
     ----------
-    images : name (without ``./`` before it) -> id, sorted by name.
-
-    Raises
-    ------
-    DataError : missing, no COLMAP database, broken, or not closed by who wrote it.
+    images : name (without ``./``) -> id, sorted by name.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
-        check_plain(self.path)
+        if not self.path.is_file():
+            raise DataError("file is missing", path=path)
         log = self.path.with_name(self.path.name + "-wal")
         if log.is_file() and log.stat().st_size:
             raise DataError(
-                f"was not closed: what is in {log.name} is not part of it yet; "
-                "open and close it once with COLMAP or sqlite3",
+                f"was not closed: the content of {log.name} is not in it yet; open and close it "
+                "once with COLMAP or sqlite3",
                 path=path,
             )
-        self._connection = self._connect()
+        uri = f"file:{quote(str(self.path.resolve()))}?mode=ro&immutable=1"
+        self._connection = sqlite3.connect(uri, uri=True)
         try:
+            self.images = {}
             with self._reading():
-                self._tables = {
-                    name
-                    for (name,) in self._connection.execute(
-                        "SELECT name FROM sqlite_master WHERE type = 'table'"
-                    )
-                }
-            self.images = self._read_images()
+                for name, image_id in self._rows("SELECT name, image_id FROM images ORDER BY name"):
+                    self.images[check_relative(str(name).removeprefix("./"))] = int(image_id)
         except BaseException:
             self._connection.close()
             raise
 
-    def keypoints(self, name: str) -> NDArray[np.float32]:
-        """Keypoints of an image, float32 (N, 2), COLMAP pixels; none is no error.
-
-        DataError where there is no such image, or a row does not fit its own sizes.
-        """
-        found = self._blob("keypoints", name)
-        if found is None:
-            return np.empty((0, 2), np.float32)
-        rows, columns, content = found
-        if columns not in _KEYPOINT_COLUMNS and rows:
-            raise self._error(f"keypoints of {name!r} have {columns} columns, not 2, 4 or 6")
-        what = f"keypoints of {name!r}"
-        array = self._array(content, "<f4", (rows, columns if rows else 2), what)[:, :2]
-        if not np.isfinite(array).all():
-            raise self._error(f"{what} are not finite")
-        return np.ascontiguousarray(array)
-
-    def feature_type(self) -> FeatureType | None:
-        """The type of all features; None where there are no descriptors to tell it.
-
-        Types that we do not know have COLMAP's number in their name, and bytes. DataError where
-        there are several types.
-        """
-        if "descriptors" not in self._tables:
-            return None
-        condition = "WHERE rows > 0"
-        if self._has_types():
-            kinds: set[Any] = set()
-            for (kind,) in self._rows("descriptors", "DISTINCT type", condition):
-                self._check_integer(kind, _UNDEFINED, _SIZE_END, "a type of descriptors")
-                kinds.add(kind)
-        else:  # before version 4; who brought features of his own could not say what they are
-            sizes = {size for (size,) in self._rows("descriptors", "DISTINCT cols", condition)}
-            kinds = {_SIFT if size == _SIFT_SIZE else _UNDEFINED for size in sizes}
-        found = [_TYPES.get(kind) or FeatureType(f"colmap-{kind}", "u1") for kind in kinds]
-        if len(found) > 1:
-            told = ", ".join(sorted(kind.name for kind in found))
-            raise self._error(f"has descriptors of several types: {told}")
-        return found[0] if found else None
-
-    def descriptors(self, name: str, expected: FeatureType = _TYPES[_SIFT]) -> NDArray[Any] | None:
-        """Descriptors of an image, (N, D) of the type's numbers; None where it has none.
-
-        DataError where image or type are others, or a row does not fit its own sizes.
-        """
-        found = self._blob("descriptors", name)
-        if found is None or found[0] == 0:
-            return None
-        rows, columns, content = found
-        if expected == _TYPES[_SIFT]:
-            self._check_sift(name)
-        size, rest = divmod(columns, np.dtype(expected.dtype).itemsize)
-        if rest:
-            raise self._error(f"descriptors of {name!r}: {columns} bytes are no whole numbers")
-        array = self._array(content, expected.dtype, (rows, size), f"descriptors of {name!r}")
-        if not np.isfinite(array).all():
-            raise self._error(f"descriptors of {name!r} are not finite")
-        return array
-
     def __exit__(self, *raised: object) -> None:
         self._connection.close()
 
-    def _connect(self) -> sqlite3.Connection:
-        path = quote(str(self.path.resolve()))
+    def keypoints(self, name: str) -> NDArray[np.float32]:
+        """Return the keypoints of an image, float32 (N, 2), COLMAP pixels."""
+        found = self._array("keypoints", name, "<f4")
+        return np.empty((0, 2), np.float32) if found is None else np.ascontiguousarray(found[:, :2])
+
+    def feature_type(self) -> FeatureType | None:
+        """Return the type of all features; None without descriptors.
+
+        Unknown types are named after COLMAP's number.
+        """
         with self._reading():
-            connection = sqlite3.connect(f"file:{path}?mode=ro&immutable=1", uri=True)
-        # what a column computes could be of any length, what stands in the file could not
-        longest = max(1_000_000, self.path.stat().st_size)
-        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(longest, 2**31 - 1))
-        return connection
+            if self._has_types():
+                rows = self._rows("SELECT DISTINCT type FROM descriptors WHERE rows > 0")
+                kinds = {int(kind) for (kind,) in rows}
+            else:  # before version 4: SIFT, or features that somebody imported
+                rows = self._rows("SELECT DISTINCT cols FROM descriptors WHERE rows > 0")
+                kinds = {_SIFT if size == _SIFT_SIZE else _UNDEFINED for (size,) in rows}
+        found = [_TYPES.get(kind) or FeatureType(f"colmap-{kind}", "u1") for kind in kinds]
+        if len(found) > 1:
+            names = ", ".join(sorted(kind.name for kind in found))
+            raise self._error(f"has descriptors of several types: {names}")
+        return found[0] if found else None
 
-    def _read_images(self) -> dict[str, int]:
-        images = {}
-        for image_id, name, camera_id in self._rows("images", "image_id, name, camera_id"):
-            if not isinstance(name, str) or not isinstance(camera_id, int):
-                raise self._error(f"image {image_id!r} has no name or no camera")
-            with named(self.path, about=f"image {image_id}"):
-                known = image_name(name)
-            if known in images:
-                raise self._error(f"image {known!r} is listed twice")
-            images[known] = int(image_id)
-        return dict(sorted(images.items()))
+    def descriptors(self, name: str, expected: FeatureType = _TYPES[_SIFT]) -> NDArray[Any] | None:
+        """Return the descriptors of an image, (N, D) of the type's dtype; None without any."""
+        return self._array("descriptors", name, expected.dtype)
 
-    def _blob(self, table: str, name: str) -> tuple[int, int, Any] | None:
-        """(rows, columns, content) of an image in a table; None where it is not there."""
+    def _array(self, table: str, name: str, dtype: str) -> NDArray[Any] | None:
         if name not in self.images:
             raise self._error(f"has no image {name!r}")
-        if table not in self._tables:
-            return None
-        found = list(
-            self._rows(table, "rows, cols, data", f"WHERE image_id = {self.images[name]:d}")
-        )
-        if not found:
-            return None
-        rows, columns, content = found[0]
-        for value, what in ((rows, "rows"), (columns, "columns")):
-            self._check_integer(value, 0, _SIZE_END, f"{table} of {name!r}: {what}")
-        return rows, columns, content
-
-    def _array(self, content: Any, dtype: str, shape: tuple[int, ...], what: str) -> NDArray[Any]:
-        content = b"" if content is None else content
-        expected = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
-        if not isinstance(content, bytes) or len(content) != expected:
-            size = f"{len(content)} bytes" if isinstance(content, bytes) else "no bytes"
-            raise self._error(f"{what}: expected {expected} bytes of data, got {size}")
-        return np.frombuffer(content, dtype).reshape(shape)
-
-    def _check_sift(self, name: str) -> None:
-        """Since version 4 there may be others, whose numbers are no bytes."""
-        if self._has_types():
-            condition = f"WHERE image_id = {self.images[name]:d}"
-            kinds = [kind for (kind,) in self._rows("descriptors", "type", condition)]
-            if kinds != [_SIFT]:
-                raise self._error(f"descriptors of {name!r} are not SIFT (type {kinds[0]!r})")
+        query = f"SELECT rows, cols, data FROM {table} WHERE image_id = {self.images[name]:d}"
+        with self._reading():
+            rows, columns, content = next(self._rows(query), (0, 0, b""))
+            if not rows:
+                return None
+            # columns of descriptors count bytes
+            size = columns // np.dtype(dtype).itemsize if table == "descriptors" else columns
+            array = np.frombuffer(content, dtype).reshape(rows, size)
+        if not np.isfinite(array).all():
+            raise self._error(f"{table} of {name!r} are not finite")
+        return array
 
     def _has_types(self) -> bool:
-        with self._reading():
-            columns = self._connection.execute("PRAGMA table_info(descriptors)")
-            return any(column[1] == "type" for column in columns)
+        return any(row[1] == "type" for row in self._rows("PRAGMA table_info(descriptors)"))
 
-    def _check_integer(self, value: Any, first: int, end: int, what: str) -> None:
-        if not isinstance(value, int) or not first <= value < end:
-            raise self._error(f"{what} is {value!r}")
-
-    def _rows(self, table: str, columns: str, condition: str = "") -> Iterator[tuple[Any, ...]]:
-        # a view of that name could take forever, or say anything
-        if table not in self._tables:
-            raise self._error(f"no COLMAP database: it has no table {table!r}")
-        with self._reading():
-            yield from self._connection.execute(f"SELECT {columns} FROM {table} {condition}")
+    def _rows(self, query: str) -> Iterator[tuple[Any, ...]]:
+        return self._connection.execute(query)
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
         try:
             yield
-        except (sqlite3.Error, UnicodeDecodeError, OverflowError) as error:
-            raise self._error(f"no readable COLMAP database: {error}") from error
+        except DataError as error:
+            raise self._error(error.message) from error
+        except (sqlite3.Error, UnicodeDecodeError, OverflowError, ValueError, TypeError) as error:
+            raise self._error(f"not a readable COLMAP database: {error}") from error
 
     def _error(self, message: str) -> DataError:
         return DataError(message, path=self.path)

@@ -1,8 +1,8 @@
 """The text files of 4Seasons and of the MLAD challenges on it.
 
-Fields stand between commas or blanks, ``#`` begins a comment line. Timestamps are integer
+Fields are separated by commas or blanks, ``#`` begins a comment line. Timestamps are integer
 nanoseconds and never pass through a float, which would lose their last digits. Rotations are
-x y z w, distances metres unless it is said that they are in a recording's own unit.
+x y z w; distances are metres, or in a recording's own unit.
 """
 
 from __future__ import annotations
@@ -32,19 +32,8 @@ CAMERA_FILES = ("undistorted_calib_0.txt", "undistorted_calib_1.txt")
 STEREO_FILE = "undistorted_calib_stereo.txt"
 
 _TIMESTAMP = re.compile(r"[1-9][0-9]{0,18}")
-_MAX_SIZE = 1 << 14
 _MAX_SCALE = 1e6
-_POSE = "timestamp tx ty tz qx qy qz qw"
-
-# Transformations.txt
-_S_AS, _W_GPSW, _E_GPSW = "transform_S_AS", "transform_w_gpsw", "transform_e_gpsw"
-_SCALE = "GNSS scale"
-
-# the tags of a keyframe's file
-_TIME_TAG, _CAMERA_TAG, _POSE_TAG, _CLOUD_TAG = "timestamp", "fx", "camToWorld", "Point Cloud"
-_TAGS = (_TIME_TAG, _CAMERA_TAG, _POSE_TAG, _CLOUD_TAG)
-
-# relocalization files of 2021, 2020 and 2022; that of 2020 lies in its source's folder
+# relocalization files of 2021, 2020 (in the source's folder) and 2022
 _RELOCALIZATION_NAMES = (
     re.compile(r"relocalizationFile_(?P<source>.+)_to_(?P<target>.+)\.txt"),
     re.compile(r"relocalizationFile_(?P<target>.+?)(?:_(?:easy|moderate|hard))?\.txt"),
@@ -71,50 +60,31 @@ class StereoCalibration:
 
 
 def read_calibration(folder: Path) -> StereoCalibration:
-    """Read the three files of a calibration folder; DataError names file and line."""
+    """Read the three files of a calibration folder."""
     cam0, cam1 = (read_pinhole(folder / name) for name in CAMERA_FILES)
     return StereoCalibration(cam0, cam1, read_rigid_matrix(folder / STEREO_FILE, comments=True))
 
 
 def read_pinhole(path: Path) -> Camera:
-    """Read ``undistorted_calib_N.txt``: ``Pinhole fx fy cx cy 0 0 0 0``, the size, twice.
-
-    DataError names file and line, also of another camera model, distortion and other sizes.
-    """
+    """Read ``undistorted_calib_N.txt``: ``Pinhole fx fy cx cy 0 0 0 0``, the size, twice."""
+    form = "'Pinhole fx fy cx cy 0.0 0.0 0.0 0.0', 'width height', 'crop', 'width height'"
     lines = read_lines(path, comments=True)
     if len(lines) not in (2, 4):
-        raise DataError(
-            "expected the lines 'Pinhole fx fy cx cy 0.0 0.0 0.0 0.0', 'width height', 'crop', "
-            f"'width height', got {len(lines)}",
-            path=path,
-            line=lines[-1].number if lines else 1,
-        )
+        raise DataError(f"expected the lines {form}, got {len(lines)}", path=path)
     first = lines[0]
     model, *values = first.comma_fields
-    if model != "Pinhole" or len(values) not in (4, 8):
-        raise first.error(
-            "expected 'Pinhole fx fy cx cy 0.0 0.0 0.0 0.0', the calibration of undistorted images"
-        )
     params = first.numbers_of(values, "camera parameter")
-    if any(params[4:]):
-        raise first.error("undistorted images cannot have distortion")
-    sizes = [_size(line) for line in lines[1::2]]
+    if model != "Pinhole" or len(values) not in (4, 8) or any(params[4:]):
+        raise first.error(f"expected {form}, without distortion, as images are undistorted")
+    sizes = []
+    for line in lines[1::2]:
+        line.expect(line.comma_fields, 2, "width height, in pixels")
+        sizes.append([line.count_of(text, "size") for text in line.comma_fields])
     if sizes[0] != sizes[-1]:
-        raise lines[3].error(f"the image's size is {sizes[0]} first and {sizes[-1]} then")
-    return _pinhole(first, *sizes[0], params[:4])
-
-
-def _size(line: Line) -> tuple[int, int]:
-    line.expect(line.comma_fields, 2, "width height, in pixels")
-    width, height = (line.count_of(text, "size") for text in line.comma_fields)
-    if max(width, height) > _MAX_SIZE:
-        raise line.error(f"no camera takes images of {width}x{height}")
-    return width, height
-
-
-def _pinhole(line: Line, width: int, height: int, params: Sequence[float]) -> Camera:
-    with line.named():
-        return Camera("PINHOLE", width, height, tuple(params))
+        raise lines[3].error(f"the image size is {sizes[0]} first, then {sizes[-1]}")
+    width, height = sizes[0]
+    with first.named():
+        return Camera("PINHOLE", width, height, tuple(params[:4]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,77 +97,61 @@ class GnssPose:
         translation is in that world's unit: metres are ``scale`` times as many.
     scale : metres per unit; None where the row ends before it.
     fusion_quality : 2 fused with GNSS, 1 interpolated, 0 none; None where the row ends before it.
-    line : of the file.
     """
 
     slam_from_cam: RigidTransform
     scale: float | None
     fusion_quality: float | None
-    line: int
 
 
 def read_times(path: Path) -> list[int]:
-    """Read ``times.txt``: timestamps (ns) of a recording's frames, published or not, in its order.
-
-    The seconds and the exposure that follow are checked and left: a float of seconds has lost the
-    last digits of the nanoseconds. DataError names file and line.
-    """
-
-    def parse(line: Line) -> None:
-        line.expect(line.comma_fields, (2, 3), "timestamp seconds exposure")
-        line.numbers_of(line.comma_fields[1:], "time or exposure")
-
-    return list(_by_timestamp(path, "frame", parse))
+    """Read ``times.txt``: timestamps (ns) of a recording's frames, published or not."""
+    return list(_by_timestamp(path, lambda line: None))
 
 
 def read_gnss_poses(path: Path) -> dict[int, GnssPose]:
-    """Read ``GNSSPoses.txt``: rows by their timestamps (ns), in the file's order.
+    """Read ``GNSSPoses.txt``: rows by their timestamps (ns).
 
     A row has 8 to 11 fields, ``timestamp tx ty tz qx qy qz qw [scale [fusion_quality [v3]]]``; the
-    published header announces 11, the published rows have 10. DataError names file and line.
+    published header announces 11, the published rows have 10.
     """
     counts: list[int] = []
 
     def parse(line: Line) -> GnssPose:
         fields = line.comma_fields
-        line.expect(fields, range(8, 12), f"{_POSE} scale fusion_quality v3")
+        form = "timestamp tx ty tz qx qy qz qw scale fusion_quality v3"
+        line.expect(fields, range(8, 12), form)
         counts.append(len(fields))
         scale = _scale(line, fields[8]) if len(fields) > 8 else None
         quality = line.number_of(fields[9], "fusion_quality") if fields[9:] else None
-        return GnssPose(_transform(line, fields[1:8]), scale, quality, line.number)
+        return GnssPose(_transform(line, fields[1:8]), scale, quality)
 
-    poses = _by_timestamp(path, "pose", parse)
-    # one that ends within a number would be read with another one
+    poses = _by_timestamp(path, parse)
+    # a last number that was cut short is still a number
     if counts[-1] < max(counts) and not read_text(path).endswith("\n"):
-        *_, last = poses.values()
-        message = "has fewer fields and is not ended: the file may be cut short"
-        raise DataError(message, path=path, line=last.line)
+        raise DataError("the last row is incomplete: the file may be cut short", path=path)
     return poses
 
 
 def read_poses(path: Path) -> dict[int, RigidTransform]:
     """Read ``poses.txt`` of the ECCV 2020 challenge: ``world_from_cam`` by timestamp (ns), metres.
 
-    Rows are ``timestamp tx ty tz qx qy qz qw``; DataError names file and line.
+    Rows are ``timestamp tx ty tz qx qy qz qw``.
     """
-    return _by_timestamp(path, "pose", lambda line: _transform(line, line.comma_fields[1:]))
+    return _by_timestamp(path, lambda line: _transform(line, line.comma_fields[1:]))
 
 
 def read_keyframe_accuracy(path: Path) -> set[int]:
-    """Read ``keyframe_accuracy.txt``: timestamps (ns) of keyframes known to better than 0.05 m.
-
-    Text after a timestamp is not documented and not looked at. DataError names file and line.
-    """
+    """Read ``keyframe_accuracy.txt``: timestamps (ns) of keyframes known to better than 0.05 m."""
     return {_timestamp(line, line.comma_fields[0]) for line in read_lines(path, comments=True)}
 
 
 def timestamp_of_name(stem: str) -> int | None:
-    """The time in nanoseconds that a file is called by; None where it is another name."""
+    """Return the time (ns) that is a file's name; None for other names."""
     return int(stem) if _TIMESTAMP.fullmatch(stem) else None
 
 
-def _by_timestamp(path: Path, what: str, parse: Callable[[Line], Row]) -> dict[int, Row]:
-    """Rows by the timestamps they begin with; a file has at least one."""
+def _by_timestamp(path: Path, parse: Callable[[Line], Row]) -> dict[int, Row]:
     rows: dict[int, Row] = {}
     for line in read_lines(path, comments=True):
         timestamp = _timestamp(line, line.comma_fields[0])
@@ -205,7 +159,7 @@ def _by_timestamp(path: Path, what: str, parse: Callable[[Line], Row]) -> dict[i
             raise line.error(f"timestamp {timestamp} is given twice")
         rows[timestamp] = parse(line)
     if not rows:
-        raise DataError(f"no {what} in the file", path=path)
+        raise DataError("the file has no rows", path=path)
     return rows
 
 
@@ -216,10 +170,8 @@ def _timestamp(line: Line, text: str) -> int:
 
 
 def _transform(line: Line, fields: Sequence[str]) -> RigidTransform:
-    """The transform of seven fields ``tx ty tz qx qy qz qw``."""
     line.expect(fields, 7, "tx ty tz qx qy qz qw")
-    tx, ty, tz = line.numbers_of(fields[:3], "translation")
-    qx, qy, qz, qw = line.numbers_of(fields[3:], "rotation")
+    tx, ty, tz, qx, qy, qz, qw = line.numbers_of(fields, "pose")
     if max(abs(tx), abs(ty), abs(tz)) > MAX_DISTANCE_M:
         raise line.error(f"the translation {tx:g} {ty:g} {tz:g} leads beyond the earth")
     with line.named():
@@ -227,10 +179,9 @@ def _transform(line: Line, fields: Sequence[str]) -> RigidTransform:
 
 
 def _scale(line: Line, text: str) -> float:
-    """Metres per unit of a SLAM world: a positive number."""
     scale = line.number_of(text, "scale")
     if not 1 / _MAX_SCALE < scale < _MAX_SCALE:
-        raise line.error(f"scale {text} is no factor between units of length")
+        raise line.error(f"scale {text} is not a factor between units of length")
     return scale
 
 
@@ -253,36 +204,25 @@ class Transformations:
 
 
 def read_transformations(path: Path) -> Transformations:
-    """Read ``Transformations.txt``: pairs of a line ``# name: ...`` and one of numbers.
-
-    Names that are not needed are passed over. Blank lines between the pairs are there in some
-    releases and not in others. DataError names file and line.
-    """
+    """Read ``Transformations.txt``: pairs of a line ``# name: ...`` and a line of numbers."""
     found: dict[str, Line] = {}
-    name: str | None = None
-    lines = read_lines(path)
-    for line in lines:
+    name = ""
+    for line in read_lines(path):
         if line.text.startswith("#"):
-            name = line.text[1:].partition(":")[0].strip(" \t")
-            continue
-        if name is None:
-            raise line.error("numbers without a line '# name: ...' before them")
-        if name in found:
+            name = line.text[1:].partition(":")[0].strip()
+        elif name in found:
             raise line.error(f"{name!r} is given twice")
-        found[name], name = line, None
-    names = (_S_AS, _W_GPSW, _E_GPSW)
-    absent = [name for name in names if name not in found]
-    if absent:
-        number = lines[-1].number if lines else 1
-        raise DataError(f"there is no {', '.join(absent)}", path=path, line=number)
-    s_from_as, w_from_gpsw, e_from_gpsw = (
-        _transform(found[name], found[name].comma_fields) for name in names
-    )
+        else:
+            found[name] = line
+    transforms = []
+    for name in ("transform_S_AS", "transform_w_gpsw", "transform_e_gpsw"):
+        if name not in found:
+            raise DataError(f"there is no {name}", path=path)
+        transforms.append(_transform(found[name], found[name].comma_fields))
     scale = None
-    if _SCALE in found:
-        line = found[_SCALE]
-        line.expect(line.comma_fields, 1, "one scale")
-        scale = _scale(line, line.comma_fields[0])
+    if (row := found.get("GNSS scale")) is not None:
+        scale = _scale(row, row.text)
+    s_from_as, w_from_gpsw, e_from_gpsw = transforms
     return Transformations(s_from_as, w_from_gpsw, e_from_gpsw, scale)
 
 
@@ -306,63 +246,48 @@ class Keyframe:
 
 
 def read_keyframe(path: Path) -> Keyframe:
-    """Read ``KeyFrame_<timestamp>.txt``; DataError names file and line."""
+    """Read ``KeyFrame_<timestamp>.txt``, whose parts begin with comment lines that name them."""
     lines = read_lines(path, blank=True)
-    first = _first_lines(lines, path)
-    timestamp = _timestamp(lines[first[_TIME_TAG]], lines[first[_TIME_TAG]].text)
-    line = lines[first[_POSE_TAG]]
-    world_from_cam = _transform(line, line.comma_fields)
-    line = lines[first[_CAMERA_TAG]]
+    timestamp_line = _part(lines, "timestamp", path)[0]
+    line = _part(lines, "fx", path)[0]
     line.expect(line.comma_fields, 7, "fx, fy, cx, cy, width, height, npoints")
     params = line.numbers_of(line.comma_fields[:4], "camera parameter")
-    width, height, num_points = (
-        line.count_of(text, "size or number of points") for text in line.comma_fields[4:]
-    )
-    camera = _pinhole(line, width, height, params)
-    points = _points(lines[first[_CLOUD_TAG] :])
-    if len(points) != num_points:
-        raise lines[-1].error(f"{len(points)} points, {num_points} are announced")
-    return Keyframe(timestamp, camera, world_from_cam, points)
-
-
-def _first_lines(lines: Sequence[Line], path: Path) -> dict[str, int]:
-    """Index of the first line behind each tag."""
-    first: dict[str, int] = {}
-    tag = ""
-    for index, line in enumerate(lines):
-        if line.text.startswith("#"):
-            title = line.text[1:].lstrip()
-            known = [one for one in _TAGS if title.startswith(one)]
-            # the cloud's columns stand in more comment lines below its tag
-            tag = known[0] if known else tag if tag == _CLOUD_TAG else ""
-        elif tag and tag not in first and (line.text or tag == _CLOUD_TAG):
-            first[tag] = index
-    if tag == _CLOUD_TAG:
-        first.setdefault(_CLOUD_TAG, len(lines))  # a cloud without points, and the file ends
-    for tag in _TAGS:
-        if tag not in first:
-            raise DataError(
-                f"no line '# {tag}' with what belongs to it below",
-                path=path,
-                line=max(len(lines), 1),
-            )
-    return first
-
-
-def _points(lines: Sequence[Line]) -> NDArray[np.float64]:
-    """Points (P, 3) of pairs of lines, up to the next blank one."""
+    width, height, num_points = (line.count_of(text, "size") for text in line.comma_fields[4:])
+    with line.named():
+        camera = Camera("PINHOLE", width, height, tuple(params))
+    # of each point a line of numbers and a line of colours
+    rows = _part(lines, "Point Cloud", path, may_be_empty=num_points == 0)[::2]
+    if len(rows) != num_points:
+        raise DataError(f"{len(rows)} points, {num_points} are announced", path=path)
     points = []
-    end = next((index for index, line in enumerate(lines) if not line.text), len(lines))
-    for index in range(0, end, 2):
-        line = lines[index]
+    for row in rows:
         form = "u,v,idepth_scaled,idepth_hessian,maxRelBaseline,numGoodRes,status"
-        line.expect(line.comma_fields, 7, form)
-        points.append(line.numbers_of(line.comma_fields[:3], "u, v or depth"))
-        colours = lines[index + 1] if index + 1 < len(lines) else None
-        if colours is None or len(colours.comma_fields) != 8:
-            message = "expected 8 colours between commas"
-            raise DataError(message, path=line.path, line=line.number + 1)
-    return np.array(points, dtype=np.float64).reshape(-1, 3)
+        row.expect(row.comma_fields, 7, form)
+        points.append(row.numbers_of(row.comma_fields[:3], "u, v or depth"))
+    timestamp = _timestamp(timestamp_line, timestamp_line.text)
+    pose_line = _part(lines, "camToWorld", path)[0]
+    pose = _transform(pose_line, pose_line.comma_fields)
+    return Keyframe(timestamp, camera, pose, np.array(points, np.float64).reshape(-1, 3))
+
+
+def _part(
+    lines: Sequence[Line], title: str, path: Path, *, may_be_empty: bool = False
+) -> list[Line]:
+    """The lines after the comments that begin with ``# title``, up to a blank line."""
+    part: list[Line] = []
+    begun = False
+    for line in lines:
+        if line.text.startswith("#"):
+            if part:
+                break
+            begun = begun or line.text[1:].lstrip().startswith(title)
+        elif begun and line.text:
+            part.append(line)
+        elif part:
+            break
+    if not part and not (begun and may_be_empty):
+        raise DataError(f"there is no '# {title}' with its values below", path=path)
+    return part
 
 
 @dataclass(frozen=True, slots=True)
@@ -381,23 +306,19 @@ class RelocalizationRow:
 
 
 def parse_relocalization_name(name: str) -> tuple[str | None, str] | None:
-    """Source (None where the name leaves it out) and target recording of a file's name.
+    """Return the source (None where the name leaves it out) and target recording of a file's name.
 
-    None for a name that is none of a relocalization file.
+    None for the name of another file.
     """
     for pattern in _RELOCALIZATION_NAMES:
-        found = pattern.fullmatch(name)
-        if found is not None:
+        if found := pattern.fullmatch(name):
             parts = found.groupdict()
             return parts.get("source"), parts["target"]
     return None
 
 
 def read_relocalization(path: Path) -> list[RelocalizationRow]:
-    """Read the pairs of a relocalization file, in its order, each once, as a pose file has it.
-
-    DataError names file and line.
-    """
+    """Read the pairs of a relocalization file, in its order, each once."""
     rows: dict[tuple[int, int], RelocalizationRow] = {}
     for line in read_lines(path, comments=True):
         fields = line.comma_fields

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,11 +17,8 @@ from megloc_kapture.datasets.formats.fourseasons_files import (
     read_relocalization,
     timestamp_of_name,
 )
-from megloc_kapture.datasets.kapture_folders import is_kapture
 from megloc_kapture.datasets.official import Count, Missing
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.files import named, reading
-from megloc_kapture.io.kapture import KaptureFolder
 
 CAMERAS = ("cam0", "cam1")
 CALIBRATION_FOLDERS = ("calibration", "Calibration")
@@ -30,7 +26,6 @@ GNSS_POSES, POSES, ACCURACY = "GNSSPoses.txt", "poses.txt", "keyframe_accuracy.t
 TRANSFORMATIONS, TIMES, KEYFRAMES = "Transformations.txt", "times.txt", "KeyFrameData"
 
 _IMAGES = "undistorted_images"
-_KAPTURE_RECORDS = "records"
 _MARKS = (_IMAGES, GNSS_POSES, POSES, TIMES)
 _RELOCALIZATION_FOLDERS = (".", "RelocalizationFiles*", "*", "*/RelocalizationFiles*")
 # pairs of source and target -> their number, from the challenges' pages
@@ -51,19 +46,15 @@ class Recording:
     Parameters
     ----------
     name : of its folder, which is also what relocalization files call it.
-    folder : where its files lie; of a kapture folder its ``records_data``.
-    kapture : has cameras and poses, where the recording was converted by kapture's importer.
+    folder : of its files.
     """
 
     name: str
     folder: Path
-    kapture: KaptureFolder | None = None
 
     @property
     def has_poses(self) -> bool:
         """True where poses of its keyframes are published and here."""
-        if self.kapture is not None:
-            return bool(self.kapture.read().trajectories)
         return (self.folder / GNSS_POSES).is_file() or (self.folder / POSES).is_file()
 
     def image(self, timestamp: int, camera: str) -> str:
@@ -71,45 +62,27 @@ class Recording:
         return f"{self.name}/{_IMAGES}/{camera}/{timestamp}.png"
 
     def file_of(self, image: str) -> Path:
-        """The file of an image of this recording, by its name."""
         return self.folder / image.removeprefix(f"{self.name}/")
 
     def image_file(self, timestamp: int, camera: str) -> Path:
-        """The file of an image, if it is there."""
         return self.folder / _IMAGES / camera / f"{timestamp}.png"
 
     def keyframe_file(self, timestamp: int) -> Path:
-        """The file of a keyframe's point cloud, if it is there."""
+        """Return the file of a keyframe's point cloud."""
         return self.folder / KEYFRAMES / f"KeyFrame_{timestamp}.txt"
 
     def times_on_disk(self, camera: str) -> list[int]:
         """Timestamps (ns) of a camera's undistorted images, sorted."""
-        folder = self.folder / _IMAGES / camera
-        with reading(folder):
-            names = os.listdir(folder) if folder.is_dir() else []
-        times = (timestamp_of_name(n.removesuffix(".png")) for n in names if n.endswith(".png"))
+        images = (self.folder / _IMAGES / camera).glob("*.png")
+        times = (timestamp_of_name(path.stem) for path in images)
         return sorted(time for time in times if time is not None)
 
     def calibration(self, root: Path) -> StereoCalibration:
-        """The cameras of its undistorted images; DataError names the file."""
-        if self.kapture is None:
-            return read_calibration(self.calibration_folder(root))
-        data = self.kapture.read()
-        cars = [members for members in data.rigs.values() if set(CAMERAS) <= set(members)]
-        with named(self.kapture.root / "sensors"):
-            if not cars or not set(CAMERAS) <= set(data.sensors):
-                raise DataError(
-                    f"no cameras {' and '.join(CAMERAS)} on one rig, as kapture's importer of "
-                    "4Seasons writes them"
-                )
-            cam0, cam1 = (data.sensors[name].camera() for name in CAMERAS)
-        car = cars[0]
-        return StereoCalibration(cam0, cam1, car[CAMERAS[1]] @ car[CAMERAS[0]].inverse())
+        """The cameras of its undistorted images."""
+        return read_calibration(self.calibration_folder(root))
 
     def calibration_files(self, root: Path) -> list[Path]:
         """The files of :meth:`calibration`; raises what it raises where there are none."""
-        if self.kapture is not None:
-            return sorted((self.kapture.root / "sensors").glob("*.txt"))
         folder = self.calibration_folder(root)
         return [folder / name for name in (*CAMERA_FILES, STEREO_FILE)]
 
@@ -157,7 +130,7 @@ def find_recordings(root: Path) -> dict[str, Recording]:
         folder.name: Recording(folder.name, folder)
         for folder in _folders(root)
         if any((folder / mark).exists() for mark in _MARKS)
-    } or _kapture_recordings(root)
+    }
     if not found:
         raise DataError(
             f"no recording here, a folder with {_IMAGES}/ and {GNSS_POSES} or {TIMES} in it",
@@ -166,22 +139,10 @@ def find_recordings(root: Path) -> dict[str, Recording]:
     return found
 
 
-def _kapture_recordings(root: Path) -> dict[str, Recording]:
-    """The recordings that kapture's importer has converted, below ``records/`` or the root."""
-    records = root / _KAPTURE_RECORDS
-    found = {}
-    for folder in _folders(records if records.is_dir() else root):
-        images = folder / "sensors" / "records_data"
-        if is_kapture(folder) and (images / _IMAGES).is_dir():
-            found[folder.name] = Recording(folder.name, images, KaptureFolder(folder))
-    return found
-
-
 def _folders(root: Path) -> list[Path]:
     if not root.is_dir():
         raise DataError("no such folder", path=root)
-    with reading(root):
-        return sorted(path for path in root.iterdir() if path.is_dir())
+    return sorted(path for path in root.iterdir() if path.is_dir())
 
 
 def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[RelocalizationFile]:
@@ -237,20 +198,10 @@ class Selection:
 def select(
     root: Path, reference: Sequence[str], queries: Sequence[str], missing: Missing
 ) -> Selection:
-    """Choose recordings by name; where no names are given, by what the dataset says.
+    """Choose recordings by name, or by relocalization files.
 
-    Parameters
-    ----------
-    reference : recordings of the map. Without: the sources of the relocalization files; without
-        such files the first recording with poses.
-    queries : recordings of the queries. Without: the targets of the relocalization files of these
-        sources; without such files all others.
-    missing : takes recordings that relocalization files mean and that are not there.
-
-    Raises
-    ------
-    DataError : there is nothing to choose from.
-    OptionError : a name is unknown, or given for both.
+    Without names the map is made of the sources of the relocalization files (without such files of
+    the first recording with poses), and the queries are of their targets (of all other recordings).
     """
     recordings = find_recordings(root)
     files = find_relocalization_files(root, recordings)

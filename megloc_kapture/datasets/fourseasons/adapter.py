@@ -105,8 +105,7 @@ class FourSeasons:
         folders=("4Seasons",),
         layout="ROOT/calibration/ and ROOT/<recording>/{undistorted_images/,GNSSPoses.txt,"
         "Transformations.txt,times.txt} of two recordings or more; relocalization files of a "
-        "challenge in ROOT or the reference recording's folder; or the recordings as "
-        "kapture_import_4seasons converts them, in ROOT/records/",
+        "challenge in ROOT or the reference recording's folder",
     )
 
     def __init__(self, options: FourSeasonsOptions | None = None) -> None:
@@ -140,13 +139,7 @@ class FourSeasons:
         yield from ground_truth_files(root)
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
-        """Read the selected recordings.
-
-        Raises
-        ------
-        DataError : something is broken, or there is nothing to import; names file and line.
-        OptionError : an option names a recording that is not here, or one for both parts.
-        """
+        """Read the selected recordings."""
         missing = Missing(root)
         suffixes: dict[StereoCalibration, str] = {}
         chosen = self._select(root, missing)

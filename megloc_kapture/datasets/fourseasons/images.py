@@ -37,10 +37,9 @@ from megloc_kapture.datasets.fourseasons import (
 from megloc_kapture.datasets.kapture_folders import MAPPING
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError
-from megloc_kapture.geometry.poses import earth_from_enu, geodetic
 from megloc_kapture.io.dataset_tables import RelocalizationPair, SimilarityTransform, World
 from megloc_kapture.io.images import write_depth_map
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor
+from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.values import Camera, RigidTransform
 
 RIG, DEPTH = "car", "depth"
@@ -60,15 +59,11 @@ class DepthJob:
 
 @dataclass
 class ImageRecords:
-    """Collects the images of one part, map or queries.
+    """The images of the map or of the queries.
 
-    Parameters
-    ----------
-    suffixes : the end of the ids of each calibration's car and sensors, shared by both parts. The
-        first car keeps the plain names, a car of another calibration is named after the first
-        recording that has it.
-    missing : takes the files that should be there.
-    stereo : whether the right camera is taken too.
+    ``suffixes`` end the ids of each calibration's car and sensors, shared by both parts: the first
+    car has none, a car of another calibration the name of its first recording. ``stereo`` takes the
+    right camera too.
     """
 
     suffixes: dict[StereoCalibration, str]
@@ -80,11 +75,7 @@ class ImageRecords:
     def add(
         self, recording: Recording, calibration: StereoCalibration, times: Iterable[int]
     ) -> str:
-        """Record a recording's images at these times (ns), as far as they are there.
-
-        Returns the id of the car, which poses belong to; DataError where another recording has an
-        image of the same time.
-        """
+        """Record a recording's images at these times (ns); returns the id of the car."""
         fresh = f"_{recording.name}" if self.suffixes else ""
         suffix = self.suffixes.setdefault(calibration, fresh)
         car = RIG + suffix
@@ -111,13 +102,8 @@ class ImageRecords:
     ) -> None:
         """Record the keyframes' point clouds as depth maps, for the recorded times of ``scales``.
 
-        ``scales`` are metres per unit of the SLAM world by timestamp (ns). DataError where the
-        recording has the name that the depth maps' folder needs.
+        ``scales`` are metres per unit of the SLAM world by timestamp (ns).
         """
-        if recording.name == DEPTH_FOLDER:
-            raise DataError(
-                "a recording of this name takes the folder of the depth maps", path=recording.folder
-            )
         suffix = self.suffixes[calibration]
         sensor, camera = DEPTH + suffix, calibration.cam0
         self.data.sensors[sensor] = Sensor.from_camera(camera, name=DEPTH, sensor_type="depth")
@@ -133,10 +119,7 @@ class ImageRecords:
 
 
 def write_depth_maps(jobs: Iterable[DepthJob], output: Path) -> None:
-    """Write the depth maps below an import's ``mapping/``.
-
-    DataError where a keyframe's file is broken, or of another time or image size.
-    """
+    """Write the depth maps below an import's ``mapping/``."""
     for job in jobs:
         keyframe = read_keyframe(job.keyframe)
         size = (keyframe.camera.width, keyframe.camera.height)
@@ -199,13 +182,10 @@ def challenge_tables(
     mapping: KaptureData,
     query: KaptureData,
 ) -> ChallengeTables:
-    """Pairs, priors and true poses of relocalization files.
+    """Return the pairs, priors and true poses of relocalization files.
 
-    Parameters
-    ----------
-    cams_from_local : of the reference recordings' keyframes: recording -> timestamp -> pose of the
-        left camera.
-    mapping, query : what was imported; a pair counts only where both of its images were.
+    ``cams_from_local`` are poses of the left camera by recording and timestamp. A pair counts where
+    both of its images were imported.
     """
     tables = ChallengeTables()
     map_images, query_images = set(mapping.image_names()), set(query.image_names())
@@ -239,10 +219,6 @@ def challenge_tables(
 
 
 # ----------------------------------------------------------------------------------- poses
-
-
-# from the centre of the earth, of roads
-_LEAST_RADIUS_M, _GREATEST_RADIUS_M = 6.3e6, 6.4e6
 
 
 @dataclass(frozen=True)
@@ -312,16 +288,10 @@ class LocalFrame:
 def read_keyframe_poses(
     recording: Recording, *, min_fusion_quality: int, on_earth: bool, missing: Missing
 ) -> KeyframePoses | None:
-    """The published poses of a recording's keyframes, or None where there are none.
+    """Return the published poses of a recording's keyframes, None without any.
 
-    Parameters
-    ----------
-    min_fusion_quality : rows of less are dropped; where none is left, that is a DataError.
-    on_earth : takes ``GNSSPoses.txt`` only; else ``poses.txt`` where it is there.
-    missing : takes a ``Transformations.txt`` that should be there.
+    ``on_earth`` takes ``GNSSPoses.txt`` only; else ``poses.txt`` is preferred.
     """
-    if recording.kapture is not None:
-        return _kapture_poses(recording.kapture)
     plain = recording.folder / POSES
     if not on_earth and plain.is_file():
         poses = read_poses(plain)
@@ -349,7 +319,6 @@ def _gnss_poses(recording: Recording, min_fusion_quality: int) -> KeyframePoses:
             raise DataError(
                 "the pose has no scale, and Transformations.txt has none either",
                 path=path,
-                line=row.line,
             )
         x, y, z = (scale * value for value in row.slam_from_cam.translation)
         metric = RigidTransform(row.slam_from_cam.quat_wxyz, (x, y, z))
@@ -362,33 +331,6 @@ def _gnss_poses(recording: Recording, min_fusion_quality: int) -> KeyframePoses:
             path=path,
         )
     return KeyframePoses(poses, transformations.e_from_gpsw, scales, dropped)
-
-
-def _kapture_poses(folder: KaptureFolder) -> KeyframePoses | None:
-    """The poses that kapture's importer writes, on earth and of the car, whose frame is cam0's.
-
-    It keeps all keyframes, whatever their fusion. The scene is made anew, east, north and up
-    amid them.
-    """
-    data = folder.read()
-    poses: dict[int, RigidTransform] = {}
-    for timestamp in sorted({timestamp for timestamp, _ in data.trajectories}):
-        cam_from_earth = data.device_from_world(timestamp, CAMERAS[0])
-        if cam_from_earth is not None:
-            poses[timestamp] = cam_from_earth.inverse()
-    if not poses:
-        return None
-    middle = np.median([pose.translation for pose in poses.values()], axis=0)
-    if not _LEAST_RADIUS_M < float(np.linalg.norm(middle)) < _GREATEST_RADIUS_M:
-        raise DataError(
-            "the poses are not on earth; kapture's importer writes ECEF where it finds "
-            f"{TRANSFORMATIONS}",
-            path=folder.root / "sensors" / "trajectories.txt",
-        )
-    earth_from_scene = earth_from_enu(*geodetic(middle))
-    scene_from_earth = earth_from_scene.inverse()
-    scene = {timestamp: scene_from_earth @ pose for timestamp, pose in poses.items()}
-    return KeyframePoses(scene, earth_from_scene, {})
 
 
 def _scales_beside(recording: Recording) -> dict[int, float]:

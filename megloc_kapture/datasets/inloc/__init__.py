@@ -3,10 +3,6 @@
 ``<BLD>_cutout_<SCAN>_<YAW>_<PITCH>.jpg`` is cut out of the panorama of a scan, and what the scanner
 measured in each of its pixels is in ``<image>.mat``, in the scan's frame (metres, z up). The scan
 stands in its floor as ``<BLD>_trans_<SCAN>.txt`` says.
-
-kapture's download has the poses of the cutouts, as ``mapping/sensors/trajectories.txt``, and none
-of the images: ``DUC1/`` and ``DUC2/`` of the official cutouts belong into its ``records_data``,
-``iphone7/`` of the queries into that of ``query/``.
 """
 
 from __future__ import annotations
@@ -20,12 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.text_lines import Line, read_lines
-from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY, kapture_parent
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import has_control_characters, named
-from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.io.kapture.format import FLOAT_PATTERN
 from megloc_kapture.io.mat_file import read_mat_array
 from megloc_kapture.values import RigidTransform
 
@@ -37,16 +30,13 @@ POINTS_SUFFIX = ".mat"  # behind the image's name
 
 LAYOUT = (
     "database/cutouts/DUC1/000/DUC_cutout_000_0_0.jpg (and .jpg.mat), "
-    "database/alignments/DUC1/transformations/DUC_trans_000.txt, query/iphone7/IMG_0000.JPG; or "
-    "as kapture's downloader leaves it, the images put into mapping/sensors/records_data/DUC1/ "
-    "and query/sensors/records_data/iphone7/"
+    "database/alignments/DUC1/transformations/DUC_trans_000.txt, query/iphone7/IMG_0000.JPG"
 )
 
 # what archives and their redistributions call the folders, most official first
 _ROOTS = ("", "dataset")
 _CUTOUTS = ("database/cutouts", "cutouts", "database/cutouts_imageonly", "cutouts_imageonly")
 _ALIGNMENTS = ("database/alignments", "alignments")
-KAPTURE_QUERIES = "iphone7"  # below records_data
 _QUERIES = ("query/iphone7", "queries/iphone7", "iphone7")
 # the published archive spells it without the "n", the documentation with it
 _WRONG_SCANS = ("know_incorrect.txt", "known_incorrect.txt")
@@ -57,20 +47,11 @@ COLOURS = "RGBcut"
 
 _CUTOUT = re.compile(r"([A-Za-z]+)_cutout_([0-9]{3})_([0-9]{1,3})_(-?[0-9]{1,2})\.jpg")
 _SCAN_NUMBER = re.compile(r"(?<![0-9])[0-9]{1,3}(?![0-9])")
-_MAX_TEXT_BYTES = 1 << 20  # of files that hold a few lines
 
 
 @dataclass(frozen=True, slots=True)
 class Cutout:
-    """A cutout, as its name describes it.
-
-    Parameters
-    ----------
-    building : ``DUC`` or ``cse``, as in the names of its other files.
-    scan : three digits.
-    yaw_deg : to the right of the scan's -x axis, 0 to 359.
-    pitch_deg : above the horizon, -90 to 90.
-    """
+    """A cutout, as its name describes it; the yaw is to the right of the scan's -x axis."""
 
     building: str
     scan: str
@@ -79,12 +60,10 @@ class Cutout:
 
     @property
     def image(self) -> str:
-        """Name of the image file."""
         return f"{self.building}_cutout_{self.scan}_{self.yaw_deg}_{self.pitch_deg}.jpg"
 
     @property
     def transformation(self) -> str:
-        """Name of the scan's transformation file."""
         return f"{self.building}_trans_{self.scan}.txt"
 
     def cam_from_scan(self) -> RigidTransform:
@@ -120,13 +99,13 @@ def parse_cutout_name(name: str) -> Cutout:
 
 
 def read_transformation(path: Path | str) -> RigidTransform:
-    """``floor_from_scan`` of a scan, after refinement; DataError names file and line.
+    """``floor_from_scan`` of a scan, after refinement.
 
     The file has two 4x4 matrices, before refinement and after it, row by row; what else stands in
     it is text.
     """
     path = Path(path)
-    rows = [line for line in _few_lines(path) if _has_four_numbers(line)]
+    rows = [line for line in read_lines(path) if _has_four_numbers(line)]
     if len(rows) != 8:
         raise DataError(
             f"{len(rows)} rows of four numbers; expected two matrices of four rows each", path=path
@@ -139,25 +118,13 @@ def read_transformation(path: Path | str) -> RigidTransform:
 
 
 def read_wrong_scans(path: Path | str) -> frozenset[str]:
-    """The scans, three digits each, that the dataset's authors list as wrongly placed.
-
-    How the list looks is not documented: every number of at most three digits counts.
-    """
-    lines = _few_lines(Path(path))
+    """Return the scans that the authors list as wrongly placed: any number of up to 3 digits."""
+    lines = read_lines(Path(path))
     return frozenset(n.zfill(3) for line in lines for n in _SCAN_NUMBER.findall(line.text))
 
 
 def read_cutout_points(path: Path | str, width: int, height: int) -> NDArray[np.float64]:
-    """The scanned points of the pixels of a cutout.
-
-    Returns
-    -------
-    float64 (height, width, 3), metres in the scan's frame; NaN where nothing came back.
-
-    Raises
-    ------
-    DataError : not a MATLAB file, broken, or of another size than the image.
-    """
+    """Return the scanned points float64 (height, width, 3), metres in the scan's frame, or NaN."""
     points = read_mat_array(path, POINTS)
     if points.shape != (height, width, 3):
         found = "x".join(map(str, points.shape))
@@ -166,14 +133,10 @@ def read_cutout_points(path: Path | str, width: int, height: int) -> NDArray[np.
 
 
 def _has_four_numbers(line: Line) -> bool:
-    return len(line.fields) == 4 and all(map(FLOAT_PATTERN.fullmatch, line.fields))
-
-
-def _few_lines(path: Path) -> list[Line]:
-    size = path.stat().st_size if path.is_file() else 0  # else the reader says what is wrong
-    if size > _MAX_TEXT_BYTES:
-        raise DataError(f"{size} bytes, too many for a few lines of text", path=path)
-    return read_lines(path)
+    try:
+        return len(list(map(float, line.fields))) == 4
+    except ValueError:
+        return False
 
 
 @dataclass(frozen=True)
@@ -183,22 +146,17 @@ class Layout:
     Parameters
     ----------
     alignments : has a folder for each floor.
-    kapture : the map's kapture folder, where poses come from there and not from the alignments.
     """
 
     cutouts: Path
     alignments: Path
     query: Path
-    kapture: KaptureFolder | None = None
 
     @classmethod
     def find(cls, root: Path) -> Layout:
         """The folders below ``root``; DataError where one of the three is not there."""
         if not root.is_dir():
             raise DataError("no such folder", path=root)
-        parent = kapture_parent(root)
-        if parent is not None and _first(root, _CUTOUTS) is None:
-            return cls._of_kapture(parent)
         for name in _ROOTS:
             cutouts, alignments, query = (
                 _first(root / name, names) for names in (_CUTOUTS, _ALIGNMENTS, _QUERIES)
@@ -211,22 +169,9 @@ class Layout:
             return cls(cutouts, alignments, query)
         raise DataError(f"{_CUTOUTS[0]}/ is missing; InLoc lies as {LAYOUT}", path=root)
 
-    @classmethod
-    def _of_kapture(cls, parent: Path) -> Layout:
-        """The folders of a kapture download."""
-        mapping = parent / MAPPING
-        query = KaptureFolder(parent / QUERY).image_path(KAPTURE_QUERIES)
-        if not query.is_dir():
-            raise DataError(f"no folder of queries; InLoc lies as {LAYOUT}", path=query)
-        folder = KaptureFolder(mapping)
-        # the download has them in mapping/, an older guide showed them beside it
-        beside = next((p for p in (mapping, parent) if (p / "DUC1_alignment").is_dir()), mapping)
-        cutouts = folder.root / "sensors" / "records_data"
-        return cls(cutouts, beside, query, folder)
-
     def alignment(self, floor: str) -> Path:
         """The folder of what is known about where a floor's scans stand."""
-        return self.alignments / (floor if self.kapture is None else f"{floor}_alignment")
+        return self.alignments / floor
 
     def queries(self) -> list[str]:
         """File names of the query images, sorted; DataError where no pose file can hold one."""
@@ -257,8 +202,6 @@ class Layout:
 
     def input_files(self, floors: tuple[str, ...], *, with_points: bool) -> Iterator[Path]:
         """All files of these floors and of the queries that an import may read."""
-        if self.kapture is not None:
-            yield from sorted((self.kapture.root / "sensors").glob("*.txt"))
         for floor in floors:
             alignments = self.alignment(floor)
             yield from sorted(alignments.glob("transformations/*.txt"))
@@ -282,26 +225,13 @@ class Layout:
         missing.files += [folder / image for image in sorted((expected | points) - there)]
         first = Cutout(building, number, 0, 0)
         transformation = self.alignment(floor) / "transformations" / first.transformation
-        if self.kapture is None:
-            missing.require(transformation)
-        return Scan(
-            floor, number, folder, tuple(cutouts), frozenset(points), transformation, self.kapture
-        )
+        missing.require(transformation)
+        return Scan(floor, number, folder, tuple(cutouts), frozenset(points), transformation)
 
 
 @dataclass(frozen=True)
 class Scan:
-    """One scan of a floor.
-
-    Parameters
-    ----------
-    number : three digits.
-    folder : of its cutouts.
-    cutouts : those there are, sorted by name.
-    with_points : images whose points lie beside them.
-    transformation : its file, which may be missing.
-    kapture : has the cutouts' poses instead of it.
-    """
+    """One scan of a floor: its cutouts, sorted by name, and those that have points."""
 
     floor: str
     number: str
@@ -309,16 +239,9 @@ class Scan:
     cutouts: tuple[Cutout, ...]
     with_points: frozenset[str]
     transformation: Path
-    kapture: KaptureFolder | None = None
 
     def poses(self) -> dict[str, RigidTransform]:
         """``cam_from_floor`` by image, of the cutouts whose pose is known."""
-        if self.kapture is not None:
-            data = self.kapture.read()
-            recorded = set(data.records_camera.values())
-            names = {c.image: f"{self.location}/{c.image}" for c in self.cutouts}
-            poses = {i: data.cam_from_world(n) for i, n in names.items() if n in recorded}
-            return {image: pose for image, pose in poses.items() if pose is not None}
         if not self.transformation.exists():
             return {}
         scan_from_floor = read_transformation(self.transformation).inverse()

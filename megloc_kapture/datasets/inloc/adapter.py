@@ -108,12 +108,7 @@ class InLoc:
         yield from ground_truth_files(root)
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
-        """Read the dataset; the depth maps are made when it is written.
-
-        Raises
-        ------
-        DataError : names the file and what is wrong with it.
-        """
+        """Read the dataset; the depth maps are made when it is written."""
         self.check(root)
         layout, missing = Layout.find(root), Missing(root)
         map_ = _Map(self.options)
@@ -333,10 +328,6 @@ def cutout_depth(job: DepthJob, step: int) -> NDArray[np.float32]:
     Returns
     -------
     float32 (H, W) of :func:`depth_camera`, metres; 0 where nothing came back.
-
-    Raises
-    ------
-    DataError : the file is broken, or its points are not those of this cutout.
     """
     camera = job.camera
     points = read_cutout_points(job.points, camera.width, camera.height)

@@ -16,11 +16,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from megloc_kapture.datasets.formats.colmap_reading import colmap_model_files, read_colmap_model
-from megloc_kapture.datasets.formats.sparse_models import SparsePoints, read_single_nvm
+from megloc_kapture.datasets.formats.nvm import read_nvm
 from megloc_kapture.datasets.formats.text_lines import Line, read_lines, shown
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.colmap_model import SparsePoints, colmap_model_files, read_colmap_model
 from megloc_kapture.values import RigidTransform
 
 CAMERAS = ("left", "rear", "right")
@@ -75,13 +75,9 @@ def parse_image(text: str) -> ImageKey | None:
 
 
 def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
-    """Read ``<camera>_intrinsics.txt``: fx, fy, cx, cy in pixels, whatever their order there.
-
-    DataError names file and line, also of a key that is unknown, given twice or absent.
-    """
+    """Read ``<camera>_intrinsics.txt``: fx, fy, cx, cy in pixels, in any order."""
     values: dict[str, float] = {}
-    lines = read_lines(path)
-    for line in lines:
+    for line in read_lines(path):
         if len(line.fields) != 2 or line.fields[0] not in INTRINSICS_KEYS:
             raise line.error(
                 f"expected a line 'key value', key one of {', '.join(INTRINSICS_KEYS)}"
@@ -90,39 +86,31 @@ def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
         if key in values:
             raise line.error(f"{key} is given twice")
         values[key] = line.number_of(text, key)
-    absent = [key for key in INTRINSICS_KEYS if key not in values]
-    if absent:
-        number = lines[-1].number if lines else 1
-        raise DataError(f"{', '.join(absent)} missing; it ends here", path=path, line=number)
+    if absent := [key for key in INTRINSICS_KEYS if key not in values]:
+        raise DataError(f"{', '.join(absent)} missing", path=path)
     fx, fy, cx, cy = (values[key] for key in INTRINSICS_KEYS)
     return fx, fy, cx, cy
 
 
 def read_query_location(path: Path) -> list[ListedImage]:
-    """Read ``queries_location_NNN.txt``, in its order; DataError names file and line."""
-    return _some([_listed(line, line.text) for line in read_lines(path)], path)
+    """Read ``queries_location_NNN.txt``, in its order."""
+    return [_listed(line, line.text) for line in _some_lines(path)]
 
 
 def read_test_list(path: Path) -> list[ListedImage]:
-    """Read ``robotcar_v2_test.txt``, in its order; DataError names file and line.
-
-    The official list leaves the condition out (``rear/123.png``); a list that has it is read too.
-    """
+    """Read ``robotcar_v2_test.txt``, in its order; its names have no condition (``rear/1.png``)."""
     listed: dict[tuple[str, str], ListedImage] = {}
-    for line in read_lines(path):
+    for line in _some_lines(path):
         entry = _listed(line, line.text, conditions=False)
         if listed.setdefault((entry.image.camera, entry.image.stem), entry) is not entry:
             raise line.error(f"{line.text!r} is listed twice")
-    return _some(list(listed.values()), path)
+    return list(listed.values())
 
 
 def read_train_poses(path: Path) -> list[ListedImage]:
-    """Read ``robotcar_v2_train.txt``: a name and the 4x4 matrix ``world_from_cam`` per line.
-
-    DataError names file and line, also of an image given twice.
-    """
+    """Read ``robotcar_v2_train.txt``: a name and the 4x4 matrix ``world_from_cam`` per line."""
     listed: dict[ImageKey, ListedImage] = {}
-    for line in read_lines(path):
+    for line in _some_lines(path):
         line.expect(line.fields, 17, "a name and 16 matrix elements")
         image = _listed(line, line.fields[0]).image
         if image in listed:
@@ -130,13 +118,14 @@ def read_train_poses(path: Path) -> list[ListedImage]:
         values = line.numbers_of(line.fields[1:], "matrix element")
         world_from_cam = line.rigid_transform(np.array(values).reshape(4, 4))
         listed[image] = ListedImage(image, line, world_from_cam.inverse())
-    return _some(list(listed.values()), path)
+    return list(listed.values())
 
 
-def _some(entries: list[ListedImage], path: Path) -> list[ListedImage]:
-    if not entries:
-        raise DataError("no image in the list", path=path, line=1)
-    return entries
+def _some_lines(path: Path) -> list[Line]:
+    lines = read_lines(path)
+    if not lines:
+        raise DataError("no image in the list", path=path)
+    return lines
 
 
 def _listed(line: Line, text: str, *, conditions: bool = True) -> ListedImage:
@@ -148,17 +137,7 @@ def _listed(line: Line, text: str, *, conditions: bool = True) -> ListedImage:
 
 
 class Layout:
-    """The official layout below ``root``.
-
-    Attributes
-    ----------
-    images : ``<condition>/<camera>/<time>.jpg`` lie below it.
-    models : the folder of all models.
-    merged_model : one model of all locations.
-    feature_database : COLMAP database with the models' features.
-    train_list : of version 2, the rear query images whose poses are public.
-    test_list : of version 2, the rear query images whose poses have to be found.
-    """
+    """The official layout below ``root``."""
 
     def __init__(self, root: Path) -> None:
         self.root = Path(root)
@@ -166,59 +145,60 @@ class Layout:
         self.models = self.root / "3D-models"
         self.merged_model = self.models / "all-merged" / "all.nvm"
         self.feature_database = self.models / "overcast-reference.db"
+        # of version 2: rear query images whose poses are public, and those to be found
         self.train_list = self.root / "robotcar_v2_train.txt"
         self.test_list = self.root / "robotcar_v2_test.txt"
 
     def absent(self) -> list[str]:
-        """Names of the layout's folders that are not there."""
+        """Return the names of the layout's folders that are not there."""
         return [path.name for path in (self.images, self.models) if not path.is_dir()]
 
     def intrinsics(self, camera: str) -> Path:
-        """Intrinsics of a camera."""
         return self.root / "intrinsics" / f"{camera}_intrinsics.txt"
 
     def extrinsics(self, camera: str) -> Path:
-        """Pose of a camera on the car."""
+        """Return the file with the pose of a camera on the car."""
         return self.root / "extrinsics" / f"{camera}_extrinsics.txt"
 
     def individual_model(self, location: str) -> Path:
-        """Folder of the COLMAP model of one location."""
+        """Return the folder of the COLMAP model of a location."""
         return self.models / "individual" / "colmap_reconstructions" / f"{location}_aligned"
 
     def query_list(self, location: str) -> Path:
-        """List of the queries of one location."""
         folder = self.models / "individual" / "queries_per_location"
         return folder / f"queries_location_{location}.txt"
 
     def individual_models(self) -> dict[str, Path]:
-        """Folders of the COLMAP models that are there, by location, sorted."""
-        found = _numbered(self.individual_model("").parent, _MODEL)
-        return {location: folder for location, folder in found.items() if folder.is_dir()}
+        """Return the folders of the COLMAP models that are there, by location, sorted."""
+        return {
+            found[1]: folder
+            for folder in sorted(self.individual_model("").parent.glob("*_aligned"))
+            if folder.is_dir() and (found := _MODEL.fullmatch(folder.name))
+        }
+
+    def query_lists(self) -> dict[str, Path]:
+        """Return the lists of queries that are there, by location, sorted."""
+        return {
+            found[1]: path
+            for path in sorted(self.query_list("").parent.glob("queries_location_*.txt"))
+            if (found := _QUERY_LIST.fullmatch(path.name))
+        }
 
     def is_merged(self, model: ModelChoice) -> bool:
-        """Whether the reference poses come from the merged model."""
+        """Return whether the reference poses come from the merged model."""
         return model == "merged" or (
             model == "auto" and (self.merged_model.is_file() or not self.individual_models())
         )
 
     def points_files(self, model: ModelChoice) -> list[Path]:
-        """The files that :func:`read_points` reads; DataError where a folder holds no model."""
+        """Return the files that :func:`read_points` reads."""
         if self.is_merged(model):
             return [self.merged_model]
         folders = self.individual_models().values()
         return [file for folder in folders for file in colmap_model_files(folder)]
 
-    def query_lists(self) -> dict[str, Path]:
-        """Lists of queries that are there, by location, sorted."""
-        return _numbered(self.query_list("").parent, _QUERY_LIST)
-
-    def num_reference_images(self) -> int:
-        """The number of images of the reference traversal that are there."""
-        files = self.image_files()
-        return sum(path.parent.parent.name == REFERENCE_CONDITION for path in files)
-
     def image_files(self) -> Iterator[Path]:
-        """Every image that is there, sorted folder by folder."""
+        """Yield every image that is there, sorted folder by folder."""
         for condition in _sorted_names(self.images):
             for camera in CAMERAS:
                 folder = self.images / condition / camera
@@ -226,11 +206,16 @@ class Layout:
                     if name.endswith(_FILE_TYPES):
                         yield folder / name
 
+    def num_reference_images(self) -> int:
+        """Return the number of images of the reference traversal that are there."""
+        files = self.image_files()
+        return sum(path.parent.parent.name == REFERENCE_CONDITION for path in files)
+
 
 def image_finder(layout: Layout, missing: Missing) -> Callable[[ImageKey], str | None]:
-    """Make a function that finds an image's path below ``images/``, with the type it has on disk.
+    """Make a function that returns an image's path below ``images/``, with its file type on disk.
 
-    Of an image that is not there it returns None, and notes it as missing.
+    For an image that is not there it returns None, and notes it as missing.
     """
     names = cache(lambda folder: frozenset(_sorted_names(folder)))
 
@@ -245,20 +230,8 @@ def image_finder(layout: Layout, missing: Missing) -> Callable[[ImageKey], str |
     return find
 
 
-def _numbered(folder: Path, pattern: re.Pattern[str]) -> dict[str, Path]:
-    found = {}
-    for name in _sorted_names(folder):
-        number = pattern.fullmatch(name)
-        if number is not None:
-            found[number[1]] = folder / name
-    return found
-
-
 def _sorted_names(folder: Path) -> list[str]:
-    try:
-        return sorted(os.listdir(folder))
-    except OSError:  # not there, or no folder: what should be in it is then missing
-        return []
+    return sorted(os.listdir(folder)) if folder.is_dir() else []
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,13 +248,8 @@ def read_reference(
 ) -> Reference:
     """Read the poses of the reference images, and which location each is of.
 
-    Of an image in several individual models the first counts; all share one world. DataError names
-    a broken model, an image name that is none, and two images of one camera and time.
-
-    Parameters
-    ----------
-    wanted : locations that have queries; their individual models are missing where the poses
-        have to come from them.
+    Of an image in several individual models the first counts; all share one world. Individual
+    models of ``wanted`` locations are missing where the poses have to come from them.
     """
     individual = layout.individual_models()
     merged = layout.is_merged(model)
@@ -300,7 +268,7 @@ def read_reference(
     else:
         poses = {}
         if missing.require(layout.merged_model):
-            nvm = read_single_nvm(layout.merged_model, with_points=False)
+            nvm = read_nvm(layout.merged_model, with_points=False)
             for index, key in enumerate(_keys(nvm.names, layout.merged_model)):
                 poses[key] = nvm.cam_from_world(index)
     path = layout.merged_model if merged else layout.individual_model("").parent
@@ -313,7 +281,7 @@ def read_reference(
 def read_points(layout: Layout, *, merged: bool) -> tuple[list[ImageKey], SparsePoints]:
     """The images and points of the merged model, or of all individual ones behind one another."""
     if merged:
-        nvm = read_single_nvm(layout.merged_model, with_points=True)
+        nvm = read_nvm(layout.merged_model, with_points=True)
         return _keys(nvm.names, layout.merged_model), nvm.points
     positions: dict[ImageKey, int] = {}
     parts = []
@@ -363,11 +331,7 @@ class Queries:
 
 
 def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missing: bool) -> Queries:
-    """Read the lists of queries of a version; those of version 2 are read wherever they are.
-
-    DataError names file and line, also of two images of one camera and time and, unless missing
-    data is allowed, of an image of version 2 that no location lists.
-    """
+    """Read the lists of queries of a version; public poses are read for both versions."""
     lists = layout.query_lists()
     if not lists:
         missing.files.append(layout.query_list("001"))
@@ -405,9 +369,8 @@ def read_test_names(
 ) -> tuple[dict[ImageKey, str], int]:
     """Read version 2's list of test images: query -> its text in the list, in its order.
 
-    Of an image that has a public pose (in ``train``) DataError names the line. Also returns how
-    many of the list are no queries. ``at_time`` : (camera, time) -> query, for the list leaves
-    conditions out.
+    Also returns how many entries are not queries. ``at_time``: (camera, time) -> query, as the list
+    leaves conditions out.
     """
     test: dict[ImageKey, str] = {}
     unlisted = 0

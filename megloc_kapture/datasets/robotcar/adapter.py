@@ -10,8 +10,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from megloc_kapture.datasets.formats.sparse_models import SparsePoints
-from megloc_kapture.datasets.kapture_folders import without_model
+from megloc_kapture.datasets.kapture_form import KaptureForm
 from megloc_kapture.datasets.official import (
     Count,
     DatasetCard,
@@ -34,15 +33,19 @@ from megloc_kapture.datasets.robotcar import (
 )
 from megloc_kapture.datasets.robotcar.images import (
     Car,
-    LocationFolders,
     Selection,
+    car_of_kapture,
     mapping_data,
+    queries_of_kapture,
     query_truth,
     read_car,
+    read_kapture_images,
+    reference_of_kapture,
     select,
 )
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.protocols import protocol_of
+from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.dataset_tables import ImageGroup, World
 from megloc_kapture.values import Options
 
@@ -129,9 +132,9 @@ class RobotCar:
 
     def check(self, root: Path) -> None:
         """Raise MeglocError, quickly, when ``root`` cannot be what is wanted of RobotCar."""
-        if LocationFolders.find(root) is not None:
+        if (form := _kapture_form(root)) is not None:
             if self.options.reference_model:
-                raise without_model(root)
+                raise form.without_model()
         elif absent := Layout(root).absent():
             raise self.card.without(root, absent)
         elif self.options.reference_model:
@@ -139,10 +142,11 @@ class RobotCar:
 
     def input_files(self, root: Path) -> Iterator[Path]:
         """Every file an import may depend on, images included."""
-        if (folders := LocationFolders.find(root)) is not None:
-            yield from folders.input_files()
+        layout = Layout(root)
+        if (form := _kapture_form(root)) is not None:
+            yield from (path for path in [layout.test_list] if path.is_file())
+            yield from form.input_files()
         else:
-            layout = Layout(root)
             single = [of(name) for of in (layout.intrinsics, layout.extrinsics) for name in CAMERAS]
             single += [layout.train_list, layout.test_list, layout.merged_model]
             if self.options.reference_model:
@@ -155,21 +159,18 @@ class RobotCar:
         yield from ground_truth_files(Path(root))
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
-        """Read the dataset.
-
-        Raises
-        ------
-        DataError : something is broken, or ``root`` is not the dataset; names file and line.
-        OptionError : an option of version 2 where version 1 is read.
-        """
+        """Read the dataset."""
         self.check(root)
         missing = Missing(Path(root))
         options = self.options
         chosen: dict[str, Any] = {"part": options.queries, "train_as_map": options.train_as_map}
-        if (folders := LocationFolders.find(root)) is not None:
-            return self._read_folders(folders, missing, chosen, allow_missing=allow_missing)
+        if (form := _kapture_form(root)) is not None:
+            return self._read_kapture(form, missing, chosen, allow_missing=allow_missing)
         layout = Layout(root)
-        version = self._version(is_second=layout.test_list.is_file())
+        version = options.version
+        if version == "auto":
+            version = 2 if layout.test_list.is_file() else 1
+        self._check_version(version)
         queries = read_queries(layout, version, missing, allow_missing=allow_missing)
         wanted = sorted({name for listed in queries.locations.values() for name in listed})
         reference = read_reference(layout, self.options.model, wanted, missing)
@@ -191,37 +192,34 @@ class RobotCar:
             reference=model,
         )
 
-    def _read_folders(
-        self,
-        folders: LocationFolders,
-        missing: Missing,
-        chosen: dict[str, Any],
-        *,
-        allow_missing: bool,
+    def _read_kapture(
+        self, form: KaptureForm, missing: Missing, chosen: dict[str, Any], *, allow_missing: bool
     ) -> OfficialDataset:
-        images = folders.read(missing)
-        listed = folders.test_list.is_file()
-        # of queries only version 2 publishes poses
-        version = self._version(is_second=listed or bool(images.poses(reference=False)))
-        queries = images.queries(version, folders.test_list, allow_missing=allow_missing)
-        paths = {key: image.name for key, image in images.files.items()}
-        reference = images.reference()
+        images = read_kapture_images(form, missing)
+        test_list = Layout(missing.root).test_list
+        wanted = None if self.options.version == "auto" else self.options.version
+        version, queries = queries_of_kapture(
+            images, wanted, test_list, allow_missing=allow_missing
+        )
+        self._check_version(version)
+        reference, car = reference_of_kapture(images), car_of_kapture(form, images)
+        paths = {key: image.name for key, image in images.items()}
         selection = select(
-            version, reference, queries, cameras=images.cameras, find=paths.get, **chosen
+            version, reference, queries, cameras=car.sensors, find=paths.get, **chosen
         )
         remarks = [f"Read from kapture folders, as version {version}."]
-        if version == 2 and not listed:
+        if version == 2 and not test_list.is_file():
             remarks.append(
-                f"Without {folders.test_list.name}, which kapture leaves out, the pose file holds "
-                "all rear images whose poses are not public; the list may be put into the root."
+                f"Without {test_list.name}, which kapture leaves out, the pose file holds all rear "
+                "images whose poses are not public; the list may be put into the root."
             )
         return self._dataset(
             selection,
-            images.car(),
+            car,
             missing,
             remarks,
-            reference_images=sum(key.condition == REFERENCE_CONDITION for key in images.files),
-            image_files={image.name: image.file for image in images.files.values()},
+            reference_images=sum(key.condition == REFERENCE_CONDITION for key in images),
+            image_files={image.name: image.file for image in images.values()},
         )
 
     def _dataset(
@@ -270,17 +268,17 @@ class RobotCar:
             "extracted again from the images."
         ]
 
-    def _version(self, *, is_second: bool) -> int:
-        """The version to read where the data look like the second's, or do not."""
-        version = self.options.version
-        if version == "auto":
-            version = 2 if is_second else 1
+    def _check_version(self, version: int) -> None:
         if version == 1 and (self.options.train_as_map or self.options.queries != "all"):
             raise OptionError(
                 "train_as_map and queries are about version 2, whose lists are not there or not "
                 "wanted (version=2)"
             )
-        return version
+
+
+def _kapture_form(root: Path) -> KaptureForm | None:
+    """The kapture folders, where the official files are not there."""
+    return KaptureForm.find(root, with_locations=True) if Layout(root).absent() else None
 
 
 def _read_points(layout: Layout, selection: Selection) -> tuple[list[str], SparsePoints]:

@@ -1,27 +1,16 @@
-"""The imported images of RobotCar Seasons as kapture: choice, cameras, rig, records and poses; and
-the images that kapture distributes, in a folder for each location, ``01/`` to ``49/``, with
-``mapping/`` and, where there are queries, ``query/``."""
+"""The imported images of RobotCar Seasons as kapture: choice, cameras, rig, records and poses."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from megloc_kapture.datasets.formats.text_lines import read_rigid_matrix
-from megloc_kapture.datasets.kapture_folders import (
-    MAPPING,
-    QUERY,
-    KaptureImage,
-    is_kapture,
-    parents,
-    read_images,
-    tables_and_images,
-)
+from megloc_kapture.datasets.kapture_form import KaptureForm, KaptureImage
 from megloc_kapture.datasets.official import Missing, with_poses
 from megloc_kapture.datasets.robotcar import (
     CAMERAS,
@@ -40,7 +29,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.poses import rotation_angles_deg, stack_poses
 from megloc_kapture.io.files import named
 from megloc_kapture.io.images import image_size
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor
+from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.values import Camera, RigidTransform
 
 RIG_ID = "car"
@@ -153,12 +142,7 @@ def _record(image: ImageKey) -> tuple[int, str]:
 
 
 def read_car(layout: Layout, selection: Selection, missing: Missing) -> Car:
-    """Read intrinsics and extrinsics; an image of each camera tells its size.
-
-    Raises
-    ------
-    DataError : a broken file; names file and line.
-    """
+    """Read intrinsics and extrinsics; an image of each camera tells its size."""
     images = {**selection.map_images, **selection.train_images, **selection.query_images}
     example = {image.camera: path for image, path in reversed(images.items())}
     sensors = {}
@@ -250,149 +234,70 @@ def middle_transform(transforms: Sequence[RigidTransform]) -> RigidTransform:
 # ------------------------------------------------------------------------- kapture folders
 
 
-@dataclass(frozen=True)
-class LocationFolders:
-    """The kapture folders of the locations.
-
-    Parameters
-    ----------
-    test_list : of version 2, which kapture leaves out; a user may put it into the root.
-    folders : location, as the official files call it (``001``) -> its folder, sorted.
-    """
-
-    test_list: Path
-    folders: Mapping[str, Path]
-
-    @classmethod
-    def find(cls, root: Path) -> LocationFolders | None:
-        """The folders that are there instead of the official files; None where these are."""
-        layout = Layout(root)
-        for parent in parents(root) if layout.absent() else ():
-            found = {
-                f"{int(folder.name):03d}": folder
-                for folder in sorted(parent.glob("[0-9][0-9]*"))
-                if re.fullmatch("[0-9]{2,3}", folder.name) and is_kapture(folder / MAPPING)
-            }
-            if found:
-                return cls(layout.test_list, found)
-        return None
-
-    def parts(self) -> Iterator[tuple[str, Path]]:
-        """Location and kapture folder, for those that are there."""
-        for location, folder in self.folders.items():
-            for part in (MAPPING, QUERY):
-                if is_kapture(folder / part):
-                    yield location, folder / part
-
-    def input_files(self) -> Iterator[Path]:
-        """Every file an import may depend on."""
-        if self.test_list.is_file():
-            yield self.test_list
-        yield from tables_and_images(folder for _, folder in self.parts())
-
-    def read(self, missing: Missing) -> SeasonsImages:
-        """Read all images.
-
-        Raises
-        ------
-        DataError : broken tables, an image that is none of RobotCar's, cameras or rigs that are
-            not the same everywhere.
-        """
-        found = SeasonsImages()
-        for location, folder in self.parts():
-            for image in read_images(folder, missing.require):
-                found.add(image, location, folder)
-            found.add_rigs(folder)
-        return found
-
-
-@dataclass
-class SeasonsImages:
-    """The images of all locations.
-
-    Parameters
-    ----------
-    files : image -> what kapture says of it.
-    locations : image -> the locations it is in.
-    cameras : name -> intrinsics.
-    rig : camera -> ``sensor_from_rig``.
-    """
-
-    files: dict[ImageKey, KaptureImage] = field(default_factory=dict)
-    locations: dict[ImageKey, tuple[str, ...]] = field(default_factory=dict)
-    cameras: dict[str, Camera] = field(default_factory=dict)
-    rig: dict[str, RigidTransform] = field(default_factory=dict)
-    _at_time: dict[tuple[str, int], ImageKey] = field(default_factory=dict)
-    _sensors: dict[str, str] = field(default_factory=dict)
-
-    def add(self, image: KaptureImage, location: str, folder: Path) -> None:
-        """Add an image of a location; raises DataError, see :meth:`LocationFolders.read`."""
+def read_kapture_images(form: KaptureForm, missing: Missing) -> dict[ImageKey, KaptureImage]:
+    """Return the images of kapture folders."""
+    found: dict[ImageKey, KaptureImage] = {}
+    cameras: dict[str, Camera] = {}
+    at_time: dict[tuple[str, int], ImageKey] = {}
+    for image in form.read(missing):
         key = parse_image(image.name)
         if key is None or not key.condition:
             raise DataError(
-                f"image {image.name!r}; expected condition/camera/time.jpg", path=folder
+                f"image {image.name!r}; expected condition/camera/time.jpg", path=image.file
             )
-        note_time(key, self._at_time, partial(DataError, path=folder))
-        if self.cameras.setdefault(key.camera, image.camera) != image.camera:
+        note_time(key, at_time, partial(DataError, path=image.file))
+        if cameras.setdefault(key.camera, image.camera) != image.camera:
             raise DataError(
-                f"camera {key.camera} of {image.name!r} is not that of other images; all of "
-                "RobotCar's images are rectified to one for each side",
-                path=folder,
+                f"camera {key.camera} is not that of other images; all of RobotCar's images are "
+                "rectified to one for each side",
+                path=image.file,
             )
-        self._sensors[image.sensor_id] = key.camera
-        self.files.setdefault(key, image)
-        others = self.locations.get(key, ())
-        if location not in others:
-            self.locations[key] = (*others, location)
+        found[key] = image
+    return found
 
-    def add_rigs(self, folder: Path) -> None:
-        """Add where cameras sit on the car; of several folders the first to say so counts."""
-        for members in KaptureFolder(folder).read().rigs.values():
-            for sensor_id, sensor_from_rig in members.items():
-                if sensor_id in self._sensors:
-                    self.rig.setdefault(self._sensors[sensor_id], sensor_from_rig)
 
-    def car(self) -> Car:
-        """The cameras on the car."""
-        sensors = {n: Sensor.from_camera(c, name=n) for n, c in sorted(self.cameras.items())}
-        return Car(sensors, dict(self.rig))
+def car_of_kapture(form: KaptureForm, images: Mapping[ImageKey, KaptureImage]) -> Car:
+    """Return the cameras, and where they sit on the car."""
+    cameras = {key.camera: image.camera for key, image in images.items()}
+    names = {image.sensor_id: key.camera for key, image in images.items()}
+    sensors = {name: Sensor.from_camera(cameras[name], name=name) for name in sorted(cameras)}
+    return Car(sensors, {names[one]: pose for one, pose in form.rig().items() if one in names})
 
-    def poses(self, *, reference: bool) -> dict[ImageKey, RigidTransform]:
-        """The poses that are known of images of the reference traversal, or of the others."""
-        return {
-            key: image.cam_from_world
-            for key, image in self.files.items()
-            if (key.condition == REFERENCE_CONDITION) == reference
-            and image.cam_from_world is not None
-        }
 
-    def reference(self) -> Reference:
-        """The images of the reference traversal that have a pose."""
-        poses = self.poses(reference=True)
-        return Reference(poses, {key: self.locations[key][0] for key in poses}, merged=False)
+def reference_of_kapture(images: Mapping[ImageKey, KaptureImage]) -> Reference:
+    """Return the images of the reference traversal that have a pose."""
+    poses = {
+        key: image.cam_from_world
+        for key, image in images.items()
+        if key.condition == REFERENCE_CONDITION and image.cam_from_world is not None
+    }
+    return Reference(poses, {key: images[key].locations[0] for key in poses}, merged=False)
 
-    def queries(self, version: int, test_list: Path, *, allow_missing: bool) -> Queries:
-        """The images under other conditions, in the order of locations and times.
 
-        Those of the rear camera that have a pose are version 2's training images. Without its
-        test list all others of that camera are handed in. DataError names a broken list, see
-        :func:`.read_test_names`.
-        """
-        listed = sorted(
-            (locations[0], key.timestamp, key.camera, key)
-            for key, locations in self.locations.items()
-            if key.condition != REFERENCE_CONDITION
-        )
-        keys = [key for *_, key in listed]
-        poses = self.poses(reference=False)
-        scored = [key for key in keys if key.camera == SCORED_CAMERA]
-        train = {key: poses[key] for key in scored if key in poses}
-        test: dict[ImageKey, str] = {}
-        unlisted = 0
-        if version == 2 and test_list.is_file():
-            listed_keys = set(keys)
-            queries = {at: key for at, key in self._at_time.items() if key in listed_keys}
-            test, unlisted = read_test_names(test_list, queries, train, allow_missing=allow_missing)
-        elif version == 2:
-            test = {key: f"{key.camera}/{key.stem}.png" for key in scored if key not in train}
-        return Queries({key: self.locations[key] for key in keys}, train, test, unlisted)
+def queries_of_kapture(
+    images: Mapping[ImageKey, KaptureImage],
+    version: int | None,
+    test_list: Path,
+    *,
+    allow_missing: bool,
+) -> tuple[int, Queries]:
+    """Return the images under other conditions, and the version; None finds it out.
+
+    Images of the rear camera that have a pose are version 2's training images. Without its test
+    list, which kapture leaves out, the poses of all others of that camera are handed in.
+    """
+    keys = sorted(
+        (key for key in images if key.condition != REFERENCE_CONDITION),
+        key=lambda key: (images[key].locations[0], key.timestamp, key.camera),
+    )
+    poses = {key: images[key].cam_from_world for key in keys if key.camera == SCORED_CAMERA}
+    train = {key: pose for key, pose in poses.items() if pose is not None}
+    version = version or (2 if train or test_list.is_file() else 1)
+    test: dict[ImageKey, str] = {}
+    unlisted = 0
+    if version == 2 and test_list.is_file():
+        at_time = {(key.camera, key.timestamp): key for key in keys}
+        test, unlisted = read_test_names(test_list, at_time, train, allow_missing=allow_missing)
+    elif version == 2:
+        test = {key: f"{key.camera}/{key.stem}.png" for key in poses if key not in train}
+    return version, Queries({key: images[key].locations for key in keys}, train, test, unlisted)

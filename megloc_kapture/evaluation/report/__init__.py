@@ -1,1 +1,1 @@
-"""Reports: one document model, rendered as text, JSON, CSV and HTML."""
+"""Reports of results: text, JSON, CSV and an HTML page; and the 3D view."""

@@ -1,338 +1,263 @@
-"""Figures of errors as inline SVG with reproducible bytes: recall, errors against inliers."""
+"""Figures of reports: error curves, errors against inliers, confidence, cameras from above."""
 
 from __future__ import annotations
 
 import io
-import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
 import numpy as np
 from cycler import cycler
-from markupsafe import Markup
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
 from megloc_kapture.evaluation.confidence import Confidence
-from megloc_kapture.evaluation.metrics import ALL, Threshold
-from megloc_kapture.evaluation.report.tables import PALETTE, colors_of
-from megloc_kapture.evaluation.report.wording import display_name
+from megloc_kapture.evaluation.report.map_view import top_view
+from megloc_kapture.evaluation.report.queries import ShownQuery
+from megloc_kapture.evaluation.results import Poses
 from megloc_kapture.evaluation.scoring import Evaluation
+from megloc_kapture.geometry.poses import camera_centers, stack_poses
+from megloc_kapture.values import RigidTransform
 
-INK = "#1f2933"
-MUTED = "#9aa5b1"
-MISS = "#c0262d"
-
+_INK, _MUTED, _MISS = "#1f2933", "#9aa5b1", "#c0262d"
+# Okabe and Ito's palette: told apart with any colour vision, in print too; then four more, for
+# RobotCar has nine conditions
+_PALETTE = (
+    *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"),
+    *("#7a5195", "#8c6d31", "#5f6b7a", "#9a1750"),
+)
 # above this many points a scatter is stored as pixels inside the SVG
-RASTER_ABOVE = 3000
+_RASTER_ABOVE = 3000
+# errors below these are drawn at them: a logarithmic axis has no zero
+_SMALLEST_POSITION_M, _SMALLEST_ANGLE_DEG = 1e-4, 1e-3
 
 _STYLE: dict[Any, Any] = {
     "axes.edgecolor": "#cbd2d9",
     "axes.grid": True,
-    "axes.labelcolor": INK,
-    "axes.prop_cycle": cycler(color=PALETTE),
+    "axes.prop_cycle": cycler(color=_PALETTE),
     "axes.spines.right": False,
     "axes.spines.top": False,
-    "axes.titlelocation": "left",
-    "axes.titlesize": 10,
     "figure.constrained_layout.use": True,
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],
     "font.size": 9,
     "grid.color": "#e4e7eb",
     "grid.linewidth": 0.6,
+    "legend.fontsize": 8,
     "legend.frameon": False,
-    "lines.linewidth": 1.8,
     "svg.fonttype": "none",
-    "svg.hashsalt": "megloc",
-    "text.color": INK,
+    "svg.hashsalt": "megloc",  # the same figure gives the same bytes
     "text.parse_math": False,  # a "$" in the name of a condition is a dollar
-    "xtick.color": "#52606d",
-    "ytick.color": "#52606d",
 }
 
 
 @contextmanager
-def styled_figure(width: float, height: float) -> Iterator[Figure]:
-    """A figure of ``width`` x ``height`` inches, with our style while the block lasts.
-
-    It is bound to no window and no global state of pyplot.
-    """
-    # rc_context alone would inherit what a user's matplotlibrc says about everything else
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
+def _figure(width: float, height: float) -> Iterator[Figure]:
+    """A figure in our style, bound to no window and to no global state of pyplot."""
+    with matplotlib.rc_context(rc=matplotlib.rcParamsDefault), warnings.catch_warnings():
+        # names in scripts that matplotlib's font lacks
+        warnings.filterwarnings("ignore", message="Glyph")
         matplotlib.rcParams.update(_STYLE)
         figure = Figure(figsize=(width, height))
         FigureCanvasSVG(figure)
         yield figure
 
 
-def to_svg(figure: Figure, prefix: str) -> Markup:
-    """The figure as an ``<svg>`` element; call inside :func:`styled_figure`.
-
-    ``prefix`` goes before every id, since several figures share one HTML page. The same figure
-    gives the same text.
-    """
-    buffer = io.StringIO()
-    with warnings.catch_warnings():
-        # names in scripts that matplotlib's own font lacks are drawn by the browser
-        warnings.filterwarnings("ignore", message="Glyph")
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    svg = buffer.getvalue()
-    svg = svg[svg.index("<svg") :]
-    # inside tags only: the text of a label may look like anything
-    ids = re.compile(r'(\sid="|href="#|url\(#)')
-    return Markup(re.sub(r"<[^>]*>", lambda tag: ids.sub(rf"\g<1>{prefix}-", tag[0]), svg))
+def _svg(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    return buffer.getvalue()
 
 
-def _legend_label(name: str) -> str:
+def _label(name: str) -> str:
     """``name`` as matplotlib shows it: one that starts with an underscore would be left out."""
-    return f" {name}" if name.startswith("_") else name
+    return f" {name}" if name.startswith("_") else name or "(no condition)"
 
 
-def _plain_ticks(axis: Axis) -> None:
-    """Numbers as people write them (0.01, 100) on a logarithmic axis, at its powers of ten only."""
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
+def _plain_ticks(axes: Axes) -> None:
+    """Numbers as people write them (0.01, 100) on logarithmic axes, at powers of ten only."""
+    for axis, scale in ((axes.xaxis, axes.get_xscale()), (axes.yaxis, axes.get_yscale())):
+        if scale != "linear":
+            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axis.set_minor_formatter(NullFormatter())
 
 
-def _legend(figure: Figure, axes: Axes) -> None:
-    """One legend below all panels; none of a single curve."""
-    handles, labels = axes.get_legend_handles_labels()
-    if len(labels) > 1:
-        columns = 8 if sum(map(len, labels)) < 90 else 3
-        figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=8)
+def error_curves(evaluations: Sequence[Evaluation]) -> bytes:
+    """Share of all queries at or below an error: position on the left, angle on the right.
 
-
-# errors below these are drawn at them: a logarithmic axis has no zero
-_SMALLEST_POSITION_M = 1e-4
-_SMALLEST_ANGLE_DEG = 1e-3
-
-
-@dataclass(frozen=True)
-class Series:
-    """One curve: errors (N,), infinite without a pose, and how it is drawn."""
-
-    name: str
-    errors: NDArray[np.float64]
-    color: str
-    style: str | tuple[int, tuple[int, int]] = "-"
-
-
-def recall_curves(evaluation: Evaluation) -> Markup:
-    """Share of all queries at or below an error, against that error, per condition.
-
-    Left the position error, right the angle; each ignores the other. The curves end below 1
-    where queries have no pose. The thresholds stand as dotted lines.
+    One curve per condition of a single result, else one per result. Curves end below 100 % where
+    queries have no pose.
     """
-    colors = _condition_colors(evaluation)
-    conditions = np.array([query.condition for query in evaluation.queries])
-    errors = evaluation.errors
-    panels = []
-    for values in (errors.position_m, errors.angle_deg):
-        series = [
-            Series(display_name(name), values[conditions == name], color)
-            for name, color in colors.items()
-        ]
-        panels.append([*series, Series("all", values, INK, (0, (4, 2)) if colors else "-")])
-    return _two_panels(panels, evaluation.thresholds)
-
-
-def compared_curves(evaluations: Sequence[Evaluation]) -> Markup:
-    """The curves of several results, over all queries; else as :func:`recall_curves`."""
-    colors = colors_of([evaluation.label for evaluation in evaluations])
-    panels = [
-        [Series(e.label, getattr(e.errors, kind), colors[e.label]) for e in evaluations]
-        for kind in ("position_m", "angle_deg")
-    ]
-    return _two_panels(panels, evaluations[0].thresholds)
-
-
-def curves_by_row(evaluations: Sequence[Evaluation]) -> Markup | None:
-    """A small panel of position error per condition or pool, several results in each.
-
-    None where there are no conditions.
-    """
-    rows = [name for name in evaluations[0].members if name != ALL]
-    if not rows:
-        return None
-    colors = colors_of([evaluation.label for evaluation in evaluations])
-    bounds = [threshold.position_m for threshold in evaluations[0].thresholds]
-    across = min(len(rows), 3)
-    down = -(-len(rows) // across)
-    every = np.concatenate([evaluation.errors.position_m for evaluation in evaluations])
-    with styled_figure(10.5, 2.5 * down + 0.4) as figure:
-        panels = figure.subplots(down, across, sharey=True, squeeze=False).ravel()
-        for axes in panels[len(rows) :]:
-            axes.set_axis_off()
-        for name, axes in zip(rows, panels, strict=False):
-            series = [
-                Series(e.label, e.errors.position_m[e.members[name]], colors[e.label])
-                for e in evaluations
-            ]
-            _draw_curves(axes, series, bounds, _SMALLEST_POSITION_M, span=every)
-            axes.set_title(display_name(name))
-        for axes in panels[max(len(rows) - across, 0) : len(rows)]:
-            axes.set_xlabel("position error (m)")
-        for axes in panels[::across]:
-            axes.set_ylabel("queries (%)")
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
-        return to_svg(figure, "rows")
-
-
-def _two_panels(panels: Sequence[Sequence[Series]], thresholds: Sequence[Threshold]) -> Markup:
-    """Position errors on the left, angles on the right, one legend below both."""
-    positions = [t.position_m for t in thresholds]
+    first = evaluations[0]
+    thresholds = first.thresholds
     angles = [t.angle_deg for t in thresholds if t.angle_deg is not None]
-    with styled_figure(10.5, 3.9) as figure:
+    with _figure(10.5, 3.9) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
-        _draw_curves(left, panels[0], positions, _SMALLEST_POSITION_M)
+        for axes, kind, bounds, smallest in (
+            (left, "position_m", [t.position_m for t in thresholds], _SMALLEST_POSITION_M),
+            (right, "angle_deg", angles, _SMALLEST_ANGLE_DEG),
+        ):
+            curves = {e.label: getattr(e.errors, kind) for e in evaluations}
+            if not evaluations[1:]:
+                errors = getattr(first.errors, kind)
+                curves = {name: errors[own] for name, own in first.members.items()}
+            every = np.concatenate([*curves.values(), bounds]).clip(smallest)
+            seen = every[np.isfinite(every)]
+            low, high = (smallest, 1.0) if not seen.size else (seen.min() / 1.5, seen.max() * 1.5)
+            for name, errors in curves.items():
+                total = len(curves) > 1 and name == "all"
+                values = np.sort(errors[np.isfinite(errors)].clip(smallest))
+                share = 100.0 * np.arange(len(values) + 1) / max(len(errors), 1)
+                axes.step(
+                    [low, *values, high],
+                    [*share, share[-1]],
+                    where="post",
+                    label=_label(name),
+                    **({"color": _INK, "linestyle": "--"} if total else {}),
+                )
+            for bound in bounds:
+                axes.axvline(bound, color=_MUTED, linewidth=0.9, linestyle=":", zorder=0)
+            axes.set(xscale="log", xlim=(low, high), ylim=(0, 102))
+            _plain_ticks(axes)
         left.set(xlabel="position error (m)", ylabel="share of queries (%)")
-        _draw_curves(right, panels[1], angles, _SMALLEST_ANGLE_DEG)
         right.set(xlabel="rotation error (deg)")
-        _legend(figure, left)
-        return to_svg(figure, "curves")
+        handles, labels = left.get_legend_handles_labels()
+        if len(labels) > 1:
+            columns = 8 if sum(map(len, labels)) < 90 else 3
+            figure.legend(handles, labels, loc="outside lower center", ncols=columns)
+        return _svg(figure)
 
 
-def _draw_curves(
-    axes: Axes,
-    series: Sequence[Series],
-    bounds: Sequence[float],
-    smallest: float,
-    *,
-    span: NDArray[np.float64] | None = None,
-) -> None:
-    """Cumulative curves on a logarithmic axis that spans the errors (or those of ``span``)."""
-    errors = np.concatenate([one.errors for one in series]) if span is None else span
-    finite = np.clip(errors[np.isfinite(errors)], smallest, None)
-    seen = np.concatenate([finite, np.clip(bounds, smallest, None)])
-    low, high = (10.0 * smallest, 1.0) if not seen.size else (seen.min() / 1.5, seen.max() * 1.5)
-    grid = np.unique(np.concatenate([np.geomspace(low, high, 400), bounds, [high]]))
-    grid = grid[(grid >= low) & (grid <= high)]
-    for one in series:
-        within = np.searchsorted(np.sort(one.errors), grid, side="right")
-        share = 100.0 * within / max(len(one.errors), 1)
-        (line,) = axes.step(grid, share, where="post", color=one.color, linestyle=one.style)
-        line.set_label(_legend_label(one.name))
-    for bound in sorted(set(bounds)):
-        axes.axvline(bound, color=MUTED, linewidth=0.9, linestyle=":", zorder=0)
-    axes.set(xscale="log", xlim=(low, high), ylim=(0, 102))
-    _plain_ticks(axes.xaxis)
+def errors_against_inliers(evaluation: Evaluation) -> bytes | None:
+    """Position error of every pose against its inliers; None where no inliers are known.
 
-
-def recall_intervals(evaluations: Sequence[Evaluation]) -> Markup:
-    """Recall of several results with its confidence interval: a panel per threshold, a line per
-    condition, pool and ``all``."""
-    colors = colors_of([evaluation.label for evaluation in evaluations])
-    rows = list(evaluations[0].members)
-    thresholds = evaluations[0].thresholds
-    number = len(evaluations)
-    lowest = min(at.low for e in evaluations for row in e.rows for at in row.recall)
-    left = 10.0 * np.floor(10.0 * lowest)
-    height = len(rows) * max(0.34, 0.17 * number) + 1.2
-    with styled_figure(10.5, height) as figure:
-        panels = figure.subplots(1, len(thresholds), sharey=True, squeeze=False)[0]
-        for index, (threshold, axes) in enumerate(zip(thresholds, panels, strict=True)):
-            for order, evaluation in enumerate(evaluations):
-                at = [row.recall[index] for row in evaluation.rows]
-                recall = 100.0 * np.array([one.recall for one in at])
-                ends = 100.0 * np.array([[one.low, one.high] for one in at])
-                # between the lines of the grid, in the order of the legend from above
-                y = np.arange(len(rows)) + (order - (number - 1) / 2) * 0.7 / number
-                color = colors[evaluation.label]
-                axes.hlines(y, ends[:, 0], ends[:, 1], color=color, linewidth=1.6, alpha=0.55)
-                label = _legend_label(evaluation.label)
-                axes.plot(recall, y, "o", color=color, markersize=4.5, label=label)
-            axes.set(title=str(threshold), xlim=(left - 2, 102), xlabel="recall (%)")
-            axes.grid(False, axis="y")
-        panels[0].set_yticks(range(len(rows)), [display_name(name) for name in rows])
-        panels[0].set_ylim(len(rows) - 0.5, -0.5)
-        _legend(figure, panels[0])
-        return to_svg(figure, "recall")
-
-
-def errors_against_inliers(evaluation: Evaluation, *, prefix: str = "inliers") -> Markup | None:
-    """Position error of every pose against the inliers it was estimated from.
-
-    A good solver's errors fall to the right: many inliers and a large error are a wrong place
-    believed in. None where no status table says how many inliers there were.
+    Errors should fall to the right: many inliers and a large error are a wrong place.
     """
-    queries = [
+    known = [
         q for q in evaluation.queries if q.num_inliers is not None and np.isfinite(q.position_m)
     ]
-    if not queries:
+    if not known:
         return None
-    inliers = np.array([q.num_inliers for q in queries], dtype=np.float64)
-    errors = np.clip([q.position_m for q in queries], _SMALLEST_POSITION_M, None)
-    guessed = np.array([q.outcome == "fallback" for q in queries])
-    conditions = np.array([q.condition for q in queries])
-    colors = _condition_colors(evaluation) or {"": INK}
-    raster = len(queries) > RASTER_ABOVE
-    with styled_figure(6.3, 4.3) as figure:
+    with _figure(6.3, 4.0) as figure:
         axes = figure.subplots()
-        for name, color in colors.items():
-            mine = (conditions == name) & ~guessed
-            label = _legend_label(display_name(name)) if len(colors) > 1 else "localized"
+        for outcome, color, marker in (("localized", _PALETTE[0], "."), ("fallback", _MISS, "x")):
+            chosen = [q for q in known if q.outcome == outcome]
             axes.scatter(
-                inliers[mine], errors[mine], s=14, c=color, alpha=0.65, linewidths=0,
-                label=label, rasterized=raster,
-            )  # fmt: skip
-        if guessed.any():
-            axes.scatter(
-                inliers[guessed], errors[guessed], s=22, c=MISS, marker="x", linewidths=1.2,
-                label="fallback pose", rasterized=raster,
-            )  # fmt: skip
-        for bound in sorted({t.position_m for t in evaluation.thresholds}):
-            axes.axhline(bound, color=MUTED, linewidth=0.9, linestyle=":", zorder=0)
+                [q.num_inliers or 0 for q in chosen],
+                np.clip([q.position_m for q in chosen], _SMALLEST_POSITION_M, None),
+                c=color,
+                marker=marker,
+                alpha=0.65,
+                label=f"{outcome} pose",
+                rasterized=len(known) > _RASTER_ABOVE,
+            )
+        for threshold in evaluation.thresholds:
+            axes.axhline(threshold.position_m, color=_MUTED, linewidth=0.9, linestyle=":")
         axes.set(xlabel="inliers", ylabel="position error (m)", yscale="log")
         axes.set_xscale("symlog", linthresh=10, linscale=0.4)
         axes.set_xlim(left=0)
-        _plain_ticks(axes.xaxis)
-        _plain_ticks(axes.yaxis)
-        if len(colors) > 1 or guessed.any():
-            # under the axes, where it hides no data
-            axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=4, fontsize=8)
-        return to_svg(figure, prefix)
+        _plain_ticks(axes)
+        if any(q.outcome == "fallback" for q in known):
+            axes.legend()
+        return _svg(figure)
 
 
-def confidence_curves(confidence: Confidence) -> Markup:
+def confidence_curves(confidence: Confidence) -> bytes:
     """The reliability diagram, and the risk against the coverage."""
-    with styled_figure(10.5, 4.0) as figure:
+    with _figure(10.5, 4.0) as figure:
         reliability, curve = figure.subplots(1, 2)
-        reliability.plot([0, 100], [0, 100], color=MUTED, linewidth=0.9, linestyle=":")
+        reliability.plot([0, 100], [0, 100], color=_MUTED, linewidth=0.9, linestyle=":")
         filled = [one for one in confidence.bins if one.num_poses]
         mean = 100 * np.array([one.mean_confidence for one in filled])
         share = 100 * np.array([one.share_right for one in filled])
-        reliability.plot(mean, share, "o-", color=INK, markersize=5)
+        reliability.plot(mean, share, "o-", color=_INK, markersize=5)
         for x, y, one in zip(mean, share, filled, strict=True):
-            reliability.annotate(
-                str(one.num_poses), (x, y), xytext=(0, 6), textcoords="offset points",
-                ha="center", fontsize=7, color=MUTED,
-            )  # fmt: skip
-        reliability.set(
-            xlabel="confidence (%)", ylabel="right poses (%)", xlim=(-2, 104), ylim=(-2, 110)
-        )
+            where: dict[str, Any] = {"xytext": (0, 6), "textcoords": "offset points"}
+            reliability.annotate(str(one.num_poses), (x, y), ha="center", fontsize=7, **where)
+        reliability.set(xlabel="confidence (%)", ylabel="right poses (%)")
+        reliability.set(xlim=(-2, 104), ylim=(-2, 110))
         coverage, risk = 100 * np.array(confidence.coverage), 100 * np.array(confidence.risk)
-        curve.step(coverage, risk, where="post", color=INK)
-        curve.set(
-            xlabel="queries answered (%)", ylabel="wrong among them (%)", xlim=(0, 102),
-            ylim=(0, max(5.0, 1.1 * float(risk.max(initial=0.0)))),
-        )  # fmt: skip
-        return to_svg(figure, "confidence")
+        curve.step(coverage, risk, where="post", color=_INK)
+        curve.set(xlabel="queries answered (%)", ylabel="wrong among them (%)", xlim=(0, 102))
+        curve.set(ylim=(0, max(5.0, 1.1 * float(risk.max(initial=0.0)))))
+        return _svg(figure)
 
 
-def _condition_colors(evaluation: Evaluation) -> dict[str, str]:
-    """A colour for each condition, in the order of the table; empty where there is none."""
-    present = {query.condition for query in evaluation.queries}
-    if present == {""}:
-        return {}
-    return colors_of([row.name for row in evaluation.rows if row.name in present])
+def views_from_above(
+    queries: Sequence[ShownQuery], map_poses: Poses, frames: Mapping[str, str], unit: str
+) -> dict[str, bytes]:
+    """Cameras of the map, truths and estimates from above: one figure per coordinate frame.
+
+    Parameters
+    ----------
+    frames : image -> frame, where a dataset has several.
+    """
+
+    def frame_of(query: ShownQuery) -> str:
+        known = (frames[image] for image in (query.image, *query.candidates) if image in frames)
+        return next(known, query.condition)
+
+    found = {}
+    mapped = {name: frames.get(name, "") for name in map_poses}
+    names = sorted(set(mapped.values())) or [""]
+    for name in names:
+        own = [q for q in queries if (f if (f := frame_of(q)) in names else names[0]) == name]
+        poses = [map_poses[image] for image, frame in mapped.items() if frame == name]
+        if any(query.estimated or query.truth for query in own):
+            found[name] = _from_above(own, poses, unit)
+    return found
+
+
+def _from_above(queries: Sequence[ShownQuery], mapped: list[RigidTransform], unit: str) -> bytes:
+    true = [query.truth for query in queries if query.truth is not None]
+    posed = [query for query in queries if query.estimated is not None]
+    # an estimate that is far off must not shrink the map to a dot
+    spanning = mapped + true or [query.estimated for query in posed if query.estimated]
+    quats, translations = stack_poses(spanning)
+    view = top_view(quats, camera_centers(quats, translations))
+
+    def seen(poses: Sequence[RigidTransform | None]) -> NDArray[np.float64]:
+        return view.project(camera_centers(*stack_poses([pose for pose in poses if pose])))
+
+    points = seen(spanning)
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = max(float((high - low).max()), 1.0)
+    # a path straight ahead would leave a figure without height
+    half = np.maximum((high - low) / 2, 0.12 * size) + 0.06 * size
+    low, high = (low + high) / 2 - half, (low + high) / 2 + half
+    number = len(mapped) + len(queries)
+    # in a crowd dots are smaller, and pixels
+    shrink, raster = float(np.clip(np.sqrt(800 / number), 0.3, 1.0)), number > _RASTER_ABOVE
+
+    def dots(poses: Sequence[RigidTransform | None], size: float, label: str, **look: Any) -> None:
+        if len(poses):
+            xy = seen(poses)
+            look = {"linewidths": 1.3 * shrink, "rasterized": raster, **look}
+            axes.scatter(xy[:, 0], xy[:, 1], s=size * shrink, label=label, **look)
+
+    width, height = (high - low).tolist()
+    with _figure(10.5, float(np.clip(10.0 * height / width, 3.0, 6.5)) + 0.6) as figure:
+        axes = figure.subplots()
+        dots(mapped, 10, "map cameras", c="#b8c4d0")
+        joined = [query for query in posed if query.truth is not None]
+        ends = [seen([getattr(q, kind) for q in joined]) for kind in ("truth", "estimated")]
+        segments = list(np.stack(ends, axis=1))
+        axes.add_collection(LineCollection(segments, colors=_MISS, rasterized=raster, alpha=0.6))
+        green: dict[str, Any] = {"facecolors": "none", "edgecolors": "#009e73"}
+        dots([query.truth for query in joined], 26, "truth", **green)
+        localized = [q.estimated for q in posed if q.outcome == "localized"]
+        guessed = [q.estimated for q in posed if q.outcome == "fallback"]
+        lost = [q.truth for q in queries if q.estimated is None and q.truth is not None]
+        dots(localized, 7, "estimated", c=_PALETTE[0], linewidths=0)
+        dots(guessed, 20, "fallback pose", c=_MISS, marker="x")
+        dots(lost, 30, "truth, no pose", c=_MISS, marker="+")
+        axes.set_aspect("equal")
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        axes.set(xlabel=f"{view.labels[0]} ({unit})", ylabel=f"{view.labels[1]} ({unit})")
+        figure.legend(loc="outside lower center", ncols=5)
+        return _svg(figure)

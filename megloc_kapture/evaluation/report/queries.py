@@ -1,4 +1,4 @@
-"""Queries that reports show: which, in what order, what is said of each, and its stored inliers."""
+"""Queries as reports and the 3D view show them: order, colours, facts, and stored inliers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.metrics import Threshold, within
+from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.wording import format_degrees, format_metres
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
@@ -88,6 +88,8 @@ def shown_queries(result: Evaluation | ResultWithoutTruth) -> list[ShownQuery]:
         known = {attribute: getattr(query, attribute) for attribute in attributes}
         if evaluation is not None:
             known["image"] = evaluation.image(name)
+            if name in evaluation.pairs and not query.candidates:
+                known["candidates"] = (evaluation.pairs[name].reference,)
         if name not in poses:
             color, meaning = NO_POSE_COLOR, "no pose"
         else:
@@ -128,109 +130,12 @@ def legend(queries: Sequence[ShownQuery]) -> list[tuple[str, str]]:
     return [(used[m], m) for m in sorted(used, key=lambda m: order.index(used[m]))]
 
 
-@dataclass(frozen=True)
-class Chosen:
-    """A query to show beside what it matches.
-
-    Attributes
-    ----------
-    name : what it is called on the page.
-    image : its image.
-    facts : what stands under its name, in order.
-    candidates : map images, best first.
-    pose : ``cam_from_world`` that matches are judged by; None: unknown.
-    pose_name : what that pose is: ``true`` or ``estimated``.
-    """
-
-    name: str
-    image: str
-    facts: tuple[str, ...]
-    candidates: tuple[str, ...]
-    pose: RigidTransform | None
-    pose_name: str
-
-
-def _chosen(evaluation: Evaluation, query: QueryResult, *facts: str) -> Chosen:
-    """Its candidates are those its pose comes from; where nothing says so, its pair's reference."""
-    name, pair = query.image, evaluation.pairs.get(query.image)
-    candidates = query.candidates or (() if pair is None else (pair.reference,))
-    image = evaluation.image(name)
-    return Chosen(name, image, facts, candidates, evaluation.truth[name], "true")
-
-
-def order_of_badness(query: QueryResult) -> tuple[float, float, str]:
-    """Sorts queries the worst first: those without a pose, then by falling error, then by name."""
-    return -query.position_m, -query.angle_deg, query.image
-
-
-def worst_queries(evaluation: Evaluation) -> list[Chosen]:
-    """The worst queries of a result; at most half of them without a pose, where others are left.
-
-    Of those without a pose the ones with most inliers come first: they failed most narrowly.
-    """
-    ranked = sorted(evaluation.queries, key=order_of_badness)
-    lost = [query for query in ranked if query.outcome == "missing"]
-    lost.sort(key=lambda query: (-(query.num_inliers or 0), query.image))
-    posed = [query for query in ranked if query.outcome != "missing"]
+def worst_queries(queries: Sequence[ShownQuery]) -> list[ShownQuery]:
+    """The worst ten of ranked queries; at most half of them without a pose, if others are left."""
+    lost = [query for query in queries if query.estimated is None]
+    posed = [query for query in queries if query.estimated is not None]
     num_posed = min(len(posed), max(NUM_SHOWN - len(lost), (NUM_SHOWN + 1) // 2))
-    shown = posed[:num_posed] + lost[: NUM_SHOWN - num_posed]
-    return [_chosen(evaluation, query, "; ".join(query_facts(query))) for query in shown]
-
-
-def disputed_queries(evaluations: Sequence[Evaluation]) -> list[tuple[int, Chosen]]:
-    """Queries that results disagree about most, then those that are worst in all of them.
-
-    Returns
-    -------
-    Position of the result that does worst on the query, whose matches are shown, and the query.
-    """
-    thresholds = evaluations[0].thresholds
-    met = np.stack([sum(within(e.errors, t).astype(int) for t in thresholds) for e in evaluations])
-    errors = np.stack([e.errors.position_m for e in evaluations])
-    dispute = met.max(axis=0) - met.min(axis=0)
-    names = evaluations[0].errors.names
-    best = errors.min(axis=0)
-    by_dispute = sorted(np.flatnonzero(dispute > 0).tolist(), key=lambda i: (-dispute[i], names[i]))
-    by_error = sorted(range(len(names)), key=lambda i: (-best[i], -errors[:, i].max(), names[i]))
-    chosen = by_dispute[: NUM_SHOWN - NUM_SHOWN // 3]
-    chosen += [i for i in by_error if i not in set(chosen)][: NUM_SHOWN - len(chosen)]
-    found = []
-    for index in chosen:
-        worst = int(np.argmax(errors[:, index]))
-        facts = (f"{e.label}: {', '.join(query_facts(e.queries[index]))}" for e in evaluations)
-        of_worst = evaluations[worst]
-        found.append((worst, _chosen(of_worst, of_worst.queries[index], *facts)))
-    return found
-
-
-def doubtful_queries(result: ResultWithoutTruth) -> list[Chosen]:
-    """Localized queries that are least sure: far from every candidate, or of few inliers."""
-    localized = [query for query in result.queries if query.outcome == "localized"]
-    known = [q.num_inliers for q in localized if q.num_inliers is not None]
-    few = float(np.quantile(known, 0.25)) if known else -math.inf
-
-    def doubt(query: QueryResult) -> tuple[bool, float, str]:
-        far = query.near is not None and query.near.nearest_m > 25.0
-        count = math.inf if query.num_inliers is None else query.num_inliers
-        return not (far and count <= few), count, query.image
-
-    def facts(query: QueryResult) -> list[str]:
-        said, near = [], query.near
-        if query.num_inliers is not None:
-            said.append(f"{query.num_inliers} inliers of {query.num_matches}")
-        if near is not None and math.isfinite(near.first_m):
-            said.append(f"{format_metres(near.first_m)} m from its first candidate")
-        if near is not None:
-            said.append(f"{format_metres(near.nearest_m)} m from the nearest candidate")
-        return said
-
-    return [
-        Chosen(
-            *(q.image, q.image, ("; ".join(facts(q)),)),
-            *(q.candidates, result.poses[q.image], "estimated"),
-        )
-        for q in sorted(localized, key=doubt)[:NUM_SHOWN]
-    ]
+    return posed[:num_posed] + lost[: NUM_SHOWN - num_posed]
 
 
 @dataclass(eq=False)

@@ -1,161 +1,167 @@
-"""Reports of results: their text, JSON, CSV tables and page as one document each."""
+"""Reports of results: text, JSON, a CSV table and an HTML page."""
 
 from __future__ import annotations
 
+import base64
 import contextlib
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
+from itertools import groupby
 from pathlib import Path
-from typing import Any
+from textwrap import fill
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from markupsafe import Markup
+from pydantic import BaseModel
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.metrics import ALL
+from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.evaluation.report import tables
-from megloc_kapture.evaluation.report.document import (
-    Block,
-    Document,
-    Items,
-    Paragraph,
-    Section,
-    render_html,
-    render_text,
-    write_document,
+from megloc_kapture.evaluation.report.queries import (
+    ShownQuery,
+    StoredInliers,
+    shown_queries,
+    worst_queries,
 )
-from megloc_kapture.evaluation.report.queries import StoredInliers, shown_queries
 from megloc_kapture.evaluation.report.wording import (
     CONFIDENT,
+    FEW,
     INTERVALS,
     agreement_sentence,
     bounds,
     comparison_sentences,
     confidence_sentences,
+    consistency_sentence,
     covariance_sentence,
     criterion,
+    format_degrees,
+    format_interval,
+    format_metres,
+    format_percent,
     method_sentence,
     notes,
-    retrieval_note,
 )
 from megloc_kapture.evaluation.results import Poses, first_map_poses
 from megloc_kapture.evaluation.scoring import Evaluation
-from megloc_kapture.evaluation.statistics import Comparison, MedianDifference, PairedTest, Seeds
+from megloc_kapture.evaluation.statistics import Comparison, MedianDifference, PairedTest
 from megloc_kapture.evaluation.without_truth import CAUTION, ResultWithoutTruth, WithoutTruth
+from megloc_kapture.io.files import write_bytes, write_json
 from megloc_kapture.values import MIN_CONFIDENCE
 
+if TYPE_CHECKING:
+    from jinja2 import Template
+    from pandas import DataFrame
+
+    from megloc_kapture.evaluation.report.gallery import Picture
+
 RECALL_JSON, RECALL_TEXT = "recall.json", "recall.txt"
-VIEW_HTML = "view.html"
 AGREEMENT_TEXT = "agreement.txt"
-PER_QUERY_CSV, DIFFERENCES_CSV = "per_query.csv", "differences.csv"
+PER_QUERY_CSV = "per_query.csv"
+REPORT_HTML, VIEW_HTML = "report.html", "view.html"
+_WIDTH = 92
+# more rows than anybody reads; the CSV beside the report has them all
+_MAX_ROWS = 500
 
-AnyReported = Evaluation | Comparison | Seeds | WithoutTruth
+AnyReported = Evaluation | Comparison | WithoutTruth
+_Results = Sequence[Evaluation] | Sequence[ResultWithoutTruth]
 
 
-def report_text(reported: AnyReported) -> str:
-    """The report as plain text, ASCII but for labels, ended by a newline."""
-    return render_text(_text_sections(reported))
-
-
-def report_of(
+def write_report(
+    folder: Path | str,
     reported: AnyReported,
     *,
     map_poses: Poses | None = None,
     provenance: Mapping[str, Any] | None = None,
-    view: bool = False,
-) -> Document:
-    """The report of one result, of several, of runs with seeds, or of results without truth.
+) -> dict[str, Path]:
+    """Write the files of a report, each atomically; returns name -> path.
+
+    With truth these are recall.json, recall.txt, per_query.csv and report.html; without truth
+    agreement.json and agreement.txt take the place of recall's. A single result has the 3D view
+    beside them, view.html.
 
     Parameters
     ----------
     map_poses : ``cam_from_world`` of the map's images, for the view from above; by default those
         of the first result that has a map.
     provenance : options, preset, inputs: plain JSON data, shown at the end with the versions.
-    view : add the 3D view of a single result, a file beside the page that leads to it.
-
-    Raises
-    ------
-    DataError : a map is broken.
     """
-    # matplotlib loads with them, which those who want the text need not wait for
-    from megloc_kapture.evaluation.report import pages
-
-    if isinstance(reported, Evaluation):
-        results: Sequence[Evaluation] | Sequence[ResultWithoutTruth] = (reported,)
-    else:
-        results = reported.results if isinstance(reported, WithoutTruth) else reported.evaluations
-    title = " and ".join(result.label for result in results)
-    if map_poses is None:
-        map_poses = first_map_poses(own.context for own in results)
-    # the gallery and the view show the same inliers
-    stored = StoredInliers(results[0].context)
-    if isinstance(reported, Evaluation):
-        title = title or "Evaluation"
-        page = pages.evaluation_page(reported, map_poses, stored)
-    elif isinstance(reported, Comparison):
-        page = pages.comparison_page(reported, map_poses)
-    elif isinstance(reported, Seeds):
-        title = f"{len(results)} runs of one method"
-        page = pages.seeds_page(reported, map_poses)
-    else:
-        title = title or "Without truth"
-        page = pages.without_truth_page(reported, map_poses, stored)
-    beside = _view(results[0], stored, title) if view and len(results) == 1 else {}
-    if beside:
-        link = Markup('<a class="view" href="{}">See it in 3D</a>').format(VIEW_HTML)
-        told = " The map's points and cameras, and the queries: coloured by their error or "
-        page = (*page[:1], _lines(Paragraph(link + f"{told}confidence.")), *page[1:])
-    csv_tables = {PER_QUERY_CSV: reported.per_query()}
-    if isinstance(reported, Comparison):
-        csv_tables[DIFFERENCES_CSV] = reported.differences()
-    return Document(
-        name="agreement" if isinstance(reported, WithoutTruth) else "recall",
-        title=title,
-        text=tuple(_text_sections(reported)),
-        page=page,
-        data=report_data(reported),
-        tables=csv_tables,
-        provenance=provenance or {},
-        beside=beside,
+    name = "agreement" if isinstance(reported, WithoutTruth) else "recall"
+    view = _view(reported)
+    page = render_report(
+        reported, map_poses=map_poses, provenance=provenance, has_view=view is not None
     )
+    texts = {f"{name}.txt": report_text(reported), REPORT_HTML: page}
+    if view is not None:
+        texts[VIEW_HTML] = view
+    # pandas reads back the very floats; what is infinite is an empty cell
+    table = reported.to_pandas().replace([np.inf, -np.inf], np.nan)
+    texts[PER_QUERY_CSV] = table.to_csv(lineterminator="\n")
+    paths = {file: Path(folder) / file for file in (*texts, f"{name}.json")}
+    for file, text in texts.items():
+        write_bytes(paths[file], text.encode("utf-8"))
+    write_json(paths[f"{name}.json"], plain(report_data(reported)))
+    return paths
 
 
-def _view(
-    result: Evaluation | ResultWithoutTruth, stored: StoredInliers, title: str
-) -> dict[str, str]:
-    """The page of the view by its name; none where no camera has a pose, or the map is broken."""
-    from megloc_kapture.evaluation.report.scene import render_view, scene_of
-
-    # a report without a view is better than none; `megloc view` says what is broken
-    with contextlib.suppress(DataError):
-        scene = scene_of(title, stored, shown_queries(result))
-        if scene is not None:
-            return {VIEW_HTML: render_view(scene)}
-    return {}
+def report_text(reported: AnyReported) -> str:
+    """The report as plain text, ended by a newline."""
+    parts = _text_without_truth(reported) if isinstance(reported, WithoutTruth) else _text(reported)
+    return "\n\n".join(parts) + "\n"
 
 
-def write_report(folder: Path | str, reported: AnyReported, **options: Any) -> dict[str, Path]:
-    """Write the report's files, each atomically; returns name -> path. ``options`` as of
-    :func:`report_of`.
+def _text(reported: Evaluation | Comparison) -> list[str]:
+    several = isinstance(reported, Comparison)
+    evaluations = reported.evaluations if isinstance(reported, Comparison) else (reported,)
+    parts = [] if several or not evaluations[0].label else [evaluations[0].label]
+    thresholds = bounds(evaluations[0].thresholds)
+    parts.append(f"recall (%) at {thresholds}\n{_wrapped(criterion(evaluations[0]))}")
+    parts.append(tables.as_text(tables.recall_table(evaluations)))
+    if by_center := [e.by_center for e in evaluations if e.by_center is not None]:
+        table = tables.as_text(tables.recall_table(by_center))
+        parts.append(f"the same by the distance of the camera centres\n{table}")
+    parts.append(f"{INTERVALS}\n{tables.as_text(tables.interval_table(evaluations))}")
+    for evaluation in evaluations:
+        whose = f" of {evaluation.label}" if several else ""
+        if (confident := tables.confident_table(evaluation)) is not None:
+            parts.append(f"{CONFIDENT}{whose}\n{tables.as_text(confident)}")
+        if (confidence := evaluation.confidence) is not None:
+            found = "; ".join(confidence_sentences(confidence, evaluation.thresholds[-1]))
+            parts.append(_wrapped(f"Confidence{whose}: {found}."))
+        if evaluation.covariance is not None:
+            found = covariance_sentence(evaluation.covariance)
+            parts.append(_wrapped(f"Covariance{whose}: {found}."))
+    if isinstance(reported, Comparison):
+        parts.append("\n".join(_wrapped(text) for text, _ in comparison_sentences(reported)))
+        parts.append(_wrapped(method_sentence(reported)))
+    for evaluation in evaluations:
+        on = f" on {evaluation.label}" if several else ""
+        parts += [_wrapped(f"Note{on}: {note}.") for note in notes(evaluation)]
+    return parts
 
-    With truth these are recall.json, recall.txt, per_query.csv and report.html, of a comparison
-    also differences.csv; without truth agreement.json and agreement.txt take the place of recall's.
-    Of a single result the 3D view stands beside them, view.html.
 
-    Raises
-    ------
-    DataError : a map is broken.
-    OutputError : a file cannot be written.
-    """
-    return write_document(folder, report_of(reported, view=True, **options))
+def _text_without_truth(found: WithoutTruth) -> list[str]:
+    parts = [f"{_wrapped(f'No recall: {found.statement}')}\n{_wrapped(CAUTION)}"]
+    for result in found.results:
+        parts.append(f"{result.label}\n{tables.as_text(tables.result_table(result))}")
+    for _, group in groupby(found.agreement, key=lambda row: (row.first, row.second)):
+        rows = list(group)
+        what = (
+            "% of all queries where both have a pose and the two are at most "
+            f"{bounds(found.thresholds)} apart"
+        )
+        table = tables.as_text(tables.agreement_table(found, rows))
+        parts.append(f"{_wrapped(what)}\n{table}\n{agreement_sentence(rows[-1], found)}")
+    return parts
 
 
-def render_report(reported: AnyReported, **options: Any) -> str:
-    """The page alone; the same arguments give the same text. ``options`` as :func:`report_of`."""
-    return render_html(report_of(reported, **options))
+def _wrapped(text: str) -> str:
+    return fill(text, _WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
 def report_data(reported: AnyReported) -> dict[str, Any]:
-    """The data of the report's JSON; see :class:`Document`."""
+    """The data of the report's JSON file."""
     if isinstance(reported, Evaluation):
         return _recall_data(reported)
     if isinstance(reported, WithoutTruth):
@@ -172,99 +178,21 @@ def report_data(reported: AnyReported) -> dict[str, Any]:
                 for row in reported.agreement
             ],
         }
-    results = [_recall_data(evaluation) for evaluation in reported.evaluations]
-    if isinstance(reported, Seeds):
-        return {"results": results, "seeds": [asdict(row) for row in reported.rows]}
-    return {"results": results, "comparison": _comparison_data(reported)}
+    labels = [evaluation.label for evaluation in reported.evaluations]
 
+    def named(test: PairedTest | MedianDifference) -> dict[str, Any]:
+        pair = {"first": labels[test.first], "second": labels[test.second]}
+        return {**asdict(test), **pair, "real": test.is_real}
 
-def _text_sections(reported: AnyReported) -> list[Section]:
-    if isinstance(reported, Seeds):
-        return _seeds_text(reported)
-    if isinstance(reported, WithoutTruth):
-        return _without_truth_text(reported)
-    several = isinstance(reported, Comparison)
-    evaluations = reported.evaluations if isinstance(reported, Comparison) else (reported,)
-    sections = []
-    if not several and evaluations[0].label:
-        sections.append(_lines(_line(evaluations[0].label)))
-    sections += _recall_sections(evaluations)
-    for evaluation in evaluations:
-        whose = f" of {evaluation.label}" if several else ""
-        if (confident := tables.confident_table(evaluation)) is not None:
-            sections.append(_lines(_line(f"{CONFIDENT} (%)"), confident))
-        if (confidence := evaluation.confidence) is not None:
-            said = "; ".join(confidence_sentences(confidence, evaluation.thresholds[-1]))
-            sections.append(_lines(Paragraph(f"Confidence{whose}: {said}.")))
-        if evaluation.covariance is not None:
-            said = covariance_sentence(evaluation.covariance)
-            sections.append(_lines(Paragraph(f"Covariance{whose}: {said}.")))
-    if isinstance(reported, Comparison):
-        sections.append(_lines(Items(tuple(comparison_sentences(reported)))))
-        sections.append(_lines(Paragraph(method_sentence(reported))))
-    for evaluation in evaluations:
-        on = f" on {evaluation.label}" if several else ""
-        sections += [_lines(Paragraph(f"Note{on}: {note}.")) for note in notes(evaluation)]
-    return sections
-
-
-def _recall_sections(evaluations: Sequence[Evaluation]) -> list[Section]:
-    by_center = [e.by_center for e in evaluations if e.by_center is not None]
-    sections = [
-        _lines(
-            _line(f"recall (%) at {bounds(evaluations[0].thresholds)}"),
-            Paragraph(criterion(evaluations[0])),
-        ),
-        _lines(tables.recall_table(evaluations)),
-    ]
-    if len(by_center) == len(evaluations):
-        sections.append(_lines(_line("the same by the distance of the camera centres")))
-        sections.append(_lines(tables.recall_table(by_center)))
-    intervals = tables.interval_table(evaluations)
-    return [*sections, _lines(_line(f"{INTERVALS}, (%)"), intervals)]
-
-
-def _seeds_text(seeds: Seeds) -> list[Section]:
-    first = seeds.evaluations[0]
-    labels = ", ".join(evaluation.label for evaluation in seeds.evaluations)
-    told = f"recall (%) at {bounds(first.thresholds)}, mean +- standard deviation of a run"
-    found = "queries found by all / by some / by none of the runs"
-    return [
-        _lines(_line(f"{len(seeds.evaluations)} runs of one method: {labels}")),
-        _lines(_line(told), Paragraph(criterion(first))),
-        _lines(tables.seeds_table(seeds)),
-        _lines(_line("smallest and largest of the runs (%)"), tables.seed_ranges(seeds)),
-        _lines(_line(found), tables.found_table(seeds)),
-    ]
-
-
-def _without_truth_text(found: WithoutTruth) -> list[Section]:
-    sections = [_lines(Paragraph(f"No recall: {found.statement}"), Paragraph(CAUTION))]
-    for result in found.results:
-        sections.append(_lines(_line(result.label)))
-        sections.append(_lines(tables.result_table(result), Paragraph(retrieval_note(result))))
-    for pair in dict.fromkeys((row.first, row.second) for row in found.agreement):
-        rows = [row for row in found.agreement if (row.first, row.second) == pair]
-        whole = next(row for row in rows if row.name == ALL)
-        first, second = (found.results[index].label for index in pair)
-        told = (
-            "% of all queries where both have a pose and the two are at most "
-            f"{bounds(found.thresholds)} apart"
-        )
-        table = tables.agreement_table(found, rows)
-        sections += [
-            _lines(Paragraph(f"agreement of {first} and {second}"), Paragraph(told)),
-            _lines(table, Paragraph(agreement_sentence(whole, found))),
-        ]
-    return sections
-
-
-def _lines(*blocks: Block) -> Section:
-    return Section(blocks)
-
-
-def _line(text: str) -> Paragraph:
-    return Paragraph(text, wrap=False)
+    return {
+        "results": [_recall_data(evaluation) for evaluation in reported.evaluations],
+        "comparison": {
+            "method": method_sentence(reported),
+            "sentences": [sentence for sentence, _ in comparison_sentences(reported)],
+            "tests": [named(test) for test in reported.tests],
+            "medians": [named(median) for median in reported.medians],
+        },
+    }
 
 
 def _recall_data(evaluation: Evaluation) -> dict[str, Any]:
@@ -285,17 +213,257 @@ def _recall_data(evaluation: Evaluation) -> dict[str, Any]:
     }
 
 
-def _comparison_data(comparison: Comparison) -> dict[str, Any]:
-    labels = [evaluation.label for evaluation in comparison.evaluations]
+def plain(data: Any) -> Any:
+    """Data for JSON: models as mappings, and None for numbers that are not finite."""
+    if isinstance(data, BaseModel):
+        return data.model_dump(mode="json")
+    if isinstance(data, Mapping):
+        return {key: plain(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [plain(value) for value in data]
+    return None if isinstance(data, float) and not np.isfinite(data) else data
 
-    def named(test: PairedTest | MedianDifference) -> dict[str, Any]:
-        pair = {"first": labels[test.first], "second": labels[test.second]}
-        return {**asdict(test), **pair, "real": test.is_real}
 
-    return {
-        "method": method_sentence(comparison),
-        "sentences": [sentence for sentence, _ in comparison_sentences(comparison)],
-        "tests": [named(test) for test in comparison.tests],
-        "tests_by_condition": [named(test) for test in comparison.tests_by_row],
-        "medians": [named(median) for median in comparison.medians],
-    }
+@dataclass
+class Section:
+    """A card of the page: paragraphs, then tables and figures in their order, then pictures."""
+
+    heading: str
+    paragraphs: list[str] = field(default_factory=list)
+    body: list[Markup] = field(default_factory=list)
+    pictures: Sequence[Picture] = ()
+
+    def table(self, frame: DataFrame | None) -> None:
+        """Add a table; nothing without one."""
+        if frame is not None:
+            import pandas as pd
+
+            with pd.option_context("display.max_colwidth", None):
+                html = frame.to_html(index=False, border=0, justify="left")
+            self.body.append(Markup('<div class="scroll">{}</div>').format(Markup(html)))
+
+    def figure(self, svg: bytes | None) -> None:
+        """Add a drawing; nothing without one."""
+        if svg is not None:
+            data = base64.b64encode(svg).decode("ascii")
+            self.body.append(Markup('<img src="data:image/svg+xml;base64,{}">').format(data))
+
+
+def render_report(
+    reported: AnyReported,
+    *,
+    map_poses: Poses | None = None,
+    provenance: Mapping[str, Any] | None = None,
+    has_view: bool = False,
+) -> str:
+    """Render the page alone; it is self-contained, and the same arguments give the same text."""
+    results = _results(reported)
+    if map_poses is None:
+        map_poses = first_map_poses(result.context for result in results)
+    if isinstance(reported, WithoutTruth):
+        sections = _sections_without_truth(reported)
+    else:
+        sections = _sections(reported)
+    for result in results:
+        sections += _sections_of(result, map_poses, several=len(results) > 1)
+    # only a report with images waits for what reads them
+    from megloc_kapture.evaluation.report.gallery import depth_pictures, mask_pictures
+
+    context, shown = results[0].context, "What masks hide is shaded."
+    sections += [
+        Section("Masks", [shown], pictures=mask_pictures(context.masked)),
+        Section(
+            "Depth of map images by stereo",
+            ["Yellow is near, purple is far, dark is unknown."],
+            pictures=depth_pictures(context.mapping),
+        ),
+    ]
+    values = dict(provenance or {})
+    return template("report.html").render(
+        title=" and ".join(result.label for result in results) or "Evaluation",
+        numbers=_numbers(reported) if isinstance(reported, Evaluation) else [],
+        view=VIEW_HTML if has_view else "",
+        steps=values.pop("steps", []),
+        sections=[s for s in sections if s.body or s.pictures or not s.heading],
+        versions=package_versions(),
+        provenance=json.dumps(values, indent=2, ensure_ascii=False) if values else "",
+    )
+
+
+def template(name: str) -> Template:
+    """A template of pages; values are escaped, and a missing value is an error."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # only a page waits for it
+
+    environment = Environment(
+        loader=PackageLoader("megloc_kapture.evaluation.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(name)
+
+
+def _results(reported: AnyReported) -> _Results:
+    if isinstance(reported, Evaluation):
+        return (reported,)
+    return reported.results if isinstance(reported, WithoutTruth) else reported.evaluations
+
+
+def _numbers(evaluation: Evaluation) -> list[tuple[str, str, str]]:
+    """Recall at each threshold and the median error, as large figures."""
+    overall = evaluation.row()
+    shown = [
+        (
+            f"{format_percent(at.recall)} %",
+            f"within {at.threshold}",
+            f"95 % interval {format_interval(at)}",
+        )
+        for at in overall.recall
+    ]
+    if not np.isfinite(overall.median_position_m):
+        return [*shown, ("none", "median", "most queries lack a pose")]
+    degrees = f"{format_degrees(overall.median_angle_deg)} deg"
+    return [*shown, (f"{format_metres(overall.median_position_m)} m", "median", degrees)]
+
+
+def _sections(reported: Evaluation | Comparison) -> list[Section]:
+    """Recall and errors of one result, or of several side by side."""
+    from megloc_kapture.evaluation.report import figures  # loads matplotlib
+
+    several = isinstance(reported, Comparison)
+    evaluations = reported.evaluations if isinstance(reported, Comparison) else (reported,)
+    overall = evaluations[0].row()
+    head = f"{overall.num_queries} queries. {criterion(evaluations[0])}"
+    sections = [Section("", [head])]
+    if isinstance(reported, Comparison):
+        sentences = comparison_sentences(reported)
+        item = Markup('<li class="{}">{}</li>')
+        items = (item.format("real" if real else "", text) for text, real in sentences)
+        listed = Markup('<ul class="said">{}</ul>').format(Markup("").join(items))
+        real = Section("Is the difference real?", [method_sentence(reported)], [listed])
+        sections.append(real)
+    recall = Section("Recall", [f"At {bounds(evaluations[0].thresholds)}."])
+    recall.table(tables.recall_table(evaluations))
+    if by_center := [e.by_center for e in evaluations if e.by_center is not None]:
+        recall.body.append(Markup("<p>The same by the distance of the camera centres:</p>"))
+        recall.table(tables.recall_table(by_center))
+    recall.body.append(Markup("<p>{}:</p>").format(INTERVALS))
+    recall.table(tables.interval_table(evaluations))
+    for evaluation in evaluations:
+        on = f"{evaluation.label}: " if several else ""
+        note = Markup('<p class="note">{}</p>')
+        recall.body += [note.format(_sentence(on + text)) for text in notes(evaluation)]
+    curves = (
+        "Share of all queries at or below an error, each error by itself; queries without a pose "
+        "keep the curves below 100 %. Dotted: the thresholds."
+    )
+    errors = Section("How large the errors are", [curves])
+    errors.figure(figures.error_curves(evaluations))
+    return [*sections, recall, errors]
+
+
+def _sections_without_truth(found: WithoutTruth) -> list[Section]:
+    sections = [Section("", [f"No recall: {found.statement} {CAUTION}"])]
+    for result in found.results:
+        sections.append(Section(result.label))
+        sections[-1].table(tables.result_table(result))
+    if found.agreement:
+        what = (
+            "Share of all queries where both results have a pose and the two are at most "
+            f"{bounds(found.thresholds)} apart."
+        )
+        whole = [agreement_sentence(row, found) for row in found.agreement if row.name == "all"]
+        sections.append(Section("Do they agree?", [what, *whole]))
+        sections[-1].table(tables.agreement_table(found, found.agreement))
+    return sections
+
+
+def _sections_of(
+    result: Evaluation | ResultWithoutTruth, map_poses: Poses, *, several: bool
+) -> list[Section]:
+    """What is shown of each result: from above, confidence, refinement, and its worst queries."""
+    from megloc_kapture.evaluation.report import figures, gallery
+
+    whose = f"{result.label}: " if several else ""
+    context, queries = result.context, shown_queries(result)
+    evaluation = result if isinstance(result, Evaluation) else None
+    views = figures.views_from_above(queries, map_poses, context.frames, context.unit)
+    above = Section(f"{whose}From above")
+    if evaluation is not None:
+        above.paragraphs.append("Red lines lead from the true camera centre to the estimate.")
+    for frame, svg in views.items():
+        above.body += [Markup("<h3>{}</h3>").format(frame)] if frame else []
+        above.figure(svg)
+    found = [above]
+    if evaluation is not None:
+        inliers = Section(
+            f"{whose}Error against inliers",
+            ["Errors should fall to the right: many inliers with a large error are a wrong place."],
+        )
+        inliers.figure(figures.errors_against_inliers(evaluation))
+        found += [inliers, _confidence(evaluation, whose)]
+    refined = Section(f"{whose}What refinement changed", ["Of accepted poses; medians."])
+    refined.paragraphs += [_sentence(consistency_sentence(row)) for row in context.consistency]
+    refined.table(tables.refinement_table(result))
+    which = "estimated" if evaluation is None else "true"
+    lines = (
+        f"Left the query, right the candidate with most matches. Green matches agree with the "
+        f"{which} pose, red ones are more than 8 pixels off their epipolar line."
+    )
+    pictures = gallery.worst_pictures(worst_queries(queries), context, map_poses)
+    found += [refined, Section(f"{whose}The worst queries", [lines], pictures=pictures)]
+    if evaluation is not None and not several:
+        found.append(_query_list(evaluation, queries))
+    return found
+
+
+def _query_list(evaluation: Evaluation, queries: Sequence[ShownQuery]) -> Section:
+    section = Section("Queries, the worst first")
+    if len(queries) > _MAX_ROWS:
+        section.paragraphs.append(f"The worst {_MAX_ROWS} of {len(queries)}.")
+    section.table(tables.query_table(evaluation, queries[:_MAX_ROWS]))
+    return section
+
+
+def _confidence(evaluation: Evaluation, whose: str) -> Section:
+    """The worth of a result's confidences and covariances."""
+    from megloc_kapture.evaluation.report import figures
+
+    section = Section(f"{whose}Confidence")
+    confidence = evaluation.confidence
+    if confidence is not None:
+        sentences = confidence_sentences(confidence, evaluation.thresholds[-1])
+        section.paragraphs += map(_sentence, sentences)
+    if evaluation.covariance is not None:
+        section.paragraphs.append(_sentence(covariance_sentence(evaluation.covariance)))
+    if (confident := tables.confident_table(evaluation)) is not None:
+        section.body.append(Markup("<p>{}:</p>").format(CONFIDENT))
+        section.table(confident)
+    if confidence is not None and confidence.num_poses >= FEW:
+        explained = (
+            "Left: where confidences can be trusted, the dots are on the dotted line. Right: poses "
+            "are accepted from the most confident on."
+        )
+        section.body.append(Markup("<p>{}</p>").format(explained))
+        section.figure(figures.confidence_curves(confidence))
+    return section
+
+
+def _view(reported: AnyReported) -> str | None:
+    """The 3D view of a single result; None where no camera has a pose, or the map is broken."""
+    from megloc_kapture.evaluation.report.scene import render_view, scene_of
+
+    results = _results(reported)
+    if len(results) > 1:
+        return None
+    # a report without a view is better than none; `megloc view` says what is broken
+    with contextlib.suppress(DataError):
+        stored = StoredInliers(results[0].context)
+        scene = scene_of(results[0].label or "Evaluation", stored, shown_queries(results[0]))
+        return None if scene is None else render_view(scene)
+    return None
+
+
+def _sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}."

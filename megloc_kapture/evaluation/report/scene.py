@@ -11,7 +11,7 @@ import base64
 import contextlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,6 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.report.document import plain, template
 from megloc_kapture.evaluation.report.map_view import top_view
 from megloc_kapture.evaluation.report.queries import (
     ShownQuery,
@@ -28,6 +27,7 @@ from megloc_kapture.evaluation.report.queries import (
     query_facts,
     spread,
 )
+from megloc_kapture.evaluation.report.reports import plain, template
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.geometry.poses import camera_centers, stack_poses
@@ -74,7 +74,6 @@ class Scene:
     frames : names of the map's coordinate frames, which share no world and are shown one at a time;
         ``point_frames``, ``camera_frames``, ``query_frames`` uint8 (P,), (C,), (Q,) say which.
     notes : sentences on what is left out.
-    rendered : query -> caption and data address of each picture of what its pose shows.
     """
 
     title: str
@@ -96,7 +95,6 @@ class Scene:
     camera_frames: NDArray[np.uint8]
     query_frames: NDArray[np.uint8]
     notes: tuple[str, ...]
-    rendered: Mapping[str, Sequence[tuple[str, str]]] = field(default_factory=dict)
 
 
 def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = ()) -> Scene | None:
@@ -107,10 +105,6 @@ def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = 
     stored : the inliers of the queries; its context says where the map and the queries' cameras
         are, each of which may be absent.
     queries : worst first; what is left out of many are the better ones.
-
-    Raises
-    ------
-    DataError : the map is broken.
     """
     context, notes = stored.context, list[str]()
     rng = np.random.default_rng(_SEED)
@@ -212,7 +206,6 @@ def render_view(scene: Scene) -> str:
                 "confidence": query.confidence,
                 "inliers": query.num_inliers,
                 "drawn": drawn,
-                "pictures": scene.rendered.get(query.name, []),
             }
             for query, drawn in zip(scene.queries, scene.num_inliers, strict=True)
         ],

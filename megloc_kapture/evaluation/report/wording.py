@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 
 from megloc_kapture.evaluation.confidence import Confidence
-from megloc_kapture.evaluation.metrics import ALL, RecallAt, Threshold
+from megloc_kapture.evaluation.metrics import RecallAt, Threshold
 from megloc_kapture.evaluation.scoring import CovarianceCheck, Evaluation
 from megloc_kapture.evaluation.statistics import (
     NUM_RESAMPLES,
@@ -17,24 +17,15 @@ from megloc_kapture.evaluation.statistics import (
     Comparison,
     MedianDifference,
     PairedTest,
-    SeedsAt,
-    Spread,
 )
-from megloc_kapture.evaluation.without_truth import (
-    PRIOR_ANGLE_DEG,
-    AgreementRow,
-    ResultWithoutTruth,
-    WithoutTruth,
-)
-from megloc_kapture.io.dataset_tables import METRES
+from megloc_kapture.evaluation.without_truth import AgreementRow, WithoutTruth
+from megloc_kapture.io.tables import ConsistencyRow
 from megloc_kapture.values import MIN_CONFIDENCE
 
-INTERVALS = "95 % confidence intervals of recall, queries taken as independent"
-CONFIDENT = f"Recall if poses with a confidence below {MIN_CONFIDENCE:g} are misses"
+INTERVALS = "95 % confidence intervals of recall, queries taken as independent (%)"
+CONFIDENT = f"Recall if poses with a confidence below {MIN_CONFIDENCE:g} are misses (%)"
 # fewer are an example, not a measurement
 FEW = 10
-_NO_CONDITION = "(no condition)"
-_MAX_NAME_WIDTH = 19
 _NAMES_SHOWN = 5
 _FALLBACK_POSES = {
     "retrieval": "of the best retrieved image",
@@ -47,13 +38,8 @@ def format_percent(share: float) -> str:
     return f"{100.0 * share:.1f}"
 
 
-def format_share(count: int, total: int) -> str:
-    """A part of a whole in percent; ``-`` of nothing."""
-    return format_percent(count / total) if total else "-"
-
-
 def format_metres(position_m: float) -> str:
-    """Metres down to a tenth of a millimetre where that is small, to a centimetre where not."""
+    """Metres down to a tenth of a millimetre below 1, to a centimetre above."""
     return f"{position_m:.4f}" if position_m < 1 else f"{position_m:.2f}"
 
 
@@ -74,35 +60,9 @@ def format_interval(at: RecallAt) -> str:
     return f"{format_percent(at.low)}-{format_percent(at.high)}"
 
 
-def format_p(p_value: float) -> str:
-    """A p-value with as many digits as mean something."""
-    return "p < 0.001" if p_value < 0.001 else f"p = {p_value:.2g}"
-
-
-def format_spread(spread: Spread | SeedsAt, *, percent: bool = False) -> str:
-    """``89.8 +- 0.3``; ``inf`` where a run has no such figure."""
-    if not math.isfinite(spread.mean):
-        return "inf"
-    form = format_percent if percent else format_metres
-    return f"{form(spread.mean)} +- {form(spread.deviation)}"
-
-
-def counted(number: int, one: str, many: str) -> str:
+def counted(number: int, one: str, many: str = "") -> str:
     """A number and the right form of its noun."""
-    return f"{number} {one if number == 1 else many}"
-
-
-def display_name(name: str) -> str:
-    """A row's name, with a stand-in for the queries that have no condition."""
-    return name or _NO_CONDITION
-
-
-def shortened(name: str, width: int = _MAX_NAME_WIDTH) -> str:
-    """A name that leaves room for the other columns: names differ at either end."""
-    if len(name) <= width:
-        return name
-    half = (width - 3) // 2
-    return f"{name[:half]}...{name[-half:]}"
+    return f"{number} {one if number == 1 else many or f'{one}s'}"
 
 
 def bounds(thresholds: Sequence[Threshold]) -> str:
@@ -122,64 +82,63 @@ def criterion(evaluation: Evaluation) -> str:
 def notes(evaluation: Evaluation) -> list[str]:
     """Sentences a reader needs beside the table: fallbacks, images without truth, no overlap."""
     row = evaluation.row()
-    said = [evaluation.alignment] if evaluation.alignment else []
+    found = [evaluation.alignment] if evaluation.alignment else []
     if row.num_queries < FEW:
-        said.append(
-            f"too few queries ({row.num_queries}) to compare recall by: the intervals say how "
-            "little they tell"
+        found.append(
+            f"too few queries ({row.num_queries}) to compare recall by: the intervals are wide"
         )
     kinds = {query.fallback for query in evaluation.queries} - {"none"}
     if row.num_fallback:
         whose = " or the one ".join(_FALLBACK_POSES[kind] for kind in sorted(kinds))
-        bear = "queries could not be localized and bear"
-        given = counted(row.num_fallback, "query could not be localized and bears", bear)
-        said.append(
-            f"{given} the pose {whose} instead; recall and the median of all count it as any pose"
+        without = counted(row.num_fallback, "query", "queries")
+        found.append(
+            f"{without} could not be localized and got the pose {whose} instead; recall and the "
+            "median of all count it like any pose"
         )
     if row.num_missing == row.num_queries:
-        said.append("no query has a pose")
+        found.append("no query has a pose")
     missing = evaluation.without_truth
     if missing:
         shown = ", ".join(missing[:_NAMES_SHOWN]) + (", ..." if missing[_NAMES_SHOWN:] else "")
-        lack = "images have no true pose and are"
-        told = counted(len(missing), "image has no true pose and is", lack)
-        said.append(f"{told} not counted: {shown}")
+        lack = counted(
+            len(missing), "image has no true pose and is", "images have no true pose and are"
+        )
+        found.append(f"{lack} not counted: {shown}")
         if evaluation.truth_known_by:
-            said.append(evaluation.truth_known_by.rstrip("."))
+            found.append(evaluation.truth_known_by.rstrip("."))
         if not evaluation.estimated and row.num_missing == row.num_queries:
-            said.append("no estimated image is in the ground truth; the names may not agree")
-    if evaluation.not_scored:
-        number = len(evaluation.not_scored)
-        told = counted(number, "image with a true pose is", "images with a true pose are")
-        said.append(f"{told} not scored by this benchmark")
-    return said
+            found.append("no estimated image is in the ground truth; the names may not agree")
+    if number := len(evaluation.not_scored):
+        ignored = counted(number, "image with a true pose is", "images with a true pose are")
+        found.append(f"{ignored} not scored by this benchmark")
+    return found
 
 
 def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[str]:
     """What the confidences of a result are worth, without a full stop."""
-    said = []
+    found = []
     if confidence.num_poses:
+        share = format_percent(confidence.num_wrong / confidence.num_poses)
         interval = f"{100 * confidence.wrong_low:.1f}-{100 * confidence.wrong_high:.1f}"
-        said.append(
-            f"of {counted(confidence.num_poses, 'pose', 'poses')} with a confidence "
-            f"{counted(confidence.num_wrong, 'is', 'are')} wrong (beyond {coarsest}): "
-            f"{format_share(confidence.num_wrong, confidence.num_poses)} % "
+        found.append(
+            f"of {counted(confidence.num_poses, 'pose')} with a confidence "
+            f"{counted(confidence.num_wrong, 'is', 'are')} wrong (beyond {coarsest}): {share} % "
             f"({interval})"
         )
     if confidence.num_wrong:
         by_inliers = confidence.area_by_inliers
         than = "" if by_inliers is None else f", by the number of inliers {by_inliers:.4f}"
-        said.append(
+        found.append(
             f"calibration error {confidence.calibration_error:.3f}; area under risk against "
             f"coverage {confidence.area:.4f}{than}, at best {confidence.least_area:.4f}"
         )
     if confidence.num_nowhere:
-        said.append(
+        found.append(
             f"{counted(confidence.num_nowhere, 'query shows', 'queries show')} nothing of the map: "
             f"{confidence.num_nowhere_refused} refused, "
             f"{confidence.num_nowhere - confidence.num_nowhere_refused} given a pose"
         )
-    return said
+    return found
 
 
 def covariance_sentence(check: CovarianceCheck) -> str:
@@ -190,28 +149,21 @@ def covariance_sentence(check: CovarianceCheck) -> str:
     )
 
 
-def no_retrieval(result: ResultWithoutTruth) -> str:
-    """The reason why nothing is said about agreement with retrieval; empty where it is said."""
-    if result.context.unit != METRES:
-        return "the scale of the map is not known, so nothing is said about distances"
-    if result.rows[-1].first_candidate is None:
-        return (
-            "no map or no ranked candidates are known, so nothing is said about agreement with "
-            "retrieval"
-        )
-    return ""
-
-
-def retrieval_note(result: ResultWithoutTruth) -> str:
-    """The legend of :func:`result_table`, or that there is no retrieval to agree with."""
-    first = result.rows[-1].first_candidate
-    if (unknown := no_retrieval(result)) or first is None:
-        return unknown
+def consistency_sentence(row: ConsistencyRow) -> str:
+    """The verdict of a map's own images on a refiner, and how far they move."""
+    frame = f" in {row.frame}" if row.frame else ""
+    if row.reason:
+        return f"{row.method}{frame} is not used: {row.reason}"
     return (
-        "first, nearest: the candidate map image that is ranked first, or lies nearest to the "
-        f"pose; facing: % that look within {PRIOR_ANGLE_DEG:g} degrees of the first; "
-        f"of {counted(first.num_compared, 'localized query', 'localized queries')} with candidates"
+        f"{row.method}{frame} is used; {row.images} map images held out move by "
+        f"{format_movement(row.moved_m, row.turned_deg)}, {row.moved_px:.1f} px (medians; claimed "
+        f"to {format_movement(row.claimed_m, row.claimed_deg)})"
     )
+
+
+def format_movement(metres: float, degrees: float) -> str:
+    """``0.0042 m, 0.150 deg``."""
+    return f"{format_metres(metres)} m, {format_degrees(degrees)} deg"
 
 
 def agreement_sentence(row: AgreementRow, found: WithoutTruth) -> str:
@@ -229,8 +181,6 @@ def threshold_sentence(test: PairedTest, labels: Sequence[str]) -> str:
     """Queries that one of two results finds and the other misses, and whether that is chance."""
     first, second = labels[test.first], labels[test.second]
     where = f"At {test.threshold}"
-    if test.row != ALL:
-        where = f"{display_name(test.row)}, at {test.threshold}"
     only_first, only_second = len(test.only_first), len(test.only_second)
     if not only_first and not only_second:
         if not test.both:
@@ -249,47 +199,38 @@ def median_sentence(difference: MedianDifference, labels: Sequence[str]) -> str:
     lost = [label for label, value in zip(pair, medians, strict=True) if math.isinf(value)]
     if lost:
         return f"Most queries of {' and of '.join(lost)} have no pose, so there is no median."
-    apart = medians[0] - medians[1]
-    told = (
+    both = (
         f"The median position error is {format_metres(medians[0])} m for {pair[0]} and "
-        f"{format_metres(medians[1])} m for {pair[1]}: {_signed(apart)} m"
+        f"{format_metres(medians[1])} m for {pair[1]}: {_signed(medians[0] - medians[1])} m"
     )
     if math.isnan(difference.low_m):
-        return f"{told}; too few queries to tell it from chance."
+        return f"{both}; too few queries to tell it from chance."
     verdict = "the difference is real" if difference.is_real else "the difference could be chance"
     interval = f"{_signed(difference.low_m)} to {_signed(difference.high_m)}"
-    return f"{told}, 95 % interval {interval} m; {verdict}."
+    return f"{both}, 95 % interval {interval} m; {verdict}."
 
 
 def comparison_sentences(comparison: Comparison) -> list[tuple[str, bool]]:
-    """All that is to say of all queries together, then what is real in single conditions; each
-    sentence with whether it tells of a real difference."""
+    """Each test and each median as a sentence, with whether the difference is real."""
     labels = [evaluation.label for evaluation in comparison.evaluations]
-    said = [(threshold_sentence(test, labels), test.is_real) for test in comparison.tests]
-    said += [(median_sentence(median, labels), median.is_real) for median in comparison.medians]
-    real = [test for test in comparison.tests_by_row if test.is_real]
-    said += [(threshold_sentence(test, labels), True) for test in real]
-    if comparison.tests_by_row and not real:
-        said.append(("In no single condition can a difference be told from chance.", False))
-    return said
+    tests = [(threshold_sentence(test, labels), test.is_real) for test in comparison.tests]
+    medians = [(median_sentence(median, labels), median.is_real) for median in comparison.medians]
+    return tests + medians
 
 
 def method_sentence(comparison: Comparison) -> str:
-    """The method of the tests, in two sentences."""
-    text = (
+    """The method of the tests."""
+    number = len(comparison.tests)
+    holm = f", after Holm's correction for {number} tests" if number > 1 else ""
+    return (
         "Exact McNemar test on the same queries, taken as independent, two-sided; real: p at or "
-        f"below {SIGNIFICANCE:g}"
+        f"below {SIGNIFICANCE:g}{holm}. Intervals of medians: {NUM_RESAMPLES} resamples of the "
+        "queries."
     )
-    families = [f"{len(comparison.tests)} tests of all queries"]
-    if comparison.tests_by_row:
-        families.append(f"{len(comparison.tests_by_row)} of the conditions")
-    if len(comparison.tests) > 1 or comparison.tests_by_row:
-        text += f", after Holm's correction (for the {' and for the '.join(families)})"
-    return f"{text}. Intervals of medians: {NUM_RESAMPLES} resamples of the queries."
 
 
 def _verdict(test: PairedTest) -> str:
-    p = format_p(test.p_adjusted)
+    p = "p < 0.001" if test.p_adjusted < 0.001 else f"p = {test.p_adjusted:.2g}"
     if test.is_real:
         return f"the difference is real ({p})"
     # the most uneven split of so few would not do either

@@ -1,14 +1,12 @@
-"""Weights of networks: what is published, checkpoints found, checked, read safely and shared.
+"""Weights of networks: the registry of published checkpoints, and the folder they lie in.
 
-The registry, ``registry.toml`` beside this file, says of each network's published checkpoints the
-file, page, licence and sha256. Checkpoints lie in the folder of MEGLOC_WEIGHTS, else
-``megloc-kapture/weights`` in the user's cache, or in a folder of it, so that a collection sorted by
-network will do.
+``registry.toml`` beside this file gives the file, page, licence and sha256 of each network's
+checkpoint. Checkpoints lie in the folder of MEGLOC_WEIGHTS, else in ``megloc-kapture/weights`` of
+the user's cache, or in a folder of it. Read are what torch saves, with ``weights_only=True``, and
+safetensors; ``scripts/convert_weights.py`` converts other containers once.
 
 Processes of a machine share what they read: the first of them writes the tensors into a folder of
-the run; it and the others map that file into memory. What is mapped is the system's cache of the
-file, which is there once, and is not counted against a process. Kept is what was read and checked,
-so that a file of the user may change meanwhile.
+the run; it and the others map that file into memory, so that the system keeps it once.
 """
 
 from __future__ import annotations
@@ -18,13 +16,13 @@ import glob
 import hashlib
 import os
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
 
@@ -36,7 +34,6 @@ from megloc_kapture.io.files import (
     reading,
     user_cache,
 )
-from megloc_kapture.io.weights.containers import read_checkpoint
 
 if TYPE_CHECKING:
     import torch
@@ -45,6 +42,8 @@ FOLDER_VARIABLE = "MEGLOC_WEIGHTS"
 UNVERIFIED = "unverified"  # folder of files that a user has instead of the published ones
 _shared_folder: Path | None = None
 _REGISTRY = Path(__file__).with_name("registry.toml")
+# under these keys training scripts keep the state dict
+_STATE_KEYS = ("state_dict", "model_state", "model", "extractor")
 _Url = Annotated[str, StringConstraints(pattern=r"^https?://[\w.:-]+/\S*$")]
 _Text = Annotated[str, StringConstraints(min_length=1)]
 _FileName = Annotated[str, AfterValidator(check_relative)]
@@ -58,22 +57,14 @@ class _Entry(BaseModel):
 
 
 class PublishedFile(_Entry):
-    """One file that a network's weights are published in.
+    """One file that a network's weights are published in; None where a value is unknown."""
 
-    Attributes
-    ----------
-    name : where it lies in the folder of weights.
-    also : other names under which other tools keep the same file.
-    url : where it can be fetched; None: only a person can, from the network's page.
-    size : bytes; None: not known.
-    sha256 : hexadecimal; None: not known.
-    """
-
-    name: _FileName
-    also: tuple[_FileName, ...] = ()
-    url: _Url | None = None
-    size: Annotated[int, Field(gt=0)] | None = None
+    name: _FileName  # in the folder of weights
+    also: tuple[_FileName, ...] = ()  # names that other tools give the same file
+    url: _Url | None = None  # None: only a person can fetch it, from the network's page
+    size: Annotated[int, Field(gt=0)] | None = None  # bytes
     sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")] | None = None
+    convert: bool = False  # scripts/convert_weights.py must make safetensors of it
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -82,30 +73,20 @@ class PublishedFile(_Entry):
 
 
 class Weights(_Entry):
-    """The checkpoint of one network.
-
-    Attributes
-    ----------
-    purpose : what the network does.
-    page : where a person finds it.
-    licence, terms : its short name, and what one may do in plain words.
-    commercial : whether commercial use is plainly allowed.
-    files : alternatives, preferred first; any one is enough.
-    unverified : what nobody has confirmed on the original file; empty: nothing.
-    """
+    """The checkpoint of one network."""
 
     name: Annotated[str, AfterValidator(check_component)]
     purpose: _Text
-    page: _Url
-    licence: _Text
-    terms: _Text
-    commercial: bool
-    files: Annotated[tuple[PublishedFile, ...], Field(min_length=1)]
-    unverified: str = ""
+    page: _Url  # where a person finds it
+    licence: _Text  # short name
+    terms: _Text  # what one may do, in plain words
+    commercial: bool  # whether commercial use is plainly allowed
+    files: Annotated[tuple[PublishedFile, ...], Field(min_length=1)]  # preferred first
+    unverified: str = ""  # what nobody has confirmed on the original file
 
     @property
     def converted(self) -> str:
-        """Name of the file that ``megloc weights convert`` makes of any of them."""
+        """Name of the file with the converted tensors."""
         return f"{self.name}.safetensors"
 
     @property
@@ -116,26 +97,26 @@ class Weights(_Entry):
 
 @lru_cache(maxsize=1)
 def registry() -> Mapping[str, Weights]:
-    """All networks by name, in the order they are listed in."""
+    """Return all networks by name, in the order of the file."""
     table = tomllib.loads(_REGISTRY.read_text(encoding="utf-8"))
     return MappingProxyType({name: Weights(name=name, **entry) for name, entry in table.items()})
 
 
 def lookup(name: str) -> Weights:
-    """The entry of a network; raises OptionError, which lists the names there are."""
+    """Return the entry of a network; OptionError lists the known names."""
     if name not in registry():
-        told = suggestion(name, registry(), listed="there are ")
-        raise OptionError(f"no weights {name!r} in the registry; {told}")
+        hint = suggestion(name, registry(), listed="there are ")
+        raise OptionError(f"no weights {name!r} in the registry; {hint}")
     return registry()[name]
 
 
 def by_sha256(sha256: str) -> tuple[Weights, PublishedFile] | None:
-    """The network and file of a checksum."""
+    """Find the network and file of a checksum."""
     return next((found for found in _all_files() if found[1].sha256 == sha256), None)
 
 
 def by_file_name(name: str) -> tuple[Weights, PublishedFile] | None:
-    """The network and file of a name without folders."""
+    """Find the network and file of a name without folders."""
     for weights, file in _all_files():
         if name in [path.rpartition("/")[2] for path in file.names]:
             return weights, file
@@ -150,12 +131,7 @@ def _all_files() -> list[tuple[Weights, PublishedFile]]:
 
 
 class MissingWeightsError(DataError):
-    """Checkpoints are not there; says where each is published and the command that adds it.
-
-    Attributes
-    ----------
-    names : the networks in the registry.
-    """
+    """Checkpoints are missing; says where each is published and the command that adds it."""
 
     def __init__(
         self,
@@ -166,7 +142,7 @@ class MissingWeightsError(DataError):
         line: int | None = None,
     ) -> None:
         super().__init__(message, path=path, line=line)
-        self.names = tuple(names)
+        self.names = tuple(names)  # the networks in the registry
 
     def lines(self) -> list[str]:
         return str(self).splitlines()
@@ -174,18 +150,11 @@ class MissingWeightsError(DataError):
 
 @dataclass(frozen=True)
 class WeightsFile:
-    """A checkpoint on disk; hashable, so that a module can be kept for it.
+    """A checkpoint on disk; hashable, so that a module can be kept for it."""
 
-    Attributes
-    ----------
-    name : the network in the registry, or the file's name where it is a user's own.
-    path : the file; of a TensorFlow checkpoint its ``.index``.
-    size, mtime_ns : of all its files: bytes, and the last change.
-    """
-
-    name: str
+    name: str  # the network in the registry, or the file's name where it is a user's own
     path: Path
-    size: int
+    size: int  # bytes
     mtime_ns: int
 
     @property
@@ -198,25 +167,18 @@ class WeightsFile:
         files = (file for file in known.files if any(path.endswith("/" + n) for n in file.names))
         return next(files, None)
 
-    def parts(self) -> list[Path]:
-        """Its files: the path, and the data of a TensorFlow checkpoint, which lie beside it."""
-        return _parts(self.path)
-
 
 def weights_folder() -> Path:
-    """The folder of weights; it need not be there."""
+    """Return the folder of weights, which may not exist yet."""
     if folder := os.environ.get(FOLDER_VARIABLE):
         return Path(os.path.abspath(Path(folder).expanduser()))
     return user_cache() / "weights"
 
 
 def find_weights(name: str) -> WeightsFile:
-    """The checkpoint of a network of the registry, or a user's own by its path.
+    """Find the checkpoint of a network of the registry, or a user's own by its path.
 
-    Raises
-    ------
-    MissingWeightsError : it is not there; names the file, its folder and the command to add it.
-    DataError : a link in the folder of weights leads out of it.
+    MissingWeightsError names the file, its folder and the command that adds it.
     """
     if name in registry():
         weights = registry()[name]
@@ -233,13 +195,7 @@ def find_weights(name: str) -> WeightsFile:
 
 
 def find_all_weights(names: Sequence[str]) -> list[WeightsFile]:
-    """The checkpoints of a network that needs several, in order.
-
-    Raises
-    ------
-    MissingWeightsError : says of all that are not there how to get them, a line each.
-    DataError : see :func:`find_weights`.
-    """
+    """Find the checkpoints of a network that needs several; one error names all missing ones."""
     found, missing = [], []
     for name in names:
         try:
@@ -252,29 +208,43 @@ def find_all_weights(names: Sequence[str]) -> list[WeightsFile]:
 
 
 def all_missing(errors: Iterable[MissingWeightsError]) -> MissingWeightsError:
-    """One error for several, each told once, a line each."""
+    """Join several errors into one, a line for each checkpoint."""
     by_line = {line: None for error in errors for line in error.lines()}
     names = dict.fromkeys(name for error in errors for name in error.names)
     return MissingWeightsError("\n".join(by_line), names=list(names))
 
 
 def files_of(weights: Weights) -> Iterator[Path]:
-    """Files of a network in the folder of weights, the preferred one first."""
+    """Yield the files of a network that can be read, the preferred one first."""
+    names = [name for file in weights.files if not file.convert for name in file.names]
+    yield from _in_folder([*names, weights.converted])
+
+
+def to_convert(weights: Weights) -> Path | None:
+    """Find a published file of a network that is there, but must be converted first."""
+    return next(_in_folder([n for file in weights.files if file.convert for n in file.names]), None)
+
+
+def _in_folder(names: Iterable[str]) -> Iterator[Path]:
     folder = weights_folder()
-    names = [name for file in weights.files for name in file.names]
-    for name in (*names, weights.converted):
+    for name in names:
         inside = folder.glob(f"*/{glob.escape(name)}") if folder.is_dir() else ()
-        for path in (folder / name, *sorted(inside)):
-            if path.is_file():
-                yield _in_folder(folder, path)
+        yield from (path for path in (folder / name, *sorted(inside)) if path.is_file())
 
 
 def how_to_get(weights: Weights) -> str:
-    """One line for people: what is missing and how to get it."""
+    """Say in one line what is missing and how to get it."""
     names = " or ".join(file.name for file in weights.files)
     fetch = f"megloc weights fetch {weights.name}"
+    if found := to_convert(weights):
+        return (
+            f"the weights {weights.name} must be converted once: {how_to_convert(weights, found)}"
+        )
     if weights.to_fetch is None:
-        how = f"download it from {weights.page} and run: megloc weights add FILE"
+        then = "megloc weights add FILE"
+        if all(file.convert for file in weights.files):
+            then = how_to_convert(weights, "FILE")
+        how = f"download it from {weights.page} and run: {then}"
     elif weights.commercial:
         how = f"published at {weights.page}; run: {fetch}"
     else:
@@ -282,119 +252,125 @@ def how_to_get(weights: Weights) -> str:
     return f"the weights {weights.name} are missing: no {names} in {weights_folder()}; {how}"
 
 
+def how_to_convert(weights: Weights, path: Path | str) -> str:
+    """Return the command that converts a published file (docs/weights.md)."""
+    return f"python scripts/convert_weights.py {weights.name} {path}"
+
+
 def describe(name: str, path: Path) -> WeightsFile:
-    """The checkpoint at a path, as it is now."""
+    """Return the checkpoint at a path, as it is now."""
     with reading(path):
-        states = [part.stat() for part in _parts(path)]
-    size = sum(state.st_size for state in states)
-    return WeightsFile(name, path, size, max(state.st_mtime_ns for state in states))
+        state = path.stat()
+    return WeightsFile(name, path, state.st_size, state.st_mtime_ns)
 
 
 @lru_cache(maxsize=256)
 def sha256_of(file: WeightsFile) -> str:
-    """sha256 of a checkpoint, hexadecimal; of a TensorFlow one, of its files one after another."""
-    digest = hashlib.sha256()
-    with reading(file.path):
-        for part in file.parts():
-            with open(part, "rb") as content:
-                hashlib.file_digest(content, lambda: digest)
-    return digest.hexdigest()
+    """Compute the sha256 of a checkpoint, hexadecimal."""
+    with reading(file.path), open(file.path, "rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
+
+
+# ----------------------------------------------------------------------------------- reading
 
 
 def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
-    """All tensors of a checkpoint by name, on the processor; no code of the file is run.
+    """Read all tensors of a checkpoint by name; no code of the file is run.
 
-    Every file is read once, and what is loaded is what the checksum was taken of. Processes that
-    :func:`share_weights` are the first of them to read it or have the tensors that the first read.
-
-    Raises DataError: it cannot be read, is damaged, holds objects that are never loaded, or its
-    sha256 is not the one that the registry knows; names the file.
-    """
-    return _shared_tensors(file, partial(_read, file))
-
-
-def _read(file: WeightsFile) -> dict[str, torch.Tensor]:
-    with reading(file.path):
-        contents = {part: part.read_bytes() for part in file.parts()}
-    digest = hashlib.sha256()
-    for content in contents.values():
-        digest.update(content)
-    check_sha256(file, digest.hexdigest())
-
-    def read_beside(ending: str) -> bytes:
-        beside = file.path.with_name(file.path.stem + ending)
-        if beside not in contents:
-            raise DataError("no such file, though the index beside it names it", path=beside)
-        return contents[beside]
-
-    return read_checkpoint(contents[file.path], str(file.path), read_beside)
-
-
-def share_weights(folder: Path | None) -> None:
-    """Let this process share what it reads with the others that are told the same folder."""
-    global _shared_folder
-    _shared_folder = folder
-
-
-def _shared_tensors(
-    key: object, read: Callable[[], dict[str, torch.Tensor]]
-) -> dict[str, torch.Tensor]:
-    """Tensors by name, of a file that the first process wrote; without a folder what is read.
-
-    ``key`` tells checkpoints apart; it is equal in all processes.
+    Names are without the prefix ``module.`` of parallel training. DataError names a file that is
+    damaged, holds objects that are never loaded, or has another sha256 than the registry's. With
+    :func:`share_weights`, only the first process reads the file.
     """
     if _shared_folder is None:
-        return read()
+        return _read(file)
     import torch
 
-    path = _shared_folder / f"weights-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}"
+    path = _shared_folder / f"weights-{hashlib.sha256(repr(file).encode()).hexdigest()[:16]}"
     found: dict[str, torch.Tensor] = {}
     try:
         with open(path.with_suffix(".lock"), "wb") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)  # the others wait for the first
             if not path.is_file():
-                found = read()
-                with atomic_write(path) as file:
-                    torch.save({name: _whole(tensor) for name, tensor in found.items()}, file)
-    except (OSError, OutputError, RuntimeError):  # torch's, too, where there is no room
+                found = _read(file)
+                with atomic_write(path) as written:
+                    # clones: a view would be written with the whole tensor that it is a part of
+                    torch.save({name: t.contiguous().clone() for name, t in found.items()}, written)
+    except (OSError, OutputError, RuntimeError):  # torch's, too, where the disk is full
         with suppress(OSError):
             path.unlink()
-        return found or read()
+        return found or _read(file)
     found = torch.load(path, mmap=True, weights_only=True)
     for tensor in found.values():  # ``load_strictly`` takes the memory as it is
         tensor.is_shared_file = True  # type: ignore[attr-defined]
     return found
 
 
-def _whole(tensor: torch.Tensor) -> torch.Tensor:
-    """Not a view, which would be written with all that it is a part of."""
-    if tensor.is_contiguous() and tensor.untyped_storage().nbytes() == tensor.nbytes:
-        return tensor
-    return tensor.contiguous().clone()
+def share_weights(folder: Path | None) -> None:
+    """Share what this process reads with the others that use the same folder."""
+    global _shared_folder
+    _shared_folder = folder
 
 
-def check_sha256(file: WeightsFile, found: str) -> None:
-    """Raise DataError, which names both, where the registry knows another checksum."""
+def _read(file: WeightsFile) -> dict[str, torch.Tensor]:
+    check_sha256(file)
+    if file.path.suffix == ".safetensors":
+        from safetensors.torch import load_file
+
+        try:
+            return _state_dict(load_file(file.path), file.path)
+        except DataError:
+            raise
+        except Exception as error:  # the library has an error of its own
+            raise DataError(f"no safetensors file: {error}", path=file.path) from error
+    return _state_dict(_load_torch(file.path), file.path)
+
+
+def check_sha256(file: WeightsFile) -> None:
+    """Raise DataError where the registry knows another checksum of the file."""
     known = file.published and file.published.sha256
-    if known and known != found:
+    if known and known != sha256_of(file):
         raise DataError(
-            f"is not the published file of {file.name}: sha256 {found} instead of {known}; "
-            "fetch or add it again, or give your own file by its path",
+            f"is not the published file of {file.name}: sha256 {sha256_of(file)} instead of "
+            f"{known}; fetch or add it again, or give your own file by its path",
             path=file.path,
         )
 
 
-def _parts(path: Path) -> list[Path]:
-    if path.suffix != ".index":
-        return [path]
-    return [path, *sorted(path.parent.glob(f"{glob.escape(path.stem)}.data-*-of-*"))]
+def _load_torch(path: Path) -> Any:
+    import numpy as np
+    import torch
 
-
-def _in_folder(folder: Path, path: Path) -> Path:
-    real, root = os.path.realpath(path), os.path.realpath(folder)
-    if not Path(real).is_relative_to(root):
+    # a score that training scripts keep beside the weights (DeepLabV3+: best_score)
+    scalar = np._core.multiarray.scalar  # type: ignore[attr-defined]
+    names = ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
+    of_scores: list[Any] = [np.dtype, type(np.dtype("f4")), type(np.dtype("f8"))]
+    of_scores += [(scalar, name) for name in names]
+    try:
+        with torch.serialization.safe_globals(of_scores):
+            return torch.load(path, weights_only=True, map_location="cpu")
+    except Exception as error:  # torch raises many kinds on damaged files
+        reason = "or it is damaged"
+        if "Unsupported global" in str(error) or "GLOBAL" in str(error):
+            reason = "because loading its objects would run code"
         raise DataError(
-            f"is or lies behind a link that leaves {folder}; give the file by its own path",
+            f"no file of weights that can be read (torch's or safetensors), {reason}; "
+            "docs/weights.md says which files are converted first",
             path=path,
-        )
-    return path
+        ) from error
+
+
+def _state_dict(found: Any, path: Path) -> dict[str, torch.Tensor]:
+    import torch
+
+    for key in _STATE_KEYS:
+        if isinstance(found, Mapping) and isinstance(found.get(key), Mapping):
+            found = found[key]
+    items = found.items() if isinstance(found, Mapping) else ()
+    tensors = {
+        str(key).removeprefix("module."): value.detach()
+        for key, value in items
+        if isinstance(value, torch.Tensor)
+    }
+    if not tensors:
+        raise DataError("holds no tensors by name", path=path)
+    return tensors

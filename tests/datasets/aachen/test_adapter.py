@@ -238,11 +238,11 @@ def test_missing_lists(root: Path, tmp_path: Path) -> None:
     [
         (edit(LIST, "db/7.jpg", "db/8.jpg"), LIST, "no line for 'db/7.jpg'"),
         (edit(LIST, " 10.5 ", " nan "), f"{LIST}:2", "'nan' is not a finite number"),
-        (edit(MODEL, "\n2\n", "\n3\n"), f"{MODEL}:10", "ends after 2 of 3 points"),
+        (edit(MODEL, "\n2\n", "\n3\n"), MODEL, "ends before its last point"),
         (edit(DAY_LIST, DAY[2], DAY[0]), f"{DAY_LIST}:3", "is listed twice"),
         (edit(NIGHT_LIST, NIGHT[0], DAY[1]), NIGHT_LIST, "is also in day_time_queries"),
         (edit(NIGHT_LIST, "IMG_9", "IMG_2"), NIGHT_LIST, "would both be IMG_2.jpg in the pose"),
-        (edit(MODEL, NVM, NVM + NVM[9:]), MODEL, "2 models, expected one"),
+        (edit(MODEL, NVM, NVM + NVM[9:]), MODEL, "several models, expected one"),
     ],
 )
 def test_broken_files_are_named(

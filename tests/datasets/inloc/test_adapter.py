@@ -273,7 +273,7 @@ def test_broken_files_are_refused(root: Path) -> None:
     path = root / "database/alignments/DUC1/transformations/DUC_trans_024.txt"
     text = path.read_text()
     path.write_text(text.replace("0 0 0 1\n\nAfter", "0 0 0 1\nAfter") + "0\n")
-    with pytest.raises(DataError, match=r"DUC_trans_024\.txt:10: the matrix' last row is"):
+    with pytest.raises(DataError, match=r"DUC_trans_024\.txt:10: the last row of the matrix is"):
         read(root)
     path.write_text(text)
     query = root / "query" / "iphone7" / "IMG_0804.JPG"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -10,13 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.evaluation.report.document import Heading
-from megloc_kapture.evaluation.report.map_view import (
-    DrawnQuery,
-    top_view,
-    views_from_above,
-    views_of,
-)
+from megloc_kapture.evaluation.report.figures import views_from_above
+from megloc_kapture.evaluation.report.map_view import top_view
+from megloc_kapture.evaluation.report.queries import shown_queries
 from megloc_kapture.evaluation.scoring import evaluate_poses
 from megloc_kapture.geometry.poses import camera_centers, stack_poses
 from megloc_kapture.values import RigidTransform
@@ -92,25 +87,9 @@ def test_frames_are_drawn_apart() -> None:
     truth = {"a.jpg": moved(1.0), "b.jpg": moved(1002.0), "c.jpg": moved(1003.0)}
     conditions = {"a.jpg": "DUC1", "b.jpg": "DUC2", "c.jpg": "DUC2"}
     evaluation = evaluate_poses({"a.jpg": moved(1.5)}, truth, conditions=conditions)
-    # on one page the two would be a kilometre apart; that nothing lies outside is not worth a word
-    blocks = views_of(evaluation, mapped, frames)
-    one, first, other, second = blocks
-    assert (one, other) == (Heading("DUC1"), Heading("DUC2"))
-    assert first.svg.count("<use ") < second.svg.count("<use ") + 20
-    assert "truth, no pose" in second.svg and "truth, no pose" not in first.svg
-    ids = re.findall(r'\sid="([^"]*)"', first.svg + second.svg)
-    assert len(ids) == len(set(ids))
-
-
-def test_one_frame_needs_no_name(world: Any) -> None:
-    evaluation = evaluate_poses(world.estimated, world.truth, conditions=world.conditions)
-    (view,) = views_of(evaluation, world.mapped, {})
-    # a frame that all images share is one page too
-    (again,) = views_of(evaluation, world.mapped, dict.fromkeys(world.mapped, "town"))
-    assert again.svg == view.svg
-
-
-def test_without_truth_estimates_span_the_page_where_there_is_no_map() -> None:
-    placed = [DrawnQuery(None, moved(10.0 * i)) for i in range(4)]
-    (view,) = views_from_above(placed, {}, {}, with_truth=False)
-    assert "truth" not in re.sub(r"<[^>]*>", "", view.svg)
+    views = views_from_above(shown_queries(evaluation), mapped, frames, "m")
+    assert list(views) == ["DUC1", "DUC2"]
+    assert b"truth, no pose" in views["DUC2"] and b"truth, no pose" not in views["DUC1"]
+    # without frames there is one view, and without poses or truth none
+    assert list(views_from_above(shown_queries(evaluation), mapped, {}, "m")) == [""]
+    assert views_from_above([], mapped, {}, "m") == {}

@@ -30,13 +30,12 @@ NAMES = (
     *("apgem-resnet101", "apgem-resnet101-lm18", "delg-r50-gld", "delg-r101-gldv2clean"),
 )
 # in the reference's table, but no file that the registry keeps
-BESIDE = ("*.data-00000-of-00001", "*.meta")
+BESIDE = ("*.data-00000-of-00001", "*.meta", "*.onnx")
 # in the registry, but not in that table
 EXTRA = {
     *("superpoint_lightglue.pth", "aliked_lightglue.pth"),
     *("best_deeplabv3plus_resnet101_cityscapes_os16.pth", "r50delg_gldv2clean_20200914.tar.gz"),
-    *("MegaLoc/model.safetensors", "megaloc.torch", "ResNet50_2048_eigenplaces.pth"),
-    "params_000007.ckpt",
+    *("MegaLoc/model.safetensors", "megaloc.torch", "depth-save.pth", "disk_lightglue.pth"),
 }
 
 
@@ -100,7 +99,7 @@ def test_the_reference_names_the_same_files(shared_data: Path) -> None:
 
 
 def test_lookup() -> None:
-    assert lookup("xfeat").files[1].name == "xfeat.onnx"
+    assert lookup("xfeat").files[0].name == "xfeat.pt"
     with pytest.raises(
         OptionError, match="no weights 'xfeet' in .*; did you mean 'xfeat'\\? there are"
     ):

@@ -218,17 +218,6 @@
             pitch: mix(from.pitch, to.pitch), distance: from.distance * (to.distance / from.distance) ** s };
     if (t === 1) flight = null;
   }
-  function pictures(q) { // what was rendered at its pose, beside the photograph
-    const row = document.createElement("div");
-    row.className = "pictures";
-    for (const [caption, address] of q.pictures) {
-      const figure = document.createElement("figure"), told = document.createElement("figcaption");
-      const image = document.createElement("img");
-      image.src = address; image.alt = caption; told.textContent = caption;
-      figure.append(image, told); row.append(figure);
-    }
-    return row;
-  }
   function choose(i) {
     chosen = i;
     if (queryFrames[i] !== frame) { at("frame").value = queryFrames[i]; enter(queryFrames[i]); }
@@ -242,7 +231,7 @@
     name.className = "name"; name.textContent = q.name;
     at("chosen").replaceChildren(name, ...said.map((text) => {
       const line = document.createElement("p");
-      line.className = "soft"; line.textContent = text; return line; }), pictures(q));
+      line.className = "soft"; line.textContent = text; return line; }));
     for (const button of at("list").querySelectorAll("button"))
       button.setAttribute("aria-current", String(Number(button.dataset.i) === i));
     const item = at("list").querySelector("[aria-current=true]");

@@ -5,14 +5,12 @@ In an environment of its own (TensorFlow is not a dependency of the project):
 
 The graph is the layer table of the published one (github.com/lzx551402/ASLFeat, configuration
 ``aachen_eval.yaml``), in TensorFlow's layouts and under its variables' names; the weights are
-random. ``aslfeat.tar.gz`` is the checkpoint that ``tf.compat.v1.train.Saver`` wrote of them, in
-the published container. ``reference.npz`` has, for each of two images, the image (uint8), the score
+random. ``variables.npz`` has them as ``tf.compat.v1.train.Saver`` saved them in the published
+container and TensorFlow read them again. ``reference.npz`` has, for each of two images, the image
+(uint8), the score
 map, the raw outputs of conv6, and keypoints (x, y), scores and descriptors.
 """
 
-import gzip
-import io
-import tarfile
 import tempfile
 from pathlib import Path
 
@@ -218,17 +216,6 @@ def texture(size, seed):
     return np.clip(128 + 45 * gray / gray.std(), 0, 255).round().astype(np.uint8)
 
 
-def archive(folder):
-    """The checkpoint's files in a tar.gz that has no dates."""
-    packed = io.BytesIO()
-    with tarfile.open(fileobj=packed, mode="w") as tar:
-        for path in sorted(Path(folder).glob(f"{CHECKPOINT}.*")):
-            member = tarfile.TarInfo(path.name)
-            member.size = path.stat().st_size
-            tar.addfile(member, io.BytesIO(path.read_bytes()))
-    return gzip.compress(packed.getvalue(), 9, mtime=0)
-
-
 def main():
     with tf1.Graph().as_default(), tf1.Session() as session:
         placeholder = tf1.placeholder(tf.float32, (1, None, None, 1), name="input")
@@ -239,7 +226,10 @@ def main():
             tf1.train.Saver().save(
                 session, f"{folder}/{CHECKPOINT}", write_meta_graph=False, write_state=False
             )
-            (HERE / "aslfeat.tar.gz").write_bytes(archive(folder))
+            reader = tf.train.load_checkpoint(f"{folder}/{CHECKPOINT}")
+            names = reader.get_variable_to_shape_map()
+            variables = {name: reader.get_tensor(name) for name in names}
+            np.savez_compressed(HERE / "variables.npz", **variables)
         arrays = {}
         for seed, (name, size) in enumerate(IMAGES.items()):
             image = texture(size, seed)

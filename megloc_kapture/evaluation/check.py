@@ -1,0 +1,512 @@
+"""Check of pose files, ours or foreign: their rows, their names or pairs, and their poses.
+
+The poses are compared with the map's cameras. Where those of a whole file look wrong, the classic
+conventions are tried in turn, and the one that brings the poses to the map is named.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation import pose_files
+from megloc_kapture.evaluation.pose_files import checked_pose, parse_number, parse_timestamp
+from megloc_kapture.evaluation.protocols import PROTOCOLS, Benchmark, benchmark_of
+from megloc_kapture.geometry.conventions import CONVENTIONS, better_conventions
+from megloc_kapture.geometry.poses import camera_centers, rotation_matrices, stack_poses
+from megloc_kapture.io.dataset_tables import SIDE_TABLES, PoseFileFormat, Protocol
+from megloc_kapture.io.files import read_text
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.values import RigidTransform
+
+# error: the server would refuse the file, or its figures would be wrong as a whole; warning: single
+# poses are wrong, or queries are lost; note: good to know
+Severity = Literal["error", "warning", "note"]
+_SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+# findings of one kind that are printed one by one; JSON has all of them
+_SHOWN_OF_A_KIND = 10
+_NAMES_SHOWN = 3
+
+# the server of this dataset is known to accept .jpg and .png
+_ANY_ENDING = "robotcar"
+# whether names have a folder, and their endings
+_SHAPES: dict[str, tuple[bool, tuple[str, ...]]] = {
+    "aachen": (False, (".jpg",)),
+    "inloc": (False, (".JPG",)),
+    "robotcar": (True, (".jpg", ".png")),
+}
+
+# fewer poses or cameras fit any convention by chance
+_MIN_POSES = 3
+# poses compared in each convention, evenly spread over the file
+_SAMPLE = 500
+# a pose is near the map up to this many times the median distance of the best convention ...
+_NEAR = 2.0
+# ... which is at least this share of the map's extent: within it, directions hardly differ
+_LEAST = 0.02
+_DUMMY = RigidTransform.identity()
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One problem.
+
+    Parameters
+    ----------
+    kind : a short name that programs can rely on (``convention``, ``missing``).
+    message : one line that names the problem and, where possible, the remedy.
+    file : the pose file, where there are several.
+    line : of the file, from 1; None for the file as a whole.
+    names : the rows or queries concerned, as the file or the challenge's list calls them.
+    """
+
+    severity: Severity
+    kind: str
+    message: str
+    file: str = ""
+    line: int | None = None
+    names: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        where = self.file if self.line is None else f"{self.file or 'line'}:{self.line}"
+        return f"{self.severity}: {where}{': ' if where else ''}{self.message}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckReport:
+    """The result of a check.
+
+    Parameters
+    ----------
+    reference : the imported dataset that the file was compared with; may be empty.
+    poses : number of rows with a usable pose.
+    expected : number of queries, or pairs, that the challenge counts; None if unknown.
+    findings : by severity; those about whole files first, then by file and line.
+    """
+
+    dataset: str
+    file: str
+    reference: str
+    poses: int
+    expected: int | None
+    findings: tuple[Finding, ...]
+
+    @property
+    def has_problems(self) -> bool:
+        """Whether any finding is an error."""
+        return any(finding.severity == "error" for finding in self.findings)
+
+    def lines(self) -> list[str]:
+        """The report as text, one problem per line; the last line is the outcome."""
+        counts: Counter[tuple[str, str]] = Counter()
+        shown = []
+        for finding in self.findings:
+            counts[finding.severity, finding.kind] += 1
+            if counts[finding.severity, finding.kind] <= _SHOWN_OF_A_KIND:
+                shown.append(str(finding))
+        shown += [
+            f"{severity}: {count - _SHOWN_OF_A_KIND} more of kind {kind!r}; --json lists all"
+            for (severity, kind), count in counts.items()
+            if count > _SHOWN_OF_A_KIND
+        ]
+        of_severity = Counter(finding.severity for finding in self.findings)
+        outcome = "no problem found"
+        if of_severity["error"]:
+            outcome = f"{_plural(of_severity['error'], 'problem')} found"
+        if of_severity["warning"]:
+            outcome += f", {_plural(of_severity['warning'], 'warning')}"
+        of = "" if self.expected is None else f" of {self.expected} queries"
+        return [*shown, f"{self.poses} poses{of}: {outcome}"]
+
+    def to_json(self) -> dict[str, Any]:
+        """The report as plain JSON data."""
+        return {**asdict(self), "reference": self.reference or None, "ok": not self.has_problems}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reference(Benchmark):
+    """An imported dataset that a pose file is compared with, and the rules of its benchmark.
+
+    Parameters
+    ----------
+    folder : its path; empty if there is none.
+    expected : name of each scored query in the pose file -> the query.
+    queries : all query images, scored or not.
+    map_poses : image -> ``cam_from_world`` in the workspace's local frame.
+    """
+
+    folder: str = ""
+    expected: Mapping[str, str] = field(default_factory=dict)
+    queries: frozenset[str] = frozenset()
+    map_poses: Mapping[str, RigidTransform] = field(default_factory=dict)
+
+
+def read_reference(folder: Path) -> Reference:
+    """Read what an import or workspace has of ``mapping/``, ``query/`` and ``megloc/``.
+
+    Raises DataError if it has none of the three, or one is broken.
+    """
+    tables = folder / SIDE_TABLES
+    mapping, query = (
+        KaptureFolder(path) if (path / "sensors" / "sensors.txt").is_file() else None
+        for path in (folder / "mapping", folder / "query")
+    )
+    if mapping is None and query is None and not tables.is_dir():
+        raise DataError(
+            "no imported dataset: it has none of mapping/, query/ and megloc/", path=folder
+        )
+    rules = benchmark_of(tables)
+    queries = frozenset() if query is None else frozenset(query.read().image_names())
+    names = rules.names or pose_files.names_in_pose_file(
+        rules.scored(queries), rules.protocol.pose_file_names
+    )
+    return Reference(
+        **vars(rules),
+        folder=str(folder),
+        expected={name: image for image, name in names.items()},
+        queries=queries,
+        map_poses={} if mapping is None else mapping.read().poses(),
+    )
+
+
+def check_submission(
+    path: Path, *, dataset: str, reference: Reference | None = None
+) -> CheckReport:
+    """Check a pose file, or an MLAD challenge's folder of pose files.
+
+    Parameters
+    ----------
+    dataset : whose rules hold, by its name without ``synthetic-``.
+    reference : the imported dataset; without it only the file itself is checked.
+    """
+    if reference is None:
+        reference = Reference(protocol=PROTOCOLS.get(dataset, Protocol()))
+    if reference.protocol.pose_file == "mlad":
+        poses, findings = _check_mlad(path, reference)
+        expected = len(reference.pairs)
+    else:
+        poses, findings = _check_file(path, dataset, reference)
+        expected = len(reference.expected)
+    if not reference.map_poses:
+        findings.append(_not_checked("poses", reference))
+
+    def order(finding: Finding) -> tuple[int, bool, str, int]:
+        rank = _SEVERITIES.index(finding.severity)
+        return rank, finding.line is not None, finding.file, finding.line or 0
+
+    return CheckReport(
+        dataset=dataset,
+        file=str(path),
+        reference=reference.folder,
+        poses=poses,
+        expected=expected or None,
+        findings=tuple(sorted(findings, key=order)),
+    )
+
+
+def _check_file(path: Path, dataset: str, reference: Reference) -> tuple[int, list[Finding]]:
+    if path.is_dir():
+        raise DataError("a folder; the pose file of this challenge is one file", path=path)
+    rows = _read_rows(path, "ltvl")
+    world = reference.world
+    findings = _check_poses(rows.poses, reference, lambda _, pose: world.pose_in_local(pose))
+    if reference.expected:
+        findings += _check_names(rows.lines, reference, dataset)
+    else:
+        findings += [*_check_shape(rows.lines, dataset), _not_checked("names", reference)]
+    return len(rows.poses), [replace(f, file=path.name) for f in [*findings, *rows.findings]]
+
+
+def _check_mlad(path: Path, reference: Reference) -> tuple[int, list[Finding]]:
+    wanted: dict[str, dict[str, str]] = defaultdict(dict)  # file -> timestamps -> reference
+    for pair in reference.pairs:
+        stamps = f"{PurePosixPath(pair.reference).stem} {PurePosixPath(pair.query).stem}"
+        wanted[pair.file][stamps] = pair.reference
+    findings, poses = list[Finding](), 0
+    if path.is_dir():
+        files = {str(p.relative_to(path)): p for p in sorted(path.rglob("*.txt"))}
+        if absent := [name for name in wanted if name not in files]:
+            findings.append(_about("error", "missing-file", absent, "file", "missing"))
+        elif not files:
+            raise DataError("there is no pose file (*.txt) in the folder", path=path)
+    else:
+        fitting = [name for name in wanted if PurePosixPath(name).name == path.name]
+        files = {fitting[0] if fitting else path.name: path}
+    for name, file in files.items():
+        rows = _read_rows(file, "mlad")
+        poses += len(rows.poses)
+        found = list(rows.findings)
+        if wanted and name not in wanted:
+            message = f"must be named like its relocalization file: {_some(wanted)}"
+            found.append(Finding("error", "file-name", message))
+        elif wanted:
+            found += _check_pairs(rows, wanted[name], reference)
+        findings += [replace(finding, file=name) for finding in found]
+    if not wanted:
+        findings.append(_not_checked("pairs", reference))
+    return poses, findings
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows of a pose file by name, or by two timestamps with a blank between them.
+
+    ``lines`` has every row, ``poses`` those with a usable pose.
+    """
+
+    lines: Mapping[str, int]
+    poses: Mapping[str, RigidTransform]
+    findings: Sequence[Finding]
+
+
+def _read_rows(path: Path, kind: PoseFileFormat) -> _Rows:
+    text = read_text(path)
+    if pose_files.is_colmap_images(text):
+        raise DataError(
+            "this is COLMAP's images.txt, not a pose file; `megloc import colmap` of its folder "
+            "and `megloc submit` make one",
+            path=path,
+        )
+    is_mlad = kind == "mlad"
+    num_keys, columns = (2, pose_files.MLAD_COLUMNS) if is_mlad else (1, pose_files.COLUMNS)
+    lines, poses, findings = dict[str, int](), dict[str, RigidTransform](), list[Finding]()
+    rows = text.split("\n")
+    if rows[-1] and not is_mlad:
+        message = "the last line has no newline: the file may be cut off"
+        findings.append(Finding("warning", "cut", message, line=len(rows)))
+    for number, line in enumerate(rows, start=1):
+        fields = line.split()
+        if not fields:
+            continue
+
+        def problem(kind: str, message: str, line: int = number) -> None:
+            findings.append(Finding("error", kind, message, line=line))
+
+        if fields[0].startswith("#"):
+            problem("comment", "a comment; the format has none, and no header")
+            continue
+        if len(fields) != num_keys + 7:
+            found = f"{_plural(len(fields), 'column')} instead of {num_keys + 7} ({columns})"
+            problem("columns", found + ("; separated by blanks, not commas" * ("," in line)))
+            if len(fields) < num_keys or "," in fields[0]:
+                continue
+        key = " ".join(fields[:num_keys])
+        if key in lines:
+            problem("duplicate", f"{key} is given twice, first on line {lines[key]}")
+            continue
+        try:
+            for stamp in fields[:num_keys] if is_mlad else ():
+                parse_timestamp(stamp)
+            lines[key] = number
+            if len(fields) == num_keys + 7:
+                values = [parse_number(value) for value in fields[num_keys:]]
+                (x, y, z), (qx, qy, qz, qw) = values[:3], values[3:]
+                if not is_mlad:
+                    (qw, qx, qy, qz), (x, y, z) = values[:4], values[4:]
+                poses[key] = checked_pose((qw, qx, qy, qz), (x, y, z), key)
+        except DataError as error:
+            problem("pose", f"{error.message}; the columns are {columns}")
+    if not lines:
+        findings.append(Finding("error", "empty", "there is no pose in the file"))
+    return _Rows(lines, poses, findings)
+
+
+def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -> list[Finding]:
+    """Find unknown, wrong, missing and double names; ``lines`` has the names of a file."""
+    expected, findings = reference.expected, list[Finding]()
+    by_stem, unscored = defaultdict(list), defaultdict(list)
+    for name in expected:
+        by_stem[_stem(name)].append(name)
+    for image in reference.queries - set(expected.values()):
+        unscored[_stem(image)].append(image)
+    given: dict[str, str] = {}  # query -> name
+    wrong, not_scored = dict[str, str](), []
+    for name, line in lines.items():
+        right = name
+        if name not in expected:
+            candidates = by_stem[_stem(name)]
+            alike = [c for c in candidates if _ends_alike(name, c)]
+            if not alike and any(_ends_alike(name, image) for image in unscored[_stem(name)]):
+                not_scored.append(name)
+                continue
+            likely = alike or candidates
+            if len(likely) != 1:
+                message = f"{name} is no name of the list"
+                findings.append(Finding("error", "unknown", message, line=line, names=(name,)))
+                continue
+            right = wrong[name] = likely[0]
+        if (other := given.setdefault(expected[right], name)) != name:
+            message = f"{name} and {other} (line {lines[other]}) are the same query"
+            findings.append(Finding("error", "duplicate", message, line=line, names=(other, name)))
+    if wrong:
+        first = next(iter(wrong))
+        message = (
+            f"{_plural(len(wrong), 'name')} other than in the challenge's list: {first} should be "
+            f"{wrong[first]}"
+        )
+        only_endings = all(n.rpartition(".")[0] == r.rpartition(".")[0] for n, r in wrong.items())
+        severity: Severity = "error"
+        if only_endings and dataset == _ANY_ENDING:
+            severity, message = "warning", f"{message} (the server is said to take either)"
+        elif len(wrong) == len(lines):
+            message += "; the server finds none of them, and every figure is zero"
+        findings.append(Finding(severity, "name", message, names=tuple(wrong)))
+    if not_scored:
+        what = "of images that are not scored, which the server ignores"
+        findings.append(_about("note", "not-scored", not_scored, "row", what))
+    if missing := [name for name, image in expected.items() if image not in given]:
+        what = f"of {len(expected)} without a row, which count as not localized"
+        severity = "error" if len(missing) == len(expected) else "warning"
+        findings.append(_about(severity, "missing", missing, "query", what))
+    return findings
+
+
+def _check_shape(names: Iterable[str], dataset: str) -> list[Finding]:
+    """Check names by themselves, where there is no list to compare with."""
+    if dataset not in _SHAPES:
+        return []
+    with_folder, endings = _SHAPES[dataset]
+    names, findings = list(names), []
+    if shaped := [name for name in names if ("/" in name) != with_folder]:
+        what = "without the camera's folder (rear/...)" if with_folder else "with a folder"
+        findings.append(_about("error", "name", shaped, "name", what))
+    if others := [name for name in names if not name.endswith(endings)]:
+        what = f"not ending in {' or '.join(endings)}"
+        findings.append(_about("error", "name", others, "name", what))
+    return findings
+
+
+def _check_pairs(rows: _Rows, wanted: Mapping[str, str], reference: Reference) -> list[Finding]:
+    """Check the rows of an MLAD file; ``wanted`` has the reference image of each pair."""
+    unknown = [key for key in rows.lines if key not in wanted]
+    swapped = [key for key in unknown if " ".join(reversed(key.split(" "))) in wanted]
+    if 2 * len(swapped) > len(rows.lines):
+        what = "with the two timestamps swapped: the reference comes first, then the query"
+        return [_about("error", "swapped", swapped, "row", what)]
+    findings = [
+        Finding("error", "unknown", f"pair {key} is not asked for", line=rows.lines[key])
+        for key in unknown
+    ]
+    if missing := [key for key in wanted if key not in rows.lines]:
+        what = f"of {len(wanted)} without a row, and every one needs one"
+        findings.append(_about("error", "missing", missing, "pair", what))
+    # a dummy is no pose, and tells nothing of the convention of the others
+    if dummies := [key for key, pose in rows.poses.items() if pose == _DUMMY]:
+        findings.append(_about("note", "dummies", dummies, "row", "with the identity, a dummy"))
+    map_poses, scale = reference.map_poses, reference.world.official_from_local.scale
+    poses = {
+        key: pose
+        for key, pose in rows.poses.items()
+        if pose != _DUMMY and wanted.get(key) in map_poses
+    }
+    if scale == 1.0:  # a map in other units only lacks this comparison
+        in_local = lambda key, pose: pose @ map_poses[wanted[key]]  # noqa: E731
+        findings += _check_poses(poses, reference, in_local)
+    return findings
+
+
+def _check_poses(
+    poses: Mapping[str, RigidTransform],
+    reference: Reference,
+    in_local: Callable[[str, RigidTransform], RigidTransform],
+) -> list[Finding]:
+    """Compare the poses of a file with the map's cameras.
+
+    ``in_local`` turns a row's name and pose into ``cam_from_local``.
+    """
+    map_poses, unit = list(reference.map_poses.values()), reference.world.unit
+    if min(len(map_poses), len(poses)) < _MIN_POSES:
+        message = f"{_plural(len(poses), 'pose')} and {_plural(len(map_poses), 'map camera')}: too "
+        return [Finding("note", "too-few", f"{message}few to compare")] if map_poses else []
+    _, centers = _frames(map_poses, 0.0)
+    extent = float(np.ptp(centers, axis=0).max()) or 1.0
+    # a wrong direction counts as much as a place at the other end of the map
+    tree = cKDTree(_frames(map_poses, extent)[0])
+    names = list(poses)
+    step = -(-len(names) // _SAMPLE)
+    distances = [
+        tree.query(_frames([in_local(n, read(poses[n])) for n in names[::step]], extent)[0])[0]
+        for read in (lambda pose: pose, *CONVENTIONS.values())
+    ]
+    near = max(_NEAR * min(float(np.median(own)) for own in distances), _LEAST * extent)
+    shares = [float((own <= near).mean()) for own in distances]
+    if better := better_conventions(shares):
+        message = (
+            f"{' or '.join(better)}: read so, {max(shares):.0%} of the poses are near the map's "
+            f"cameras, as given {shares[0]:.0%}; the format has cam_from_world with x right, y "
+            "down, z forward"
+        )
+        return [Finding("error", "convention", message)]
+    _, centers_of_poses = _frames([in_local(name, pose) for name, pose in poses.items()], 0.0)
+    distance = cKDTree(centers).query(centers_of_poses)[0]
+    # where the queries were taken apart from the map, a distance that most of them have is usual
+    limit = max(extent, min(4 * float(np.median(distance)), 3 * extent))
+    order = np.argsort(-distance, kind="stable")
+    far = order[distance[order] > limit].tolist()
+    if not far:
+        return []
+    shown = _some(f"{names[i]} ({distance[i]:.4g} {unit})" for i in far)
+    far_names = tuple(names[i] for i in far)
+    if 2 * len(far) > len(names):
+        message = (
+            f"{len(far)} of {len(names)} poses are far from every map camera, and no usual "
+            f"convention explains it; is it another frame, or another scale? {shown}"
+        )
+        return [Finding("error", "far", message, names=far_names)]
+    message = f"{_plural(len(far), 'pose')} far from every map camera: {shown}"
+    return [Finding("warning", "far", message, names=far_names)]
+
+
+def _frames(
+    poses: Sequence[RigidTransform], length: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Cameras as points of one space, (N, 9): the centre, and the ends of the x and z axes.
+
+    Distances between them grow with distance and angle alike; ``length`` is that of the axes.
+    Also returns the centres, (N, 3).
+    """
+    quats, translations = stack_poses(poses)
+    centers = camera_centers(quats, translations)
+    axes = length * rotation_matrices(quats)  # rows: x, y, z of the camera in the world
+    return np.hstack([centers, centers + axes[:, 0], centers + axes[:, 2]]), centers
+
+
+def _stem(name: str) -> str:
+    return PurePosixPath(name).stem.lower()
+
+
+def _ends_alike(name: str, other: str) -> bool:
+    """Whether one path, without its ending, ends with the other."""
+    a, b = (f"/{text.lstrip('./').rpartition('.')[0].lower()}" for text in (name, other))
+    return a.endswith(b) or b.endswith(a)
+
+
+def _not_checked(things: str, reference: Reference) -> Finding:
+    why = "no imported dataset to compare with; give one with --data"
+    if reference.folder:
+        why = f"{reference.folder} does not have what they are compared with"
+    return Finding("note", "not-checked", f"the {things} are not checked: {why}")
+
+
+def _plural(count: int, noun: str) -> str:
+    plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
+    return f"{count} {noun if count == 1 else plural}"
+
+
+def _some(names: Iterable[str]) -> str:
+    listed = list(names)
+    text = ", ".join(listed[:_NAMES_SHOWN])
+    return text if len(listed) <= _NAMES_SHOWN else f"{text} and {len(listed) - _NAMES_SHOWN} more"
+
+
+def _about(severity: Severity, kind: str, names: Sequence[str], noun: str, what: str) -> Finding:
+    message = f"{_plural(len(names), noun)} {what}: {_some(names)}"
+    return Finding(severity, kind, message, names=tuple(names))

@@ -1,0 +1,128 @@
+"""Local features by networks of kornia: XFeat (Potje et al., CVPR 2024) and DISK (Tyszkiewicz et
+al., NeurIPS 2020)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+
+from megloc_kapture.features.network import (
+    Images,
+    LocalNetwork,
+    LocalNetworkOptions,
+    LocalOptions,
+    Masks,
+)
+from megloc_kapture.nets.kornia_networks import (
+    load_disk,
+    load_xfeat,
+    require_kornia,
+    xfeat_descriptors,
+)
+from megloc_kapture.nets.runtime import image_tensor, inference
+from megloc_kapture.values import LocalFeatures
+
+_XFEAT_STRIDE_PX = 32  # XFeat resizes images to multiples of it, downwards
+_ALL = 1 << 30  # keypoints: masks come before the best are selected
+
+
+class _KorniaFeatures(LocalNetwork[LocalOptions]):
+    name: str
+
+    def __init__(self, options: LocalOptions | None = None) -> None:
+        require_kornia(self.name)
+        super().__init__(options)
+
+    def _of_each(self, found: Any, masks: Masks, offset_px: Any = 0.5) -> list[LocalFeatures]:
+        """Keep the best of (keypoints, scores, descriptors) of each image."""
+        features = []
+        for (xy, scores, descriptors), mask in zip(found, masks, strict=True):
+            values = scores.float().cpu().numpy()
+            # kornia's first pixel is centred at (0, 0)
+            table = np.column_stack([xy.cpu().numpy() + offset_px, values]).astype(np.float32)
+            rows_of = descriptors.float().cpu().__getitem__
+            features.append(self._best(table, values, rows_of, mask))
+        return features
+
+
+class XFeatOptions(LocalNetworkOptions):
+    """Options of XFeat."""
+
+    weights: str = Field(default="xfeat", description="name in the registry, or a file")
+    descriptor_weights: str | None = Field(
+        default=None, description="file of another XFeat network, whose descriptors are taken"
+    )
+    threshold: float = Field(default=0.05, ge=0, lt=1, description="probability of a keypoint")
+
+
+class XFeat(_KorniaFeatures[XFeatOptions]):
+    """The extractor ``xfeat``: keypoints (N, 3) = x, y, score; descriptors float32 (N, 64).
+
+    With other descriptors than its own it is another type of features, named after their file.
+    """
+
+    name = "xfeat"
+    descriptor_size = 64
+    Options = XFeatOptions
+
+    def __init__(self, options: XFeatOptions | None = None) -> None:
+        super().__init__(options)
+        if self._descriptor_weights is not None:
+            # descriptors of different networks do not match
+            self.name = f"xfeat-{self._descriptor_weights.path.stem}"
+
+    def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
+        make = partial(self.network, load_xfeat, channels_last=True)
+        network, device = make()
+        tensors = [image_tensor(image, device) for image in images]
+        with inference(device, self.options.half_precision):
+            found = network.detectAndCompute(torch.cat(tensors), _ALL, self.options.threshold)
+            if self._descriptor_weights is not None:
+                other, _ = make(file=self._descriptor_weights)
+                for one, tensor in zip(found, tensors, strict=True):
+                    one["descriptors"] = xfeat_descriptors(other, tensor, one["keypoints"])
+        each = ((one["keypoints"], one["scores"], one["descriptors"]) for one in found)
+        return self._of_each(each, masks, offset_px=xfeat_offset_px(images[0].shape))
+
+
+def xfeat_offset_px(shape: Sequence[int]) -> NDArray[np.float32]:
+    """Return what COLMAP's pixels exceed kornia's by, (x, y), in an image of a shape.
+
+    kornia's are those of the resized image, first centre (0, 0), times the ratio of the sizes.
+    """
+    sides = np.array([shape[1], shape[0]], np.float32)
+    resized = np.maximum(sides // _XFEAT_STRIDE_PX, 1) * _XFEAT_STRIDE_PX
+    return np.asarray(0.5 * sides / resized, np.float32)
+
+
+class DiskOptions(LocalNetworkOptions):
+    """Options of DISK."""
+
+    weights: str = Field(default="disk", description="name in the registry, or a file")
+    nms_window_px: int = Field(default=5, ge=1, description="odd side of the window")
+    threshold: float = Field(default=0.0, description="scores kept are larger; they are logits")
+
+
+class Disk(_KorniaFeatures[DiskOptions]):
+    """The extractor ``disk``: keypoints (N, 3) = x, y, score; descriptors float32 (N, 128)."""
+
+    name = "disk"
+    descriptor_size = 128
+    Options = DiskOptions
+
+    def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
+        options = self.options
+        network, device = self.network(load_disk)
+        batch = torch.cat([image_tensor(image, device) for image in images])
+        with inference(device, options.half_precision):
+            found = network(
+                batch, None, options.nms_window_px, options.threshold, pad_if_not_divisible=True
+            )
+        each = ((one.keypoints, one.detection_scores, one.descriptors) for one in found)
+        return self._of_each(each, masks)

@@ -1,0 +1,284 @@
+"""COLMAP's sparse models, read through pycolmap, and points of structure-from-motion models."""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.colmap import load_pycolmap, quiet_stderr
+from megloc_kapture.io.files import check_relative, named, owned_name
+from megloc_kapture.io.kapture.sensors import unit_quaternion
+from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
+
+TEXT_FILES = ("cameras.txt", "images.txt", "points3D.txt")
+BINARY_FILES = ("cameras.bin", "images.bin", "points3D.bin")
+_RIG_FILES = ("rigs", "frames")  # since COLMAP 4
+# camera models without distortion that kapture has under another name, and its extra zeros
+_SAME_AS = {"SIMPLE_FISHEYE": ("SIMPLE_RADIAL_FISHEYE", 1), "FISHEYE": ("OPENCV_FISHEYE", 4)}
+# records of variable length: bytes before the number of items, its type, bytes of an item
+_RECORDS = {
+    "images.bin": (64, "<Q", 24),
+    "points3D.bin": (43, "<Q", 8),
+    "frames.bin": (64, "<I", 16),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class SparsePoints:
+    """Points of a model and their observations.
+
+    Parameters
+    ----------
+    xyz : float64 (P, 3) in the model's world.
+    rgb : uint8 (P, 3).
+    point_ids : int64 (O,), rows of ``xyz``, ascending.
+    image_ids : int32 (O,), positions in the model's list of images.
+    feature_ids : int32 (O,), index of the feature in its image. They have gaps: a model may name
+        only features that observe a point. An image may observe a point twice.
+    xy_px : float32 (O, 2); the centre of the first pixel is (0.5, 0.5).
+    """
+
+    xyz: NDArray[np.float64]
+    rgb: NDArray[np.uint8]
+    point_ids: NDArray[np.int64]
+    image_ids: NDArray[np.int32]
+    feature_ids: NDArray[np.int32]
+    xy_px: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    @classmethod
+    def none(cls) -> SparsePoints:
+        """No points."""
+        return cls.of_rows(np.empty((0, 6)), np.empty(0), np.empty((0, 4)))
+
+    @classmethod
+    def of_rows(
+        cls, heads: NDArray[Any], lengths: NDArray[Any], observations: NDArray[Any]
+    ) -> SparsePoints:
+        """Points in the order of a file.
+
+        Parameters
+        ----------
+        heads : (P, 6): X Y Z R G B.
+        lengths : (P,), number of observations of each point.
+        observations : (O, 4): image, feature, x, y.
+        """
+        return cls(
+            heads[:, :3].copy(),
+            heads[:, 3:].astype(np.uint8),
+            np.repeat(np.arange(len(heads), dtype=np.int64), lengths.astype(np.int64)),
+            observations[:, 0].astype(np.int32),
+            observations[:, 1].astype(np.int32),
+            observations[:, 2:].astype(np.float32),
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[SparsePoints]) -> SparsePoints:
+        """Concatenate the points of several models of one list of images.
+
+        An image in several models must have the same feature ids in all of them.
+        """
+        firsts = np.cumsum([0, *(len(part) for part in parts)])
+        moved = [
+            replace(part, point_ids=part.point_ids + first)
+            for part, first in zip(parts, firsts[:-1], strict=True)
+        ] or [cls.none()]
+        names = [field.name for field in fields(cls)]
+        return cls(*(np.concatenate([getattr(part, n) for part in moved]) for n in names))
+
+
+@dataclass(frozen=True, slots=True)
+class ColmapImage:
+    """A registered image of a model."""
+
+    image_id: int
+    name: str
+    camera_id: int
+    cam_from_world: RigidTransform
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapModel:
+    """One reconstruction.
+
+    Parameters
+    ----------
+    cameras : by camera id; images may share one.
+    images : sorted by ``image_id``.
+    points : ``image_ids`` are positions in ``images``, not COLMAP's ids.
+    cams_from_rig : rig id -> camera id -> ``cam_from_rig``, for cameras whose pose is known.
+    frames : image id -> id of its frame, the images that a rig took at one time.
+    """
+
+    cameras: dict[int, Camera]
+    images: tuple[ColmapImage, ...]
+    points: SparsePoints
+    cams_from_rig: Mapping[int, Mapping[int, RigidTransform]] = field(default_factory=dict)
+    frames: Mapping[int, int] = field(default_factory=dict)
+
+
+def colmap_model_files(folder: Path, *, with_points: bool = True) -> tuple[Path, ...]:
+    """Return the files of the model in a folder, the binary ones where there are both."""
+    folder = Path(folder)
+    names = next((n for n in (BINARY_FILES, TEXT_FILES) if (folder / n[1]).exists()), None)
+    if names is None:
+        raise DataError(
+            f"no COLMAP model: neither {BINARY_FILES[1]} nor {TEXT_FILES[1]} is here", path=folder
+        )
+    paths = [folder / name for name in (names if with_points else names[:2])]
+    more = [folder / f"{name}{paths[0].suffix}" for name in _RIG_FILES]
+    return (*paths, *(path for path in more if path.exists()))
+
+
+def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
+    """Read the model of a folder.
+
+    Parameters
+    ----------
+    with_points : False reads cameras and poses only; the file of points need not exist.
+    """
+    paths = colmap_model_files(folder, with_points=with_points)
+    for path in paths:
+        if not path.is_file():
+            raise DataError("file is missing", path=path)
+        if path.name in _RECORDS:
+            _check_complete(path)
+    with tempfile.TemporaryDirectory(prefix=f".{owned_name()}") as links:
+        for path in paths:
+            link = Path(links) / path.name
+            if path.name == TEXT_FILES[1]:
+                # pycolmap drops the last image where its empty line of features is missing
+                link.write_bytes(path.read_bytes() + b"\n\n")
+            else:
+                link.symlink_to(path.resolve())
+        if not with_points:
+            no_points = bytes(8) if paths[0].suffix == ".bin" else b""
+            (Path(links) / f"points3D{paths[0].suffix}").write_bytes(no_points)
+        try:
+            with quiet_stderr():
+                model = load_pycolmap().Reconstruction(links)
+        except (OSError, RuntimeError, ValueError, IndexError) as error:
+            reason = str(error).partition("] ")[2] or str(error)
+            names = ", ".join(path.name for path in paths)
+            raise DataError(
+                f"COLMAP cannot read the model ({names}): {' '.join(reason.split())}; if the "
+                "files were copied, copy them again",
+                path=folder,
+            ) from error
+    cameras = {camera_id: _camera(camera, paths[0]) for camera_id, camera in model.cameras.items()}
+    if paths[0].suffix == ".bin":
+        size = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
+        if paths[0].stat().st_size != size:
+            raise _incomplete(paths[0])
+    images = _images(model, paths[1])
+    return ColmapModel(
+        cameras,
+        images,
+        _points(model, images) if with_points else SparsePoints.none(),
+        {rig_id: _cams_from_rig(rig) for rig_id, rig in sorted(model.rigs.items())},
+        {image_id: image.frame_id for image_id, image in model.images.items()},
+    )
+
+
+def _check_complete(path: Path) -> None:
+    """Compare the records of a binary file with its size.
+
+    pycolmap 4 does not: of a file that was cut short it allocates memory until the machine stops.
+    """
+    head, length_type, item = _RECORDS[path.name]
+    length_size = struct.calcsize(length_type)
+    try:
+        with (
+            open(path, "rb") as file,
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
+        ):
+            (count,), at = struct.unpack_from("<Q", data), 8
+            for _ in range(count):
+                at += head
+                if path.name == BINARY_FILES[1]:
+                    at = data.find(b"\0", at) + 1 or len(data)  # the image's name
+                (length,) = struct.unpack_from(length_type, data, at)
+                at += length_size + item * length
+            if at != len(data):
+                raise _incomplete(path)
+    except (ValueError, struct.error, OverflowError) as error:
+        raise _incomplete(path) from error
+
+
+def _incomplete(path: Path) -> DataError:
+    return DataError("the file is damaged or was cut short; copy it again", path=path)
+
+
+def _camera(camera: Any, path: Path) -> Camera:
+    model, params = camera.model.name, tuple(camera.params)
+    if model in _SAME_AS:
+        model, zeros = _SAME_AS[model]
+        params += (0.0,) * zeros
+    if model not in CAMERA_MODEL_NUM_PARAMS:
+        raise DataError(
+            f"kapture has no camera model {model}; `colmap image_undistorter` makes a model and "
+            "images with PINHOLE cameras (of panoramas COLMAP's panorama_sfm.py does)",
+            path=path,
+        )
+    with named(path, about=f"camera {camera.camera_id}"):
+        return Camera(model, camera.width, camera.height, params)
+
+
+def _images(model: Any, path: Path) -> tuple[ColmapImage, ...]:
+    images: dict[str, ColmapImage] = {}
+    for image_id, image in sorted(model.images.items()):
+        if not image.has_pose:
+            continue
+        with named(path, about=f"image {image.name!r}"):
+            name = check_relative(image.name.removeprefix("./"))
+            if name in images:
+                raise DataError("is listed twice")
+            pose = _transform(image.cam_from_world())
+        images[name] = ColmapImage(image_id, name, image.camera_id, pose)
+    return tuple(images.values())
+
+
+def _transform(transform: Any) -> RigidTransform:
+    x, y, z, w = transform.rotation.quat.tolist()
+    tx, ty, tz = transform.translation.tolist()
+    if not np.isfinite([tx, ty, tz]).all():
+        raise DataError("the pose is not finite")
+    return RigidTransform(unit_quaternion((w, x, y, z)), (tx, ty, tz))
+
+
+def _cams_from_rig(rig: Any) -> dict[int, RigidTransform]:
+    camera_type = load_pycolmap().SensorType.CAMERA
+    poses = {rig.ref_sensor_id: RigidTransform.identity()}
+    poses |= {
+        sensor: _transform(pose) for sensor, pose in rig.non_ref_sensors.items() if pose is not None
+    }
+    return {sensor.id: pose for sensor, pose in poses.items() if sensor.type == camera_type}
+
+
+def _points(model: Any, images: Sequence[ColmapImage]) -> SparsePoints:
+    positions = {image.image_id: position for position, image in enumerate(images)}
+    heads, lengths, observations = [], [], []
+    features = {image.image_id: model.images[image.image_id].points2D for image in images}
+    for _, point in sorted(model.points3D.items()):
+        track = [(one.image_id, one.point2D_idx) for one in point.track.elements]
+        heads.append((*point.xyz, *point.color))
+        lengths.append(len(track))
+        observations += [
+            (positions[image_id], index, *features[image_id][index].xy) for image_id, index in track
+        ]
+    return SparsePoints.of_rows(
+        np.array(heads, np.float64).reshape(-1, 6),
+        np.array(lengths, np.int64),
+        np.array(observations, np.float64).reshape(-1, 4),
+    )

@@ -1,0 +1,138 @@
+"""Networks of kornia, filled from local weight files: XFeat, DISK, LightGlue and LighterGlue.
+
+kornia's own ``from_pretrained`` downloads, so it is never called: each module is built without
+weights and loaded strictly.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import re
+from collections.abc import Callable, Mapping
+from threading import Lock
+from typing import Any
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.nets.runtime import batch_counters, load_strictly
+
+Tensors = Mapping[str, torch.Tensor]
+_BLOCK = re.compile(r"^(self_attn|cross_attn)\.(\d+)\.")
+# the authors' file of LighterGlue has the matcher, and the XFeat it was trained with
+_MATCHER, _EXTRACTOR = "matcher.", "extractor.model.net."
+_building = Lock()
+
+
+def require_kornia(what: str) -> None:
+    """Raise OptionError where kornia is not installed."""
+    if importlib.util.find_spec("kornia") is None:
+        raise OptionError(f"{what} needs kornia: pip install 'megloc-kapture[kornia]'")
+
+
+def load_xfeat(tensors: Tensors, where: str) -> nn.Module:
+    """Build XFeat (Potje et al., CVPR 2024) from the authors' ``xfeat.pt``."""
+    network = _features().XFeat()
+    keys = network.net.state_dict()
+    unused = {key for key in keys if key.startswith("fine_matcher.")} | batch_counters(network.net)
+    load_strictly(network.net, tensors, where, may_lack=unused)
+    return network.eval()
+
+
+def xfeat_descriptors(network: Any, images: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
+    """Describe keypoints (N, 2) of an image (1, 3, H, W) by XFeat: unit vectors (N, 64).
+
+    The keypoints are kornia's: pixels of the resized image times the ratio of the sizes.
+    """
+    resized, *ratio_yx = network._preprocess_tensor(images)
+    dense = functional.normalize(network.net(resized)[0], dim=1)
+    places = xy / xy.new_tensor(ratio_yx[::-1])
+    height, width = resized.shape[-2:]
+    sampled = network.interpolator(dense, places[None], H=height, W=width)[0]
+    return functional.normalize(sampled, dim=-1)
+
+
+def load_disk(tensors: Tensors, where: str) -> nn.Module:
+    """Build DISK (Tyszkiewicz et al., NeurIPS 2020) from the authors' ``depth-save.pth``."""
+    return load_strictly(_features().DISK(), tensors, where).eval()
+
+
+def load_lighterglue(tensors: Tensors, where: str, *options: Any) -> nn.Module:
+    """Build LighterGlue, the LightGlue of XFeat, from the authors' ``xfeat-lighterglue.pt``."""
+    named = {
+        key.removeprefix(_MATCHER): value
+        for key, value in tensors.items()
+        if not key.startswith(_EXTRACTOR)
+    }
+    return load_lightglue(named, where, *options, width=96, num_heads=1)
+
+
+def load_lightglue(
+    tensors: Tensors,
+    where: str,
+    threshold: float = 0.1,
+    depth_confidence: float = -1.0,
+    width_confidence: float = -1.0,
+    half_precision: bool = False,
+    *,
+    width: int = 256,
+    num_heads: int = 4,
+) -> nn.Module:
+    """Build LightGlue (Lindenberger et al., ICCV 2023) from one of the authors' files.
+
+    The number of layers and the size of the descriptors are the checkpoint's. What only early
+    stopping (``depth_confidence``) and pruning (``width_confidence``) use may be absent where both
+    are off (-1). In half precision positions and the assignment stay in float32.
+    """
+    tensors = {_BLOCK.sub(r"transformers.\2.\1.", key): value for key, value in tensors.items()}
+    layers = {int(key.split(".")[1]) for key in tensors if key.startswith("transformers.")}
+    if not layers:
+        raise DataError("this file does not fit LightGlue: it has no layers", path=where)
+    projection = tensors.get("input_proj.weight")
+    with _building:
+        # kornia's attention sets it for the whole process
+        flash = torch.backends.cuda.flash_sdp_enabled()  # type: ignore[no-untyped-call]
+        try:
+            network = _features().LightGlue(
+                None,
+                flash=False,
+                n_layers=max(layers) + 1,
+                input_dim=width if projection is None else projection.shape[-1],
+                descriptor_dim=width,
+                num_heads=num_heads,
+                filter_threshold=threshold,
+                depth_confidence=depth_confidence,
+                width_confidence=width_confidence,
+            )
+        finally:
+            torch.backends.cuda.enable_flash_sdp(flash)
+    adaptive = depth_confidence > 0 or width_confidence > 0
+    last = f"log_assignment.{max(layers)}."
+    optional = ("token_confidence.", "log_assignment.")
+    unused = [
+        key
+        for key in network.state_dict()
+        if key == "confidence_thresholds"
+        or (not adaptive and key.startswith(optional) and not key.startswith(last))
+    ]
+    load_strictly(network, tensors, where, may_lack=unused)
+    if half_precision:
+        for layer in network.transformers:
+            layer.forward = _in_half_precision(layer.forward)
+    return network.eval()
+
+
+def _in_half_precision(forward: Callable[..., Any]) -> Callable[..., Any]:
+    def run(x: torch.Tensor, *others: Any, **named: Any) -> Any:
+        half = torch.float16 if x.device.type == "cuda" else torch.bfloat16
+        with torch.autocast(x.device.type, dtype=half):
+            return tuple(found.float() for found in forward(x, *others, **named))
+
+    return run
+
+
+def _features() -> Any:
+    return importlib.import_module("kornia.feature")

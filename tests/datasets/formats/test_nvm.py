@@ -1,0 +1,234 @@
+"""NVM with every quirk of the published files, compared with kapture's own importer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import kapture
+import kapture.io.csv
+import numpy as np
+import pytest
+from kapture.io.records import TransferAction
+from megloc_twins.model_files import write_nvm
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.datasets.formats import nvm as nvm_reader
+from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.colmap_model import SparsePoints
+from megloc_kapture.io.images import write_image
+
+SAMPLE = "kapture_samples/Aachen-Day-Night"
+
+CAMERA = "db/7.jpg 1000.0 1 0 0 0 2.0 0.0 -5.0 0.08 0"
+TURNED = "db/8.jpg 900.5 0.5 -0.5 0.5 0.5 1 2 3 -0.25 0"
+POINTS = [
+    "1.5 -2 3e1 255 0 7 3 0 12 10.5 20.25 1 3 30.125 40 0 9 11 21",
+    "4 5 6 1 2 3 1 1 2147483647 1e2 .5",
+    "-7 8 9 0 0 0 0",
+]
+MODEL = ["2", CAMERA, TURNED, "", "3", *POINTS]
+ARRAYS = ("xyz", "rgb", "point_ids", "image_ids", "feature_ids", "xy_px")
+
+
+@pytest.fixture
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let borders of blocks be everywhere."""
+    monkeypatch.setattr(nvm_reader, "_ROWS", 2)
+
+
+def file(path: Path, lines: list[str], end: str = "\n") -> Path:
+    path.write_bytes(end.join(["NVM_V3", "", *lines]).encode())
+    return path
+
+
+def check_model(model: NvmModel) -> None:
+    """What the lines above say."""
+    assert model.names == ("db/7.jpg", "db/8.jpg")
+    assert model.focal_px.tolist() == [1000.0, 900.5]
+    assert model.k_colmap.tolist() == [-0.08, 0.25]
+    assert model.centers.tolist() == [[2, 0, -5], [1, 2, 3]]
+    assert model.cam_from_world(0).translation == (-2.0, 0.0, 5.0)
+    rotation = Rotation.from_quat([-0.5, 0.5, 0.5, 0.5])
+    expected = -rotation.as_matrix() @ [1, 2, 3]
+    assert model.cam_from_world(1).quat_wxyz == (0.5, -0.5, 0.5, 0.5)
+    assert np.allclose(model.cam_from_world(1).translation, expected, atol=1e-14)
+    points = model.points
+    assert points.xyz.tolist() == [[1.5, -2, 30], [4, 5, 6], [-7, 8, 9]]
+    assert points.rgb.tolist() == [[255, 0, 7], [1, 2, 3], [0, 0, 0]]
+    assert points.point_ids.tolist() == [0, 0, 0, 1]
+    assert points.image_ids.tolist() == [0, 1, 0, 1]
+    assert points.feature_ids.tolist() == [12, 3, 9, 2147483647]
+    assert points.xy_px.tolist() == [[10.5, 20.25], [30.125, 40], [11, 21], [100, 0.5]]
+    dtypes = [getattr(points, name).dtype for name in ARRAYS]
+    assert dtypes == [np.float64, np.uint8, np.int64, np.int32, np.int32, np.float32]
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.usefixtures("small_blocks")
+def test_the_plain_form(tmp_path: Path, end: str) -> None:
+    for tail in ([], [""], ["0"], ["", "0", "", "some PLY stuff"]):
+        model = read_nvm(file(tmp_path / "m.nvm", MODEL + tail, end))
+        check_model(model)
+    # a file of cameras alone is a model too
+    model = read_nvm(file(tmp_path / "m.nvm", ["1", CAMERA, "0", "0"], end))
+    assert model.names == ("db/7.jpg",) and len(model.points) == 0
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_all_known_variants_of_the_layout(tmp_path: Path) -> None:
+    lines = ["\ufeffNVM_V3 FixedK 1000 512 1000.5 384 ", " ", "\t", " 2  "]
+    lines += ["./db/7.jpg\t1000.0 1 0 0 0  2.0 0.0 -5.0 0.08 0 ", "", TURNED.replace(" ", "\t")]
+    lines += ["", "", "3 ", *(f"  {point} \n" for point in POINTS)]
+    unregistered = [f"unregistered/{k}.jpg 0 1 0 0 0 0 0 0 0 0" for k in (1, 2)]
+    lines += ["2", *unregistered, "0", "0", "# what follows is not looked at: 1 2 three"]
+    path = tmp_path / "m.nvm"
+    path.write_bytes("\n".join(lines).encode() + b"\n\xff\x00\xfe")
+    check_model(read_nvm(path))
+    poses = read_nvm(path, with_points=False)
+    assert len(poses.points) == 0 and np.array_equal(poses.centers, read_nvm(path).centers)
+
+
+def test_quaternions_are_normalised_or_refused(tmp_path: Path) -> None:
+    camera = "a.jpg 1 0.5003 -0.5 0.5 0.5 0 0 0 0 0"
+    model = read_nvm(file(tmp_path / "m.nvm", ["1", camera, "0"]))
+    assert np.linalg.norm(model.quat_wxyz[0]) == pytest.approx(1, abs=1e-15)
+    w, x, y, z = model.quat_wxyz[0]
+    assert w / x == pytest.approx(-0.5003 / 0.5, rel=1e-12)
+    assert (y, z) == (-x, -x)
+    path = file(tmp_path / "m.nvm", ["2", camera.replace("0.5003", "0.503"), CAMERA, "0"])
+    with pytest.raises(DataError, match=r"m\.nvm: camera 'a.jpg': .*not a unit quaternion"):
+        read_nvm(path)
+
+
+def import_with_kapture(nvm: Path, images: Path, output: Path) -> kapture.Kapture:
+    from tools.kapture_import_nvm import import_nvm
+
+    import_nvm(str(nvm), str(images), str(output), None, False, True, True, TransferAction.skip)
+    return kapture.io.csv.kapture_from_dir(str(output))
+
+
+def observed(data: kapture.Kapture, folder: Path) -> list[tuple[int, str, float, float]]:
+    """(point, image, x, y) of every observation."""
+    rows = []
+    for point in data.observations:
+        for image, keypoint in data.observations[point, "sift"]:
+            path = kapture.io.features.get_keypoints_fullpath("sift", str(folder), image)
+            keypoints = kapture.io.features.image_keypoints_from_file(path, np.float32, 2)
+            rows.append((point, image, *keypoints[keypoint].tolist()))
+    return sorted(rows)
+
+
+def check_against_kapture(model: NvmModel, data: kapture.Kapture, folder: Path) -> None:
+    """Poses, distortion, points and observations."""
+    points = model.points
+    merged = np.hstack([points.xyz, points.rgb])
+    assert np.allclose(merged, data.points3d.as_array(), atol=1e-9)
+    sensors = {name: (time, sensor) for time, sensor, name in kapture.flatten(data.records_camera)}
+    for index, name in enumerate(model.names):
+        camera = data.sensors[sensors[name][1]]
+        assert camera.camera_params[2] == model.focal_px[index]
+        assert camera.camera_params[5] == model.k_colmap[index]
+        theirs, ours = data.trajectories[sensors[name]], model.cam_from_world(index)
+        # kapture keeps the length of the quaternion, which has six digits here
+        assert np.allclose(ours.quat_wxyz, theirs.r_raw, atol=1e-6)
+        assert np.allclose(ours.translation, theirs.t_raw, atol=1e-9)
+    columns = points.point_ids, points.image_ids, points.xy_px.tolist()
+    rows: set[tuple[Any, ...]] = {
+        (int(point), model.names[image], x, y)
+        for point, image, (x, y) in zip(*columns, strict=True)
+    }
+    assert sorted(rows) == observed(data, folder)
+
+
+@pytest.mark.slow
+def test_the_published_sample_reads_as_kapture_reads_it(shared_data: Path, tmp_path: Path) -> None:
+    nvm = shared_data / SAMPLE / "3D-models" / "aachen_cvpr2018_db.nvm"
+    data = import_with_kapture(nvm, shared_data / SAMPLE / "images_upright", tmp_path)
+    check_against_kapture(read_nvm(nvm), data, tmp_path)
+    with pytest.raises(DataError, match="several models"):
+        read_nvm(nvm.with_name("aachen_two_parts.nvm"))
+
+
+def random_model(seed: int, num_images: int = 7, num_points: int = 60) -> NvmModel:
+    rng = np.random.default_rng(seed)
+    rotations = Rotation.random(num_images, random_state=seed).as_quat()
+    seen = rng.random((num_points, num_images)) < 0.4
+    point_ids, image_ids = np.nonzero(seen)
+    # an image sees a point twice, and features are not dense
+    point_ids, image_ids = np.r_[point_ids[:1], point_ids], np.r_[image_ids[:1], image_ids]
+    features = np.concatenate([rng.permutation(500)[: len(point_ids)]])
+    points = SparsePoints(
+        rng.normal(0, 1e3, (num_points, 3)),
+        rng.integers(0, 256, (num_points, 3)).astype(np.uint8),
+        point_ids.astype(np.int64),
+        image_ids.astype(np.int32),
+        features.astype(np.int32),
+        rng.uniform(0, 1e3, (len(features), 2)).astype(np.float32),
+    )
+    return NvmModel(
+        tuple(f"db/{i}.jpg" for i in rng.permutation(num_images)),
+        rng.uniform(500, 1000, num_images),
+        np.roll(rotations, 1, axis=1),
+        rng.normal(0, 1e3, (num_images, 3)),
+        rng.normal(0, 0.1, num_images),
+        points,
+    )
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_what_is_written_comes_back_exactly_and_kapture_reads_it(tmp_path: Path) -> None:
+    model, path = random_model(2), tmp_path / "m.nvm"
+    write_nvm(path, model)
+    read = read_nvm(path)
+    assert read.names == model.names
+    for name in ("focal_px", "centers", "k_colmap"):
+        assert np.array_equal(getattr(read, name), getattr(model, name))
+    assert np.allclose(read.quat_wxyz, model.quat_wxyz, rtol=0, atol=1e-15)
+    for name in ARRAYS:
+        ours, theirs = getattr(read.points, name), getattr(model.points, name)
+        assert ours.dtype == theirs.dtype and np.array_equal(ours, theirs)
+    # COLMAP's exporter leaves blanks in blank lines, which kapture does not take for blank
+    text = path.read_text()
+    assert text.startswith("NVM_V3 \n \n7  \n")
+    path.write_text(text.replace("\n \n", "\n\n"))
+    for name in model.names:
+        write_image(tmp_path / "images" / name, np.zeros((48, 64, 3), np.uint8))
+    data = import_with_kapture(path, tmp_path / "images", tmp_path / "kapture")
+    check_against_kapture(model, data, tmp_path / "kapture")
+
+
+@pytest.mark.parametrize(
+    ("lines", "match"),
+    [
+        (["2", CAMERA, TURNED, "1", "1 2 3 4 5"], "broken points from '1 2 3 4 5"),
+        (["2", CAMERA, TURNED, "1", "1 2 3 4 5 6 1 0 0 1"], "broken points"),
+        (["2", CAMERA, TURNED, "1", "1 2 nan 4 5 6 0"], "broken points"),
+        (["2", CAMERA, TURNED, "1", "1 2 3 4 5 6 1 2 0 1 2"], "unknown image"),
+        (["2", CAMERA, TURNED, "9", *POINTS], "the file ends before its last point"),
+        (["2", CAMERA], "the file ends after 1 of 2 cameras"),
+        (["2", CAMERA, CAMERA, "0"], "camera 'db/7.jpg': .*each image once"),
+        (["1", CAMERA.replace("2.0", "nan"), "0"], "camera 'db/7.jpg': expected 10 finite"),
+        (["1", CAMERA + " 5", "0"], "camera 'db/7.jpg': expected 10 "),
+        (["1", CAMERA.replace("db", ".."), "0"], "camera '../7.jpg': .*leads out"),
+        (["one", CAMERA, "0"], "expected the number of cameras, got 'one'"),
+        (["1", CAMERA], "expected the number of points, got ''"),
+        (["1", CAMERA, "0", "1", TURNED, "1", POINTS[2]], "several models"),
+    ],
+)
+def test_what_is_broken_is_named(tmp_path: Path, lines: list[str], match: str) -> None:
+    path = file(tmp_path / "m.nvm", lines)
+    with pytest.raises(DataError, match=match) as caught:
+        read_nvm(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe\0", b"PLY\n"])
+def test_other_files_are_named(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "m.nvm"
+    with pytest.raises(DataError, match=r"m\.nvm: cannot read"):
+        read_nvm(path)
+    path.write_bytes(content)
+    with pytest.raises(DataError, match="first line must begin with NVM_V3"):
+        read_nvm(path)

@@ -1,0 +1,368 @@
+"""The check of pose files: conventions against the map, rows, names and MLAD's pairs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.check import (
+    CheckReport,
+    Finding,
+    Reference,
+    check_submission,
+    read_reference,
+)
+from megloc_kapture.io.dataset_tables import (
+    ImageGroup,
+    Protocol,
+    RelocalizationPair,
+    SimilarityTransform,
+    World,
+    write_groups,
+    write_names,
+    write_protocol,
+)
+from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.values import RigidTransform
+
+OPENGL = np.diag([1.0, -1.0, -1.0])
+CONVENTIONS = {
+    "inverted": "poses inverted (camera-to-world",
+    "axes": "poses read with OpenGL's axes",
+    "inverted+axes": "poses inverted and with OpenGL's axes",
+    "centre": "translations read as camera centres",
+    "xyzw": "quaternions read as x, y, z, w",
+}
+
+Poses = dict[str, RigidTransform]
+Check = Callable[..., CheckReport]
+
+
+def looking(centers: np.ndarray, yaw: np.ndarray, pitch: np.ndarray, folder: str) -> Poses:
+    """``cam_from_world`` of cameras that stand upright in a world whose z points up."""
+    poses = {}
+    for number, (center, a, b) in enumerate(zip(centers, yaw, pitch, strict=True)):
+        forward = np.array([np.cos(b) * np.cos(a), np.cos(b) * np.sin(a), np.sin(b)])
+        right = np.array([np.sin(a), -np.cos(a), 0.0])
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        name = f"{folder}/{number:03d}.jpg"
+        poses[name] = RigidTransform.from_matrix(rotation, -rotation @ center)
+    return poses
+
+
+def street(number: int, folder: str, rng: np.random.Generator) -> Poses:
+    """Along a bend of 600 m, far from the origin."""
+    along = np.sort(rng.uniform(0, 600, number))
+    centers = np.stack([200 * np.sin(along / 150), along, 0 * along + rng.normal(0, 0.1)], axis=1)
+    heading = np.pi / 2 - along / 400 + rng.normal(0, 0.05, number)
+    return looking(centers + [620_000.0, 5_735_000.0, 100.0], heading, 0 * along - 0.2, folder)
+
+
+def table(number: int, folder: str, rng: np.random.Generator) -> Poses:
+    """Around an object of a metre, which is the origin."""
+    around, above = rng.uniform(0, 3.5, number), rng.uniform(0.2, 1.2, number)
+    level = np.stack([np.cos(around), np.sin(around)], axis=1) * np.cos(above)[:, None]
+    centers = np.column_stack([level, np.sin(above)]) * rng.uniform(0.8, 1.2, (number, 1))
+    return looking(centers, around + np.pi, -above + rng.normal(0, 0.1, number), folder)
+
+
+def made(make: Callable[..., Poses]) -> tuple[Reference, Poses]:
+    rng = np.random.default_rng(4)
+    map_poses, poses = make(80, "m", rng), make(40, "q", rng)
+    expected = {name: name for name in poses}
+    queries = frozenset(poses)
+    return Reference(
+        folder="import", map_poses=map_poses, expected=expected, queries=queries
+    ), poses
+
+
+def lines_of(poses: Mapping[str, RigidTransform], mistake: str = "") -> list[str]:
+    """Rows of a pose file, written by scipy and matrices, with a mistake in all of them."""
+    lines = []
+    for name, pose in poses.items():
+        rotation, translation = pose.rotation_matrix(), np.array(pose.translation)
+        if "axes" in mistake:
+            rotation, translation = OPENGL @ rotation, OPENGL @ translation
+        center = -rotation.T @ translation
+        if "inverted" in mistake:
+            rotation = rotation.T
+        if "inverted" in mistake or mistake == "centre":
+            translation = center
+        quat = Rotation.from_matrix(rotation).as_quat()
+        quat = quat if mistake == "xyzw" else np.roll(quat, 1)
+        lines.append(" ".join([name, *map(repr, map(float, (*quat, *translation)))]) + "\n")
+    return lines
+
+
+@pytest.fixture
+def check(tmp_path: Path) -> Check:
+    def run(
+        lines: Sequence[str],
+        reference: Reference | None = None,
+        dataset: str = "kapture",
+        name: str = "poses.txt",
+    ) -> CheckReport:
+        (tmp_path / name).write_text("".join(lines))
+        return check_submission(tmp_path / name, dataset=dataset, reference=reference)
+
+    return run
+
+
+def kinds(report: CheckReport) -> list[tuple[str, str]]:
+    return [(finding.severity, finding.kind) for finding in report.findings]
+
+
+def only(report: CheckReport) -> Finding:
+    (finding,) = report.findings
+    return finding
+
+
+@pytest.mark.parametrize("scene", [street, table])
+def test_the_five_conventions(check: Check, scene: Callable[..., Poses]) -> None:
+    reference, poses = made(scene)
+    report = check(lines_of(poses), reference)
+    assert report.lines() == ["40 poses of 40 queries: no problem found"]
+    for mistake, words in CONVENTIONS.items():
+        error = only(check(lines_of(poses, mistake), reference))
+        assert (error.severity, error.kind) == ("error", "convention") and words in error.message
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", ["fountain_p11", "herzjesu_p25", "herzjesu_wide", "redkitchen_rgbd"]
+)
+def test_the_conventions_on_real_scenes(shared_data: Path, check: Check, name: str) -> None:
+    folder = shared_data / "scenes" / name
+    poses = KaptureFolder(folder / "query_gt").read().poses()
+    reference = read_reference(folder)
+    assert not check(lines_of(poses), reference).findings
+    for mistake, words in CONVENTIONS.items():
+        # where cameras hardly turn several conventions are named
+        assert words in only(check(lines_of(poses, mistake), reference)).message
+
+
+def test_a_recentred_map(check: Check) -> None:
+    reference, poses = made(street)
+    world = World(
+        official_from_local=SimilarityTransform(translation=(620_000.0, 5_735_000.0, 100.0))
+    )
+    local = {name: world.pose_in_local(pose) for name, pose in reference.map_poses.items()}
+    recentred = replace(reference, map_poses=local, world=world)
+    assert not check(lines_of(poses), recentred).findings
+    forgotten = {name: world.pose_in_local(pose) for name, pose in poses.items()}
+    error = only(check(lines_of(forgotten), recentred))
+    assert error.kind == "far" and "another frame, or another scale" in error.message
+
+
+def test_single_poses_that_are_far(check: Check) -> None:
+    reference, poses = made(street)
+    lines = lines_of(poses)
+    lines[5] = "q/005.jpg 1 0 0 0 1e9 0 0\n"
+    warning = only(check(lines, reference))
+    assert (warning.severity, warning.kind, warning.names) == ("warning", "far", ("q/005.jpg",))
+
+
+def test_too_few_poses(check: Check) -> None:
+    reference, poses = made(table)
+    lines = lines_of(poses, "inverted")[:2]
+    assert ("note", "too-few") in kinds(check(lines, reference))
+
+
+GOOD = "a.jpg 0.6 0.8 0 0 1.5 -0.2 3\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "kind", "words"),
+    [
+        ("b.jpg 1 0 0 0 1.5 -0.2", "columns", "7 columns instead of 8 (name qw qx qy qz tx ty tz)"),
+        ("b.jpg", "columns", "1 column instead"),
+        ("b.jpg, 0.6, 0.8, 0, 0, 1.5, -0.2", "columns", "separated by blanks, not commas"),
+        ("# name qw qx qy qz tx ty tz", "comment", "no header"),
+        ("b.jpg 1 0 0 0 1.5 -0.2 x", "pose", "'x' is not a number"),
+        ("b.jpg 1 0 0 0 nan -0.2 3", "pose", "b.jpg: the pose is not finite"),
+        ("b.jpg 0 0 0 0 1 -0.2 3", "pose", "b.jpg: quaternion of length 0, not 1"),
+        ("b.jpg 10 20 30 0.6 0.8 0 0", "pose", "the columns are name qw qx qy qz tx ty tz"),
+        ("a.jpg 1 0 0 0 1 -0.2 3", "duplicate", "given twice, first on line 1"),
+    ],
+)
+def test_wrong_rows(check: Check, line: str, kind: str, words: str) -> None:
+    report = check([GOOD, "\n", f"{line}\n"])
+    found = report.findings[0]
+    assert (found.severity, found.kind, found.line) == ("error", kind, 3)
+    assert words in found.message and report.poses == 1
+
+
+def test_files_that_are_empty_cut_or_something_else(check: Check, tmp_path: Path) -> None:
+    assert ("error", "empty") in kinds(check(["\n"]))
+    assert kinds(check(["b.jpg 1 0 0 0 1.5 -0.2 3.1"]))[0] == ("warning", "cut")
+    with pytest.raises(DataError, match="COLMAP's images.txt"):
+        check(["1 1 0 0 0 0 0 0 1 a.jpg\n", "0 0 -1\n"])
+    with pytest.raises(DataError, match="one file"):
+        check_submission(tmp_path, dataset="kapture")
+    with pytest.raises(DataError, match="no imported dataset"):
+        read_reference(tmp_path)
+
+
+def test_text_and_json(check: Check) -> None:
+    report = check([GOOD, *(f"{n}.jpg 1\n" for n in range(30))])
+    lines = report.lines()
+    assert lines[0].startswith("error: poses.txt:2: 2 columns")
+    assert "error: 20 more of kind 'columns'; --json lists all" in lines
+    assert lines[-1] == "1 poses: 30 problems found"
+    content = json.loads(json.dumps(report.to_json()))
+    assert content["ok"] is False and len(content["findings"]) == 32
+    assert "give one with --data" in content["findings"][-1]["message"]
+
+
+ROBOTCAR = {f"rear/{i}.jpg": f"dawn/rear/{i}.jpg" for i in range(100, 106)}
+AACHEN = {f"IMG_{i}.jpg": f"query/day/IMG_{i}.jpg" for i in range(5)}
+
+
+def named(
+    check: Check, names: Sequence[str], expected: Mapping[str, str], dataset: str = "aachen"
+) -> list[Finding]:
+    sides = {q.replace("/rear/", f"/{s}/") for q in expected.values() for s in ("left", "rear")}
+    reference = Reference(folder="import", expected=expected, queries=frozenset(sides))
+    report = check([f"{name} 1 0 0 0 0 0 0\n" for name in names], reference, dataset)
+    return [finding for finding in report.findings if finding.kind != "not-checked"]
+
+
+@pytest.mark.parametrize(
+    ("change", "expected", "words"),
+    [
+        (
+            lambda name: name.removeprefix("rear/"),
+            ROBOTCAR,
+            "100.jpg should be rear/100.jpg; the server finds none of them, and every figure is",
+        ),
+        (lambda name: AACHEN[name], AACHEN, "query/day/IMG_0.jpg should be IMG_0.jpg"),
+        (lambda name: f"./{name}", AACHEN, "./IMG_0.jpg should be IMG_0.jpg"),
+        (lambda name: name.replace(".jpg", ".JPG"), AACHEN, "IMG_0.JPG should be IMG_0.jpg"),
+    ],
+)
+def test_names_that_are_wrong_in_one_way(
+    check: Check, change: Callable[[str], str], expected: Mapping[str, str], words: str
+) -> None:
+    (finding,) = named(check, list(map(change, expected)), expected)
+    assert (finding.severity, finding.kind) == ("error", "name") and words in finding.message
+
+
+def test_endings_and_cameras_of_robotcar(check: Check) -> None:
+    names = [name.replace(".jpg", ".png") for name in ROBOTCAR]
+    (finding,) = named(check, names, ROBOTCAR, "robotcar")
+    assert finding.severity == "warning" and "take either" in finding.message
+    names = [*ROBOTCAR, *(name.replace("rear", "left") for name in ROBOTCAR)]
+    (finding,) = named(check, names, ROBOTCAR, "robotcar")
+    assert (finding.severity, finding.kind, len(finding.names)) == ("note", "not-scored", 6)
+
+
+def test_unknown_missing_and_double_names(check: Check) -> None:
+    names = ["IMG_0.jpg", "else.jpg", "IMG_1.jpg", "query/day/IMG_1.jpg"]
+    found = {finding.kind: finding for finding in named(check, names, AACHEN)}
+    assert found.keys() == {"unknown", "name", "duplicate", "missing"}
+    assert (found["unknown"].line, found["unknown"].names) == (2, ("else.jpg",))
+    assert found["duplicate"].line == 4 and "(line 3)" in found["duplicate"].message
+    missing = found["missing"]
+    assert missing.severity == "warning" and missing.message.startswith("3 queries of 5 without")
+    assert missing.names == ("IMG_2.jpg", "IMG_3.jpg", "IMG_4.jpg")
+
+
+def test_names_without_a_list(check: Check) -> None:
+    for dataset, line, words in (
+        ("aachen", "q/a.jpg", "with a folder"),
+        ("inloc", "a.jpg", "not ending in .JPG"),
+        ("robotcar", "1.jpg", "without the camera's folder"),
+    ):
+        report = check([f"{line} 1 0 0 0 0 0 0\n"], None, dataset)
+        assert words in report.findings[0].message and report.has_problems
+
+
+def drive() -> tuple[Reference, dict[str, RigidTransform]]:
+    """A road that is driven twice; the second time in the other lane, with true relative poses."""
+    rng = np.random.default_rng(0)
+    along = np.arange(0, 300, 3.0)
+    path = np.stack([120 * np.sin(along / 120), 120 * (1 - np.cos(along / 120)), 0 * along], axis=1)
+    side = 2.0 * np.stack([np.sin(along / 120), -np.cos(along / 120), 0 * along], axis=1)
+    first = list(looking(path, along / 120, 0 * along, "").values())
+    second = list(looking(path + side, along / 120, 0 * along, "").values())
+    references = [f"ref/{1000 + i}.png" for i in range(len(along))]
+    pairs, poses = [], {}
+    for i in range(2, len(along) - 2):
+        j = i + int(rng.integers(-2, 3))
+        pairs.append(RelocalizationPair("a_to_b.txt", references[j], f"q/{5000 + i}.png"))
+        poses[f"{1000 + j} {5000 + i}"] = second[i] @ first[j].inverse()
+    protocol = Protocol(dataset="4seasons", pose_file="mlad")
+    map_poses = dict(zip(references, first, strict=True))
+    return Reference(
+        folder="import", protocol=protocol, pairs=tuple(pairs), map_poses=map_poses
+    ), poses
+
+
+def mlad_lines(poses: Mapping[str, RigidTransform]) -> list[str]:
+    lines = []
+    for key, pose in poses.items():
+        w, *xyz = pose.quat_wxyz
+        numbers = " ".join(map(repr, map(float, (*pose.translation, *xyz, w))))
+        lines.append(f"{key} {numbers}\n")
+    return lines
+
+
+def test_mlad_files(check: Check) -> None:
+    reference, poses = drive()
+    lines = mlad_lines(poses)
+
+    def found(lines: Sequence[str], name: str = "a_to_b.txt") -> list[tuple[str, str]]:
+        return kinds(check(lines, reference, "4seasons", name))
+
+    assert found(lines) == []
+    assert found(lines, "mine.txt") == [("error", "file-name")]
+    assert found(lines[1:]) == [("error", "missing")]
+    assert found([*lines, "1 2 3 0 0 0 0 0 1\n"]) == [("error", "unknown")]
+    swapped = [" ".join([b, a, rest]) for a, b, rest in (line.split(" ", 2) for line in lines)]
+    assert found(swapped) == [("error", "swapped")]
+    assert ("error", "pose") in found(["x 205 1.5 -0.2 3 0 0 0 1\n"])
+    dummies = [f"{key} 0 0 0 0 0 0 1\n" for key in poses]
+    assert found([*dummies[:4], *lines[4:]]) == [("note", "dummies")]
+    assert found(dummies)[-1] == ("note", "too-few")
+
+
+def test_a_folder_of_mlad_files(tmp_path: Path) -> None:
+    reference, poses = drive()
+    second = [replace(pair, file="second.txt") for pair in reference.pairs[50:]]
+    both = replace(reference, pairs=(*reference.pairs[:50], *second))
+    folder = tmp_path / "submission"
+    folder.mkdir()
+
+    def with_file(name: str, lines: Sequence[str]) -> CheckReport:
+        (folder / name).write_text("".join(lines))
+        return check_submission(folder, dataset="4seasons", reference=both)
+
+    lines = mlad_lines(poses)
+    assert kinds(with_file("a_to_b.txt", lines[:50])) == [("error", "missing-file")]
+    report = with_file("second.txt", lines[50:])
+    assert not report.findings and report.poses == len(lines)
+    assert kinds(with_file("third.txt", lines[:1])) == [("error", "file-name")]
+    with pytest.raises(DataError, match="no pose file"):
+        (tmp_path / "empty").mkdir()
+        check_submission(tmp_path / "empty", dataset="4seasons")
+
+
+def test_what_is_read_of_an_import(scene: Path, tmp_path: Path) -> None:
+    for part in ("mapping", "query"):
+        (tmp_path / part).symlink_to(scene / part)
+    found = read_reference(tmp_path)
+    queries = KaptureFolder(scene / "query").read().image_names()
+    assert list(found.expected) == queries and found.queries == set(queries)
+    assert found.map_poses == KaptureFolder(scene / "mapping").read().poses()
+    write_protocol(tmp_path / "megloc", Protocol(dataset="aachen"))
+    write_groups(tmp_path / "megloc", {queries[0]: ImageGroup(scored=False)})
+    assert set(read_reference(tmp_path).expected) == set(queries[1:])
+    write_names(tmp_path / "megloc", {queries[1]: "b.png", queries[0]: "a.png"})
+    assert read_reference(tmp_path).expected == {"b.png": queries[1], "a.png": queries[0]}

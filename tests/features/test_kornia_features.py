@@ -1,0 +1,92 @@
+"""XFeat and DISK of kornia: where their keypoints are, masks, and local files alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import kornia.core.download
+import numpy as np
+import pytest
+import torch
+from images import Image
+from kornia.feature import DISK
+from kornia.feature.xfeat import XFeat as KorniaXFeat
+
+from megloc_kapture.features.kornia_features import Disk, DiskOptions, XFeat, XFeatOptions
+from megloc_kapture.io.weights import find_weights, read_weights
+
+ALL = 100_000
+
+
+@pytest.fixture(scope="module")
+def weights(shared_data: Path) -> str:
+    return str(shared_data / "weights" / "xfeat" / "xfeat.pt")
+
+
+@pytest.fixture(autouse=True)
+def _no_download(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError("kornia downloads")
+
+    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", refuse)
+    monkeypatch.setattr(kornia.core.download, "load_state_dict_from_url", refuse)
+
+
+def xfeat(weights: str, **options: object) -> XFeat:
+    given = {"weights": weights, "max_keypoints": ALL, "device": "cpu", **options}
+    return XFeat(XFeatOptions.model_validate(given))
+
+
+def test_xfeat_is_kornias_half_a_pixel_on(weights: str, photograph: Image) -> None:
+    image = np.ascontiguousarray(photograph[:256, :320])
+    theirs = KorniaXFeat(top_k=ALL).eval()
+    theirs.net.load_state_dict(read_weights(find_weights(weights)))
+    tensor = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
+    expected = {key: value.numpy() for key, value in theirs.detectAndCompute(tensor)[0].items()}
+    found = xfeat(weights).extract(image)
+    # theirs has the first pixel's centre at (0, 0)
+    ours = np.lexsort(found.keypoints_px[:, :2].T)
+    order = np.lexsort(expected["keypoints"].T)
+    np.testing.assert_array_equal(found.keypoints_px[ours, :2] - 0.5, expected["keypoints"][order])
+    np.testing.assert_allclose(found.descriptors[ours], expected["descriptors"][order], atol=1e-4)
+    # of the same network as descriptors of their own, they are the same
+    again = xfeat(weights, descriptor_weights=weights).extract(image)
+    np.testing.assert_allclose(again.descriptors, found.descriptors, atol=1e-4)
+
+
+@pytest.mark.parametrize(("x", "y"), [(200, 300), (600, 200), (900, 600)])
+def test_keypoints_of_an_image_that_is_resized_are_where_they_are(
+    weights: str, photograph: Image, x: int, y: int
+) -> None:
+    """OpenCV enlarges as COLMAP counts, by 47 %; XFeat makes multiples of 32 of it again."""
+    small = np.ascontiguousarray(photograph[y : y + 64, x : x + 64])
+    large = cv2.resize(small, (94, 94), interpolation=cv2.INTER_LINEAR)
+    a = xfeat(weights).extract(small).keypoints_px[:, :2]
+    b = xfeat(weights).extract(np.asarray(large, np.uint8)).keypoints_px[:, :2] * 64 / 94
+    distance = np.linalg.norm(a[:, None] - b, axis=2)
+    found = distance.min(axis=1) < 1.5
+    assert found.sum() > 20
+    offset = (b[distance.argmin(axis=1)] - a)[found]
+    # without the half pixel of the resizing, (1 - 64 / 94) / 2 = 0.16, a median would be off too
+    assert np.abs(np.median(offset, axis=0)).max() < 1e-3
+    assert np.abs(offset.mean(axis=0)).max() < 0.12
+
+
+def test_disk_of_a_local_file(tmp_path: Path, photograph: Image) -> None:
+    torch.manual_seed(0)
+    network = DISK().eval()
+    torch.save({"extractor": network.state_dict()}, tmp_path / "depth-save.pth")
+    options = {"weights": str(tmp_path / "depth-save.pth"), "max_keypoints": 10, "device": "cpu"}
+    image = np.ascontiguousarray(photograph[:90, :120])
+    mask = np.ones(image.shape[:2], bool)
+    mask[:, :60] = False
+    found = Disk(DiskOptions.model_validate(options)).extract(image, mask)
+    assert found.keypoints_px.shape == (10, 3) and found.descriptors.shape == (10, 128)
+    assert found.keypoints_px[:, 0].min() > 60 and found.num_masked > 0
+    tensor = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
+    with torch.inference_mode():
+        theirs = network(tensor, pad_if_not_divisible=True)[0]
+    known = {tuple(xy) for xy in (theirs.keypoints.numpy() + 0.5).tolist()}
+    assert {tuple(xy) for xy in found.keypoints_px[:, :2].tolist()} <= known
