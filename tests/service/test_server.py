@@ -132,6 +132,7 @@ def test_a_signal_lets_running_requests_finish(
     served_map: Path, tmp_path: Path, photos: list[Photo], number: signal.Signals
 ) -> None:
     with served(served_map, tmp_path) as (process, url):
+        assert httpx2.get(f"{url}health", timeout=60).status_code == 200
         content = photos[0].content
         host, port = url.removeprefix("http://").strip("/").split(":")
         with socket.create_connection((host, int(port)), timeout=60) as connection:
