@@ -353,7 +353,11 @@ class PyramidMapping(_PyramidStage):
     name = "mapping_pyramid"
     version = 2
     uses = (*MATCHING_OPTIONS, "mapping_verification", "guided_pyramid", "mask_margin_px")
-    explained_by = ("guided_pyramid.mode", "guided_pyramid.min_matches")
+    explained_by = (
+        "guided_pyramid.mode",
+        "guided_pyramid.min_matches",
+        "guided_pyramid.count",
+    )
     inputs = (Layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS, MAPPING_MATCHES)
     outputs = (MAPPING_PYRAMID,)
 
@@ -380,7 +384,11 @@ class PyramidQueries(_PyramidStage):
     name = "query_pyramid"
     version = 2
     uses = (*MATCHING_OPTIONS, "query_verification", "guided_pyramid", "mask_margin_px")
-    explained_by = ("guided_pyramid.mode", "guided_pyramid.min_matches")
+    explained_by = (
+        "guided_pyramid.mode",
+        "guided_pyramid.min_matches",
+        "guided_pyramid.count",
+    )
     inputs = (Layout.mapping, Layout.query, LOCAL_FEATURES, MAP, QUERY_PAIRS, QUERY_MATCHES)
     outputs = (QUERY_PYRAMID,)
 
