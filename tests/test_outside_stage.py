@@ -114,7 +114,6 @@ def test_it_has_a_command_of_its_own(
     assert "count-keypoints" in megloc("--help")[1]
     text = megloc("count-keypoints", "--help")[1]
     assert "Count the keypoints of every map image." in text
-    assert text.endswith("examples:\n  megloc count-keypoints -w runs/kapture-my_scene-classic\n")
     command = ("count-keypoints", "-w", str(workspace.root), "--executor", "inline")
     assert megloc(*command) == (2, f"megloc: {workspace.root} is no workspace of megloc eval\n")
     run_plan(planned(scene, {}), workspace, last="import")

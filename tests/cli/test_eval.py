@@ -114,6 +114,9 @@ def test_the_pose_file_of_each_result_is_among_the_submissions(
     (run / POSES).unlink()
     assert megloc(*command, *same, "--workspace", run).status == 0  # nobody asked for a copy
     done = megloc(*command, *same, *until, "--workspace", run, "--submissions", "kept")
+    assert done.status == 2 and "no such file; --from submission writes it again" in done.err
+    again = ("--from", "submission", *until, "--workspace", run, "--submissions", "kept")
+    done = megloc(*command, *same, *again)
     assert done.out == f"pose file  {Path('kept') / first.name}\n"
     assert not done.err.count("evaluation")
 

@@ -197,7 +197,7 @@ def test_processes_render_the_same_views(
     )
     assert one == two and len(one) >= 2 * len(KaptureFolder(mapping).read().poses())
     elsewhere = ("--scheduler", "tcp://127.0.0.1:1")
-    megloc(*command, "-o", tmp_path / "x", *elsewhere).refused("without --executor dask")
+    megloc(*command, "-o", tmp_path / "x", *elsewhere).refused("needs --executor dask")
 
 
 def test_views_that_no_camera_took_join_the_map(

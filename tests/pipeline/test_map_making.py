@@ -118,7 +118,7 @@ def test_nothing_is_kept_of_what_cannot_be_imported(
     path = workspace / "sparse" / "0" / "points3D.bin"
     content = path.read_bytes()
     path.write_bytes(content[:-3])
-    with pytest.raises(megloc.DataError, match=r"points3D.bin: the file ends within"):
+    with pytest.raises(megloc.DataError, match=r"points3D.bin: the file is damaged"):
         megloc.open_map(workspace)
     assert list(colmap_maps_folder().iterdir()) == []
     path.write_bytes(content)

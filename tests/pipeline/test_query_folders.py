@@ -132,9 +132,8 @@ def test_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(DataError, match=words):
             Photographs(paths)
-    for every, words in ((3, "no video"), (0, "give 1 or more")):
-        with pytest.raises(OptionError, match=words):
-            Photographs([one], every=every)
+    with pytest.raises(OptionError, match="give 1 or more"):
+        Photographs([one], every=0)
 
 
 def test_a_list_gives_each_image_its_camera(tmp_path: Path) -> None:
