@@ -65,11 +65,11 @@ def test_the_steps_of_the_paper_come_first(world: Any, page_of: Any) -> None:
     ]
     html = render_report(evaluation_of(world), provenance={"preset": "megloc", "steps": steps})
     text = page_of(html).text
-    assert "Steps of the paper: 1 of 2 are on" in text
+    assert "Stages: 1 of 2 are on" in text
     assert text.index("ASLFeat") < text.index("poses refined by ICP") < text.index("Recall")
     assert "<no> depth" in text and "<no>" not in html
     assert "steps" not in html.partition("<pre>")[2]  # not once more at the end
-    assert "Steps of the paper" not in render_report(evaluation_of(world))
+    assert "Stages: " not in render_report(evaluation_of(world))
 
 
 def test_a_users_matplotlib_settings_change_nothing_and_are_kept(world: Any) -> None:
