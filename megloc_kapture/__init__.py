@@ -8,8 +8,8 @@
 
 import sys
 
-# pycolmap 4.1.1 to 4.2.1 corrupt the heap when they are imported before zlib, which must stay the
-# first import of the package that is not there anyway (tests/test_import_order.py)
+# pycolmap 4.1.1 to 4.2.1 corrupt the heap when imported before zlib, so zlib stays the first import
+# that is not already loaded (tests/test_import_order.py)
 import zlib  # noqa: F401
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -63,7 +63,7 @@ __all__ = [
     "train",
 ]
 
-# loaded when asked for: an error must not cost the import of numpy, a value that of the solvers
+# lazy: an error must not import numpy, nor a value the solvers
 _LAZY = {
     **dict.fromkeys(
         ("Camera", "Failure", "LocalFeatures", "Pose", "RigidTransform"), "megloc_kapture.values"

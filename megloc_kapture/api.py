@@ -58,17 +58,17 @@ if TYPE_CHECKING:
     from PIL import Image
 
 Changes = Mapping[str, Any]
-# not Sequence, which a text is too
+# not Sequence, which includes str
 Files = list[str] | list[Path] | tuple[Path | str, ...]
 
 
 class Map:
-    """A kapture map and how it is localized in. The map is never written to.
+    """A kapture map with its localization options. The map is never written to.
 
     Attributes
     ----------
-    kapture_map : the map itself: its images, points and keypoints types.
-    options : those of localizing; the others change nothing.
+    kapture_map : images, points and keypoint types of the map.
+    options : localization options; other options have no effect.
     """
 
     def __init__(self, kapture_map: KaptureMap, options: PipelineOptions) -> None:
@@ -81,7 +81,7 @@ class Map:
         return f"Map({str(own.folder.root)!r}: {len(own.images)} images, features {types})"
 
     def localizer(self, refine: str | Sequence[str] = ()) -> Localizer:
-        """The localizer that :meth:`localize` uses, with these pose refiners; kept.
+        """Return the cached localizer of :meth:`localize` with these pose refiners.
 
         Raises
         ------
@@ -102,8 +102,9 @@ class Map:
         result: Path | str | Results | None = None,
         truth: Path | str | None = None,
     ) -> None:
-        """Write a page that shows the map in 3D, and the queries of a result in it; see
-        :func:`megloc_kapture.evaluation.view.write_view`."""
+        """Write a 3D page of the map and a result; see
+        :func:`megloc_kapture.evaluation.view.write_view`.
+        """
         from megloc_kapture.evaluation.view import write_view
 
         if isinstance(result, Results):
@@ -163,26 +164,24 @@ class Map:
     ) -> Pose | Failure | Results:
         """Localize one image, or all images of a list or a folder.
 
+        A single image returns a Pose, or a Failure, which is falsy and has a reason. A list or a
+        folder returns lazy :class:`Results`, a mapping from image name to either.
+
         Parameters
         ----------
-        query : image file; uint8 (H, W, 3) RGB; an image of pillow; a list of image files; a
-            kapture folder, or a folder of plain images.
-        camera : intrinsics of the images' pixels as they are stored, COLMAP's models and pixel
-            origin. Without one an image is turned upright by its EXIF orientation, and its focal
-            length, EXIF's or a guess, is estimated with the pose: ``Pose.camera``.
-        prior : names of the map images that one image may be matched with.
-        refine : pose refiners by name, one after another: icp, rendering.
+        query : image file; uint8 (H, W, 3) RGB; a pillow image; a list of image files; a kapture
+            folder, or a folder of plain images.
+        camera : intrinsics of the pixels as stored, with COLMAP's models and pixel origin. Without
+            one, an image is rotated upright by its EXIF orientation, and its focal length, from
+            EXIF or guessed, is estimated with the pose: ``Pose.camera``.
+        prior : names of the map images to match with one image.
+        refine : names of pose refiners, applied in order: icp, rendering.
         workers : threads, for lists and folders.
-
-        Returns
-        -------
-        Of one image Pose, or Failure, which is falsy and says why; of a list or a folder
-        :class:`Results`, image name to either, lazy.
 
         Raises
         ------
-        DataError : something cannot be read, or features can neither be read nor extracted.
-        OptionError : an argument that changes nothing for such a query.
+        DataError : a file cannot be read, or features can neither be read nor extracted.
+        OptionError : an argument has no effect for such a query.
         """
         if isinstance(query, str):
             query = Path(query)
@@ -212,11 +211,10 @@ def _query_of(
     camera: Camera | None,
     prior: Sequence[str] | None,
 ) -> Query:
-    """The query of one image; raises DataError."""
     name, orientation = "query", 1
     permitted = None if prior is None else tuple(prior)
     if isinstance(image, Path):
-        name = image.name  # as a list or a folder names it
+        name = image.name  # as in a list or a folder
         if camera is None:
             photo = read_photo(image)
             camera, orientation = photo.upright_camera, photo.orientation
@@ -240,19 +238,19 @@ def open_map(
     features_dirs: Sequence[Path | str] = (),
     pixel_origin: PixelOriginChoice = "auto",
 ) -> Map:
-    """Open a map, ours or another tool's, with all keypoints types that have points.
+    """Open a map, from this package or another tool, with all keypoint types that have points.
 
     Parameters
     ----------
-    path : kapture map, or a COLMAP model or workspace, which is imported into the user's cache
-        when it is new or has changed (:func:`megloc_kapture.pipeline.map_making.kapture_of`).
-    preset, set : how it is localized in; ``{"localization.rank.name": "perceptual"}``.
-    features_dirs : folders with features beside the map.
-    pixel_origin : where the map's intrinsics put the pixel origin; auto finds it out.
+    path : kapture map, or a COLMAP model or workspace, which is imported into the user's cache when
+        new or changed (:func:`megloc_kapture.pipeline.map_making.kapture_of`).
+    preset, set : localization options; ``{"localization.rank.name": "perceptual"}``.
+    features_dirs : additional folders with features.
+    pixel_origin : pixel origin of the map's intrinsics; auto detects it.
 
     Raises
     ------
-    DataError : it is no map, or broken, or contradicts itself; names file and line.
+    DataError : no map, or a broken or inconsistent one; names file and line.
     OptionError : an unknown option.
     """
     options = options_of_preset(preset, assignments=set or {})
@@ -269,7 +267,6 @@ def open_map(
 def _run(
     stages: Sequence[Stage], folder: Path | str, workers: int, scheduler: str | None
 ) -> Workspace:
-    """Run stages in a workspace, on processes or a cluster."""
     workspace = Workspace(Path(folder))
     executor = (
         open_executor("processes", workers)
@@ -294,11 +291,11 @@ def build_map(
 
     Parameters
     ----------
-    mapping : kapture folder with images and poses; it stays as it is.
-    workspace : where everything is kept, ``runs/MAPPING-PRESET`` unless given; what is done and
-        still true is kept, the map is its folder ``map``.
+    mapping : kapture folder with images and poses; it is not changed.
+    workspace : folder of all results, ``runs/MAPPING-PRESET`` by default; up-to-date results are
+        reused, the map is its folder ``map``.
     workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
-    scheduler : address of a dask scheduler, whose workers do the work instead.
+    scheduler : address of a dask scheduler, whose workers are used instead.
 
     Raises
     ------
@@ -328,20 +325,20 @@ def map_photographs(
     Parameters
     ----------
     images : photographs, videos, or folders of them.
-    camera : of all of them, of their pixels as they are stored; else focal lengths are EXIF's or
-        guesses, and estimated with the poses.
-    scale : ``"gps"``, the positions in EXIF; or two photographs, by their names, and the metres
-        between them. Without it the map has no metres: ``map.kapture_map.unit``.
+    camera : shared by all, for the pixels as stored; else focal lengths, from EXIF or guessed, are
+        estimated with the poses.
+    scale : ``"gps"`` for EXIF positions, or the names of two photographs and their distance in
+        metres. Without it the map is not metric: ``map.kapture_map.unit``.
     mapper : COLMAP's, incremental or global.
-    workspace : where everything is kept, ``runs/IMAGES-PRESET`` unless given; what is done and
-        still true is kept, the map is its folder ``map``, ``megloc/unregistered.csv`` names the
-        photographs that are not in it.
+    workspace : folder of all results, ``runs/IMAGES-PRESET`` by default; up-to-date results are
+        reused, the map is its folder ``map``, ``megloc/unregistered.csv`` lists the missing
+        photographs.
     workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
-    scheduler : address of a dask scheduler, whose workers do the work instead.
+    scheduler : address of a dask scheduler, whose workers are used instead.
 
     Raises
     ------
-    DataError : no map can be made of the photographs; says what is wrong with them.
+    DataError : no map can be made of the photographs, with the reason.
     MeglocError : the options cannot be used.
     """
     paths = [Path(one) for one in ([images] if isinstance(images, str | Path) else images)]
@@ -359,12 +356,11 @@ def map_photographs(
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A run of ``megloc eval`` and what it made.
+    """A run of ``megloc eval`` and its results.
 
     Attributes
     ----------
-    workspace : where everything is.
-    pose_file : what is handed in; a folder where it is several files.
+    pose_file : the file to submit; a folder if there are several.
     """
 
     workspace: Path
@@ -388,7 +384,7 @@ class FinishedRun:
 
     @cached_property
     def recall(self) -> pd.DataFrame:
-        """Recall by condition (rows) and threshold (columns); empty where no truth is known."""
+        """Recall by condition (rows) and threshold (columns); empty without ground truth."""
         import pandas as pd
 
         table = {
@@ -408,17 +404,17 @@ def run(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> FinishedRun:
-    """Run a benchmark as ``megloc eval`` does; what is done and still true is kept.
+    """Run a benchmark as ``megloc eval`` does; up-to-date results are reused.
 
     Parameters
     ----------
-    root : the dataset as it is published; looked for below MEGLOC_DATA unless given.
-    preset : that of the dataset's benchmark file unless given.
+    root : the dataset as published; searched in MEGLOC_DATA by default.
+    preset : that of the dataset's benchmark file by default.
     set : options, ``{"localization.rank.name": "perceptual"}``.
-    workspace : ``runs/DATASET-PRESET`` unless given; of kapture folders
+    workspace : ``runs/DATASET-PRESET`` by default; for kapture folders
         ``runs/kapture-ROOT-PRESET``.
     workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
-    scheduler : address of a dask scheduler, whose workers do the work instead.
+    scheduler : address of a dask scheduler, whose workers are used instead.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The errors a user of the package can meet; all share one root."""
+"""Errors of the package, with a common base class."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from pathlib import Path
 
 
 class MeglocError(Exception):
-    """Root of every error the package raises on purpose.
+    """Base of every error raised on purpose.
 
-    The message is one line that says what is wrong, where, and what to do. The command line
-    prints it and exits with 2; anything that is not a ``MeglocError`` is a defect of ours.
+    The message is one line: problem, place, remedy. The command line prints it and exits with 2;
+    any other exception is an internal error.
     """
 
     def lines(self) -> list[str]:
-        """The message as the command line prints it: one line, or one for each of several."""
+        """Return the message lines as the command line prints them."""
         return [" ".join(str(self).split())]
 
 
 class DataError(MeglocError):
-    """Data is missing, broken or inconsistent; names the file and, where it can, the line."""
+    """Data is missing, broken or inconsistent; names the file and, if possible, the line."""
 
     def __init__(
         self, message: str, *, path: Path | str | None = None, line: int | None = None
@@ -32,7 +32,7 @@ class DataError(MeglocError):
         self.line = line
 
     def __reduce__(self) -> tuple[object, ...]:
-        # the keyword-only fields are lost by Exception's own pickling (process pools)
+        # Exception's own pickling (process pools) loses the keyword-only fields
         return (_rebuild_data_error, (type(self), self.message, self.path, self.line))
 
 
@@ -43,11 +43,11 @@ def _rebuild_data_error(
 
 
 class OptionError(MeglocError):
-    """An option or argument has a value that cannot be used; lists what would be valid."""
+    """An invalid option or argument; lists the valid values."""
 
 
 class OutputError(MeglocError):
-    """The output cannot be written: not ours to overwrite, no space, no permission."""
+    """The output cannot be written: existing files, no space, no permission."""
 
 
 class PluginError(MeglocError):
@@ -55,13 +55,13 @@ class PluginError(MeglocError):
 
 
 def suggestion(name: str, known: Iterable[str], *, listed: str = "known: ") -> str:
-    """What an error says behind a name that there is not: a like one that there is, and all."""
+    """Return a message with the most similar known name, and all names."""
     names = list(known)
     near = get_close_matches(name, names, n=1)
     return f"{f'did you mean {near[0]!r}? ' if near else ''}{listed}{', '.join(names) or 'none'}"
 
 
-# packages that an extra brings, and the extra
+# packages of an extra, and the extra
 _EXTRAS = {
     "torch": "torch",
     "kornia": "kornia",
@@ -72,7 +72,7 @@ _EXTRAS = {
 
 
 def missing_extra(error: BaseException) -> str | None:
-    """What to install where an import failed for want of a package that an extra brings."""
+    """Return the installation advice for a failed import of an extra's package."""
     package = (getattr(error, "name", None) or "").partition(".")[0]
     if not isinstance(error, ModuleNotFoundError) or package not in _EXTRAS:
         return None

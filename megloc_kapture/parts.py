@@ -21,16 +21,10 @@ from megloc_kapture.values import Camera, Failure, ImageFeatures, Pose
 
 
 def extract(features: str, image: Path | str | NDArray[np.uint8], **options: Any) -> ImageFeatures:
-    """Local features of an image, by the name of their extractor.
+    """Extract local features of an image by the name of the extractor.
 
-    Parameters
-    ----------
-    image : path of an image file, or uint8 (H, W, 3) RGB.
-    options : the extractor's.
-
-    Raises
-    ------
-    PluginError, MissingWeightsError : there is no such extractor, or it cannot be made.
+    ``image`` is an image file or uint8 (H, W, 3) RGB; ``options`` are the extractor's. PluginError
+    or MissingWeightsError if the extractor cannot be loaded.
     """
     pixels = image if isinstance(image, np.ndarray) else read_image_rgb(Path(image))
     found = extract_bounded(load_plugin(LOCAL_FEATURES, features, options), [(pixels, None)])[0]
@@ -41,11 +35,9 @@ def extract(features: str, image: Path | str | NDArray[np.uint8], **options: Any
 def match(
     matcher: str, first: ImageFeatures, second: ImageFeatures, **options: Any
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Matches of two images by the name of a matcher: int64 (K, 2) rows, and scores (K,).
+    """Match two images by the name of a matcher: int64 (K, 2) rows, and scores (K,).
 
-    Raises
-    ------
-    PluginError, MissingWeightsError : there is no such matcher, or it cannot be made.
+    PluginError or MissingWeightsError if the matcher cannot be loaded.
     """
     found: tuple[NDArray[np.int64], NDArray[np.float32]]
     found = load_plugin(MATCHERS, matcher, options).match(first, second)
@@ -61,17 +53,13 @@ def solve_pose(
     min_inliers: int = 12,
     seed: int = 0,
 ) -> Pose | Failure:
-    """The pose of one image from 2D-3D matches: LO-RANSAC, then refinement with covariance.
+    """Estimate one image's pose from 2D-3D matches: LO-RANSAC, then refinement with covariance.
 
     Parameters
     ----------
     points_px : (N, 2), first pixel's centre at (0.5, 0.5).
     points_world : (N, 3).
-    max_error_px : reprojection error of an inlier.
-
-    Raises
-    ------
-    DataError : the arrays do not have these shapes.
+    max_error_px : inlier threshold of the reprojection error.
     """
     options = AbsolutePoseOptions(max_error_px=max_error_px, min_inliers=min_inliers, seed=seed)
     return absolute_pose(points_px, np.asarray(points_world, np.float64), camera, options)
@@ -89,25 +77,18 @@ def train(
     threads: int = 1,
     force: bool = False,
 ) -> dict[str, float]:
-    """Train SuperGlue or descriptors as ``megloc train`` does; goes on where it was interrupted.
+    """Train SuperGlue or descriptors as ``megloc train`` does; an interrupted run is resumed.
+
+    Returns the last row of the training curves by column.
 
     Parameters
     ----------
     task : "matcher" or "descriptor".
-    output : the file to write, ``X.safetensors``; others beside it, see
-        :func:`megloc_kapture.training.train.train`.
-    kaptures, held_out : kapture folders with poses and depth, to train on and to evaluate on.
-    photographs : folders of images, trained on under random homographies.
-    features : the extractor whose features are matched, or whose detector is frozen.
+    output : ``X.safetensors``; for further files see :func:`megloc_kapture.training.train.train`.
+    kaptures, held_out : kapture folders with poses and depth, for training and for evaluation.
+    photographs : folders of images, for training with random homographies.
+    features : extractor of the matched features, or of the frozen detector.
     set : options, ``{"steps": 20000}``.
-
-    Returns
-    -------
-    The last row of the curves by column.
-
-    Raises
-    ------
-    MeglocError : options, data, weights or the output cannot be used.
     """
     from megloc_kapture.training.train import TASKS, TrainingData
     from megloc_kapture.training.train import train as run_training

@@ -1,4 +1,4 @@
-"""How a plugin is found by its name, made with its options, and what its results depend on."""
+"""Loading of plugins by name, their options, and the fingerprint of their code."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def entry_points(**of: str) -> metadata.EntryPoints:
-    """Those of the packages on the search path; reading them takes 10 ms, and is done once."""
+    """Return the entry points on the search path, cached: reading takes 10 ms."""
     return _selected(tuple(sys.path), *sorted(of.items()))
 
 
@@ -32,20 +32,16 @@ def _selected(search_path: tuple[str, ...], *of: tuple[str, str]) -> Any:
 
 @cache
 def _entry_points_on(_search_path: tuple[str, ...]) -> Any:
-    """All of them; Python 3.11 has another type for that, which selects alike."""
+    """Any: Python 3.11 has another return type with the same selection."""
     return metadata.entry_points()
 
 
 def plugin_names(group: str) -> list[str]:
-    """Names registered under a group, sorted."""
     return sorted({entry.name for entry in entry_points(group=group)})
 
 
 def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) -> Any:
-    """Make the plugin ``name`` of ``group``, with its options.
-
-    Raises PluginError: no such plugin, or it refuses its options.
-    """
+    """Make the plugin ``name`` of ``group``, with its options; PluginError if impossible."""
     kind = plugin_class(group, name)
     model: Any = getattr(kind, "Options", None)
     try:
@@ -59,7 +55,7 @@ def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) ->
     except ValidationError as error:
         fault = option_fault(error, model)
         raise PluginError(f"plugin {name!r} refuses its options: {fault}") from error
-    except Exception as error:  # whatever a foreign constructor raises
+    except Exception as error:  # any error of a foreign constructor
         reason = " ".join(str(error).split())
         raise PluginError(f"plugin {name!r} refuses its options: {reason}") from error
 
@@ -67,9 +63,9 @@ def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) ->
 def checked_array(
     who: str, array: Any, shape: tuple[int | None, ...], *dtypes: str
 ) -> NDArray[Any]:
-    """Return an array of a plugin if it has this shape, one of these types and finite values.
+    """Return a plugin's array if it has the shape, one of the types and finite values.
 
-    ``who`` names the plugin and the image in the error; None in ``shape`` means any length.
+    ``who`` names plugin and image in the error; None in ``shape`` means any length.
     """
     import numpy as np
 
@@ -88,7 +84,7 @@ def checked_array(
 
 
 def option_fault(error: ValidationError, model: type[Options]) -> str:
-    """Say which option cannot be used and why; of one that is unknown, the ones it may mean."""
+    """Describe the invalid option; for an unknown one, suggest similar names."""
     first = error.errors()[0]
     option = ".".join(map(str, first["loc"]))
     if first["type"] == "extra_forbidden":
@@ -98,12 +94,7 @@ def option_fault(error: ValidationError, model: type[Options]) -> str:
 
 
 def plugin_class(group: str, name: str) -> Any:
-    """The class registered as ``name`` in ``group``.
-
-    Raises
-    ------
-    PluginError : none, it cannot be imported, or it does not fulfil the group's protocol.
-    """
+    """Return the class registered as ``name`` in ``group``; PluginError if impossible."""
     found = [entry for entry in entry_points(group=group) if entry.name == name]
     if not found:
         known = suggestion(name, plugin_names(group), listed="registered: ")
@@ -113,7 +104,7 @@ def plugin_class(group: str, name: str) -> Any:
         raise PluginError(f"plugin {name!r} of {group} is registered twice: {sorted(origins)}")
     try:
         kind = found[0].load()
-    except Exception as error:  # whatever a foreign module raises while it is imported
+    except Exception as error:  # any error of a foreign module's import
         reason = missing_extra(error) or error
         raise PluginError(
             f"plugin {name!r} ({found[0].value}) cannot be loaded: {reason}"
@@ -130,7 +121,7 @@ def plugin_class(group: str, name: str) -> Any:
 
 @cache
 def option_models(name: str) -> tuple[type[Options], ...]:
-    """The models of the options of plugins of that name, of any group; raises PluginError."""
+    """Return the option models of the plugins of a name, of any group."""
     named = entry_points(name=name)
     groups = sorted({one.group for one in named} & PROTOCOLS.keys())
     models = [getattr(plugin_class(group, name), "Options", None) for group in groups]
@@ -139,9 +130,9 @@ def option_models(name: str) -> tuple[type[Options], ...]:
 
 @cache
 def code_of(kind: type) -> str:
-    """Version of the package that registers a class, and hash of the code that defines it.
+    """Return package version and code hash of a class.
 
-    Of our own classes that is their module; of others all modules of their package.
+    The hash covers its module, for foreign classes all modules of their package.
     """
     module = sys.modules.get(kind.__module__)
     source = getattr(module, "__file__", None)
@@ -159,12 +150,11 @@ def code_of(kind: type) -> str:
 
 
 def is_ours(kind: type) -> bool:
-    """Whether a class is of this package."""
     return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
 
 
 def weights_of(plugin: object) -> dict[str, str]:
-    """File name to sha256 of the weights a plugin uses; none where it has none."""
+    """Return the sha256 of a plugin's weights by file name."""
     weights = getattr(plugin, "weights", None)
     return dict(weights()) if callable(weights) else {}
 

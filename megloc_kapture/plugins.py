@@ -1,10 +1,9 @@
-"""The protocols of plugins; ``plugin_loading.py`` finds a plugin by its name.
+"""Plugin protocols; ``plugin_loading.py`` loads plugins by name.
 
-A plugin is a class registered under one of the entry-point groups below; our own are registered
-in the same way. A class may carry ``Options``, a frozen pydantic model its constructor takes, and
-``weights() -> dict[str, str]``, the sha256 of each file of weights it uses by name: part of what a
-stage's result depends on, and kept in its manifest. Plugins are sent to worker processes, so they
-must be picklable.
+A plugin is a class registered under one of the entry-point groups below, like those of this
+package. It must be picklable, and may have ``Options``, a frozen pydantic model for its
+constructor, and ``weights() -> dict[str, str]``, the sha256 of each weight file by name, which is
+part of a stage's fingerprint and manifest.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ STAGES = "megloc_kapture.stages"
 
 
 class PluginChoice(Options):
-    """A plugin by its registered name, and its options; a text stands for the name alone."""
+    """A plugin by its registered name, and its options; a string is the name alone."""
 
     name: str
     options: dict[str, Any] = Field(default_factory=dict)
@@ -46,7 +45,7 @@ class PluginChoice(Options):
 
 
 def chosen_by_name(known: Iterable[PluginChoice], names: Iterable[str]) -> list[dict[str, Any]]:
-    """Choices of plugins by their names, each with the settings that it is known with, if any."""
+    """Choose plugins by name, with their known settings."""
     of_name = {one.name: one.model_dump() for one in known}
     return [of_name.get(name, {"name": name}) for name in names]
 
@@ -55,8 +54,8 @@ def chosen_by_name(known: Iterable[PluginChoice], names: Iterable[str]) -> list[
 class LocalFeatureExtractor(Protocol):
     """Group ``megloc_kapture.local_features``: image to local features.
 
-    An extractor that is faster on several images at once may have ``extract_many(images, masks)``,
-    the features of images of one size, as a list in their order.
+    An optional ``extract_many(images, masks)`` extracts from images of one size at once and returns
+    a list in their order.
     """
 
     name: str
@@ -65,43 +64,45 @@ class LocalFeatureExtractor(Protocol):
     def extract(
         self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
     ) -> LocalFeatures:
-        """Features of an RGB image, uint8 (H, W, 3); none on False pixels of the mask (H, W).
+        """Extract from an RGB image, uint8 (H, W, 3), only on True pixels of the mask (H, W).
 
-        Raises DataError where it refuses an image, for example one that is too small: guided
-        pyramid matching then does without that scale.
+        DataError for a rejected image, for example a too small one: guided pyramid matching then
+        skips that scale.
         """
         ...
 
 
 @runtime_checkable
 class GlobalFeatureExtractor(Protocol):
-    """Group ``megloc_kapture.global_features``: image to one vector that is compared by cosine.
+    """Group ``megloc_kapture.global_features``: image to one vector, compared by cosine.
 
-    An extractor that is faster on several images at once may have ``describe_many(images)``, the
-    vectors float32 (B, D) of B images of one size, in their order.
+    An optional ``describe_many(images)`` returns the vectors, float32 (B, D), of B images of one
+    size.
     """
 
     name: str
     """The kapture type name its vectors are stored under; it tells the model as well."""
 
     def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The vector of an RGB image, uint8 (H, W, 3): float32 (D,), unit length."""
+        """Describe an RGB image, uint8 (H, W, 3): float32 (D,), unit length."""
         ...
 
 
 @runtime_checkable
 class Matcher(Protocol):
-    """Group ``megloc_kapture.matchers``: the features of two images to matches.
+    """Group ``megloc_kapture.matchers``: features of two images to matches.
 
-    A matcher that is faster on several pairs at once may have ``match_many(a, others)``, the
-    matches of one image with each of several, as a list in their order.
+    An optional ``match_many(a, others)`` returns the matches of one image with each of several, in
+    order.
     """
 
     def match(
         self, a: ImageFeatures, b: ImageFeatures
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Matches int64 (K, 2), rows of a and b, each row at most once, and scores (K,): the surest
-        matches have the greatest, with which verification begins."""
+        """Return matches int64 (K, 2), rows of a and b, each at most once, and scores (K,).
+
+        Verification begins with the highest scores.
+        """
         ...
 
 
@@ -117,13 +118,13 @@ class Segmenter(Protocol):
     """Classes whose pixels are masked unless the options say otherwise."""
 
     def segment(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Labels uint8 (H, W) of an RGB image, uint8 (H, W, 3)."""
+        """Return labels uint8 (H, W) of an RGB image, uint8 (H, W, 3)."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class HypothesisView:
-    """One camera of a query under a pose that might be right.
+    """One camera of a query under a pose hypothesis.
 
     Attributes
     ----------
@@ -149,8 +150,8 @@ class PoseHypothesis:
     Attributes
     ----------
     images : the cluster's map images that match the query, best first.
-    views : the cameras of the query: one, or those of a rig.
-    max_error_px : reprojection error of an inlier.
+    views : the query's cameras: one, or those of a rig.
+    max_error_px : inlier threshold of the reprojection error.
     """
 
     images: tuple[str, ...]
@@ -160,12 +161,12 @@ class PoseHypothesis:
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """A depth map that was taken with an image.
+    """A depth map of an image.
 
     Attributes
     ----------
     camera : of the depth sensor.
-    depth_m : float32 (H, W), along the optical axis; 0, less or NaN where nothing is known.
+    depth_m : float32 (H, W), along the optical axis; 0, less or NaN where unknown.
     image_from_depth : from the depth camera's frame to that of the image.
     """
 
@@ -176,13 +177,13 @@ class DepthView:
 
 @dataclass(frozen=True, eq=False)
 class StereoView:
-    """An image without distortion, for stereo.
+    """An undistorted image for stereo.
 
     Attributes
     ----------
     image : uint8 (H, W, 3), RGB.
     camera : PINHOLE, of that size.
-    mask : bool (H, W), True = use; None: all of it.
+    mask : bool (H, W), True = use; None means no mask.
     """
 
     image: NDArray[np.uint8]
@@ -193,7 +194,7 @@ class StereoView:
 
 @dataclass(frozen=True, eq=False)
 class DepthEstimate:
-    """Depth of an image by stereo; 0 in all three where nothing is known.
+    """Depth of an image by stereo; 0 in all three where unknown.
 
     Attributes
     ----------
@@ -209,7 +210,7 @@ class DepthEstimate:
 
 @runtime_checkable
 class DepthEstimator(Protocol):
-    """Group ``megloc_kapture.depth_estimators``: an image and its neighbours to its depth."""
+    """Group ``megloc_kapture.depth_estimators``: an image and its neighbours to depth."""
 
     def estimate(
         self,
@@ -217,74 +218,72 @@ class DepthEstimator(Protocol):
         sources: Sequence[StereoView],
         depth_range_m: tuple[float, float],
     ) -> DepthEstimate:
-        """Depth of the reference's pixels.
+        """Estimate the depth of the reference's pixels.
+
+        MeglocError for unusable views; the image then stays without depth, with the reason.
 
         Parameters
         ----------
         sources : at least one, best first.
-        depth_range_m : nearest and farthest depth there may be.
-
-        Raises
-        ------
-        MeglocError : the views cannot be used; the image stays without depth, with the reason.
+        depth_range_m : nearest and farthest possible depth.
         """
         ...
 
 
 class RankingScene(Protocol):
-    """What rankers and refiners may look at beside the matches; read only when asked for."""
+    """Data for rankers and refiners, read on demand."""
 
     def query_image(self, name: str) -> NDArray[np.uint8]:
-        """RGB pixels (H, W, 3) of a query image; raises DataError where there are none."""
+        """Return RGB pixels (H, W, 3) of a query image; DataError without any."""
         ...
 
     def query_mask(self, name: str) -> NDArray[np.bool_] | None:
-        """Mask (H, W) of a query image, True = use; None without one."""
+        """Return the mask (H, W) of a query image, True = use, or None."""
         ...
 
     def query_depth(self, name: str) -> DepthView | None:
-        """Depth that was taken with a query image; None without."""
+        """Return the depth map of a query image, or None."""
         ...
 
     def map_image(self, name: str) -> NDArray[np.uint8]:
-        """RGB pixels (H, W, 3) of a map image; raises DataError where there are none."""
+        """Return RGB pixels (H, W, 3) of a map image; DataError without any."""
         ...
 
     def map_mask(self, name: str) -> NDArray[np.bool_] | None:
-        """Mask (H, W) of a map image, True = use; None without one."""
+        """Return the mask (H, W) of a map image, True = use, or None."""
         ...
 
     def map_depth(self, name: str) -> DepthView | None:
-        """Depth that was taken with a map image; None without."""
+        """Return the depth map of a map image, or None."""
         ...
 
     def map_points(self, name: str) -> NDArray[np.float64]:
-        """Points of the map that an image observes, in the world, (N, 3)."""
+        """Return the map points observed by an image, in the world, (N, 3)."""
         ...
 
     def map_camera(self, name: str) -> Camera:
-        """Camera of a map image."""
+        """Return the camera of a map image."""
         ...
 
     def map_pose(self, name: str) -> RigidTransform:
-        """``cam_from_world`` of a map image."""
+        """Return ``cam_from_world`` of a map image."""
         ...
 
 
 @runtime_checkable
 class PoseRanker(Protocol):
-    """Group ``megloc_kapture.pose_rankers``: which of several poses of one query is right."""
+    """Group ``megloc_kapture.pose_rankers``: pose hypotheses of one query to scores."""
 
     def score(
         self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene
     ) -> NDArray[np.float64]:
-        """One score (H,) per hypothesis, higher is better; of equals the first wins."""
+        """Return one score (H,) per hypothesis, higher is better; the first wins a tie."""
         ...
 
 
 @runtime_checkable
 class ImageDistance(Protocol):
-    """Group ``megloc_kapture.image_distances``: how different two aligned images look."""
+    """Group ``megloc_kapture.image_distances``: two aligned images to a distance."""
 
     name: str
     """The measure, for reports."""
@@ -292,23 +291,23 @@ class ImageDistance(Protocol):
     def distance(
         self, a: NDArray[np.uint8], b: NDArray[np.uint8], valid: NDArray[np.bool_]
     ) -> float:
-        """Distance of two RGB images of one size, uint8 (H, W, 3), over valid pixels (H, W).
+        """Return the distance of two RGB images, uint8 (H, W, 3), over valid pixels (H, W).
 
-        Lower is more alike; infinite where too little is valid to tell.
+        Lower is more similar; infinite for too few valid pixels.
         """
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class PoseRefinement:
-    """What refining a pose came to.
+    """Result of a pose refinement.
 
     Attributes
     ----------
-    cam_from_world : the better pose, or the old one where ``reason`` says why it stays.
-    reason : empty where the new pose is accepted.
-    measures : numbers by name, e.g. residuals and overlap before and after; for tables.
-    covariance : as of :class:`~megloc_kapture.values.Pose`, or None.
+    cam_from_world : the refined pose, or the old one if rejected.
+    reason : of a rejection; empty if accepted.
+    measures : numbers by name for tables, such as residuals before and after.
+    covariance : as in :class:`~megloc_kapture.values.Pose`, or None.
     """
 
     cam_from_world: RigidTransform
@@ -318,7 +317,6 @@ class PoseRefinement:
 
     @property
     def accepted(self) -> bool:
-        """Whether the pose is a new one."""
         return not self.reason
 
 
@@ -339,9 +337,7 @@ class PoseRefiner(Protocol):
     ) -> PoseRefinement:
         """Refine the pose of one query image.
 
-        Parameters
-        ----------
-        references : map images that may show the same, best first.
+        ``references`` are map images that may overlap with it, best first.
         """
         ...
 
@@ -351,7 +347,7 @@ class DatasetAdapter(Protocol):
     """Group ``megloc_kapture.datasets``: a dataset's official layout to kapture folders.
 
     ``card`` is a ``megloc_kapture.datasets.official.DatasetCard``, ``read`` returns an
-    ``OfficialDataset`` of the same module. Nothing is ever written below ``root``.
+    ``OfficialDataset`` of the same module. ``root`` is read-only.
     """
 
     name: str
@@ -360,24 +356,24 @@ class DatasetAdapter(Protocol):
     """Where it is published and how it lies on disk."""
 
     def check(self, root: Path) -> None:
-        """Raise DataError, quickly, when ``root`` cannot be this dataset."""
+        """Check quickly whether ``root`` can be this dataset; DataError if not."""
         ...
 
     def input_files(self, root: Path) -> Iterator[Path]:
-        """Every file an import of ``root`` may depend on, images included; cheap to list."""
+        """Yield every file that an import of ``root`` may depend on, including images; cheap."""
         ...
 
     def read(self, root: Path, *, allow_missing: bool = False) -> Any:
-        """Read the dataset; raises DataError that names file and line."""
+        """Read the dataset; DataError names file and line."""
         ...
 
 
 @runtime_checkable
 class RenderedDataset(Protocol):
-    """Group ``megloc_kapture.rendered_datasets``: a dataset that is drawn, its true poses with it.
+    """Group ``megloc_kapture.rendered_datasets``: a synthetic dataset with its true poses.
 
-    Registered under the name of the dataset in whose official layout it is written, or
-    ``synthetic`` for kapture folders.
+    The name is that of the dataset with the same official layout, or ``synthetic`` for kapture
+    folders.
     """
 
     version: int
@@ -385,13 +381,13 @@ class RenderedDataset(Protocol):
 
     @property
     def options(self) -> Options:
-        """Everything that determines its files."""
+        """Return all parameters of its files."""
         ...
 
     def write(self, root: Path, work: Any) -> Mapping[str, float]:
-        """Render it below ``root``, with a ``megloc_kapture.stages.work.Work``; returns counts.
+        """Render it below ``root``, with a ``megloc_kapture.stages.work.Work``; return counts.
 
-        The bytes depend on the options alone. Raises OutputError where nothing can be written.
+        The bytes depend on the options alone. OutputError if the files cannot be written.
         """
         ...
 
@@ -400,8 +396,7 @@ class RenderedDataset(Protocol):
 class StageOfAPlan(Protocol):
     """Group ``megloc_kapture.stages``: a step of a run, see ``megloc_kapture.stages.stage.Stage``.
 
-    Deriving from that class leaves four things to say: what the stage is called, what it reads and
-    writes in a workspace, and what it does.
+    A subclass of that class defines name, inputs, outputs and work of the stage.
     """
 
     name: str
@@ -412,7 +407,7 @@ class StageOfAPlan(Protocol):
     """Paths in the workspace."""
 
     def run(self, work: Any) -> Mapping[str, float]:
-        """Do it, with a ``megloc_kapture.stages.stage.StageWork``; returns counts for the log."""
+        """Run it with a ``megloc_kapture.stages.stage.StageWork``; return counts for the log."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""Plain value types that every storey shares: cameras, rigid transforms, features."""
+"""Plain value types of all layers: cameras, rigid transforms, features."""
 
 from __future__ import annotations
 
@@ -43,33 +43,33 @@ Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 
 
 def _is_list(annotation: Any) -> bool:
-    """True for ``tuple[X, ...]``, also where it may be None."""
+    """True for ``tuple[X, ...]``, also if it may be None."""
     kinds = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
     return any(get_origin(one) is tuple and get_args(one)[-1] is Ellipsis for one in kinds)
 
 
 def _may_be_none(annotation: Any) -> bool:
-    """True where None is a value of the type, and no choice of it is called ``none``."""
+    """True if None is a value of the type, and no choice is named ``none``."""
     kinds = get_args(annotation)
     return type(None) in kinds and not any("none" in get_args(kind) for kind in kinds)
 
 
 def listed(value: Any) -> Any:
-    """A list that is given as one name, as names between commas, or as one table."""
+    """Convert a name, comma-separated names or a table to a list."""
     if isinstance(value, str):
         return tuple(name.strip() for name in value.split(","))
     return (value,) if isinstance(value, dict) else value
 
 
 class Options(BaseModel):
-    """Base of all option models: frozen, validated, unknown keys refused."""
+    """Base of all option models: frozen, validated, without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
     @model_validator(mode="before")
     @classmethod
     def _as_typed(cls, values: Any) -> Any:
-        """Read ``none`` as None where an option may be None, and one name as a list of one."""
+        """Read ``none`` as None where allowed, and one name as a list."""
         if not isinstance(values, dict):
             return values
         read: dict[str, Any] = {}
@@ -91,15 +91,14 @@ class Camera:
     ----------
     model : name of a COLMAP camera model, e.g. ``"PINHOLE"``.
     width, height : image size in pixels.
-    params : the model's parameters in COLMAP's order; pixels for focal lengths and principal
-        point. The centre of the first pixel is (0.5, 0.5).
-    focal_deviation : standard deviation of the focal length, as a share of it. 0: it is known, and
-        stays as it is; else it is estimated with the pose.
+    params : the model's parameters in COLMAP's order; pixels for focal lengths and principal point.
+        The centre of the first pixel is (0.5, 0.5).
+    focal_deviation : relative standard deviation of the focal length. 0: known and fixed; else it
+        is estimated with the pose.
 
     Raises
     ------
-    DataError : unknown model, wrong number of parameters, or a size or parameter that is not
-        finite and positive where it must be.
+    DataError : unknown model, wrong number of parameters, or an invalid size or parameter.
     """
 
     model: str
@@ -130,23 +129,20 @@ class Camera:
 
     @classmethod
     def pinhole(cls, width: int, height: int, focal: float) -> Camera:
-        """A camera without distortion, its principal point in the middle; focal length in px."""
+        """Create a camera without distortion and with a centred principal point; focal in px."""
         return cls("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
 
     @classmethod
     def from_colmap(cls, camera: Any) -> Camera:
-        """A ``pycolmap.Camera``; raises DataError for a model that is not supported."""
+        """Convert a ``pycolmap.Camera``; DataError for an unsupported model."""
         return cls(camera.model.name, camera.width, camera.height, tuple(camera.params))
 
     @classmethod
     def from_exif(cls, path: Path | str) -> Camera:
-        """The camera of a photograph's pixels as they are stored, by COLMAP's reading of its EXIF.
+        """Create the camera of a photograph's pixels as stored, from EXIF read by COLMAP.
 
-        Its focal length is not certain (``focal_deviation``), and a guess where EXIF has none.
-
-        Raises
-        ------
-        DataError : missing, or not an image.
+        The focal length is uncertain (``focal_deviation``), and a guess without EXIF. DataError for
+        a missing file or no image.
         """
         from megloc_kapture.io.images import read_photo
 
@@ -174,9 +170,9 @@ class RigidTransform:
     def from_matrix(
         cls, rotation: NDArray[np.float64], translation: NDArray[np.float64]
     ) -> RigidTransform:
-        """From a rotation matrix (3, 3) and a translation (3,)."""
+        """Create a transform from a rotation matrix (3, 3) and a translation (3,)."""
         (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, dtype=np.float64)
-        # the symmetric 4x4 matrix whose largest eigenvector is the quaternion: stable everywhere
+        # the quaternion is the largest eigenvector of a symmetric 4x4 matrix: stable everywhere
         k = np.array(
             [
                 [a + e + i, 0.0, 0.0, 0.0],
@@ -193,7 +189,7 @@ class RigidTransform:
         return cls((qw, qx, qy, qz), (tx, ty, tz))
 
     def rotation_matrix(self) -> NDArray[np.float64]:
-        """Rotation as (3, 3) float64."""
+        """Return the rotation as float64 (3, 3)."""
         w, x, y, z = self.quat_wxyz
         return np.array(
             [
@@ -204,20 +200,20 @@ class RigidTransform:
         )
 
     def matrix(self) -> NDArray[np.float64]:
-        """As a matrix (4, 4) float64."""
+        """Return the transform as float64 (4, 4)."""
         found = np.eye(4)
         found[:3, :3], found[:3, 3] = self.rotation_matrix(), self.translation
         return found
 
     def inverse(self) -> RigidTransform:
-        """``b_from_a`` of an ``a_from_b``."""
+        """Return ``b_from_a`` of an ``a_from_b``."""
         w, x, y, z = self.quat_wxyz
         turned = RigidTransform((w, -x, -y, -z), (0.0, 0.0, 0.0))
         tx, ty, tz = turned._applied(self.translation)
         return RigidTransform(turned.quat_wxyz, (-tx, -ty, -tz))
 
     def __matmul__(self, other: RigidTransform) -> RigidTransform:
-        """``a_from_b @ b_from_c`` is ``a_from_c``."""
+        """Compose: ``a_from_b @ b_from_c`` is ``a_from_c``."""
         w1, x1, y1, z1 = self.quat_wxyz
         w2, x2, y2, z2 = other.quat_wxyz
         w = w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2
@@ -229,7 +225,7 @@ class RigidTransform:
         return RigidTransform((w / norm, x / norm, y / norm, z / norm), translation)
 
     def _applied(self, point: tuple[float, float, float]) -> tuple[float, float, float]:
-        """Transform one point, with the same bits on every processor (BLAS's differ)."""
+        """Transform one point, bit-identical on every processor (unlike BLAS)."""
         px, py, pz = point
         (tx, ty, tz), rotation = self.translation, self.rotation_matrix().tolist()
         x, y, z = (row[0] * px + row[1] * py + row[2] * pz for row in rotation)
@@ -242,7 +238,7 @@ class RigidTransform:
         return turned + np.array(self.translation)
 
     def center(self) -> NDArray[np.float64]:
-        """For a ``cam_from_world``: the camera centre in the world, (3,) float64."""
+        """Return the camera centre in the world, (3,) float64, of a ``cam_from_world``."""
         return np.array(self.inverse().translation)
 
 
@@ -255,7 +251,7 @@ class LocalFeatures:
     keypoints_px : float32 (N, 2 or more); x, y first. The first pixel's centre is (0.5, 0.5).
     scores : float32 (N,), higher is better; keypoints are sorted by it, best first.
     descriptors : (N, D), float32 or uint8.
-    num_masked : keypoints that the mask removed before the best were selected.
+    num_masked : keypoints removed by the mask before the selection.
     """
 
     keypoints_px: NDArray[np.float32]
@@ -266,14 +262,14 @@ class LocalFeatures:
 
 @dataclass(frozen=True, eq=False)
 class ImageFeatures:
-    """What a matcher gets of one image.
+    """Features of one image as a matcher's input.
 
     Parameters
     ----------
-    keypoints_px : float32 (N, 2 or more); x, y first, then what the type stores beside (SuperPoint
-        and its like: the score). The first pixel's centre is (0.5, 0.5).
+    keypoints_px : float32 (N, 2 or more); x, y first, then further stored columns (SuperPoint and
+        similar: the score). The first pixel's centre is (0.5, 0.5).
     descriptors : (N, D).
-    width, height : of the image that the keypoints stand in, pixels.
+    width, height : size of the keypoints' image in pixels.
     """
 
     keypoints_px: NDArray[np.float32]
@@ -284,14 +280,14 @@ class ImageFeatures:
 
 @dataclass(frozen=True)
 class ClusterPose:
-    """What one cluster of a query's candidates came to.
+    """Result of one cluster of a query's candidates.
 
     Attributes
     ----------
     images : map images of the cluster that match the query, best first.
     num_matches, num_inliers : of its 2D-3D matches.
-    cam_from_world : its pose before the final refinement, of a rig ``rig_from_world``; None where
-        it has none, ``reason`` then says why.
+    cam_from_world : its pose before the final refinement, of a rig ``rig_from_world``; None without
+        a pose, with the ``reason``.
     score : of the ranking, higher is better; None without a pose.
     """
 
@@ -305,16 +301,16 @@ class ClusterPose:
 
 @dataclass(frozen=True)
 class RefinementRow:
-    """One refiner's work on one query.
+    """Result of one refiner for one query.
 
     Attributes
     ----------
     image : name of the query.
     method : name of the refiner.
-    reason : why the old pose stays; empty where the new one is accepted.
-    moved_m, turned_deg : of the new pose against the old, unit of the map; 0 where it stays.
+    reason : of a rejection; empty if the new pose is accepted.
+    moved_m, turned_deg : displacement by the refinement, unit of the map; 0 if rejected.
     measures : ``name=value`` texts, e.g. of residuals before and after.
-    before : ``cam_from_world`` that the refiner was given.
+    before : initial ``cam_from_world``.
     """
 
     image: str
@@ -327,13 +323,12 @@ class RefinementRow:
 
     @property
     def accepted(self) -> bool:
-        """Whether the pose is a new one."""
         return not self.reason
 
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A query that was localized; truthy.
+    """A localized query; truthy.
 
     Attributes
     ----------
@@ -341,22 +336,20 @@ class Pose:
     num_matches, num_inliers : of the 2D-3D matches.
     inliers : bool (num_matches,) or None.
     inlier_points_px, inlier_points_world : float64 (num_inliers, 2) and (num_inliers, 3), in the
-        query's own pixels and in the map; None where they were not kept.
-    covariance : float64 (6, 6) or None: rotation in radians, then translation in the map's unit,
-        of a left perturbation of ``cam_from_world``.
-    camera : with the focal length that was estimated with the pose, and its deviation; None where
-        it was known.
-    candidates : map images that took part, best first.
-    clusters : all clusters of candidates that were tried, that of the best candidate first.
-    cluster : the one this pose comes from, an index into ``clusters``.
-    refinements : what each pose refiner made of it, in their order.
-    remarks : steps that were left out because the query, or the map, lacks what they need; or that
-        the camera's focal length does not fit.
-    confidence : the probability that the pose is right, None where it was not asked for; of the
-        pose before refinement by other means.
-    evidence : the terms behind it, see :mod:`megloc_kapture.localization.confidence`.
+        query's pixels and in the map; None if not kept.
+    covariance : float64 (6, 6) or None: rotation in radians, then translation in the map's unit, of
+        a left perturbation of ``cam_from_world``.
+    camera : with the focal length estimated with the pose, and its deviation; None if known.
+    candidates : matched map images, best first.
+    clusters : all tried clusters of candidates, that of the best candidate first.
+    cluster : index of the pose's cluster in ``clusters``.
+    refinements : results of the pose refiners, in their order.
+    remarks : skipped steps, with the missing data of query or map, and doubts about the focal
+        length.
+    confidence : probability that the pose before refinement is right; None if not requested.
+    evidence : its terms, see :mod:`megloc_kapture.localization.confidence`.
     name : of the query.
-    seconds : by step, from the extraction of features on.
+    seconds : by step, from feature extraction on.
     """
 
     cam_from_world: RigidTransform
@@ -382,19 +375,19 @@ class Pose:
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """``cam_from_world`` as a matrix (4, 4)."""
+        """Return ``cam_from_world`` as a matrix (4, 4)."""
         return self.cam_from_world.matrix()
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A query that was not localized; falsy, and says why.
+    """A query without a trusted pose; falsy, with a reason.
 
     Attributes
     ----------
-    num_matches, num_inliers, candidates : of the cluster that came nearest to a pose.
-    confidence : of the pose that was found and not trusted; None where there was none.
-    clusters, remarks, seconds, name : as of :class:`Pose`.
+    num_matches, num_inliers, candidates : of the cluster closest to a pose.
+    confidence : of a rejected pose; None without one.
+    clusters, remarks, seconds, name : as in :class:`Pose`.
     """
 
     reason: str

@@ -1,4 +1,4 @@
-"""Flags that commands share, named as kapture's tools name theirs; and what a person sees."""
+"""Flags shared by commands, named after kapture's tools, and console output."""
 
 from __future__ import annotations
 
@@ -59,21 +59,19 @@ class Console:
         self.terminal = sys.stderr.isatty()
 
     def say(self, text: str) -> None:
-        """A line about what goes on; to standard error, so that results can be piped."""
+        """Print a progress message to standard error."""
         if not self.quiet:
             print(text, file=sys.stderr, flush=True)
 
     def result(self, text: str) -> None:
-        """A line of the result."""
         print(text, flush=True)
 
     def counts(self, counts: Mapping[str, float]) -> None:
-        """A line of the result for each count."""
         for words, figure in starmap(count_label, counts.items()):
             self.result(f"{words:44s}{figure:>8}")
 
     def track(self, items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
-        """Yield the items and show how far it is."""
+        """Yield the items with a progress bar."""
         if self.quiet:
             yield from items
         elif self.terminal:
@@ -101,7 +99,6 @@ class Console:
 
 
 def existing(folders: Sequence[Path]) -> tuple[Path, ...]:
-    """The folders; raises DataError when one is not there, which would be as if not given."""
     for folder in folders:
         if not folder.is_dir():
             raise DataError("no such folder", path=folder)
@@ -109,7 +106,7 @@ def existing(folders: Sequence[Path]) -> tuple[Path, ...]:
 
 
 def assigned_pairs(flag: str, texts: Sequence[str], takes: str) -> Iterator[tuple[str, str]]:
-    """Both sides of each ``A=B``, by the last sign; raises OptionError where one is empty."""
+    """Yield both sides of each ``A=B``, split at the last sign."""
     for text in texts:
         name, _, value = text.rpartition("=")
         if not (name and value):
@@ -118,16 +115,15 @@ def assigned_pairs(flag: str, texts: Sequence[str], takes: str) -> Iterator[tupl
 
 
 def refuse_given(of: str, **flags: object) -> None:
-    """Raise OptionError where one of these flags, which are of others, is given."""
+    """Raise OptionError if a flag of another mode is given."""
     for name, value in flags.items():
         if value is not None:
             raise OptionError(f"--{name.replace('_', '-')} changes nothing: it is of {of}")
 
 
 def opened_map(path: Path, console: Console, *, force: bool = False) -> Path:
-    """The kapture folder of a map, or of a workspace; a COLMAP model's is made in the user's cache,
-    and said."""
-    # commands that open no map do not wait for all stages
+    """Return a map's kapture folder; a COLMAP model is imported into the user's cache."""
+    # the stages take long to import
     from megloc_kapture.datasets.colmap_map import is_colmap
     from megloc_kapture.pipeline.map_making import kapture_of
 
@@ -140,7 +136,7 @@ def opened_map(path: Path, console: Console, *, force: bool = False) -> Path:
 
 
 def camera_of_text(text: str) -> Camera:
-    """The camera of ``MODEL,WIDTH,HEIGHT,PARAMETERS``; raises OptionError."""
+    """Parse ``MODEL,WIDTH,HEIGHT,PARAMETERS``."""
     try:
         model, width, height, *params = text.split(",")
         return Camera(model.strip(), int(width), int(height), tuple(map(float, params)))
@@ -153,14 +149,14 @@ def camera_of_text(text: str) -> Camera:
 
 
 def cameras_of_text(text: str | None) -> Camera | CameraList | None:
-    """As :func:`camera_of_text`, or of a file with a list of cameras; raises DataError too."""
+    """Parse a camera as :func:`camera_of_text` does, or read a camera list file."""
     if text is None:
         return None
     return read_cameras(Path(text)) if Path(text).is_file() else camera_of_text(text)
 
 
 def side_tables_beside(result: Path) -> Path | None:
-    """The workspace's side tables, where a result lies in a workspace."""
+    """Return the side tables of the workspace that contains a result, if any."""
     folder = result.resolve().parent / SIDE_TABLES
     return folder if (folder / PROTOCOL_FILE).is_file() else None
 
@@ -179,9 +175,7 @@ class Common:
     """Show the traceback of an error."""
 
     def console(self) -> Console:
-        """The console these flags ask for."""
         level = "debug" if self.debug else self.verbose
-        # to standard error
         logging.basicConfig(
             level=getattr(logging, level.upper()), format="%(levelname)s %(name)s: %(message)s"
         )
@@ -200,12 +194,10 @@ class Working(Common):
     """Address of a running dask scheduler (tcp://HOST:8786); a local cluster unless given."""
 
     def open_executor(self, output: Path) -> AbstractContextManager[Executor | None]:
-        """The executor that these flags ask for; a cluster must see the output's folder."""
         return open_executor(self.executor, self.workers, self.scheduler, output)
 
     @contextmanager
     def working(self, output: Path) -> Iterator[Work]:
-        """Open the executor; all workers must see the folder of the output."""
         folder = output if output.is_dir() else output.absolute().parent
         with single_threaded(), self.open_executor(folder) as executor:
             yield Work(executor, self.console().track, self.workers or available_cores())
@@ -214,7 +206,7 @@ class Working(Common):
     def staged(
         self, output: Path, kind: str, *, force: bool, adds: bool = False
     ) -> Iterator[tuple[Path, Work]]:
-        """A folder to write into, which ends as the output, and what to work with."""
+        """Yield a staging folder, published as ``output``, and the executor."""
         with (
             staged_output(output, kind=kind, force=force, adds=adds) as out,
             self.working(out) as work,
@@ -223,7 +215,7 @@ class Working(Common):
 
     @contextmanager
     def working_in(self, workspace: Workspace) -> Iterator[Work]:
-        """Open the executor for a workspace, and lock it."""
+        """Open the executor for a locked workspace."""
         with workspace.lock(), self.working(workspace.root) as work:
             yield work
 
@@ -237,12 +229,11 @@ class Linked:
     proxy folders do; may be repeated."""
 
     def kapture(self, root: Path) -> KaptureFolder:
-        """A kapture folder; raises DataError where a folder that links may lead to is not there."""
         return KaptureFolder(root, allow_links_below=existing(self.allow_links_below))
 
     def kapture_map(self, root: Path) -> KaptureFolder:
-        """The kapture folder of a map, which a workspace may stand for; raises as the other."""
-        # commands that open no workspace do not wait for its imports
+        """Open the kapture folder of a map or workspace."""
+        # the workspace takes long to import
         from megloc_kapture.pipeline.workspace import map_of_workspace
 
         return self.kapture(map_of_workspace(root))
@@ -256,7 +247,6 @@ class Reading(Linked):
     """Features folder beside the kapture folders; may be repeated."""
 
     def kapture(self, root: Path) -> KaptureFolder:
-        """A kapture folder with the given features folders."""
         return KaptureFolder(
             root,
             features_dirs=existing(self.features_dir),
@@ -266,7 +256,6 @@ class Reading(Linked):
     def open_map(
         self, path: Path, keypoints_types: tuple[str, ...], pixel_origin: PixelOriginChoice
     ) -> KaptureMap:
-        """Open a map with the given features folders."""
         from megloc_kapture.pipeline.kapture_map import KaptureMap
 
         return KaptureMap.open(
@@ -288,7 +277,7 @@ class Computing:
     """Of networks; half: float16 on a GPU, bfloat16 on a processor. Full unless given."""
 
     def placement(self) -> list[str]:
-        """As ``--set`` takes them."""
+        """Return device and precision in ``--set`` syntax."""
         given = {"device": self.device, "precision": self.precision}
         return [f"{name}={value}" for name, value in given.items() if value is not None]
 
@@ -303,7 +292,6 @@ class Choosing(Computing):
     """Change an option: key.key=value; may be repeated."""
 
     def assignments(self) -> tuple[str, ...]:
-        """Assignments by --set and by flags."""
         return (*self.set, *self.placement())
 
 
@@ -316,7 +304,6 @@ class Deciding(Choosing):
     challenges, where a wrong answer costs nothing. 0.6 unless given."""
 
     def assignments(self) -> tuple[str, ...]:
-        """Assignments by --set and by flags."""
         if self.min_confidence is None:
             return super().assignments()
         return (*super().assignments(), f"localization.min_confidence={self.min_confidence:g}")

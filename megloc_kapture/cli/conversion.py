@@ -1,4 +1,4 @@
-"""Commands that bring data in and out: datasets as kapture, rendered ones, exports and views."""
+"""Commands to import, render, export and view data."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ class View(Linked, Common):
     """Overwrite a file that is no view."""
 
     def run(self, console: Console) -> None:
-        # only this command waits for it
+        # slow import
         from megloc_kapture.evaluation.view import write_view
 
         for path in (self.result, self.gt):

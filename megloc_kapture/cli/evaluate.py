@@ -1,4 +1,4 @@
-"""Commands of results: recall and reports, what is handed in, and whether that is right."""
+"""Commands to evaluate, report, submit and check results."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Evaluate(Common):
     force: Force = False
 
     def run(self, console: Console) -> None:
-        # only this command waits for them
+        # slow import
         from megloc_kapture.evaluation.evaluate import (
             benchmark_beside,
             evaluate_results,
@@ -157,7 +157,6 @@ class Submit(Common):
 
 
 def summary(counts: Mapping[str, int]) -> str:
-    """What has been written, in one line."""
     text = f"{counts['poses']} poses of {counts['scored']} queries"
     if counts["scored"] != counts["queries"] and not counts["dummies"]:
         text += f" that are scored ({counts['queries']} in all)"
@@ -170,7 +169,7 @@ def summary(counts: Mapping[str, int]) -> str:
     return ", ".join([text, *filter(None, parts)])
 
 
-# a wrong file is the user's to mend, as wrong data are
+# user errors, as wrong data are
 PROBLEMS_FOUND = 2
 _RUNS = Path("runs")
 
@@ -189,7 +188,7 @@ class Check(Common):
     """Print everything that was found as JSON."""
 
     def run(self, console: Console) -> int:
-        """Run it; returns 2 where there are problems."""
+        """Return 2 if there are problems."""
         from megloc_kapture.evaluation.check import check_submission, read_reference
         from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
         from megloc_kapture.pipeline.datasets import TWIN_PREFIX, check_known
@@ -217,7 +216,7 @@ class Check(Common):
     def _workspace(self, console: Console) -> Path | None:
         from megloc_kapture.pipeline.datasets import dataset_names
 
-        # runs/synthetic-aachen-classic is no run of dataset synthetic
+        # e.g. runs/synthetic-aachen-classic is not of dataset synthetic
         longer = tuple(f"{n}-" for n in dataset_names() if n.startswith(f"{self.dataset}-"))
         found = [
             path

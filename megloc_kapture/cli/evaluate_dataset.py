@@ -1,4 +1,4 @@
-"""``megloc eval``: everything, from a dataset to a pose file and a recall table; resumable."""
+"""``megloc eval``: resumable run from a dataset to a pose file and a recall table."""
 
 from __future__ import annotations
 
@@ -73,7 +73,6 @@ class Eval(Deciding, Working):
     poses that contradict the matches of their images."""
 
     def run(self, console: Console) -> int:
-        """Run it; returns the exit status."""
         run = choose_run(
             self.dataset,
             self.root,
@@ -119,7 +118,7 @@ class Eval(Deciding, Working):
             pose_file = run.submission_below(workspace.root, workspace.path(SIDE_TABLES))
             self._hand_in(console, pose_file, submissions)
             doubtful = done["submission"].counts.get("doubtful", 0)
-            if doubtful and run.source.adapter is not None:  # a challenge, which has a server
+            if doubtful and run.source.adapter is not None:  # only challenges have a server
                 console.say(
                     f"{doubtful:,} queries that the pose file lacks had a pose of too little "
                     "confidence; a server counts a missing pose as a wrong one: --set "
@@ -131,7 +130,6 @@ class Eval(Deciding, Working):
         return status
 
     def _check_truth(self, choice: DatasetChoice) -> None:
-        """Raise OptionError for what needs true poses, where they are not measured against."""
         if self.fail_below is not None and not 0.0 <= self.fail_below <= 1.0:
             raise OptionError(f"--fail-below is a share between 0 and 1, got {self.fail_below:g}")
         if self.fail_below is None:
@@ -142,7 +140,6 @@ class Eval(Deciding, Working):
             raise OptionError(f"--fail-below needs true poses: {choice.root}/query_gt is missing")
 
     def _hand_in(self, console: Console, pose_file: Path, submissions: Path | None) -> None:
-        """Say where the pose file is, and put it among the others where that is wanted."""
         if submissions is not None:
             kept = keep_submission(pose_file, submissions)
             if kept.name != pose_file.name:
@@ -176,7 +173,7 @@ class Eval(Deciding, Working):
 
 
 def published_results(benchmark: BenchmarkFile) -> list[str]:
-    """Lines about what others have reached on the dataset; empty where nothing is known."""
+    """Format published results on the dataset."""
     if not benchmark.published:
         return []
     width = max(len(result.method) for result in benchmark.published)
@@ -188,7 +185,7 @@ def published_results(benchmark: BenchmarkFile) -> list[str]:
 
 
 def shown(path: Path) -> str:
-    """A path as short as it can be typed from here."""
+    """Return the shortest path from the current folder."""
     try:
         return str(path.relative_to(Path.cwd()))
     except ValueError:

@@ -1,4 +1,4 @@
-"""``megloc info`` and ``options``: the contents of a kapture folder, and the list of options."""
+"""``megloc info`` and ``options``: contents of a kapture folder, and the list of options."""
 
 from __future__ import annotations
 
@@ -62,7 +62,6 @@ class Info(Reading, Common):
     """Read every file, images included."""
 
     def run(self, console: Console) -> None:
-        """Print it."""
         folder = self.kapture(opened_map(self.input, console))
         describe_content(console, folder)
         folder.validate(deep=self.deep)
@@ -100,9 +99,8 @@ class Info(Reading, Common):
 
 
 def describe_content(console: Console, folder: KaptureFolder) -> None:
-    """Print counts of what a kapture folder has."""
     data = folder.read()
-    # also of cameras that are not calibrated yet
+    # includes uncalibrated cameras
     devices = (data.sensors[device] for _, device in data.records_camera)
     models = Counter("".join(sensor.params[:1]) or UNKNOWN_CAMERA for sensor in devices)
     cameras = ", ".join(f"{count} {model}" for model, count in sorted(models.items()))
@@ -113,7 +111,7 @@ def describe_content(console: Console, folder: KaptureFolder) -> None:
     if data.records_depth:
         joined = len(depth_records(data))
         told = f"{len(data.records_depth)}, of {joined} images"
-        # of an image is what a rig joins to its camera
+        # depth sensors in the camera's rig
         told += "" if joined else ": no rig joins their sensor to a camera, and they are not used"
         line(console, "depth maps", told)
     for kind in ("keypoints", "descriptors", "global_features"):
@@ -132,7 +130,7 @@ def describe_content(console: Console, folder: KaptureFolder) -> None:
 
 
 def describe_sizes(folder: KaptureFolder) -> Iterator[str]:
-    """Describe images of another size than their cameras; reads headers only."""
+    """Describe images whose size differs from their camera's, from headers only."""
     scaled, errors = cameras_of_folder(folder)
     for sensor_id, camera in scaled.items():
         known = folder.read().sensors[sensor_id].camera()
@@ -145,7 +143,6 @@ def describe_sizes(folder: KaptureFolder) -> Iterator[str]:
 
 
 def describe_refinement(console: Console, folder: KaptureFolder) -> None:
-    """Print what the map's refinement removed, and how sure its points are."""
     for row, text in enumerate(report_lines(folder.root)):
         line(console, "" if row else "refinement", text)
     covariances = read_point_covariances(folder.root, len(folder.points3d()))
@@ -161,7 +158,6 @@ def describe_refinement(console: Console, folder: KaptureFolder) -> None:
 
 
 def describe_extraction(local_type: str, extractor: PluginChoice | None) -> str:
-    """Describe how features of queries can be obtained."""
     if extractor is None:
         return f"must be given in kapture: no extractor for {local_type} is installed"
     try:
@@ -174,7 +170,6 @@ def describe_extraction(local_type: str, extractor: PluginChoice | None) -> str:
 def describe_descriptors(
     opened: KaptureMap, keypoints: MapKeypoints, extractor: PluginChoice | None
 ) -> str:
-    """Describe the state of a map's descriptors."""
     if keypoints.has_descriptors(opened.images):
         return "there"
     if extractor is None:
@@ -185,7 +180,6 @@ def describe_descriptors(
 
 
 def describe_retrieval(console: Console, opened: KaptureMap) -> None:
-    """Print which map images queries are matched with, and by what they are ranked."""
     for keypoints in opened.keypoints.values():
         missing = not keypoints.has_descriptors(opened.images)
         if missing and not (keypoints.extractor() and opened.has_images()):
@@ -201,7 +195,6 @@ def describe_retrieval(console: Console, opened: KaptureMap) -> None:
 
 
 def line(console: Console, name: str, text: str) -> None:
-    """One line of the description."""
     console.result(f"{name:{_COLUMN}s}{text}")
 
 
@@ -233,7 +226,7 @@ class OptionsCommand(Common):
 
 
 def shown(value: Any) -> str:
-    """A value as ``--set`` takes it."""
+    """Format a value for ``--set``."""
     if isinstance(value, PluginChoice) and not value.options:
         return value.name
     if isinstance(value, Options):
@@ -250,7 +243,7 @@ def _is_below(key: str, asked: str) -> bool:
 
 
 def _plugins() -> dict[str, list[str]]:
-    """The groups of each plugin that may have options."""
+    """Return the plugin groups of each configurable plugin."""
     found: dict[str, list[str]] = {VLAD: []}
     for group in (
         *(LOCAL_FEATURES, GLOBAL_FEATURES, MATCHERS, POSE_RANKERS, POSE_REFINERS),

@@ -1,4 +1,4 @@
-"""``megloc localize`` and ``megloc serve``: queries into any kapture map, which stays as it is."""
+"""``megloc localize`` and ``megloc serve``: localization in a kapture map (read only)."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Localize(Reading, Deciding, Common):
         _check_consistent(kapture_map, self.input, force=self.force)
         options = _options_of(self)
         given = None if self.pairs is None else dict(iterate_candidates(read_pairs(self.pairs)))
-        # what is wrong is found before the first query, and before anything is written
+        # fail before the first query and before anything is written
         localizer = Localizer(kapture_map, options=options)
         results = Results(localizer, folder, workers=workers, candidates=given, track=console.track)
         queries = results.queries
@@ -131,7 +131,6 @@ class Localize(Reading, Deciding, Common):
             console.say(f"warning: no query was localized; reasons are in {self.output}/status.csv")
 
     def _check_queries(self) -> None:
-        """Raise OptionError unless the queries are given, in one way."""
         if (self.query is None) == (not self.images):
             raise OptionError("give the queries: either --query, a kapture folder, or --images")
         if self.query is not None and self.query.is_file():
@@ -203,7 +202,7 @@ class Serve(Reading, Deciding, Common):
 
 
 def _read_token(path: Path) -> str:
-    """The token in a file: one line of printable ASCII; raises DataError."""
+    """Read a token of one line of printable ASCII."""
     token = read_text(path).strip()
     if len(token) < _MIN_TOKEN_LENGTH or not token.isascii() or not token.isprintable():
         raise DataError(
@@ -217,7 +216,7 @@ def _options_of(command: Deciding) -> PipelineOptions:
 
 
 def _check_consistent(kapture_map: KaptureMap, path: Path, *, force: bool) -> None:
-    """Raise DataError for a map that contradicts itself, unless it is to be used all the same."""
+    """Raise DataError for an inconsistent map, unless forced."""
     if not force and (fault := kapture_map.fault()):
         raise DataError(
             f"{fault}; the poses would be wrong (--force localizes all the same)", path=path

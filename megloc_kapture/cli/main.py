@@ -1,6 +1,6 @@
-"""``megloc``: parse the arguments, run a command, and turn errors into messages and an exit status.
+"""``megloc``: parse arguments, run a command, and convert errors to messages and exit status.
 
-Heavy modules are imported within :func:`main`, so that Ctrl-C is handled during imports as well.
+Heavy modules are imported within :func:`main`, so that Ctrl-C is handled during imports.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ class Command(Protocol):
     def console(self) -> Console: ...
 
     def run(self, console: Console) -> int | None:
-        """Run it; returns the exit status, None for success."""
+        """Run the command; return the exit status, or None for success."""
         ...
 
 
-# name, module and class, first line of the help: only the command that runs is imported
+# name, module:class and first help line, so that only the requested command is imported
 _TABLE = """
 eval evaluate_dataset:Eval Run all stages on a dataset; what is done and still true is kept.
 import conversion:Import Bring a dataset into DIR/{mapping,query,query_gt,megloc}, or a COLMAP \
@@ -96,7 +96,6 @@ COMMANDS: dict[str, tuple[str, str]] = {
 
 
 def command_class(name: str) -> type[Any]:
-    """Import the command of a name."""
     if name in COMMANDS:
         module, _, kind = COMMANDS[name][0].partition(":")
         found: type[Any] = getattr(import_module(f"megloc_kapture.cli.{module}"), kind)
@@ -107,10 +106,7 @@ def command_class(name: str) -> type[Any]:
 
 
 def _parser(given: Sequence[str]) -> Any:
-    """The type that tyro parses; only the given command has its flags, the others their names.
-
-    Raises OptionError for an unknown command.
-    """
+    """Return the type that tyro parses; only the given command has flags."""
     from dataclasses import make_dataclass
 
     import tyro
@@ -122,13 +118,13 @@ def _parser(given: Sequence[str]) -> Any:
     if given and not given[0].startswith("-") and given[0] not in [*COMMANDS, *stages]:
         commands = suggestion(given[0], [*COMMANDS, *stages], listed="commands: ")
         raise OptionError(f"unknown command {given[0]!r}; {commands}")
-    annotated: Any = Annotated  # of types that are values here, which mypy does not follow
-    completes = given[:1] and given[0].startswith("--tyro-")  # then all that there is
+    annotated: Any = Annotated  # of runtime types, which mypy does not follow
+    completes = given[:1] and given[0].startswith("--tyro-")  # shell completion needs all commands
     texts = {name: f"Run the stage {name}, of another package." for name in stages}
     texts |= {name: text for name, (_, text) in COMMANDS.items()}
     entries = []
     for name in [*COMMANDS, *(name for name in stages if name not in COMMANDS)]:
-        # a stage that cannot be loaded must not take the other commands with it
+        # a stage that fails to load must not break other commands
         asked = name in given[:1] or (completes and name in COMMANDS)
         kind = command_class(name) if asked else make_dataclass(name.replace("-", "_"), [])
         text = kind.__doc__ if asked and name not in COMMANDS else texts[name]
@@ -141,9 +137,9 @@ def _terminate(number: int, frame: object) -> NoReturn:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run a command; exits with 0, 1 (defect), 2 (user's error), 3, 130 (Ctrl-C) or 143.
+    """Run a command; exit with 0, 1 (defect), 2 (user's error), 3, 130 (Ctrl-C) or 143.
 
-    Without arguments it is the console script, which takes those of the process.
+    ``arguments`` default to those of the process.
     """
     given = sys.argv[1:] if arguments is None else arguments
     debug = False
@@ -174,9 +170,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _tell(error: BaseException, debug: bool) -> int:
-    """Tell the user's errors in a line each, and the exit status; raises again what is a defect."""
+    """Print a user error, a line each, and return the exit status; reraise internal errors."""
     if isinstance(error, BrokenPipeError):
-        # who reads our output has gone; the flush at exit must not complain about it
+        # our reader has gone; the flush at exit must not complain
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     if isinstance(error, MeglocError):
@@ -184,7 +180,7 @@ def _tell(error: BaseException, debug: bool) -> int:
     elif isinstance(error, ModuleNotFoundError) and (hint := missing_extra(error)) is not None:
         lines = [hint]
     elif isinstance(error, OSError) and error.filename is not None:
-        lines = [f"{error.filename}: {error.strerror}"]  # closed to us, or too long a name
+        lines = [f"{error.filename}: {error.strerror}"]  # unreadable file, or name too long
     else:
         raise error
     if debug:

@@ -1,4 +1,4 @@
-"""Commands of maps: of photographs, refined, with depth; and poses that a map makes better."""
+"""Commands that make and refine maps, and refine poses with a map."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class RefineMap(Reading, StageCommand):
 
 
 def report_lines(root: Path) -> list[str]:
-    """What the refinement of a map removed, as a table; empty where it was not refined."""
+    """Tabulate the observations and points that refinement removed; empty without refinement."""
     path = root / "reconstruction" / REPORT_FILE
     if not path.is_file():
         return []
@@ -185,7 +185,7 @@ class RefinePoses(Linked, StageCommand):
     def run(self, console: Console) -> None:
         changes: dict[str, object] = {"pose_refinement": {"by": list(self.by)}} if self.by else {}
         options = self.options(changes).pose_refinement
-        if self.by:  # in this order, with the options that --set gives them
+        if self.by:  # in the order of --by, with options from --set
             options = options.with_refiners(self.by)
         if not options.refines():
             names = ", ".join(plugin_names(POSE_REFINERS))

@@ -1,4 +1,4 @@
-"""Commands of retrieval: global features, and which images are matched."""
+"""Commands of retrieval: global features and image pairs."""
 
 from __future__ import annotations
 
@@ -176,7 +176,6 @@ class PairsQuery(Reading, StageCommand):
         console.say(f"{len(pairs)} pairs")
 
     def _types_of_both(self, mapping: KaptureFolder, query: KaptureFolder) -> list[str]:
-        """The local features to rerank by; raises OptionError."""
         both = set(mapping.types("descriptors")) & set(query.types("descriptors"))
         asked = self.local_features or sorted(both)
         if not asked:
@@ -197,7 +196,7 @@ def _retrieval(
     fusion: FusionMethod | None,
     options: PipelineOptions,
 ) -> Retrieval:
-    """The types of global features to compare; their weights are the preset's."""
+    """Return the global-feature types to compare, with the preset's weights."""
     types = tuple(only_type(mapping, "global_features", one) for one in asked or (None,))
     how = options.fusion
     if fusion is not None:

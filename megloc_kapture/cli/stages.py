@@ -1,6 +1,6 @@
-"""Commands of single stages: images, features, matches and points, and other packages' stages.
+"""Commands of single stages: images, features, matches and points, and plugin stages.
 
-What our own write, any kapture tool can read; a stage of another package runs in a workspace.
+Built-in commands write plain kapture data; a plugin stage runs in a workspace.
 """
 
 from __future__ import annotations
@@ -68,7 +68,6 @@ _SOURCES = {
 @dataclass(frozen=True, kw_only=True)
 class StageCommand(Choosing, Working):
     def options(self, changes: dict[str, object] | None = None) -> PipelineOptions:
-        """Return the preset's options, with the changes of the flags."""
         return options_of_preset(
             self.preset or DEFAULT_PRESET,
             changes=[changes or {}, assigned(self.placement())],
@@ -76,14 +75,13 @@ class StageCommand(Choosing, Working):
         )
 
     def named(self, key: str, names: Sequence[str]) -> dict[str, object]:
-        """Changes that choose plugins by their names, with the settings that the preset has of
-        them; none without names."""
+        """Return changes that select plugins by name, with the preset's settings for them."""
         preset = getattr(options_of_preset(self.preset or DEFAULT_PRESET), key)
         return {key: chosen_by_name(preset, names)} if names else {}
 
 
 def only_type(folder: KaptureFolder, kind: str, asked: str | None) -> str:
-    """The type of a kind that is meant: the one asked for, or the only one; raises OptionError."""
+    """Return the requested type, or the only type of a kind."""
     types = folder.types(kind)  # type: ignore[arg-type]
     there = ", ".join(types)
     if asked in types or (asked is None and len(types) == 1):
@@ -98,7 +96,7 @@ def only_type(folder: KaptureFolder, kind: str, asked: str | None) -> str:
 
 
 def restrictions_beside(folder: Path) -> Restrictions:
-    """Of the dataset whose tables lie beside a kapture folder; none where there are none."""
+    """Return restrictions of the dataset that contains a kapture folder, if any."""
     tables = side_tables_beside(folder)
     return UNRESTRICTED if tables is None else Restrictions.read(tables)
 
@@ -164,7 +162,7 @@ class Match(Reading, StageCommand):
         local_type = only_type(mapping, "descriptors", self.features)
         changes: dict[str, object] = {"matching": {"name": self.matcher}} if self.matcher else {}
         options = self.options(changes)
-        # --matcher also where the preset has another one for this type
+        # --matcher applies even if the preset has another one for this type
         chosen = options.matching if self.matcher else options.matching_of(local_type)
         matcher = load_plugin(MATCHERS, chosen.name, chosen.options)
         first, verification = mapping, options.verify_mapping()
@@ -217,7 +215,7 @@ class Triangulate(Reading, StageCommand):
 
 
 def _read_pairs_of(path: Path, first: KaptureFolder, second: KaptureFolder) -> list[ImagePair]:
-    """The pairs of a file, which must be of images of the two folders; raises DataError."""
+    """Read pairs and check that their images exist in the two folders."""
     pairs = read_pairs(path)
     known_first, known_second = (set(one.read().image_names()) for one in (first, second))
     for pair in pairs:
@@ -247,7 +245,7 @@ class OutsideStage(Working):
 
 
 def stage_command(name: str) -> type[Any]:
-    """The command of a registered stage; raises PluginError where it cannot be loaded."""
+    """Return the command of a registered stage."""
     command = make_dataclass(name, [], bases=(OutsideStage,), frozen=True, kw_only=True)
     command.stage = name  # type: ignore[attr-defined]
     command.__doc__ = getdoc(plugin_class(STAGES, name)) or f"Run the stage {name}."
@@ -297,7 +295,6 @@ class Preprocess(Linked, Computing, Working):
             console.say(line)
 
     def options(self) -> PreprocessingOptions:
-        """The options that the flags make."""
         masks: dict[str, Any] = {
             "segmenter": None if self.segmenter is None else {"name": self.segmenter},
             "dynamic": self.dynamic or None,
@@ -328,7 +325,7 @@ class Preprocess(Linked, Computing, Working):
 
 
 def report_lines(report: PreprocessingReport) -> list[str]:
-    """What was done, for people: cameras, then the share of pixels masked by each source."""
+    """Format camera changes and the share of pixels masked by each source."""
     lines = [f"{report.images} images, {report.images_changed} of them changed"]
     changes: dict[str, int] = {}
     for camera in report.cameras.values():

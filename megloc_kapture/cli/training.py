@@ -59,7 +59,7 @@ class Train(Linked, Common):
     """Begin again where files of another training stand."""
 
     def run(self, console: Console) -> None:
-        # only this command waits for torch
+        # torch imports slowly
         from megloc_kapture.pipeline.presets import options_with
         from megloc_kapture.training.train import TASKS, TrainingData, train
 
@@ -246,7 +246,7 @@ class Render(Linked, Working):
 
 
 def _pose_of_text(text: str) -> RigidTransform:
-    """``cam_from_world`` of ``qw,qx,qy,qz,tx,ty,tz``; raises OptionError."""
+    """Parse ``cam_from_world`` as ``qw,qx,qy,qz,tx,ty,tz``."""
     try:
         w, x, y, z, *translation = map(float, text.split(","))
         quat = unit_quaternion((w, x, y, z))

@@ -1,4 +1,4 @@
-"""``megloc weights`` and ``doctor``: weights of networks and their licences; the environment."""
+"""``megloc weights`` and ``doctor``: network weights with licences, and environment checks."""
 
 from __future__ import annotations
 
@@ -53,7 +53,6 @@ class List(Common):
     """List all networks: file, size, licence, whether it is there and its sha256 known."""
 
     def run(self, console: Console) -> None:
-        """Print the table."""
         rows: list[tuple[str, ...]] = [
             ("name", "what for", "file", "size", "licence", "state", "sha256")
         ]
@@ -172,7 +171,7 @@ class Check(Common):
     """Networks, by their names in the list; all whose files are there unless given."""
 
     def run(self, console: Console) -> int:
-        """Run it; returns 2 where a file is wrong."""
+        """Return 2 if a file is wrong."""
         wrong = sum(_wrong(console, lookup(name)) for name in self.names)
         if not self.names:
             wrong = sum(_wrong(console, w) for w in registry().values() if _state(w) == "there")
@@ -194,27 +193,22 @@ class WeightsCommand:
 
     @property
     def debug(self) -> bool:
-        """Whether to show the traceback of an error."""
         return self.action.debug
 
     def console(self) -> Console:
-        """The console that the flags ask for."""
         return self.action.console()
 
     def run(self, console: Console) -> int | None:
-        """Run what was chosen."""
         return self.action.run(console)
 
 
 def summary() -> str:
-    """Say how many networks have their weights, and where."""
     there = [weights.name for weights in registry().values() if _state(weights) == "there"]
     names = f": {', '.join(there)}" if there else ""
     return f"{len(there)} of {len(registry())} in {weights_folder()}{names}"
 
 
 def _missing(preset: str) -> tuple[str, ...]:
-    """The weights that a preset needs and has not."""
     try:
         check_weights(options_of_preset(preset))
     except MissingWeightsError as error:
@@ -274,7 +268,7 @@ def _fetchable(weights: Weights, accepted: bool) -> tuple[Weights, PublishedFile
 
 
 def _wrong(console: Console, weights: Weights) -> int:
-    """Print the state of each file of a network; the number that are wrong."""
+    """Print the state of each file of a network; return the number of wrong files."""
     wrong = 0
     paths = list(files_of(weights))
     if not paths:
@@ -339,7 +333,7 @@ class Doctor(Common):
     """Check the environment: versions, known-bad combinations, GPU, weights."""
 
     def run(self, console: Console) -> None:
-        """Print what there is; exit status 2 when something is wrong."""
+        """Print the environment and exit with 2 if something is wrong."""
         for package in _PACKAGES:
             console.result(f"{package:24s}{installed_version(package) or 'not installed'}")
         console.result(f"{'GPU':24s}{gpu()}")
@@ -353,7 +347,6 @@ class Doctor(Common):
 
 
 def gpu() -> str:
-    """Name of the GPU that torch sees."""
     try:
         import torch
     except ModuleNotFoundError as error:
@@ -363,7 +356,7 @@ def gpu() -> str:
 
 
 def find_problems() -> list[str]:
-    """Known-bad combinations of installed packages, each with its remedy."""
+    """Return known-bad package combinations with remedies."""
     problems = []
     torch, vision = installed_version("torch"), installed_version("torchvision")
     if vision and torch and "+cpu" in torch:

@@ -1,8 +1,7 @@
 """A COLMAP model as a kapture map: cameras, rigs, poses, points, features; images are linked.
 
-A model names all features of its images by numbers. With the database that it was made of the map
-has these features, with their descriptors. Without one COLMAP's SIFT is extracted again from the
-images, which finds most of what a model of SIFT was made of, and the observations move to it.
+Features and descriptors come from the model's database. Without a database, SIFT is extracted
+again from the images and the observations move to the new keypoints.
 """
 
 from __future__ import annotations
@@ -53,28 +52,20 @@ _SIFT = "sift"
 
 @dataclass(frozen=True)
 class ColmapFolders:
-    """Where the parts of a COLMAP reconstruction are.
-
-    Attributes
-    ----------
-    model : folder of the cameras, images and points.
-    images : folder that the images' names are relative to; None: there is none.
-    database : with the features; None: there is none.
-    """
+    """The parts of a COLMAP reconstruction; ``images`` and ``database`` are None if missing."""
 
     model: Path
     images: Path | None
     database: Path | None
 
     def files(self) -> Iterator[Path]:
-        """The files that an import reads, images apart."""
         yield from colmap_model_files(self.model)
         if self.database is not None:
             yield self.database
 
 
 def is_colmap(path: Path) -> bool:
-    """Whether a folder is a COLMAP model, or one of COLMAP's workspaces, and no kapture."""
+    """Return whether a folder is a COLMAP model or workspace, and not a kapture."""
     path = Path(path)
     return not is_kapture(path) and bool(_models(path))
 
@@ -82,15 +73,10 @@ def is_colmap(path: Path) -> bool:
 def find_colmap(
     path: Path, *, images: Path | None = None, database: Path | None = None
 ) -> ColmapFolders:
-    """The parts of a reconstruction by the folder of its model, or the workspace around it.
+    """Find the parts of a reconstruction from the folder of its model or its workspace.
 
-    A workspace has ``sparse/0`` or ``sparse``, ``images`` and ``database.db``. The latter two are
-    looked for beside the model and in the folder above, of ``sparse/0`` in the one above that.
-
-    Parameters
-    ----------
-    path : folder of the model, or the workspace.
-    images, database : instead of those that would be found.
+    A workspace has ``sparse/0`` or ``sparse``, ``images`` and ``database.db``; the latter two may
+    also lie next to the model. Arguments ``images`` and ``database`` replace the search.
     """
     models = _models(path)
     if not models:
@@ -117,7 +103,6 @@ def find_colmap(
 
 
 def _models(path: Path) -> list[Path]:
-    """The models of a folder: itself, else that of its ``sparse``, else those in there."""
     around = path if path.name == SPARSE else path / SPARSE
     for places in ([path], [around], sorted(around.glob("*"))):
         found = [place for place in places if _holds_model(place)]
@@ -127,25 +112,23 @@ def _models(path: Path) -> list[Path]:
 
 
 def _holds_model(folder: Path) -> bool:
-    # one file may be missing: then that is said
+    # one file may be missing: its error comes later
     return any(sum((folder / n).is_file() for n in ns) > 1 for ns in (BINARY_FILES, TEXT_FILES))
 
 
 class OtherFeaturesError(DataError):
-    """A model without descriptors, whose features are none that we could extract again."""
+    """A model without descriptors whose features cannot be extracted again."""
 
 
 @dataclass(frozen=True, eq=False)
 class ColmapReconstruction:
-    """A reconstruction that was read, and what it is in kapture.
+    """A COLMAP reconstruction and its kapture data.
 
     Attributes
     ----------
-    data : sensors, rigs, records and poses. The images of a frame of a rig share a timestamp, the
-        frame's id; elsewhere the timestamp is the image's id.
-    names : name in kapture of each image of the model, by its name there.
-    scales : of the images, by their names in kapture, that are smaller or larger than in the model,
-        as ``data`` has their cameras: in x and y.
+    data : sensors, rigs, records and poses. Timestamps are frame ids for rigs, else image ids.
+    names : kapture name by model name.
+    scales : (x, y) scale by kapture name, for images of another size than in the model.
     """
 
     source: ColmapFolders
@@ -156,7 +139,6 @@ class ColmapReconstruction:
 
     @classmethod
     def read(cls, source: ColmapFolders) -> ColmapReconstruction:
-        """Read the model; DataError names what is broken, or what kapture cannot hold."""
         model = read_colmap_model(source.model)
         names = kapture_names(model, source.model)
         if source.images is not None:
@@ -171,7 +153,7 @@ class ColmapReconstruction:
                         f"{told}; `megloc import colmap` takes their folder by --images",
                         path=source.images,
                     )
-                # features come from the database
+                    # the database has the features
                 _log.warning("%s: %s", source.images, told)
         scaled = _scaled_cameras(source, model)
         scales = {
@@ -184,28 +166,25 @@ class ColmapReconstruction:
 
     @property
     def renamed(self) -> dict[str, str]:
-        """Names in kapture that are others than in the model, to these."""
+        """Return model names by kapture name, if they differ."""
         return {new: old for old, new in self.names.items() if new != old}
 
     def write_images(self, output: Path) -> None:
-        """Write sensors, poses and links to the images, as a kapture folder without a map."""
         write_sensors(output, self.data)
         self.link_images(output)
 
     def link_images(self, output: Path) -> None:
-        """Link the images of a kapture folder, instead of what is linked there."""
+        """Replace the image links of a kapture folder."""
         link = output / "sensors" / "records_data"
         if link.is_symlink():
             link.unlink()
         link_records(output, self._links())
 
     def write_map(self, output: Path, *, work: Work = HERE) -> dict[str, float]:
-        """Write the map; ``output`` is empty.
+        """Write the map into the empty folder ``output`` and return counts for the log.
 
-        Returns
-        -------
-        Counts for the log; without descriptors in a database ``found_again``, the share of the
-        observations whose keypoints were found again.
+        Without descriptors in a database, ``found_again`` is the share of observations with a
+        re-extracted keypoint.
         """
         source = self.source
         local_type = None
@@ -241,7 +220,7 @@ class ColmapReconstruction:
         with tempfile.TemporaryDirectory(prefix=".megloc-", dir=output) as scratch:
             reference, images, sift = (Path(scratch) / n for n in ("reference", "images", _SIFT))
             self._write_reference(reference, keypoints_type=_SIFT)
-            # a folder of its own: the model's keypoints would come before the extracted ones
+            # separate folder: the model's keypoints would take precedence
             self.write_images(images)
             mapping = KaptureFolder(images, features_dirs=[sift])
             extractor = load_plugin(LOCAL_FEATURES, _SIFT)
@@ -253,7 +232,7 @@ class ColmapReconstruction:
                     raise
                 message = error.message.replace("the given map", "the model")
                 raise OtherFeaturesError(message, path=self.source.model) from None
-        self.link_images(output)  # what was linked to was the scratch folder
+        self.link_images(output)  # links pointed to the scratch folder
         return counts
 
     def _write_reference(self, output: Path, **features: Any) -> dict[str, float]:
@@ -266,7 +245,6 @@ class ColmapReconstruction:
         )
 
     def _links(self) -> dict[str, Path]:
-        """Links to the images: their folder, or each where some have other names in kapture."""
         images = self.source.images
         if images is None:
             return {}
@@ -276,8 +254,6 @@ class ColmapReconstruction:
 
 
 def _scaled_cameras(source: ColmapFolders, model: ColmapModel) -> dict[int, Camera]:
-    """The cameras whose images are scaled; a warning says so. DataError where one is otherwise of
-    another size."""
     if source.images is None:
         return {}
     files = ((image.camera_id, source.images / image.name) for image in model.images)
@@ -293,11 +269,7 @@ def _scaled_cameras(source: ColmapFolders, model: ColmapModel) -> dict[int, Came
 
 
 def kapture_names(model: ColmapModel, folder: Path) -> dict[str, str]:
-    """The name in kapture of each image of a model, by its name there.
-
-    kapture separates fields by commas and blanks: a comma, a blank at either end and a # at the
-    beginning become ``_``. DataError where two images would have one name.
-    """
+    """Return kapture names by model names; characters that kapture's files reserve become ``_``."""
     names: dict[str, str] = {}
     taken: dict[str, str] = {}
     for image in model.images:
@@ -314,10 +286,7 @@ def kapture_names(model: ColmapModel, folder: Path) -> dict[str, str]:
 
 
 def kapture_data(model: ColmapModel, names: dict[str, str]) -> KaptureData:
-    """Return the sensors, rigs of several cameras, records and poses of a model.
-
-    ``names`` are those of the images in kapture, by those in the model.
-    """
+    """Return sensors, multi-camera rigs, records and poses; ``names`` are kapture names."""
     data = KaptureData()
     sensor_of = {camera_id: f"cam{camera_id}" for camera_id in sorted(model.cameras)}
     for camera_id, camera in model.cameras.items():
@@ -326,7 +295,7 @@ def kapture_data(model: ColmapModel, names: dict[str, str]) -> KaptureData:
     times = {image_id: model.frames.get(image_id, image_id) for image_id in records}
     shared = {(times[image_id], image.camera_id) for image_id, image in records.items()}
     if len(shared) < len(records):
-        times = {image_id: image_id for image_id in records}  # frames with two images of a camera
+        times = {image_id: image_id for image_id in records}  # two images of a camera per frame
     for rig_id, cams_from_rig in model.cams_from_rig.items():
         members = {sensor_of[k]: v for k, v in cams_from_rig.items() if k in sensor_of}
         if len(members) > 1:

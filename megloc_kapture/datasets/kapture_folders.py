@@ -1,4 +1,4 @@
-"""Any pair of kapture folders as a dataset: mapping/, query/ and perhaps query_gt/ and megloc/."""
+"""A pair of kapture folders as a dataset: mapping/, query/, optional query_gt/ and megloc/."""
 
 from __future__ import annotations
 
@@ -44,17 +44,16 @@ _SENSORS = "sensors/sensors.txt"
 
 
 def is_kapture(folder: Path) -> bool:
-    """True where a folder is a kapture."""
     return (folder / _SENSORS).is_file()
 
 
 def check_root(root: Path) -> Path:
-    """The root of a pair of kapture folders."""
+    """Check that ``root`` has a mapping/ and a query/ kapture, and return it."""
     root = Path(root)
     if not root.is_dir():
         raise DataError("no such folder", path=root)
     for part in (MAPPING, QUERY):
-        try:  # is_file() of Python 3.14 takes what may not be read for missing
+        try:  # in Python 3.14 is_file() reports unreadable files as missing
             (root / part / _SENSORS).stat()
         except (FileNotFoundError, NotADirectoryError) as error:
             raise DataError(
@@ -66,12 +65,12 @@ def check_root(root: Path) -> Path:
 
 
 def input_files(root: Path) -> Iterator[Path]:
-    """Every file whose content an import depends on: sensors, images, masks, depth, side tables."""
+    """Yield every file that an import depends on."""
     for part in (MAPPING, QUERY, QUERY_GT):
         folder = KaptureFolder(root / part)
         if (folder.root / "sensors").is_dir():
             files = files_of(folder, images=part != QUERY_GT)
-            # a query without its image fails by itself, see stages/localized_folder.py
+            # queries without image fail later, see stages/localized_folder.py
             yield from (path for path in files if part != QUERY or path.is_file())
     if (nowhere := table_path(root / QUERY_GT, NOWHERE_FILE)).is_file():
         yield nowhere
@@ -82,7 +81,7 @@ def input_files(root: Path) -> Iterator[Path]:
 
 
 def files_of(folder: KaptureFolder, *, images: bool = True) -> Iterator[Path]:
-    """Every file of a kapture folder that an import depends on; ``images`` with masks and depth."""
+    """Yield every file of a kapture folder; ``images`` includes masks and depth."""
     sensors = folder.root / "sensors"
     yield from sorted(sensors.glob("*.txt"))
     if not images:
@@ -98,7 +97,7 @@ def files_of(folder: KaptureFolder, *, images: bool = True) -> Iterator[Path]:
 
 
 def tell_of_truth_without_query(folder: Path, images: Sequence[str]) -> None:
-    """Warn of true poses of images that are no query: the names may be wrong."""
+    """Warn of true poses of unknown queries: the image names may be wrong."""
     said = "%s: true poses of %d images that are no query are left out, the first is %s"
     _log.warning(said, folder, len(images), images[0])
 
@@ -106,8 +105,7 @@ def tell_of_truth_without_query(folder: Path, images: Sequence[str]) -> None:
 def checked_folders(
     root: Path, query_prefix: str = ""
 ) -> tuple[KaptureFolder, KaptureData, KaptureFolder, KaptureData]:
-    """The map's and the queries' folders, checked, with the cameras of the images as they are; see
-    :func:`import_kapture_folders`."""
+    """Return the checked folders of map and queries, with cameras fitted to the image sizes."""
     root = check_root(root)
     mapping, query = KaptureFolder(root / MAPPING), KaptureFolder(root / QUERY)
     map_data, query_data = with_cameras_of_images(mapping), with_cameras_of_images(query)
@@ -133,16 +131,15 @@ def import_kapture_folders(
     query_prefix: str = "",
     protocol_change: Callable[[Protocol], Protocol] | None = None,
 ) -> dict[str, float]:
-    """Import ``root``'s folders into ``output``: checked, written anew, images linked.
+    """Check the folders of ``root``, rewrite them below ``output``, and link the images.
 
-    ``query_prefix`` is a folder name put before the queries' names, for datasets whose map and
-    queries share names. Returns counts for the log.
+    ``query_prefix`` is prepended to query names if map and queries share names.
     """
     mapping, map_data, query, query_data = checked_folders(root, query_prefix)
     rename = prefixed(query_prefix)
     write_sensors(output / MAPPING, map_data)
     link_images(mapping.root, output / MAPPING)
-    # a query folder with poses in it must not let a stage see them
+    # stages must not see poses of a query folder
     write_sensors(output / QUERY, _renamed(query_data, rename, is_truth=False))
     link_images(query.root, output / QUERY, below=query_prefix)
     truth = 0
@@ -168,7 +165,7 @@ def import_kapture_folders(
 
 
 def import_mapping(mapping: KaptureFolder, output: Path) -> dict[str, float]:
-    """Import images with poses, without queries; see :func:`import_kapture_folders`."""
+    """Import a mapping folder without queries; see :func:`import_kapture_folders`."""
     poses, data = _map_poses(mapping), with_cameras_of_images(mapping)
     check_images(mapping, data)
     write_sensors(output / MAPPING, data)
@@ -181,7 +178,6 @@ def import_mapping(mapping: KaptureFolder, output: Path) -> dict[str, float]:
 
 
 def mapping_files(mapping: KaptureFolder) -> Iterator[Path]:
-    """Every file that :func:`import_mapping` depends on."""
     yield from files_of(mapping)
     if (groups := table_path(_tables_beside(mapping), GROUPS_FILE)).is_file():
         yield groups
@@ -199,16 +195,12 @@ def _map_poses(mapping: KaptureFolder) -> dict[str, RigidTransform]:
 
 
 def check_images(folder: KaptureFolder, data: KaptureData) -> None:
-    """Raise DataError for the first image that :func:`check_image_size` refuses.
-
-    ``data``: of the folder, with the cameras that the images should have.
-    """
     for image in data.image_names():
         check_image_size(folder.image_path(image), data.camera_of(image))
 
 
 def check_image_size(path: Path, camera: Camera) -> None:
-    """Raise DataError where an image's header is missing, none, or not of its camera's size."""
+    """Raise DataError if an image is unreadable or its size differs from its camera's."""
     size = image_size(path)
     if size != (camera.width, camera.height):
         raise _other_size(path, size, camera)
@@ -224,17 +216,10 @@ def _other_size(path: Path, size: tuple[int, int], camera: Camera) -> DataError:
 def cameras_of_images(
     cameras: Mapping[Key, Camera], images: Iterable[tuple[Key, Path]]
 ) -> tuple[dict[Key, Camera], list[DataError]]:
-    """Compare cameras with the sizes of their images, which headers say.
+    """Compare cameras with the image sizes in the files' headers; unreadable files are skipped.
 
-    Parameters
-    ----------
-    images : camera and file of each; those that are missing or no image are not looked at.
-
-    Returns
-    -------
-    The cameras that are of another size, scaled to it, where all images of one have the same, with
-    both sides scaled by one factor up to rounding; and an error for each image that is of another
-    size otherwise.
+    Returns cameras scaled to their images, if these agree on one scale factor up to rounding, and
+    an error for each image of any other size.
     """
     of_camera: dict[Key, dict[tuple[int, int], list[Path]]] = {}
     for key, path in images:
@@ -256,14 +241,13 @@ def cameras_of_images(
 
 
 def is_scaled(camera: Camera, size: tuple[int, int]) -> bool:
-    """Whether an image has both sides of its camera, scaled by one factor up to rounding."""
+    """Return whether an image size is the camera's times one factor, up to rounding."""
     width, height = size
     difference = abs(width * camera.height - height * camera.width)
     return difference <= max(width, height, camera.width, camera.height)
 
 
 def cameras_of_folder(folder: KaptureFolder) -> tuple[dict[str, Camera], list[DataError]]:
-    """:func:`cameras_of_images` of a kapture folder, by the ids of its sensors."""
     data = folder.read()
     taken = {sensor_id for _, sensor_id in data.records_camera}
     known = {
@@ -280,7 +264,7 @@ def cameras_of_folder(folder: KaptureFolder) -> tuple[dict[str, Camera], list[Da
 
 
 def with_cameras_of_images(folder: KaptureFolder) -> KaptureData:
-    """The data of a folder with its cameras scaled to its images; a warning says where."""
+    """Read a folder and scale its cameras to its images, with a warning."""
     data, (scaled, _) = folder.read(), cameras_of_folder(folder)
     warn_of_scaled(folder.root, [(data.sensors[key].camera(), one) for key, one in scaled.items()])
     sensors = {
@@ -291,7 +275,6 @@ def with_cameras_of_images(folder: KaptureFolder) -> KaptureData:
 
 
 def warn_of_scaled(place: Path, cameras: Sequence[tuple[Camera, Camera]]) -> None:
-    """Warn of cameras that were scaled: each as it is stored, and as its images have it."""
     if cameras:
         stored, scaled = cameras[0]
         said = "%s: %d cameras are scaled to their images, the first from %dx%d to %dx%d"
@@ -300,7 +283,7 @@ def warn_of_scaled(place: Path, cameras: Sequence[tuple[Camera, Camera]]) -> Non
 
 
 def prefixed(prefix: str) -> Callable[[str], str]:
-    """Puts a folder name before an image name; the empty prefix changes nothing."""
+    """Return a function that prepends a folder to image names; ``""`` leaves them unchanged."""
     if not prefix:
         return lambda name: name
     folder = check_relative(prefix.rstrip("/"))
@@ -308,7 +291,6 @@ def prefixed(prefix: str) -> Callable[[str], str]:
 
 
 def _renamed(data: KaptureData, rename: Callable[[str], str], *, is_truth: bool) -> KaptureData:
-    """The queries' records under their names in the workspace, with poses or with depth."""
     depth = {} if is_truth else data.records_depth
     return replace(
         data,
@@ -321,13 +303,12 @@ def _renamed(data: KaptureData, rename: Callable[[str], str], *, is_truth: bool)
 def _renamed_tables(
     tables: SideTables, rename: Callable[[str], str], map_data: KaptureData, query_data: KaptureData
 ) -> SideTables:
-    """The tables with the queries' names in the workspace."""
     of_map, of_query = set(map_data.image_names()), set(query_data.image_names())
     groups: dict[str, ImageGroup] = {}
     for name, group in tables.groups.items():
         if name in of_query:
             groups[rename(name)] = group
-        # a name that both have says the same of both
+            # a name in map and queries keeps its group for both
         if name in of_map or name not in of_query:
             groups[name] = group
     return replace(

@@ -1,9 +1,4 @@
-"""Challenge datasets as kapture distributes them: the official images in kapture folders.
-
-kapture's downloader unpacks an archive per part: ``mapping/`` and ``query/``, Aachen's queries by
-day and at night apart, RobotCar's locations each in a folder of its own. Images have their official
-names, queries no poses.
-"""
+"""Challenge datasets as distributed by kapture: an archive per part, official image names."""
 
 from __future__ import annotations
 
@@ -25,7 +20,7 @@ _FOLDERS_OF_LOCATIONS = ("[0-9][0-9]/mapping", "[0-9][0-9]/query")
 
 @dataclass(frozen=True, slots=True)
 class KaptureImage:
-    """An image and what kapture says of it; ``locations`` are ``001`` and so on."""
+    """An image with its kapture data; ``locations`` are ``001`` and so on."""
 
     name: str
     file: Path
@@ -46,7 +41,7 @@ class KaptureForm:
 
     @classmethod
     def find(cls, root: Path, *, with_locations: bool = False) -> KaptureForm | None:
-        """Return the folders below a root; None where there is no map."""
+        """Find the folders below a root; return None without a map."""
         patterns = _FOLDERS_OF_LOCATIONS if with_locations else _FOLDERS
         for parent in (Path(root) / name for name in _PARENTS):
             found = [
@@ -58,7 +53,6 @@ class KaptureForm:
         return None
 
     def input_files(self) -> Iterator[Path]:
-        """Every file an import may depend on."""
         for path in self.folders:
             folder = KaptureFolder(path)
             yield from files_of(folder, images=False)
@@ -66,10 +60,7 @@ class KaptureForm:
             yield from (image for image in images if image.exists())
 
     def read(self, missing: Missing) -> list[KaptureImage]:
-        """Return each image once, folder by folder in the order of times.
-
-        Images whose file is not there are left out; of each camera one image's size is checked.
-        """
+        """Read the existing images by folder and time; check one image size per camera."""
         images: dict[str, KaptureImage] = {}
         for path in self.folders:
             folder = KaptureFolder(path)
@@ -102,7 +93,7 @@ class KaptureForm:
         return list(images.values())
 
     def rig(self) -> dict[str, RigidTransform]:
-        """Return ``sensor_from_rig`` by sensor id, of the first folder that has it."""
+        """Return ``sensor_from_rig`` by sensor id; the first folder wins."""
         found: dict[str, RigidTransform] = {}
         for path in self.folders:
             for members in KaptureFolder(path).read().rigs.values():
@@ -110,7 +101,6 @@ class KaptureForm:
         return found
 
     def without_model(self) -> OptionError:
-        """Return the error for options about a dataset's own model."""
         return OptionError(
             f"the reference model is read from the official layout, and {self.root} has kapture "
             "folders; megloc localize localizes in a kapture map"

@@ -1,16 +1,14 @@
-"""MegaDepth as kapture folders with depth, one for each scene, to train on.
+"""MegaDepth as kapture folders with depth, one per scene, for training.
 
-The layout is that of the published archives and of what the open trainings make of them (D2-Net's
-``megadepth_utils``)::
+The layout is that of the published archives and of D2-Net's ``megadepth_utils``::
 
     phoenix/S6/zl548/MegaDepth_v1/SCENE/dense0/depths/NAME.h5    depth of the undistorted images
-    depth_undistorted/SCENE/NAME.h5                              the same, where glue-factory has it
+    depth_undistorted/SCENE/NAME.h5                              the same in glue-factory
     Undistorted_SfM/SCENE/{images,sparse or sparse-txt}          COLMAP's image_undistorter
     scene_info/SCENE.npz                                         paths, intrinsics, poses
 
-Cameras and poses are those of the undistorted model; without one, those of ``scene_info``, whose
-arrays of Python objects are pickles and are not read: docs/training.md has the lines that make
-plain arrays of them.
+Cameras and poses come from the undistorted model, else from ``scene_info``. Pickled object arrays
+are not read; docs/training.md shows how to convert them to plain arrays.
 """
 
 from __future__ import annotations
@@ -49,8 +47,6 @@ class MegaDepthOptions(Options):
 
 @dataclass(frozen=True)
 class _Image:
-    """An undistorted image: its file, its depth map's, camera and pose."""
-
     path: Path
     depth: Path
     camera: Camera
@@ -60,14 +56,7 @@ class _Image:
 def import_megadepth(
     root: Path, output: Path, options: MegaDepthOptions | None = None, *, work: Work = HERE
 ) -> dict[str, int]:
-    """Write ``output/SCENE`` of each scene: links to its images, poses, and depth maps.
-
-    Images without metric depth are left out; a depth map takes four bytes for each pixel.
-
-    Raises
-    ------
-    DataError : no scene, or a file of one is missing or broken; names it.
-    """
+    """Write ``output/SCENE`` of each scene; images without metric depth are omitted."""
     options = options or MegaDepthOptions()
     scenes = [check_component(name) for name in options.scenes] or _scenes(root)
     if not scenes:
@@ -85,10 +74,7 @@ def import_megadepth(
 
 
 def read_megadepth_depth(path: Path) -> NDArray[np.float32] | None:
-    """A depth map (H, W), 0 where unknown; None of an image that has only an order of depths.
-
-    DataError where the file is no HDF5 file with an array ``depth`` of its own.
-    """
+    """Read a depth map (H, W), 0 if unknown; return None for images with ordinal depth only."""
     import h5py
 
     try:
@@ -105,7 +91,7 @@ def read_megadepth_depth(path: Path) -> NDArray[np.float32] | None:
             depth_m = np.asarray(found[...], np.float32)
     except (OSError, RuntimeError, KeyError) as error:
         raise DataError(f"cannot read as HDF5: {error}", path=path) from error
-    # relative depth has signs for labels: nearer, farther
+    # ordinal depth has negative labels
     if (depth_m < 0).any():
         return None
     depth_m[~np.isfinite(depth_m)] = 0.0
@@ -118,7 +104,6 @@ def _scenes(root: Path) -> list[str]:
 
 
 def _images(root: Path, scene: str) -> Iterator[_Image]:
-    """The images of a scene that are there, sorted by name."""
     folder = root / _UNDISTORTED / scene
     model = next((folder / name for name in _MODELS if (folder / name).is_dir()), None)
     table = root / _SCENE_INFO / f"{scene}.npz"

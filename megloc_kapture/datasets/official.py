@@ -1,8 +1,7 @@
-"""A dataset as its adapter read it from the official layout, and its kapture folders.
+"""A dataset read from its official layout by an adapter, and its kapture folders.
 
-An adapter (group ``megloc_kapture.datasets``) reads; :func:`write_official` writes, the same way
-for every dataset: ``mapping/``, ``query/``, ``query_gt/`` where truth is known, ``megloc/`` and,
-where asked for, ``reference/``, the model the dataset ships. Images are linked.
+:func:`write_official` writes ``mapping/``, ``query/``, optional ``query_gt/``, ``megloc/`` and
+optional ``reference/`` (the dataset's model); images are linked.
 """
 
 from __future__ import annotations
@@ -37,10 +36,7 @@ _MISSING_SHOWN = 5
 
 
 class DatasetCard(Options):
-    """The address of a dataset and its layout on disk, for messages.
-
-    ``folders`` are names that the root usually has, below MEGLOC_DATA.
-    """
+    """Address and layout of a dataset, for messages; ``folders`` are usual root names."""
 
     title: str
     published_at: str
@@ -49,7 +45,6 @@ class DatasetCard(Options):
     layout: str
 
     def without(self, root: Path, absent: Sequence[str]) -> DataError:
-        """Return the error for a folder that lacks folders of the dataset."""
         return DataError(
             f"not {self.title}, no folder {' and '.join(absent)}; it has to lie as {self.layout}",
             path=root,
@@ -58,7 +53,7 @@ class DatasetCard(Options):
 
 @dataclass(frozen=True, slots=True)
 class Count:
-    """A line of an import's summary: what was found, beside what is published."""
+    """A line of an import's summary."""
 
     what: str
     found: int
@@ -73,13 +68,13 @@ class Count:
 
 @dataclass
 class Missing:
-    """Files that should be there and are not; collected, then refused or let pass."""
+    """Missing files, collected to be reported together."""
 
     root: Path
     files: list[Path] = field(default_factory=list)
 
     def require(self, file: Path) -> bool:
-        """Return whether a file exists; else remember it."""
+        """Return whether a file exists; record it if not."""
         if file.exists():
             return True
         self.files.append(file)
@@ -96,7 +91,6 @@ class Missing:
         ]
 
     def refuse(self) -> None:
-        """Raise DataError where files are missing."""
         if not self.files:
             return
         parts = self.by_folder()
@@ -114,22 +108,11 @@ class Missing:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class OfficialDataset(SideTables):
-    """A dataset as its adapter read it, with its tables.
+    """A dataset with its tables; poses are in the local frame.
 
-    Parameters
-    ----------
-    mapping : sensors, records and poses of the map's images, in the local frame.
-    query : sensors and records of the queries; without poses.
-    query_gt : the queries' true poses where they are known, in the local frame; else None.
-    links : folder below ``records_data`` -> folder of the dataset it is a link to; ``""`` makes
-        ``records_data`` itself the link.
-    image_files : image -> its file, for images that lie in no such folder; linked one by one.
-    summary : what was found beside what is published.
-    remarks : what a user should know, a sentence each.
-    missing : what is not there.
-    reference : the model the dataset ships, where it is asked for.
-    write_more : writes what else belongs to the dataset (depth maps below ``mapping``) below the
-        folder it is given.
+    ``links`` maps folders below ``records_data`` to folders of the dataset (``""`` is
+    ``records_data`` itself), ``image_files`` maps other images to files. ``write_more`` writes
+    further files (depth maps) below the output folder.
     """
 
     mapping: KaptureData
@@ -146,7 +129,6 @@ class OfficialDataset(SideTables):
 
 
 def check_official(dataset: OfficialDataset, *, allow_missing: bool = False) -> None:
-    """Check that a dataset is complete enough to be written."""
     if dataset.missing is not None and not allow_missing:
         dataset.missing.refuse()
     root = dataset.missing.root if dataset.missing is not None else None
@@ -160,7 +142,6 @@ def check_official(dataset: OfficialDataset, *, allow_missing: bool = False) -> 
 
 
 def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: bool = False) -> None:
-    """Write a dataset below ``output``: mapping/, query/, query_gt/ and megloc/."""
     check_official(dataset, allow_missing=allow_missing)
     for part, data in ((MAPPING, dataset.mapping), (QUERY, dataset.query)):
         write_sensors(output / part, data)
@@ -185,7 +166,6 @@ def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: boo
 
 
 def ground_truth_files(root: Path) -> Iterator[Path]:
-    """The files :func:`read_ground_truth` depends on."""
     folder = root / GROUND_TRUTH
     yield from sorted((folder / QUERY / "sensors").glob("*.txt"))
     yield from sorted((folder / SIDE_TABLES).glob("*.csv"))
@@ -194,15 +174,10 @@ def ground_truth_files(root: Path) -> Iterator[Path]:
 def read_ground_truth(
     root: Path, query: KaptureData, world: World
 ) -> tuple[KaptureData | None, dict[str, ImageGroup]]:
-    """True poses that lie beside a dataset, for those of ``query`` that have one.
+    """Read true poses (in the local frame) and groups from ``<root>/ground_truth``, if present.
 
-    The challenges keep theirs; rendered twins bring them, and a user may put his own there:
-    ``<root>/ground_truth/query`` is a kapture folder with poses in the official frame and the
-    image names of the import, ``<root>/ground_truth/megloc/groups.csv`` the queries' conditions.
-
-    Returns
-    -------
-    The poses in the local frame (with ``query``'s sensors and records) or None, and the groups.
+    ``query/`` in it is a kapture folder with poses in the official frame and the image names of the
+    import, ``megloc/groups.csv`` has the conditions.
     """
     folder = root / GROUND_TRUTH
     if not (folder / QUERY).exists():
@@ -220,10 +195,9 @@ def read_ground_truth(
 
 
 def with_poses(data: KaptureData, poses: Mapping[tuple[int, str], RigidTransform]) -> KaptureData:
-    """``data`` with these trajectories, by (timestamp, device), instead of its own."""
+    """Replace the trajectories of ``data``, by (timestamp, device)."""
     return replace(data, trajectories=dict(poses), records_depth={})
 
 
 def last_part(image: str) -> str:
-    """The file name of an image path."""
     return PurePosixPath(image).name

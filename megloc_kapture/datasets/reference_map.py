@@ -1,4 +1,4 @@
-"""The model a dataset ships, as a kapture map: what hloc and others localize in."""
+"""A dataset's sparse model as a kapture map, as used by hloc and others."""
 
 from __future__ import annotations
 
@@ -25,20 +25,19 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 
-# the database of another model has its features elsewhere; this one's differ by printed digits
+# features of the same model differ by printed digits only
 _MAX_SHIFT_PX = 1.0
 
 
 @dataclass(frozen=True)
 class ReferenceModel:
-    """The model a dataset ships: reads the names of its images and its points; its database."""
+    """A dataset's model: a reader of image names and points, and its feature database."""
 
     read: Callable[[], tuple[Sequence[str], SparsePoints]]
     database: Path | None
 
 
 def check_model_files(files: Iterable[Path]) -> None:
-    """Raise DataError where a file of the model that a dataset comes with is missing."""
     for file in files:
         if not file.is_file():
             raise DataError("missing; the reference model is read from it", path=file)
@@ -58,26 +57,16 @@ def write_reference_map(
 ) -> dict[str, int]:
     """Write a sparse model as a kapture map: sensors, poses, keypoints, points, observations.
 
-    Row i of ``points3d.txt`` is point i of the model. Images of the model that ``data`` does not
-    record are left out, with their observations. Without a database the keypoints of an image are
-    those that observe points, in the order of their ids in the model, numbered anew without gaps.
-    With one they are all keypoints of the database, with their descriptors.
+    Row i of ``points3d.txt`` is point i of the model; images without a record are omitted. Without
+    a database, keypoints are the observed ones, renumbered in the order of their ids; with a
+    database, all of its keypoints and descriptors are written.
 
     Parameters
     ----------
-    output : the kapture folder to write.
-    data : sensors, records and poses of the images.
-    links : folders of images, see :func:`~megloc_kapture.io.files.link_records`.
-    image_names : name in ``data`` of each image of the model, in its order.
-    keypoints_type : the type name of keypoints and descriptors.
-    database : COLMAP database with the features of the model; its images have the names of
-        ``image_names``, or these with another suffix.
-    database_names : names in the database of images that have another name there.
-    scales : of images whose camera in ``data`` is another size than in the model, in x and y.
-
-    Returns
-    -------
-    Numbers of images, keypoints, points and observations, by these words.
+    image_names : name in ``data`` of each image of the model, in model order.
+    database : COLMAP database with the names of ``image_names``, up to their suffixes.
+    database_names : database names that differ from ``image_names``.
+    scales : (x, y) scale of images whose camera in ``data`` has another size than in the model.
     """
     write_sensors(output, data)
     link_records(output, links)
@@ -96,7 +85,7 @@ def write_reference_map(
         positions = {name: position for position, name in enumerate(image_names)}
         order = np.argsort(points.image_ids, kind="stable")
         ends = np.cumsum([0, *np.bincount(points.image_ids, minlength=len(image_names)).tolist()])
-        keypoint_ids = np.full(len(order), -1, np.int32)  # -1: a left out observation
+        keypoint_ids = np.full(len(order), -1, np.int32)  # -1: omitted observation
         new_ids = np.zeros(len(image_names), np.int32)
         num_keypoints = 0
         for new_id, name in enumerate(names):
@@ -112,7 +101,7 @@ def write_reference_map(
             if scales and name in scales:
                 keypoints = keypoints * np.array(scales[name], np.float32)
             num_keypoints += len(keypoints)
-            # with a database an image without features has empty files, as after extraction
+            # with a database, images without features get empty files
             if len(keypoints) or source is not None:
                 writer.write(name, keypoints)
             pairs = np.stack([points.point_ids[rows], numbers], axis=1)
@@ -136,8 +125,6 @@ def write_reference_map(
 
 
 class _DatabaseFeatures(AbstractContextManager["_DatabaseFeatures"]):
-    """All features of a database; writes the descriptors of the images it is asked for."""
-
     def __init__(
         self, database: ColmapDatabase, output: Path, keypoints_type: str, names: Mapping[str, str]
     ) -> None:
@@ -155,7 +142,7 @@ class _DatabaseFeatures(AbstractContextManager["_DatabaseFeatures"]):
     def of_image(
         self, name: str, features: NDArray[np.int64], xy_px: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Return the keypoints of an image, which the model's features (M,) at (M, 2) must fit."""
+        """Return the keypoints of an image; they must agree with the model's features."""
         name_there = self._name_there(name)
         if name_there is None:
             if len(features):
@@ -184,7 +171,6 @@ class _DatabaseFeatures(AbstractContextManager["_DatabaseFeatures"]):
         return keypoints
 
     def __exit__(self, *raised: object) -> None:
-        """Write empty descriptors of the images without keypoints."""
         if self._writer is not None:
             for name in self._without:
                 config = self._writer.config

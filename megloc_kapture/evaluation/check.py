@@ -1,7 +1,7 @@
-"""Check of pose files, ours or foreign: their rows, their names or pairs, and their poses.
+"""Check of pose files: rows, names or pairs, and poses.
 
-The poses are compared with the map's cameras. Where those of a whole file look wrong, the classic
-conventions are tried in turn, and the one that brings the poses to the map is named.
+Poses are compared with the map's cameras. If a whole file looks wrong, the usual conventions
+are tried and the one that fits the map is named.
 """
 
 from __future__ import annotations
@@ -59,13 +59,8 @@ _DUMMY = RigidTransform.identity()
 class Finding:
     """One problem.
 
-    Parameters
-    ----------
-    kind : a short name that programs can rely on (``convention``, ``missing``).
-    message : one line that names the problem and, where possible, the remedy.
-    file : the pose file, where there are several.
-    line : of the file, from 1; None for the file as a whole.
-    names : the rows or queries concerned, as the file or the challenge's list calls them.
+    ``kind`` is a stable identifier for programs (``convention``, ``missing``); ``line``
+    counts from 1.
     """
 
     severity: Severity
@@ -82,15 +77,7 @@ class Finding:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckReport:
-    """The result of a check.
-
-    Parameters
-    ----------
-    reference : the imported dataset that the file was compared with; may be empty.
-    poses : number of rows with a usable pose.
-    expected : number of queries, or pairs, that the challenge counts; None if unknown.
-    findings : by severity; those about whole files first, then by file and line.
-    """
+    """Result of a check; ``findings`` are sorted by severity, file and line."""
 
     dataset: str
     file: str
@@ -101,11 +88,10 @@ class CheckReport:
 
     @property
     def has_problems(self) -> bool:
-        """Whether any finding is an error."""
         return any(finding.severity == "error" for finding in self.findings)
 
     def lines(self) -> list[str]:
-        """The report as text, one problem per line; the last line is the outcome."""
+        """Format the report, one problem per line; the last line is the outcome."""
         counts: Counter[tuple[str, str]] = Counter()
         shown = []
         for finding in self.findings:
@@ -127,20 +113,15 @@ class CheckReport:
         return [*shown, f"{self.poses} poses{of}: {outcome}"]
 
     def to_json(self) -> dict[str, Any]:
-        """The report as plain JSON data."""
         return {**asdict(self), "reference": self.reference or None, "ok": not self.has_problems}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Reference(Benchmark):
-    """An imported dataset that a pose file is compared with, and the rules of its benchmark.
+    """Imported dataset and the rules of its benchmark.
 
-    Parameters
-    ----------
-    folder : its path; empty if there is none.
-    expected : name of each scored query in the pose file -> the query.
-    queries : all query images, scored or not.
-    map_poses : image -> ``cam_from_world`` in the workspace's local frame.
+    ``expected`` maps names in the pose file to scored queries; ``map_poses`` are ``cam_from_world``
+    in the workspace's local frame.
     """
 
     folder: str = ""
@@ -150,10 +131,7 @@ class Reference(Benchmark):
 
 
 def read_reference(folder: Path) -> Reference:
-    """Read what an import or workspace has of ``mapping/``, ``query/`` and ``megloc/``.
-
-    Raises DataError if it has none of the three, or one is broken.
-    """
+    """Read ``mapping/``, ``query/`` and ``megloc/`` of an import or workspace."""
     tables = folder / SIDE_TABLES
     mapping, query = (
         KaptureFolder(path) if (path / "sensors" / "sensors.txt").is_file() else None
@@ -182,10 +160,7 @@ def check_submission(
 ) -> CheckReport:
     """Check a pose file, or an MLAD challenge's folder of pose files.
 
-    Parameters
-    ----------
-    dataset : whose rules hold, by its name without ``synthetic-``.
-    reference : the imported dataset; without it only the file itself is checked.
+    Without ``reference`` only the file itself is checked.
     """
     if reference is None:
         reference = Reference(protocol=PROTOCOLS.get(dataset, Protocol()))
@@ -320,7 +295,6 @@ def _read_rows(path: Path, kind: PoseFileFormat) -> _Rows:
 
 
 def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -> list[Finding]:
-    """Find unknown, wrong, missing and double names; ``lines`` has the names of a file."""
     expected, findings = reference.expected, list[Finding]()
     by_stem, unscored = defaultdict(list), defaultdict(list)
     for name in expected:
@@ -370,7 +344,6 @@ def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -
 
 
 def _check_shape(names: Iterable[str], dataset: str) -> list[Finding]:
-    """Check names by themselves, where there is no list to compare with."""
     if dataset not in _SHAPES:
         return []
     with_folder, endings = _SHAPES[dataset]
@@ -385,7 +358,6 @@ def _check_shape(names: Iterable[str], dataset: str) -> list[Finding]:
 
 
 def _check_pairs(rows: _Rows, wanted: Mapping[str, str], reference: Reference) -> list[Finding]:
-    """Check the rows of an MLAD file; ``wanted`` has the reference image of each pair."""
     unknown = [key for key in rows.lines if key not in wanted]
     swapped = [key for key in unknown if " ".join(reversed(key.split(" "))) in wanted]
     if 2 * len(swapped) > len(rows.lines):
@@ -418,10 +390,6 @@ def _check_poses(
     reference: Reference,
     in_local: Callable[[str, RigidTransform], RigidTransform],
 ) -> list[Finding]:
-    """Compare the poses of a file with the map's cameras.
-
-    ``in_local`` turns a row's name and pose into ``cam_from_local``.
-    """
     map_poses, unit = list(reference.map_poses.values()), reference.world.unit
     if min(len(map_poses), len(poses)) < _MIN_POSES:
         message = f"{_plural(len(poses), 'pose')} and {_plural(len(map_poses), 'map camera')}: too "
@@ -484,7 +452,6 @@ def _stem(name: str) -> str:
 
 
 def _ends_alike(name: str, other: str) -> bool:
-    """Whether one path, without its ending, ends with the other."""
     a, b = (f"/{text.lstrip('./').rpartition('.')[0].lower()}" for text in (name, other))
     return a.endswith(b) or b.endswith(a)
 

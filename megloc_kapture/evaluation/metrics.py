@@ -83,7 +83,6 @@ class PoseErrors:
 
     @property
     def has_pose(self) -> NDArray[np.bool_]:
-        """(N,) whether the query has an estimated pose."""
         return np.isfinite(self.position_m)
 
 
@@ -284,5 +283,4 @@ def _check_free(name: str, taken: Mapping[str, object]) -> None:
 
 
 def _median(values: NDArray[np.float64]) -> float:
-    """Median; of nothing, or of more missing than present, infinite."""
     return float(np.median(values)) if values.size else float("inf")

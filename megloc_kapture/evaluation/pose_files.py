@@ -52,7 +52,7 @@ Names = PoseFileNames | Mapping[str, str]
 
 
 def name_by_rule(image: str, rule: PoseFileNames) -> str:
-    """What an image is called in a pose file, by the rule of its challenge."""
+    """Return the name of an image in a pose file by the challenge's rule."""
     return image if rule == "full" else image.rsplit("/", 1)[-1]
 
 
@@ -148,14 +148,12 @@ def is_colmap_images(text: str) -> bool:
 
 
 def _rows(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Line numbers and columns, without empty lines and comments."""
     for number, line in enumerate(text.split("\n"), start=1):
         if (fields := line.split()) and not fields[0].startswith("#"):
             yield number, fields
 
 
 def _colmap_rows(text: str) -> Iterator[tuple[int, list[str]]]:
-    """The rows of ``images.txt`` in the order of a pose file's columns."""
     lines = iter(enumerate(text.split("\n"), start=1))
     for number, line in lines:
         if (fields := line.split(maxsplit=9)) and not fields[0].startswith("#"):
@@ -207,7 +205,6 @@ def poses_by_image(
 
 
 def _ends(image: str) -> list[str]:
-    """The paths that end an image's path: of ``a/b/c.jpg`` that, ``b/c.jpg`` and ``c.jpg``."""
     parts = image.split("/")
     return ["/".join(parts[start:]) for start in range(len(parts))]
 
@@ -231,7 +228,7 @@ def checked_pose(
     translation: tuple[float, float, float],
     whose: str,
 ) -> RigidTransform:
-    """The pose with a unit quaternion; one that is unit to rounding keeps its very digits."""
+    """Return the pose with a unit quaternion; an almost unit quaternion is unchanged."""
     # beyond, squares overflow
     if not all(abs(v) < 1e100 for v in (*quat_wxyz, *translation)):
         raise DataError(f"{whose}: the pose is not finite")
@@ -322,7 +319,6 @@ def read_mlad_file(path: Path | str) -> list[RelativePose]:
 
 
 def parse_timestamp(text: str) -> int:
-    """A timestamp: a whole number in plain digits."""
     if not _TIMESTAMP.fullmatch(text):
         raise DataError(f"{text!r} is not a timestamp (a whole number)")
     return int(text)
@@ -355,7 +351,6 @@ _PACKAGES = (
 
 @cache  # parsing a package's metadata takes 2 ms, and every stage writes nine
 def installed_version(package: str) -> str | None:
-    """Installed version of a package, None where it is absent."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -363,7 +358,6 @@ def installed_version(package: str) -> str | None:
 
 
 def package_versions() -> dict[str, str]:
-    """Package -> installed version, for those that are installed."""
     found = ((package, installed_version(package)) for package in _PACKAGES)
     return {package: version for package, version in found if version is not None}
 

@@ -104,7 +104,6 @@ class Benchmark:
     pairs: tuple[RelocalizationPair, ...] = ()
 
     def thresholds(self) -> tuple[Threshold, ...]:
-        """The protocol's thresholds."""
         return thresholds_from_pairs(self.protocol.thresholds)
 
     def scored(self, images: Iterable[str]) -> set[str]:

@@ -96,11 +96,9 @@ class ResultContext:
         return {image: group.frame for image, group in groups.items() if group.frame}
 
     def map_poses(self) -> dict[str, RigidTransform]:
-        """``cam_from_world`` of the map's images; empty without a map."""
         return {} if self.mapping is None else self.mapping.read().poses()
 
     def query_images(self) -> list[str]:
-        """Names of the queries; empty where they are not known."""
         return [] if self.queries is None else self.queries.read().image_names()
 
 
@@ -254,7 +252,7 @@ def read_poses(source: Path) -> dict[str, RigidTransform]:
 
 
 def model_of(folder: Path) -> Path | None:
-    """The folder of the COLMAP model in a folder; None where there is none, and of kapture's."""
+    """Return the folder of the COLMAP model in a folder, if any."""
     if (folder / _SENSORS).is_file():
         return None
     places = (folder, folder / "sparse", folder / "sparse" / "0")

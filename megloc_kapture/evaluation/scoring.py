@@ -85,8 +85,6 @@ class QueryResult:
 
 
 class Reported(ABC):
-    """A result, or several, that a report can be made of; prints as its tables."""
-
     __slots__ = ()
 
     @abstractmethod
@@ -100,7 +98,6 @@ class Reported(ABC):
         return report_text(cast("AnyReported", self)).removesuffix("\n")
 
     def html(self, path: Path | str) -> None:
-        """Write the report as an HTML page."""
         from megloc_kapture.evaluation.report.reports import render_report
 
         write_bytes(path, render_report(cast("AnyReported", self)).encode("utf-8"))
@@ -123,8 +120,6 @@ class Reported(ABC):
 
 @dataclass(frozen=True, slots=True)
 class CovarianceCheck:
-    """Errors of poses against what their covariances claim."""
-
     num_poses: int
     num_within: int
 
@@ -176,7 +171,6 @@ class Evaluation(Reported):
 
     @property
     def confidence(self) -> Confidence | None:
-        """The confidences of the result against the truth; None where it brings none."""
         return confidence_of(self.queries, self.thresholds[-1], self.nowhere)
 
     def rows_above(self, min_confidence: float) -> tuple[RecallRow, ...]:
@@ -210,14 +204,12 @@ class Evaluation(Reported):
         return columns
 
     def row(self, name: str = "all") -> RecallRow:
-        """The recall row of a condition or pool; KeyError for an unknown name."""
         for row in self.rows:
             if row.name == name:
                 return row
         raise KeyError(name)
 
     def image(self, query: str) -> str:
-        """The image of a query, which in ``queries`` may be called by its pair."""
         return self.pairs[query].query if query in self.pairs else query
 
 
@@ -339,13 +331,7 @@ def query_result(
     errors: tuple[float, float],
     confidence: float | None = None,
 ) -> QueryResult:
-    """The outcome of a query.
-
-    Parameters
-    ----------
-    status : its row of ``status.csv``, whose confidence goes before ``confidence``.
-    errors : metres and degrees.
-    """
+    """Return the outcome of a query; errors are in metres and degrees."""
     if status is None:
         outcome: Outcome = "localized" if has_pose else "missing"
         reason = "" if has_pose else "no pose in the result"
@@ -462,7 +448,6 @@ def evaluate_pairs(
 
 
 def _conditions(files: Iterable[str]) -> dict[str, str]:
-    """Relocalization file -> what it is called as a condition: the recording it is about."""
     whole = {file: PurePosixPath(file).stem for file in files}
     short = {}
     for file, stem in whole.items():

@@ -47,7 +47,6 @@ class PairedTest:
 
     @property
     def is_real(self) -> bool:
-        """Whether chance is an unlikely explanation, at 5 %."""
         return self.p_adjusted <= SIGNIFICANCE
 
 
@@ -72,7 +71,6 @@ class MedianDifference:
 
     @property
     def is_real(self) -> bool:
-        """Whether the interval excludes zero."""
         return self.low_m > 0.0 or self.high_m < 0.0
 
 
@@ -95,10 +93,7 @@ class Comparison(Reported):
 
 
 def compare(evaluations: Sequence[Evaluation]) -> Comparison:
-    """Compare at least two results on the same queries, thresholds and conditions.
-
-    Raises OptionError if they differ in any of these, or two have one label.
-    """
+    """Compare at least two results on the same queries, thresholds and conditions."""
     _check_comparable(evaluations)
     names = np.array(evaluations[0].errors.names, dtype=object)
     tables, medians = [], []

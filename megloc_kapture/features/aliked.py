@@ -1,9 +1,8 @@
 """ALIKED local features (Zhao et al., IEEE TIM 2023), with the keys of the official checkpoints.
 
-The network is run as it is defined, but nothing of its 128 channels is ever made in the image's own
-resolution: the score head's first layer is a matrix product with each pixel, so it is applied to
-every level before that is enlarged, and the descriptor head reads features where it looks for them.
-Batch normalisation is folded into the convolutions, so the module is for inference only.
+For inference only: batch normalisation is folded into the convolutions. The 128 channels are never
+computed at full resolution: the score head's first layer, a matrix product per pixel, is applied to
+each level before upsampling, and descriptors are sampled at keypoints only.
 """
 
 from __future__ import annotations
@@ -33,16 +32,14 @@ from megloc_kapture.nets.score_maps import (
 )
 from megloc_kapture.values import LocalFeatures
 
-_TEMPERATURE = 0.1  # of the sub-pixel position, the one the network was trained with
-_MULTIPLE = 32  # image sides are padded to multiples of it, the coarsest level's stride
-_STRIP_ROWS = 2  # of the image, at once in the score head's first layer: what a cache holds
-_PATCH = 3  # side of the square of pixels that says where to look, in pixels
+_TEMPERATURE = 0.1  # of the sub-pixel position, as in training
+_MULTIPLE = 32
+_STRIP_ROWS = 2  # of the image per block of the score head's first layer, to fit the cache
+_PATCH = 3
 _VALUES_AT_ONCE = {"cpu": 1 << 23, "cuda": 1 << 28}
 
 
 class AlikedOptions(LocalNetworkOptions):
-    """Options of ALIKED."""
-
     weights: str = Field(
         default="aliked-n16",
         description="aliked-t16 (64-d), aliked-n16, aliked-n16rot, aliked-n32, or a file",
@@ -59,12 +56,11 @@ class Aliked(LocalNetwork[AlikedOptions]):
 
     def __init__(self, options: AlikedOptions | None = None) -> None:
         super().__init__(options)
-        # the type's name carries the model: descriptors of different ones do not match
+        # the type name contains the model: descriptors of different models do not match
         self.name = Path(self._weights.name).stem
 
     @property
     def descriptor_size(self) -> int:
-        """64 or 128, of the checkpoint."""
         return int(self.network(aliked_from)[0].descriptor_size)
 
     def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
@@ -77,7 +73,6 @@ class Aliked(LocalNetwork[AlikedOptions]):
     def _selected(
         self, net: AlikedNet, maps: AlikedMaps, mask: NDArray[np.bool_] | None
     ) -> LocalFeatures:
-        """The best keypoints of one image, and their descriptors."""
         options, scores = self.options, maps.scores
         found = select_pixels(
             suppress_non_maxima(scores, options.nms_radius),
@@ -87,7 +82,7 @@ class Aliked(LocalNetwork[AlikedOptions]):
         xy = soft_argmax(scores, found.xy, options.nms_radius, _TEMPERATURE)
         height, width = scores.shape
         read = read_bilinear(scores.reshape(-1, 1), xy[:, 1], xy[:, 0], (height, width))
-        # the network puts the centre of the first pixel at (0, 0), COLMAP at (0.5, 0.5)
+        # the network's first pixel centre is (0, 0), COLMAP's (0.5, 0.5)
         xy_px = xy.cpu().numpy() + np.float32(0.5)
         score = read[:, 0].cpu().numpy()
         return self._best(
@@ -99,10 +94,10 @@ class Aliked(LocalNetwork[AlikedOptions]):
 
 
 class AlikedNet(nn.Module):
-    """Image to score map and features; the keys are those of ``aliked-*.pth``.
+    """Network from image to score map and features; the keys are those of ``aliked-*.pth``.
 
-    ``channels``: of the four blocks; the last one is that of the descriptors; ``positions``: number
-    of positions that a descriptor is gathered from.
+    ``channels``: of the four blocks; the last is the descriptor size; ``positions``: number of
+    sampling positions of a descriptor.
     """
 
     def __init__(self, channels: tuple[int, int, int, int], positions: int) -> None:
@@ -130,7 +125,7 @@ class AlikedNet(nn.Module):
         self.desc_head = DescriptorHead(self.descriptor_size, positions)
 
     def forward(self, images: torch.Tensor) -> list[AlikedMaps]:
-        """The maps of RGB images, (B, 3, H, W) in [0, 1]."""
+        """Compute the maps of RGB images, (B, 3, H, W) in [0, 1]."""
         height, width = images.shape[2:]
         extra_y, extra_x = -height % _MULTIPLE, -width % _MULTIPLE
         top, left = extra_y // 2, extra_x // 2
@@ -154,7 +149,6 @@ class AlikedNet(nn.Module):
         return found
 
     def _score_logits(self, fine: _Level, coarse: list[torch.Tensor]) -> torch.Tensor:
-        # the first layer's weights, apart for the channels of each level
         first, *others = (
             weight[:, :, 0, 0].T
             for weight in self.get_parameter("score_head.0.weight").chunk(4, dim=1)
@@ -176,36 +170,34 @@ class AlikedNet(nn.Module):
         return self.score_head[1:](by_pixel.view(1, *fine.size, -1).permute(0, 3, 1, 2))
 
     def fine_tap(self, level1: torch.Tensor) -> torch.Tensor:
-        """Features (N, D / 4) of the finest level for rows of the first block's, (N, C)."""
+        """Return features (N, D / 4) of the finest level for rows (N, C) of the first block."""
         return functional.selu(level1 @ self.conv1.weight[:, :, 0, 0].T, inplace=True)
 
 
 @dataclass(frozen=True, eq=False)
 class _Level:
-    """Features of one level: (h w, channels), and (h, w)."""
-
     table: torch.Tensor
     size: tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
 class AlikedMaps:
-    """The maps of one image: scores float32 (H, W) in (0, 1), and features, read at pixels."""
+    """Maps of one image: scores float32 (H, W) in (0, 1), and features sampled at pixels."""
 
     _net: AlikedNet
     scores: torch.Tensor
     _origin: tuple[int, int]  # row and column of the image's first pixel in the padded levels
-    _fine: _Level  # before its 1x1 convolution, which is cheap where only some pixels are asked for
+    _fine: _Level
     _coarse: list[_Level]
 
     def features_at(self, rows: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
-        """Unit features (N, D) of pixels of the image, int64 (N,) rows and columns."""
+        """Return unit features (N, D) of pixels, int64 (N,) rows and columns."""
         row, column = rows + self._origin[0], columns + self._origin[1]
         height, width = self._fine.size
         parts = [self._net.fine_tap(self._fine.table[row * width + column])]
         for level in self._coarse:
             h, w = level.size
-            # corners aligned: the first and last pixels of both maps lie on one another
+            # align_corners: the corner pixels of both maps coincide
             y = row.to(level.table.dtype) * ((h - 1) / (height - 1))
             x = column.to(level.table.dtype) * ((w - 1) / (width - 1))
             parts.append(read_bilinear(level.table, y.clamp(max=h - 1), x.clamp(max=w - 1), (h, w)))
@@ -217,8 +209,6 @@ def _level(features: torch.Tensor) -> _Level:
 
 
 class _Block(nn.Module):
-    """Two convolutions, each batch-normalised, with SELU; residual but for the first block."""
-
     def __init__(
         self, inputs: int, outputs: int, *, deformable: bool, residual: bool = True
     ) -> None:
@@ -239,26 +229,20 @@ class _Block(nn.Module):
 
 
 class _Conv(nn.Conv2d):
-    """3x3 convolution without bias."""
-
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__(inputs, outputs, 3, padding=1, bias=False)
 
     def normalised(self, x: torch.Tensor, norm: nn.BatchNorm2d) -> torch.Tensor:
-        """The convolution and the batch normalisation after it, in one."""
         return functional.conv2d(x, *_folded(self.weight, norm), padding=1)
 
 
 class _DeformableConv(nn.Module):
-    """3x3 deformable convolution without amplitudes."""
-
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
         self.offset_conv = nn.Conv2d(inputs, 18, 3, padding=1)
         self.regular_conv = nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
 
     def normalised(self, x: torch.Tensor, norm: nn.BatchNorm2d) -> torch.Tensor:
-        """The convolution and the batch normalisation after it, in one."""
         limit = max(x.shape[2:]) / 4
         offset = self.offset_conv(x).clamp(-limit, limit)
         return deform_conv2d(x, offset, *_folded(self.regular_conv.weight, norm))
@@ -271,7 +255,7 @@ def _folded(weight: torch.Tensor, norm: nn.BatchNorm2d) -> tuple[torch.Tensor, t
 
 
 def aliked_from(tensors: Mapping[str, torch.Tensor], where: str) -> AlikedNet:
-    """The network of a checkpoint, its variant read from the shapes; in eval mode."""
+    """Build the network of a checkpoint, its variant inferred from shapes, in eval mode."""
     try:
         first = tensors["block1.conv1.weight"].shape[0]
         second, third, fourth = (tensors[f"conv{level}.weight"].shape[1] for level in (2, 3, 4))
@@ -283,8 +267,6 @@ def aliked_from(tensors: Mapping[str, torch.Tensor], where: str) -> AlikedNet:
 
 
 class DescriptorHead(nn.Module):
-    """Features around a keypoint to the positions that its descriptor is gathered from."""
-
     def __init__(self, size: int, positions: int) -> None:
         super().__init__()
         self.positions = positions
@@ -297,10 +279,7 @@ class DescriptorHead(nn.Module):
         self.sf_conv = nn.Conv2d(size, size, 1, bias=False)
 
     def forward(self, maps: AlikedMaps, xy: torch.Tensor) -> torch.Tensor:
-        """Descriptors of unit length, float32 (N, D), at xy (N, 2); a pixel's centre is an integer.
-
-        The map has at least 4 pixels a side.
-        """
+        """Return unit descriptors, float32 (N, D), at xy (N, 2); pixel centres are integers."""
         size = self.agg_weights.shape[1]
         at_once = _VALUES_AT_ONCE[xy.device.type] // (4 * self.positions * size)
         parts = [self._describe(maps, part) for part in torch.split(xy, max(at_once, 1))]
@@ -309,8 +288,8 @@ class DescriptorHead(nn.Module):
     def _describe(self, maps: AlikedMaps, xy: torch.Tensor) -> torch.Tensor:
         height, width = maps.scores.shape
         number, size = len(xy), self.agg_weights.shape[1]
-        # the patch is centred on the pixel the keypoint lies in. As published, it keeps off the
-        # last row and column
+        # the patch is centred on the keypoint's pixel; as published, it avoids the last row and
+        # column
         left = (xy[:, 0].long() - 1).clamp(0, width - 1 - _PATCH)
         top = (xy[:, 1].long() - 1).clamp(0, height - 1 - _PATCH)
         side = torch.arange(_PATCH, device=xy.device)

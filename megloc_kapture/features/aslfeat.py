@@ -1,8 +1,7 @@
 """ASLFeat local features (Luo et al., CVPR 2020), with the official checkpoint converted.
 
-The module's keys are the names of TensorFlow's variables with dots for slashes, and torch's words
-for the last part (``scripts/convert_weights.py``). Batch normalisation is folded into the
-convolutions, so the module is for inference only.
+For inference only: batch normalisation is folded into the convolutions. The keys are TensorFlow's
+names in torch's notation (``scripts/convert_weights.py``).
 """
 
 from __future__ import annotations
@@ -42,24 +41,21 @@ from megloc_kapture.nets.score_maps import (
 from megloc_kapture.values import LocalFeatures
 
 DESCRIPTOR_SIZE = 128
-STRIDE = 4  # of the features; their pixel (i, j) is read at the image's (4 i, 4 j)
-# layers whose raw outputs are scored: dilation of the neighbourhood, and weight in the sum
+STRIDE = 4  # of the features; feature (i, j) is at pixel (4 i, 4 j)
+# scored layers: dilation of the neighbourhood, and weight in the sum
 _SCORED = {"conv1": (3, 1 / 6), "conv3": (2, 2 / 6), "conv6": (1, 3 / 6)}
 _DEFORMABLE = ("conv6_0", "conv6_1", "conv6")
 _NORM_EPSILON = 1e-5
 _VALUES_AT_ONCE = {"cpu": 1 << 19, "cuda": 1 << 27}
 _BORDER_PX = 5
 _NOTHING = (np.zeros((0, 3), np.float32), np.zeros(0, np.float32), torch.zeros(0, DESCRIPTOR_SIZE))
-# the image pyramid of the authors
 _SCALE_STEP = math.sqrt(0.5)
 _SMALLEST_SCALE = 0.3
 _SMALLEST_SIDE_PX = 128
-_BLUR_PX = 0.8  # of the smaller image, before each step
+_BLUR_PX = 0.8  # in the smaller image, before each step
 
 
 class AslFeatOptions(LocalNetworkOptions):
-    """Options of ASLFeat."""
-
     weights: str = Field(default="aslfeat", description="name in the registry, or a file")
     threshold: float = Field(default=0.5, ge=0, description="scores kept are larger")
     nms_radius: int = Field(default=1, ge=0, description="pixels")
@@ -80,7 +76,7 @@ class AslFeat(LocalNetwork[AslFeatOptions]):
 
     def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
         grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in images]
-        # without contrast the network would see nothing but the zeros around the image
+        # without contrast the network would see only its zero padding
         usable = [k for k, gray in enumerate(grays) if gray.min() != gray.max()]
         of_image = [_scales(grays[k]) if self.options.multi_scale else [grays[k]] for k in usable]
         found: list[list[Level]] = [[] for _ in images]
@@ -111,7 +107,7 @@ class AslFeat(LocalNetwork[AslFeatOptions]):
             scores = candidates.scores[kept]
             coarse = maps.features.shape[1], maps.features.shape[2]
             x, y = (xy / STRIDE).unbind(1)
-            # the border keeps all of them inside the features
+            # the border keeps keypoints inside the features
             read = read_bilinear(pixel_table(maps.features), y, x, coarse)
             descriptors = functional.normalize(read, dim=1)
         xy_px = in_image_px(xy.cpu().numpy(), maps.scores.shape, full_size)
@@ -120,14 +116,13 @@ class AslFeat(LocalNetwork[AslFeatOptions]):
 
 
 def _scales(gray: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-    """The image at the scales of the authors' pyramid, each blurred and resized from the last."""
     smallest = max(_SMALLEST_SCALE, _SMALLEST_SIDE_PX / max(gray.shape))
     number = math.floor(max(math.log(smallest) / math.log(_SCALE_STEP), 1))
     levels = [gray]
     for _ in range(number - 1):
         blurred = cv2.GaussianBlur(levels[-1], (0, 0), _BLUR_PX / _SCALE_STEP)
         height, width = (round(side * _SCALE_STEP) for side in blurred.shape)
-        # by size: by a factor OpenCV would sample at the factor, not at the ratio of the sizes
+        # by size: with a factor, OpenCV ignores the rounding of the size
         resized = cv2.resize(blurred, (width, height))
         levels.append(np.asarray(resized, dtype=np.float32))
     return levels
@@ -135,19 +130,13 @@ def _scales(gray: NDArray[np.float32]) -> list[NDArray[np.float32]]:
 
 @dataclass(frozen=True, eq=False)
 class AslFeatMaps:
-    """The maps of one image.
-
-    ``scores`` float32 (H, W) are of its size and not negative; ``features`` (128, ceil(ceil(H / 2)
-    / 2), the same of W) are the descriptors before normalisation.
-    """
+    """Maps of one image: scores float32 (H, W), not negative; raw descriptors (128, h, w)."""
 
     scores: torch.Tensor
     features: torch.Tensor
 
 
 class AslFeatNet(nn.Module):
-    """Gray image to score map and features; 821,745 weights in kernels and biases."""
-
     def __init__(self) -> None:
         super().__init__()
         self.conv0 = _Conv(1, 32)
@@ -163,7 +152,7 @@ class AslFeatNet(nn.Module):
         self.tower = nn.ModuleDict({name: _Scale() for name in _SCORED})
 
     def forward(self, images: torch.Tensor) -> list[AslFeatMaps]:
-        """The maps of gray images, (B, 1, H, W) in 0 to 255, of at least 11 pixels a side."""
+        """Compute the maps of gray images, (B, 1, H, W) in 0 to 255, at least 11 pixels a side."""
         height, width = images.shape[2:]
         normalised = []
         for image in torch.split(images, 1):
@@ -200,8 +189,6 @@ class AslFeatNet(nn.Module):
 
 
 class _Norm(nn.Module):
-    """Batch normalisation without scale and offset, as it is used after the training."""
-
     running_mean: torch.Tensor
     running_var: torch.Tensor
 
@@ -211,12 +198,10 @@ class _Norm(nn.Module):
         self.register_buffer("running_var", torch.ones(channels))
 
     def folded_into(self, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Weight and bias of a convolution that normalises what one of this weight gives."""
         scale, shift = self._line()
         return weight * scale[:, None, None, None], shift
 
     def rectified_(self, x: torch.Tensor) -> torch.Tensor:
-        """Normalise and rectify (B, C, H, W) in its own memory."""
         scale, shift = self._line()
         return x.mul_(scale[:, None, None]).add_(shift[:, None, None]).relu_()
 
@@ -226,7 +211,7 @@ class _Norm(nn.Module):
 
 
 class _Conv(nn.Module):
-    """3x3 convolution without bias, padded as TensorFlow's SAME, and the normalisation after it."""
+    """3x3 convolution without bias, padded as TensorFlow's SAME, and its normalisation."""
 
     def __init__(
         self, inputs: int, outputs: int, *, stride: int = 1, normalised: bool = True
@@ -237,18 +222,14 @@ class _Conv(nn.Module):
         self.bn = _Norm(outputs) if normalised else None
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """The convolution alone."""
         return conv_same(x, self.weight, None, self.stride)
 
     def normalised(self, x: torch.Tensor) -> torch.Tensor:
-        """Convolution, normalisation and rectification in one."""
         assert self.bn is not None
         return conv_same(x, *self.bn.folded_into(self.weight), self.stride).relu_()
 
 
 class _Deformation(nn.Module):
-    """Offsets and amplitudes of a deformable convolution's nine readings."""
-
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.offset = nn.Conv2d(channels, 18, 3, padding=1)
@@ -259,8 +240,6 @@ class _Deformation(nn.Module):
 
 
 class _Scale(nn.Module):
-    """The value that a layer's outputs are divided by before they are scored."""
-
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("instance_max", torch.ones(()))
@@ -278,11 +257,10 @@ def aslfeat_from(tensors: Mapping[str, torch.Tensor], where: str) -> AslFeatNet:
 
 
 def peakiness(features: torch.Tensor, dilation: int, scale: torch.Tensor) -> torch.Tensor:
-    """Peakiness of each pixel in space and among channels, of its best channel (eq. 6 to 8).
+    """Return the peakiness of each pixel in space and among channels (eq. 6 to 8), (H, W).
 
-    max over channels of softplus(y - its mean over a 3x3 neighbourhood) times
-    softplus(y - its mean over the channels), where y = features / scale. Returns (H, W), at least
-    float32.
+    max over channels of softplus(y - its mean over a 3x3 neighbourhood) times softplus(y - its mean
+    over the channels), where y = features / scale. At least float32.
 
     Parameters
     ----------
@@ -311,17 +289,12 @@ def peakiness(features: torch.Tensor, dilation: int, scale: torch.Tensor) -> tor
 
 
 def _reflected(start: int, stop: int, size: int, device: torch.device) -> torch.Tensor:
-    """Indices from start to stop of a row of some size that is mirrored at its end pixels."""
     index = torch.arange(start, stop, device=device).abs()
     return size - 1 - (size - 1 - index).abs()
 
 
 def resize_as_tensorflow_1(values: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
-    """Resize (h, w) to (H, W) bilinearly with TensorFlow 1's sampling.
-
-    Pixel i of the result lies at i * (input / output) of the input, with no half pixels; what would
-    lie beyond the last row or column is that one.
-    """
+    """Resize (h, w) to (H, W) bilinearly as TensorFlow 1: without half pixels, clamped."""
     for axis, wanted in enumerate(size):
         given = values.shape[axis]
         if given == wanted:

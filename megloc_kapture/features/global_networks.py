@@ -1,8 +1,8 @@
 """Global features by networks: NetVLAD, OpenIBL, AP-GeM, DELG and MegaLoc.
 
-Plugins of group ``megloc_kapture.global_features`` with their authors' weights: NetVLAD
-(Arandjelovic et al., CVPR 2016), OpenIBL (Ge et al., ECCV 2020, "SFRS"), AP-GeM (Revaud et al.,
-ICCV 2019), DELG (Cao et al., ECCV 2020) and MegaLoc (Berton and Masone, CVPR Workshops 2025).
+Plugins of group ``megloc_kapture.global_features`` with the authors' weights: NetVLAD (Arandjelovic
+et al., CVPR 2016), OpenIBL (Ge et al., ECCV 2020, "SFRS"), AP-GeM (Revaud et al., ICCV 2019), DELG
+(Cao et al., ECCV 2020) and MegaLoc (Berton and Masone, CVPR Workshops 2025).
 """
 
 from __future__ import annotations
@@ -45,8 +45,6 @@ _MEGALOC_SIZE_PX = 322  # the paper's, section 4
 
 
 class GlobalNetworkOptions(NetworkOptions):
-    """Options that these features share."""
-
     weights: str
 
 
@@ -54,16 +52,11 @@ GlobalOptions = TypeVar("GlobalOptions", bound=GlobalNetworkOptions)
 
 
 class GlobalNetwork(Checkpointed[GlobalOptions]):
-    """Global features by a network with a checkpoint.
-
-    The type's name carries the model as well as the method, since vectors of different ones cannot
-    be compared. A method says how its network is made (``_load``), what it sees of an image and
-    what it makes of a batch of them.
-    """
+    """Global features by a network with a checkpoint; the type name contains method and model."""
 
     name: str
     method: ClassVar[str]
-    _load: Any  # makes the network of a checkpoint's tensors, the file's name and _load_with
+    _load: Any
     _load_with: tuple[Any, ...] = ()
     _channels_last: ClassVar[bool] = False
 
@@ -73,21 +66,16 @@ class GlobalNetwork(Checkpointed[GlobalOptions]):
         self.name = stem if self.method in stem else f"{self.method}-{stem}"
 
     def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The vector of an RGB image, uint8 (H, W, 3): float32 (D,), unit length."""
+        """Describe an RGB image, uint8 (H, W, 3): float32 (D,), unit length."""
         return self.describe_many([image])[0]
 
     def describe_many(self, images: Images) -> NDArray[np.float32]:
-        """The vectors of images of one size, float32 (B, D), in their order, of one batch.
-
-        As one by one but for rounding.
-        """
         made = self.network(self._load, *self._load_with, channels_last=self._channels_last)
         network, device = made
         batch = torch.cat([self._seen(image, device) for image in images])
         return self._vectors(network, batch).cpu().numpy()
 
     def _seen(self, image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
-        """An image as the network sees it, (1, 3, h, w)."""
         options: Any = self.options
         return sized_tensor(image, options.max_size_px, device)
 
@@ -98,8 +86,6 @@ class GlobalNetwork(Checkpointed[GlobalOptions]):
 
 
 class NetVladOptions(GlobalNetworkOptions):
-    """Options of NetVLAD."""
-
     weights: str = Field(
         default="netvlad-pitts30k", description="netvlad-pitts30k, netvlad-tokyotm, or a file"
     )
@@ -110,7 +96,6 @@ class NetVladOptions(GlobalNetworkOptions):
 
 class _VggNetVladNetwork(GlobalNetwork[GlobalOptions]):
     def _vectors(self, network: VggNetVlad, batch: torch.Tensor) -> torch.Tensor:
-        """Only the convolutions are made in half precision; sums and whitening stay in float32."""
         height, width = batch.shape[-2:]
         if min(height, width) < STRIDE_PX:
             raise DataError(
@@ -120,7 +105,7 @@ class _VggNetVladNetwork(GlobalNetwork[GlobalOptions]):
         half_precision = self.options.half_precision
         with inference(batch.device, half_precision):
             features = network.features(batch).float()
-            # colours of 0 to 255 can take this trunk beyond what float16 holds
+            # colours of 0 to 255 may overflow float16 in this trunk
             overflow = half_precision and not bool(features.isfinite().all())
         with inference(batch.device):
             if overflow:
@@ -129,7 +114,7 @@ class _VggNetVladNetwork(GlobalNetwork[GlobalOptions]):
 
 
 class NetVlad(_VggNetVladNetwork[NetVladOptions]):
-    """NetVLAD on VGG-16 with its whitening: one vector of unit length, float32 (4096,)."""
+    """NetVLAD on VGG-16 with whitening: float32 (4096,), unit length."""
 
     name = method = "netvlad"
     Options = NetVladOptions
@@ -137,8 +122,6 @@ class NetVlad(_VggNetVladNetwork[NetVladOptions]):
 
 
 class OpenIblOptions(GlobalNetworkOptions):
-    """Options of OpenIBL."""
-
     weights: str = Field(default="openibl", description="openibl, or a file")
     max_size_px: int | None = Field(
         default=None,
@@ -149,7 +132,7 @@ class OpenIblOptions(GlobalNetworkOptions):
 
 
 class OpenIbl(_VggNetVladNetwork[OpenIblOptions]):
-    """OpenIBL's VGG-16 with NetVLAD and PCA: one vector of unit length, float32 (4096,)."""
+    """OpenIBL's VGG-16 with NetVLAD and PCA: float32 (4096,), unit length."""
 
     name = method = "openibl"
     Options = OpenIblOptions
@@ -162,18 +145,15 @@ class OpenIbl(_VggNetVladNetwork[OpenIblOptions]):
 
 
 def official_size(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The image, uint8 (480, 640, 3), as the authors resize it."""
+    """Resize an image as the authors do, to uint8 (480, 640, 3)."""
     return _bilinear(image, (_OPENIBL_WIDTH_PX, _OPENIBL_HEIGHT_PX))
 
 
 def _bilinear(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Resize by Pillow's filter, over all pixels that a smaller one covers, rounded to 8 bits."""
     return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BILINEAR), np.uint8)
 
 
 class ApGemOptions(GlobalNetworkOptions):
-    """Options of AP-GeM."""
-
     weights: str = Field(
         default="apgem-resnet101-lm18",
         description="apgem-resnet101-lm18 (Google-Landmarks), apgem-resnet101, or a file",
@@ -198,7 +178,6 @@ class ApGemOptions(GlobalNetworkOptions):
 def _apgem_with_whitening(
     tensors: Tensors, where: str, whitening: str, power: float
 ) -> nn.ModuleList:
-    """The network, then the whitening of that name, if there is a name."""
     modules: list[nn.Module] = [apgem_from(tensors, where)]
     if whitening:
         modules.append(whitening_from(tensors, whitening, where, power=power))
@@ -206,11 +185,7 @@ def _apgem_with_whitening(
 
 
 class ApGem(GlobalNetwork[ApGemOptions]):
-    """AP-GeM vectors of unit length, float32 (2048,).
-
-    The name tells the checkpoint and, with one, the whitening and its power: vectors of different
-    ones do not compare.
-    """
+    """AP-GeM vectors, float32 (2048,), unit length; named after checkpoint, whitening and power."""
 
     name = method = "apgem"
     Options = ApGemOptions
@@ -233,8 +208,6 @@ class ApGem(GlobalNetwork[ApGemOptions]):
 
 
 class DelgOptions(GlobalNetworkOptions):
-    """Options of DELG; the defaults are the authors'."""
-
     weights: str = Field(
         default="delg-r101-gldv2clean",
         description="delg-{r50,r101}-{gld,gldv2clean}, or a converted file",
@@ -266,7 +239,6 @@ class Delg(GlobalNetwork[DelgOptions]):
 
 
 def _with_longer_side(image: NDArray[np.uint8], max_size_px: int | None) -> NDArray[np.uint8]:
-    """Make an image smaller as the authors do."""
     height, width = image.shape[:2]
     if max_size_px is None or max(height, width) <= max_size_px:
         return image
@@ -276,22 +248,17 @@ def _with_longer_side(image: NDArray[np.uint8], max_size_px: int | None) -> NDAr
 
 
 class MegaLocOptions(GlobalNetworkOptions):
-    """Options of MegaLoc."""
-
     weights: str = Field(default="megaloc", description="name in the registry, or a file")
     size_px: int = Field(
         default=_MEGALOC_SIZE_PX,
-        ge=9 * PATCH_PX,  # with fewer patches not every cluster gets one
+        ge=9 * PATCH_PX,  # fewer patches would leave clusters empty
         multiple_of=PATCH_PX,
         description="both sides that the network sees; the map's must be the queries'",
     )
 
 
 class MegaLoc(GlobalNetwork[MegaLocOptions]):
-    """MegaLoc's vector of an image, float32 (8448,), unit length.
-
-    The image is scaled to a square, its shape is not kept: so the paper evaluates.
-    """
+    """MegaLoc's unit vector, float32 (8448,), of an image scaled to a square as in the paper."""
 
     name = method = "megaloc"
     Options = MegaLocOptions

@@ -1,7 +1,7 @@
-"""A bound on the size of the images that local features are extracted from.
+"""Size limit of images for local feature extraction.
 
-Memory grows with the pixels: RootSIFT and ALIKED take about 0.25 GB for a megapixel. A larger
-image is reduced first, and its keypoints are scaled back.
+Memory grows with the pixels: RootSIFT and ALIKED take about 0.25 GB per megapixel. Larger images
+are reduced first, and their keypoints scaled back.
 """
 
 from __future__ import annotations
@@ -24,8 +24,6 @@ DEFAULT_MEGAPIXELS = 8.0
 
 
 class BoundedOptions(Options):
-    """An option that all our extractors of local features have."""
-
     max_megapixels: float = Field(
         default=DEFAULT_MEGAPIXELS,
         gt=0,
@@ -36,7 +34,6 @@ class BoundedOptions(Options):
 
 
 def bounded_size(width: int, height: int, max_megapixels: float) -> tuple[int, int]:
-    """The size of an image that is reduced to at most that; itself where it is no larger."""
     if width * height <= max_megapixels * 1e6:
         return width, height
     scale = math.sqrt(max_megapixels * 1e6 / (width * height))
@@ -46,7 +43,7 @@ def bounded_size(width: int, height: int, max_megapixels: float) -> tuple[int, i
 def bounded_image(
     image: NDArray[np.uint8], max_megapixels: float = DEFAULT_MEGAPIXELS
 ) -> NDArray[np.uint8]:
-    """The image (H, W, 3), reduced where it is larger; the same array where it is not."""
+    """Reduce an image (H, W, 3) if it is too large; else return the same array."""
     height, width = image.shape[:2]
     size = bounded_size(width, height, max_megapixels)
     if size == (width, height):
@@ -55,17 +52,16 @@ def bounded_image(
 
 
 def max_megapixels_of(extractor: object) -> float:
-    """The bound among an extractor's options; the default for one that has no such option."""
     options: Any = getattr(extractor, "options", None)
     return float(getattr(options, "max_megapixels", DEFAULT_MEGAPIXELS))
 
 
 def extract_bounded(extractor: Any, frames: Sequence[Frame]) -> list[LocalFeatures]:
-    """Extract from images of one size, reduced where they are larger than the extractor's bound.
+    """Extract from images of one size, reduced to the extractor's limit.
 
-    x and y of the keypoints are those in the images as given; other columns, as a scale, are those
-    of the reduced ones. A pixel of a reduced mask is used where all that it covers is. The
-    extractor is a plugin of local features that has ``extract_many`` where images are several.
+    x and y of the keypoints are pixels of the given images; other columns, as a scale, are of the
+    reduced ones. A pixel of a reduced mask is usable if all that it covers is. For several images
+    the extractor needs ``extract_many``.
     """
     bound = max_megapixels_of(extractor)
     small = [_reduced(*frame, bound) for frame in frames]
@@ -76,7 +72,7 @@ def extract_bounded(extractor: Any, frames: Sequence[Frame]) -> list[LocalFeatur
         else [extractor.extract(*small[0])]
     )
     (height, width), (own_height, own_width) = small[0][0].shape[:2], frames[0][0].shape[:2]
-    # the first pixel's centre is (0.5, 0.5): sizes scale as a whole
+    # the first pixel's centre is (0.5, 0.5), so coordinates scale with the size
     ratio = np.array([own_width / width, own_height / height], np.float32)
     return found if small[0][0] is frames[0][0] else [_scaled(each, ratio) for each in found]
 
@@ -94,18 +90,14 @@ def _reduced(
 
 def _scaled(features: LocalFeatures, ratio: NDArray[np.float32]) -> LocalFeatures:
     if not isinstance(features, LocalFeatures):
-        return features  # whoever checks plugins says so
+        return features
     keypoints_px = features.keypoints_px.copy()
     keypoints_px[:, :2] *= ratio
     return replace(features, keypoints_px=keypoints_px)
 
 
 def on_mask(mask: NDArray[np.bool_], points_px: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
-    """Points (N, 2) that lie on True pixels of a mask (H, W); beyond it the nearest pixel counts.
-
-    The first pixel's centre is (0.5, 0.5). Rounding may put a keypoint of a resized image onto the
-    image's last edge.
-    """
+    """Return which points (N, 2) lie on True pixels of a mask (H, W), clamped to the border."""
     last = np.array(mask.shape[::-1]) - 1
     column, row = np.clip(points_px.astype(np.int64), 0, last).T
     return mask[row, column]

@@ -1,5 +1,4 @@
-"""Local features by networks of kornia: XFeat (Potje et al., CVPR 2024) and DISK (Tyszkiewicz et
-al., NeurIPS 2020)."""
+"""Local features by kornia: XFeat (Potje et al., CVPR 2024), DISK (Tyszkiewicz et al., 2020)."""
 
 from __future__ import annotations
 
@@ -28,8 +27,8 @@ from megloc_kapture.nets.kornia_networks import (
 from megloc_kapture.nets.runtime import image_tensor, inference
 from megloc_kapture.values import LocalFeatures
 
-_XFEAT_STRIDE_PX = 32  # XFeat resizes images to multiples of it, downwards
-_ALL = 1 << 30  # keypoints: masks come before the best are selected
+_XFEAT_STRIDE_PX = 32  # XFeat rounds image sides down to multiples of it
+_ALL = 1 << 30  # keypoints: the mask is applied before the selection
 
 
 class _KorniaFeatures(LocalNetwork[LocalOptions]):
@@ -40,11 +39,10 @@ class _KorniaFeatures(LocalNetwork[LocalOptions]):
         super().__init__(options)
 
     def _of_each(self, found: Any, masks: Masks, offset_px: Any = 0.5) -> list[LocalFeatures]:
-        """Keep the best of (keypoints, scores, descriptors) of each image."""
         features = []
         for (xy, scores, descriptors), mask in zip(found, masks, strict=True):
             values = scores.float().cpu().numpy()
-            # kornia's first pixel is centred at (0, 0)
+            # kornia's first pixel centre is (0, 0)
             table = np.column_stack([xy.cpu().numpy() + offset_px, values]).astype(np.float32)
             rows_of = descriptors.float().cpu().__getitem__
             features.append(self._best(table, values, rows_of, mask))
@@ -52,8 +50,6 @@ class _KorniaFeatures(LocalNetwork[LocalOptions]):
 
 
 class XFeatOptions(LocalNetworkOptions):
-    """Options of XFeat."""
-
     weights: str = Field(default="xfeat", description="name in the registry, or a file")
     descriptor_weights: str | None = Field(
         default=None, description="file of another XFeat network, whose descriptors are taken"
@@ -64,7 +60,7 @@ class XFeatOptions(LocalNetworkOptions):
 class XFeat(_KorniaFeatures[XFeatOptions]):
     """The extractor ``xfeat``: keypoints (N, 3) = x, y, score; descriptors float32 (N, 64).
 
-    With other descriptors than its own it is another type of features, named after their file.
+    Other descriptor weights make another feature type, named after their file.
     """
 
     name = "xfeat"
@@ -74,7 +70,6 @@ class XFeat(_KorniaFeatures[XFeatOptions]):
     def __init__(self, options: XFeatOptions | None = None) -> None:
         super().__init__(options)
         if self._descriptor_weights is not None:
-            # descriptors of different networks do not match
             self.name = f"xfeat-{self._descriptor_weights.path.stem}"
 
     def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
@@ -92,18 +87,13 @@ class XFeat(_KorniaFeatures[XFeatOptions]):
 
 
 def xfeat_offset_px(shape: Sequence[int]) -> NDArray[np.float32]:
-    """Return what COLMAP's pixels exceed kornia's by, (x, y), in an image of a shape.
-
-    kornia's are those of the resized image, first centre (0, 0), times the ratio of the sizes.
-    """
+    """Return the offset (x, y) of COLMAP's pixels from kornia's, which are resized first."""
     sides = np.array([shape[1], shape[0]], np.float32)
     resized = np.maximum(sides // _XFEAT_STRIDE_PX, 1) * _XFEAT_STRIDE_PX
     return np.asarray(0.5 * sides / resized, np.float32)
 
 
 class DiskOptions(LocalNetworkOptions):
-    """Options of DISK."""
-
     weights: str = Field(default="disk", description="name in the registry, or a file")
     nms_window_px: int = Field(default=5, ge=1, description="odd side of the window")
     threshold: float = Field(default=0.0, description="scores kept are larger; they are logits")

@@ -1,4 +1,4 @@
-"""Local features by networks: images one by one or several at once, the best of their keypoints."""
+"""Base of networks for local features, with batches and keypoint selection."""
 
 from __future__ import annotations
 
@@ -22,8 +22,6 @@ Level = tuple[NDArray[np.float32], NDArray[np.float32], torch.Tensor]
 
 
 class LocalNetworkOptions(NetworkOptions, BoundedOptions):
-    """Options that networks of local features share."""
-
     weights: str
     max_keypoints: int = Field(default=1500, gt=0, description="best scores kept")
 
@@ -32,8 +30,6 @@ LocalOptions = TypeVar("LocalOptions", bound=LocalNetworkOptions)
 
 
 class LocalNetwork(Checkpointed[LocalOptions], ABC):
-    """Local features by a network."""
-
     descriptor_dtype = "float32"
     metric = "L2"
 
@@ -49,10 +45,7 @@ class LocalNetwork(Checkpointed[LocalOptions], ABC):
 
     @abstractmethod
     def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
-        """Extract from RGB images of one size, in one batch; see :meth:`extract`.
-
-        As one by one but for rounding.
-        """
+        """Extract from RGB images of one size in one batch; equal up to rounding."""
 
     def _best(
         self,
@@ -61,11 +54,7 @@ class LocalNetwork(Checkpointed[LocalOptions], ABC):
         describe: Callable[[torch.Tensor], torch.Tensor],
         mask: NDArray[np.bool_] | None,
     ) -> LocalFeatures:
-        """The best of an image's keypoints (N, 3): x and y in its pixels, and a third column.
-
-        Ties by y, then x; the mask (H, W) comes first. ``describe`` gives descriptors (K, D) of
-        rows of the table.
-        """
+        """Select the best keypoints (N, 3), masked before; ties by y, then x."""
         x, y = table[:, 0], table[:, 1]
         usable = np.arange(len(table))
         if mask is not None:
@@ -78,7 +67,6 @@ class LocalNetwork(Checkpointed[LocalOptions], ABC):
     def _best_of_levels(
         self, levels: Sequence[Level], mask: NDArray[np.bool_] | None
     ) -> LocalFeatures:
-        """The same of the keypoints of several scales."""
         tables, scores, descriptors = zip(*levels, strict=True)
         rows_of = torch.cat(descriptors).cpu().__getitem__
         return self._best(np.concatenate(tables), np.concatenate(scores), rows_of, mask)
@@ -87,10 +75,10 @@ class LocalNetwork(Checkpointed[LocalOptions], ABC):
 def in_image_px(
     xy: NDArray[Any], size: Sequence[int], image_size: Sequence[int]
 ) -> NDArray[np.float32]:
-    """Positions (N, 2) in a map whose first pixel's centre is (0, 0) as pixels of the whole image.
+    """Convert positions (N, 2) of a map, first centre (0, 0), to pixels of the whole image.
 
-    There it is at (0.5, 0.5), as COLMAP has it, so that sizes, height and width first, scale as a
-    whole.
+    Its first centre is (0.5, 0.5), as COLMAP's, so that coordinates scale with the size (height,
+    width).
     """
     ratio = np.array([image_size[1] / size[1], image_size[0] / size[0]])
     return ((xy + 0.5) * ratio).astype(np.float32)

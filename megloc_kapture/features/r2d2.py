@@ -1,8 +1,7 @@
-"""R2D2 local features (Revaud et al., NeurIPS 2019, section 3): kapture's own tools make them.
+"""R2D2 local features (Revaud et al., NeurIPS 2019, section 3), the default of kapture's tools.
 
-The network has the keys of the official checkpoints. It is an L2-Net whose strides became
-dilations, so that all maps have the image's resolution; a last convolution 8 by 8 is replaced by
-three of 2 by 2.
+The network has the keys of the official checkpoints: an L2-Net with dilations for strides, so that
+maps have full resolution, whose last 8x8 convolution is replaced by three of 2x2.
 """
 
 from __future__ import annotations
@@ -32,16 +31,16 @@ from megloc_kapture.nets.trunks import imagenet_normalised
 from megloc_kapture.values import LocalFeatures
 
 DESCRIPTOR_SIZE = 128
-# kernel, width in units of the base width, dilation; ReLU after those of 3 by 3
+# kernel, width in units of the base width, dilation; ReLU after 3x3 kernels
 _LAYERS = ((3, 1, 1), (3, 1, 1), (3, 2, 1), (3, 2, 2), (3, 4, 2), (3, 4, 4), (2, 4, 4), (2, 4, 8))
 _STEPS_PER_OCTAVE = 4
-_TOLERANCE = 0.001  # of a scale: a side that rounding leaves a pixel short is still large enough
+_TOLERANCE = 0.001  # of a scale: tolerance for a side rounded down by a pixel
 _DEFAULT_WEIGHTS = "r2d2_WASF_N16"
-_PATCH_PX = 32.0  # the scale of a keypoint found at the image's own size, as the authors write it
+_PATCH_PX = 32.0  # keypoint scale at full resolution, as in the authors' code
 
 
 class R2D2Options(LocalNetworkOptions):
-    """Options of R2D2; the authors' but for the number of keypoints."""
+    """Options of R2D2; the authors' except for the number of keypoints."""
 
     weights: str = Field(default=_DEFAULT_WEIGHTS, description="name in the registry, or a file")
     max_keypoints: int = Field(default=1500, gt=0, description="best kept; the authors keep 5000")
@@ -52,7 +51,6 @@ class R2D2Options(LocalNetworkOptions):
 
     @model_validator(mode="after")
     def _levels_exist(self) -> R2D2Options:
-        # the levels are 2^(1/4) apart: a range that wide has at least one
         if self.max_size < 1.2 * self.min_size:
             raise ValueError("max_size is at least 1.2 times min_size")
         return self
@@ -61,8 +59,8 @@ class R2D2Options(LocalNetworkOptions):
 class R2D2(LocalNetwork[R2D2Options]):
     """The extractor ``r2d2``: keypoints (N, 3) = x, y, scale; descriptors float32 (N, 128).
 
-    Keypoints of all levels of a pyramid; a score is reliability times repeatability. Other weights
-    than the default make another type of features, named after their file.
+    Keypoints come from all pyramid levels; the score is reliability times repeatability. Other
+    weights make another feature type, named after their file.
     """
 
     name = "r2d2"
@@ -76,7 +74,7 @@ class R2D2(LocalNetwork[R2D2Options]):
 
     def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
         options = self.options
-        # twice as fast on a processor as with channels first
+        # twice as fast on a CPU as channels first
         network, device = self.network(load_r2d2, channels_last=True)
         found: list[list[Level]] = [[] for _ in images]
         with inference(device, options.half_precision):
@@ -90,7 +88,6 @@ class R2D2(LocalNetwork[R2D2Options]):
                 scale = np.float32(_PATCH_PX * max(images[0].shape[:2]) / max(level.shape[-2:]))
                 told = maps.features, maps.reliability[:, 0], maps.repeatability[:, 0]
                 for own, features, reliability, repeatability in zip(found, *told, strict=True):
-                    # section 3.3 of the paper
                     rows, columns = torch.nonzero(
                         (repeatability == window_maximum(repeatability, 1))
                         & (repeatability >= options.min_repeatability)
@@ -110,16 +107,13 @@ class R2D2(LocalNetwork[R2D2Options]):
 class R2D2Maps(NamedTuple):
     """Maps of images, each (B, C, H, W)."""
 
-    features: torch.Tensor  # C = 128; a descriptor is one pixel of it, normalised
-    reliability: torch.Tensor  # C = 1, in [0, 1]: how surely the pixel's descriptor will be matched
-    repeatability: torch.Tensor  # C = 1, in [0, 1]: how surely a local maximum is found again
+    features: torch.Tensor  # C = 128, one descriptor per pixel, normalised
+    reliability: torch.Tensor  # C = 1, in [0, 1]: expected matching success of the descriptor
+    repeatability: torch.Tensor  # C = 1, in [0, 1]: expected repeatability of a local maximum
 
 
 class R2D2Network(nn.Module):
-    """Dense features, reliability and repeatability.
-
-    ``base_width`` is of the first layer: 32 channels or, in the big model, 48.
-    """
+    """Dense features, reliability and repeatability; ``base_width``: 32, or 48 if big."""
 
     def __init__(self, base_width: int = 32) -> None:
         super().__init__()
@@ -141,7 +135,7 @@ class R2D2Network(nn.Module):
         self.sal = nn.Conv2d(DESCRIPTOR_SIZE, 1, 1)
 
     def forward(self, images: torch.Tensor) -> R2D2Maps:
-        """Maps of RGB images, float (B, 3, H, W) in [0, 1]."""
+        """Compute the maps of RGB images, float (B, 3, H, W) in [0, 1]."""
         features = self.ops(imagenet_normalised(images))
         squared = features**2
         positive = functional.softplus(self.sal(squared).float())
@@ -151,7 +145,7 @@ class R2D2Network(nn.Module):
 
 
 def load_r2d2(tensors: Mapping[str, torch.Tensor], where: str) -> R2D2Network:
-    """The network of a checkpoint, for inference; its width is the file's."""
+    """Build the network of a checkpoint, with its width, for inference."""
     first = tensors.get("ops.0.weight")
     if first is None or first.ndim != 4:
         raise DataError(
@@ -161,12 +155,11 @@ def load_r2d2(tensors: Mapping[str, torch.Tensor], where: str) -> R2D2Network:
 
 
 def pyramid_levels(image: torch.Tensor, *, min_size: int, max_size: int) -> Iterator[torch.Tensor]:
-    """Yield an image at scales 1, 2^-1/4, 2^-1/2 and so on, each level resized from the one before.
+    """Yield an image at scales 1, 2^-1/4, 2^-1/2 and so on, each resized from the last.
 
-    This is R2D2's pyramid (Revaud et al., 2019, section 4), largest first; a pixel of one level is
-    w'/w of the pixels of another, both having their origin at the image's corner. ``image``: float
-    (B, C, H, W); ``min_size`` and ``max_size``: the levels' longer side in pixels; larger ones are
-    made but left out. An image that is itself smaller than ``min_size`` is the only level.
+    R2D2's pyramid (Revaud et al., 2019, section 4); levels share the origin at the image's corner.
+    ``image``: float (B, C, H, W); ``min_size`` and ``max_size``: limits of the longer side in
+    pixels. An image smaller than ``min_size`` is the only level.
     """
     height, width = image.shape[-2:]
     longer = max(height, width)

@@ -1,9 +1,8 @@
-"""SIFT with descriptors normalised as RootSIFT (Arandjelovic and Zisserman, CVPR 2012, section 3).
+"""SIFT with RootSIFT descriptors (Arandjelovic and Zisserman, CVPR 2012, section 3).
 
-``rootsift`` uses OpenCV's SIFT rather than pycolmap's: 2 to 5 times faster per image, with matches
-that fit the true poses as well (docs/experiments/features.md).
-``sift`` is COLMAP's: the features that official models and their databases are made of, Lowe's
-detector (IJCV 2004) as VLFeat has it, descriptors stored as bytes.
+``rootsift`` uses OpenCV's SIFT, 2 to 5 times faster than pycolmap's and as accurate
+(docs/experiments/features.md). ``sift`` is COLMAP's: Lowe's detector (IJCV 2004) by VLFeat with
+byte descriptors, as in official models and their databases.
 """
 
 from __future__ import annotations
@@ -23,8 +22,6 @@ _NO_LIMIT = 2**31 - 1
 
 
 class RootSiftOptions(BoundedOptions):
-    """Options of RootSIFT."""
-
     max_keypoints: int = Field(default=5000, gt=0, description="strongest responses kept")
     contrast_threshold: float = Field(
         default=0.01, ge=0, description="lower keeps weaker blobs (OpenCV's own default is 0.04)"
@@ -34,7 +31,7 @@ class RootSiftOptions(BoundedOptions):
 
 
 class RootSift:
-    """SIFT keypoints with Hellinger-normalised descriptors, float32 (N, 128) of unit length."""
+    """SIFT keypoints with Hellinger-normalised descriptors, float32 (N, 128), unit length."""
 
     name = "rootsift"
     descriptor_size = 128
@@ -55,22 +52,22 @@ class RootSift:
         options = self.options
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         sift = cv2.SIFT.create(
-            # OpenCV applies its own mask after the selection of the strongest, so with a mask it
-            # gets no limit; nor does it describe only what is left, for without a keypoint of the
-            # first octave it builds another pyramid and other descriptors
+            # OpenCV masks after the selection, so with a mask it gets no limit; and it cannot
+            # describe the masked keypoints only: without a keypoint of the first octave it builds
+            # another pyramid
             options.max_keypoints if mask is None else 0,
             3,
             options.contrast_threshold,
             options.edge_threshold,
             options.sigma_px,
-            True,  # precise upscaling: without it the first octave is shifted by a quarter pixel
+            True,  # precise upscaling: else the first octave is shifted by a quarter pixel
         )
         keypoints, descriptors = sift.detectAndCompute(gray, None)
         if descriptors is None:
             descriptors = np.zeros((0, self.descriptor_size), np.float32)
         found = [(*one.pt, one.response, one.size, one.angle) for one in keypoints]
         x, y, response, size, angle = np.array(found, np.float64).reshape(-1, 5).T
-        # OpenCV puts the centre of the first pixel at (0, 0), COLMAP at (0.5, 0.5)
+        # OpenCV's first pixel centre is (0, 0), COLMAP's (0.5, 0.5)
         xy_px = np.stack([x, y], axis=1) + 0.5
         order = np.lexsort((angle, size, x, y, -response))
         if mask is not None:
@@ -86,14 +83,14 @@ class RootSift:
 
 
 def root_sift(descriptors: NDArray[Any]) -> NDArray[np.float32]:
-    """Square root of L1-normalised SIFT, float32 (N, 128): Euclidean distance becomes Hellinger."""
+    """Return the square root of L1-normalised SIFT, float32 (N, 128), for Hellinger distances."""
     values = np.asarray(descriptors, dtype=np.float32)
     total = values.sum(axis=1, keepdims=True)
     return np.sqrt(values / np.maximum(total, np.finfo(np.float32).tiny))
 
 
 class ColmapSiftOptions(BoundedOptions):
-    """Options of COLMAP's SIFT; the defaults are COLMAP's, and so what official models have."""
+    """Options of COLMAP's SIFT, with COLMAP's defaults."""
 
     max_keypoints: int = Field(
         default=8192,
@@ -123,10 +120,10 @@ class ColmapSift:
     def extract(
         self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
     ) -> LocalFeatures:
-        """Extract from an RGB image, uint8 (H, W, 3); scores are scales, by which COLMAP selects.
+        """Extract from an RGB image, uint8 (H, W, 3); scores are scales, as in COLMAP's selection.
 
-        Keypoints on False pixels of the mask (H, W) are dropped before the coarsest are selected,
-        exactly ``max_keypoints`` of them where there are so many.
+        Keypoints on False pixels of the mask (H, W) are dropped before the coarsest
+        ``max_keypoints`` are selected.
         """
         options = self.options
         masked = mask is not None and not mask.all()
@@ -136,7 +133,6 @@ class ColmapSift:
             first_octave=options.first_octave,
             peak_threshold=options.peak_threshold,
         )
-        # several orientations at one position keep their order
         order = np.argsort(-keypoints[:, 2], kind="stable")
         num_masked = 0
         if mask is not None and masked:

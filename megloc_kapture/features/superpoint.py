@@ -1,11 +1,9 @@
 """SuperPoint local features (DeTone, Malisiewicz and Rabinovich, CVPR workshops 2018, section 3).
 
-Detection and descriptors as the authors of SuperGlue run it, or with the descriptors of a second
-checkpoint: MegLoc freezes the detector and fine-tunes the descriptors, which then have a network of
-their own. State-dict keys are those of Magic Leap's ``superpoint_v1.pth``. The MIT-licensed
-retraining (rpautrat/SuperPoint) has the same topology with a batch normalisation *after* each
-activation, and the keys of its own ``superpoint_v6_from_tf.pth``; its descriptors are not those
-that SuperGlue's weights were trained with.
+The keys are those of Magic Leap's ``superpoint_v1.pth``, or of the MIT-licensed retraining's
+``superpoint_v6_from_tf.pth`` (rpautrat/SuperPoint), which normalises *after* each activation and
+whose descriptors do not fit SuperGlue's weights. Descriptors may come from a second checkpoint:
+MegLoc fine-tunes them with a frozen detector.
 """
 
 from __future__ import annotations
@@ -36,13 +34,13 @@ from megloc_kapture.values import LocalFeatures
 
 _OFFICIAL_WEIGHTS = "superpoint_v1"
 DESCRIPTOR_SIZE = 256
-_STRIP_ROWS = 64  # even; measured: fewer cost more halo, more do not fit into the caches
+_STRIP_ROWS = 64  # even; measured: fewer rows cost more halo, more do not fit the caches
 DescriptorSampling = Literal["official", "exact"]
-_EPSILON = 1e-3  # TensorFlow's default, which it was trained with
+_EPSILON = 1e-3  # TensorFlow's default, as in training
 
 
 class SuperPointOptions(LocalNetworkOptions):
-    """Options of SuperPoint; radius, threshold and border are the authors' own."""
+    """Options of SuperPoint; radius, threshold and border are the authors'."""
 
     weights: str = Field(
         default=_OFFICIAL_WEIGHTS,
@@ -63,10 +61,10 @@ class SuperPointOptions(LocalNetworkOptions):
 
 
 class SuperPoint(LocalNetwork[SuperPointOptions]):
-    """SuperPoint keypoints (x, y, score) and descriptors, float32 (N, 256) of unit length.
+    """SuperPoint keypoints (x, y, score) and descriptors, float32 (N, 256), unit length.
 
-    What an image's sides exceed a multiple of 8 by has no keypoints. Other weights than the
-    official ones make another type of features, named after their files.
+    Pixels beyond a multiple of 8 have no keypoints. Other weights than the official ones make
+    another feature type, named after their files.
     """
 
     name = "superpoint"
@@ -89,7 +87,7 @@ class SuperPoint(LocalNetwork[SuperPointOptions]):
                 np.zeros((0, DESCRIPTOR_SIZE), np.float32),
             )
             return [nothing] * len(images)
-        # oneDNN's convolutions are a third faster where the channels of a pixel lie together
+        # oneDNN's convolutions are a third faster with channels last
         net, device = self.network(superpoint_from, self._descriptor_weights, channels_last=True)
         exact = options.descriptor_sampling == "exact"
         sampling: DescriptorSampling = "exact" if exact else net.official_sampling
@@ -116,19 +114,16 @@ class SuperPoint(LocalNetwork[SuperPointOptions]):
 
 
 def gray_tensor(image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
-    """An RGB image as the network was trained to see it, float32 (1, 1, H, W) in [0, 1].
-
-    Luma rounded to 8 bits, as an image that is read as gray.
-    """
+    """Convert an RGB image to 8-bit luma, float32 (1, 1, H, W) in [0, 1]."""
     gray = np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY))
     return torch.from_numpy(gray).to(device)[None, None].float() / 255.0
 
 
 class SuperPointNet(nn.Module):
-    """The network: gray image to scores per pixel and descriptors per cell of 8 x 8 pixels.
+    """Network from gray image to scores per pixel and descriptors per cell of 8 x 8 pixels.
 
-    ``detector`` and ``descriptor`` are the heads it has. ``official_sampling`` is that of
-    descriptors in the authors' own code, see :func:`sample_descriptors`.
+    ``detector`` and ``descriptor`` select the heads; ``official_sampling`` see
+    :func:`sample_descriptors`.
     """
 
     official_sampling: DescriptorSampling = "official"
@@ -147,7 +142,7 @@ class SuperPointNet(nn.Module):
             self.convDb = nn.Conv2d(256, DESCRIPTOR_SIZE, kernel_size=1)
 
     def encode(self, gray: torch.Tensor) -> torch.Tensor:
-        """Features (B, 128, h, w) of images (B, 1, H, W) in [0, 1]; h = H // 8, w = W // 8."""
+        """Compute features (B, 128, H // 8, W // 8) of images (B, 1, H, W) in [0, 1]."""
         x = self._first_stage(gray)
         for first, second in ((self.conv2a, self.conv2b), (self.conv3a, self.conv3b)):
             x = second(functional.relu_(first(x)))
@@ -155,11 +150,7 @@ class SuperPointNet(nn.Module):
         return functional.relu_(self.conv4b(functional.relu_(self.conv4a(x))))
 
     def _first_stage(self, gray: torch.Tensor) -> torch.Tensor:
-        """Features (B, 64, H // 2, W // 2), in strips of rows.
-
-        At full resolution 64 channels are 1 GB for two megapixels, and most of the time goes into
-        moving them. Two rows more at each side of a strip make it the same numbers.
-        """
+        """Compute features (B, 64, H // 2, W // 2) in strips, to save memory traffic."""
         strips = []
         for top in range(0, gray.shape[2] // 2 * 2, _STRIP_ROWS):
             start = max(top - 2, 0)
@@ -169,21 +160,21 @@ class SuperPointNet(nn.Module):
         return torch.cat(strips, dim=2)
 
     def detect(self, features: torch.Tensor) -> torch.Tensor:
-        """Scores (B, 8h, 8w) in (0, 1), before non-maximum suppression."""
+        """Return scores (B, 8h, 8w) in (0, 1), before non-maximum suppression."""
         return pixel_scores(self.convPb(functional.relu_(self.convPa(features))))
 
     def describe(self, features: torch.Tensor) -> torch.Tensor:
-        """Descriptors (B, 256, h, w) of unit length."""
+        """Return descriptors (B, 256, h, w) of unit length."""
         return functional.normalize(self.convDb(functional.relu_(self.convDa(features))), dim=1)
 
     def forward(self, gray: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Scores (B, 8h, 8w) and descriptors (B, 256, h, w) of gray images (B, 1, H, W)."""
+        """Return scores (B, 8h, 8w) and descriptors (B, 256, h, w) of gray images (B, 1, H, W)."""
         features = self.encode(gray)
         return self.detect(features), self.describe(features)
 
 
 class SplitSuperPoint(nn.Module):
-    """A detector and a descriptor network that share nothing (MegLoc, section "local features")."""
+    """Separate detector and descriptor networks (MegLoc, section "local features")."""
 
     official_sampling: DescriptorSampling = "official"
 
@@ -193,7 +184,6 @@ class SplitSuperPoint(nn.Module):
         self.descriptor = descriptor
 
     def forward(self, gray: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """As :meth:`SuperPointNet.forward`."""
         scores = self.detector.detect(self.detector.encode(gray))
         return scores, self.descriptor.describe(self.descriptor.encode(gray))
 
@@ -201,7 +191,7 @@ class SplitSuperPoint(nn.Module):
 def superpoint_from(
     tensors: Mapping[str, torch.Tensor], where: str, descriptor_weights: WeightsFile | None = None
 ) -> SuperPointNet | SplitSuperPoint | SuperPointBatchNormNet:
-    """The network of a checkpoint, of either layout, maybe with the descriptors of another file."""
+    """Build the network of a checkpoint, of either layout, with optional descriptor weights."""
     if any(key.startswith("backbone.") for key in tensors):
         if descriptor_weights is not None:
             raise OptionError(
@@ -227,12 +217,11 @@ def superpoint_with_descriptor(
     detector_where: str,
     descriptor_where: str,
 ) -> SuperPointNet | SplitSuperPoint:
-    """The detector of one checkpoint and the descriptors of another.
+    """Combine the detector of one checkpoint with the descriptors of another.
 
-    ``detector``: an official checkpoint; its descriptor head may be missing and is not used;
-    ``descriptor``: the descriptor head alone, which then works on the detector's features, or the
-    head with a backbone of its own. A detector head in it is not used: that of the other file is
-    frozen.
+    ``detector``: an official checkpoint, whose descriptor head is ignored; ``descriptor``: a
+    descriptor head alone, which uses the detector's features, or with a separate backbone; its
+    detector head is ignored.
     """
     head = {key: value for key, value in descriptor.items() if not key.startswith("convP")}
     frozen = {key: value for key, value in detector.items() if not key.startswith("convD")}
@@ -252,15 +241,15 @@ def superpoint_with_descriptor(
 def sample_descriptors(
     descriptors: torch.Tensor, xy: torch.Tensor, sampling: DescriptorSampling
 ) -> torch.Tensor:
-    """Descriptors float32 (N, D) at pixels, bilinear between cells and of unit length.
+    """Sample descriptors float32 (N, D) at pixels, bilinear between cells, unit length.
 
     Parameters
     ----------
     descriptors : float32 (D, h, w), of unit length.
     xy : (N, 2), pixels; the first pixel's centre is (0, 0).
-    sampling : ``exact`` puts the centre of cell (i, j) at pixel (8 i + 3.5, 8 j + 3.5). So does
-        ``official`` at the top left, but its scale is short by (w - 1) / (w - 9/16): it drifts to
-        3.5 pixels at the bottom right. SuperGlue was trained with it.
+    sampling : ``exact`` puts the centre of cell (i, j) at pixel (8 i + 3.5, 8 j + 3.5).
+        ``official`` has a scale too small by (w - 1) / (w - 9/16), which drifts to 3.5 pixels at
+        the bottom right; SuperGlue was trained with it.
     """
     size, height, width = descriptors.shape
     if len(xy) == 0:
@@ -286,8 +275,6 @@ def _conv3(channels_in: int, channels_out: int) -> nn.Conv2d:
 
 
 class _Block(nn.Module):
-    """Convolution, activation, normalisation, in this order."""
-
     def __init__(self, channels_in: int, channels_out: int, size: int, *, relu: bool = True):
         super().__init__()
         self.conv = nn.Conv2d(channels_in, channels_out, size, padding=size // 2)
@@ -300,7 +287,7 @@ class _Block(nn.Module):
 
 
 class SuperPointBatchNormNet(nn.Module):
-    """The retrained network: as :class:`SuperPointNet`, with both heads."""
+    """The retrained network, with the interface of :class:`SuperPointNet`."""
 
     official_sampling: DescriptorSampling = "exact"
 
@@ -321,7 +308,6 @@ class SuperPointBatchNormNet(nn.Module):
         )
 
     def forward(self, gray: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Scores (B, 8h, 8w) and descriptors (B, 256, h, w) of gray images (B, 1, H, W)."""
         features = self.backbone(gray)
         descriptors = functional.normalize(self.descriptor(features), dim=1)
         return pixel_scores(self.detector(features)), descriptors

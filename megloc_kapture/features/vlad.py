@@ -1,12 +1,12 @@
 """VLAD: aggregation of local descriptors into one global descriptor.
 
-Hard assignment: Jegou et al., CVPR 2010. Soft assignment: Arandjelovic et al., NetVLAD,
-CVPR 2016, equations 1 and 2, as MegLoc uses it::
+Hard assignment: Jegou et al., CVPR 2010. Soft assignment: Arandjelovic et al., NetVLAD, CVPR 2016,
+equations 1 and 2, as in MegLoc::
 
     V(j, k) = sum_i a_k(x_i) (x_i(j) - c_k(j)),   a_k(x) = exp(-alpha |x - c_k|^2) / sum_k'(...)
 
-Intra-normalisation: Arandjelovic and Zisserman, All about VLAD, CVPR 2013. Power law: Perronnin
-et al., ECCV 2010. Several vocabularies, whitened together: Jegou and Chum, ECCV 2012.
+Intra-normalisation: Arandjelovic and Zisserman, All about VLAD, CVPR 2013. Power law: Perronnin et
+al., ECCV 2010. Whitening of several vocabularies: Jegou and Chum, ECCV 2012.
 """
 
 from __future__ import annotations
@@ -27,18 +27,16 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 Float32 = NDArray[np.float32]
 
-_CHUNK = 16384  # descriptors assigned at once: bounds memory at 16384 x clusters floats
-# whitening is learnt from at most this many images, and numbers in all: 1 GiB of float32
+_CHUNK = 16384  # descriptors per block: bounds memory at 16384 x clusters floats
+# limits of the training of whitening: images, and numbers in total (1 GiB of float32)
 _WHITENING_IMAGES = 4096
 _WHITENING_NUMBERS = 1 << 28
-_COLUMNS = 4096  # dimensions that are held in float64 at once
-# variances below this share of the first are rounding of the float32 vectors
+_COLUMNS = 4096
+# relative variances below this are float32 rounding
 _LEAST = 1e-9
 
 
 class VladOptions(Options):
-    """Options of the vocabulary and the aggregation."""
-
     num_clusters: int = Field(default=128, gt=0, description="of each vocabulary")
     vocabularies: int = Field(
         default=1, gt=0, description="trained with different seeds, their vectors side by side"
@@ -73,18 +71,16 @@ class VladOptions(Options):
 class PcaWhitening:
     """PCA whitening of global descriptors: ``y = projection (x - mean)``, then unit length.
 
-    Jegou and Chum, "Negative evidences and co-occurrences in image retrieval", ECCV 2012: vectors
-    of several vocabularies are centred, turned into the frame of their principal components,
-    divided by the deviation along each, cut and scaled to unit length. That makes up for what
-    occurs together and removes what the vocabularies tell twice. Of the mean float32 (D,) and the
-    projection float32 (d, D), whose rows are scaled principal components, the strongest first.
+    Jegou and Chum, "Negative evidences and co-occurrences in image retrieval", ECCV 2012: whitening
+    compensates for co-occurrences and for redundant vocabularies. ``mean`` is float32 (D,),
+    ``projection`` float32 (d, D), rows of scaled principal components, the strongest first.
     """
 
     mean: Float32
     projection: Float32
 
     def apply(self, vector: NDArray[np.floating[Any]]) -> Float32:
-        """Whiten one vector (D,): float32 (d,), unit length; the zero vector gives zero."""
+        """Whiten one vector (D,): float32 (d,), unit length; zero stays zero."""
         if not np.any(vector):
             return np.zeros(len(self.projection), dtype=np.float32)
         whitened = self.projection @ (np.asarray(vector, dtype=np.float32) - self.mean)
@@ -93,25 +89,23 @@ class PcaWhitening:
 
 
 def learn_whitening(vectors: Float32, dimensions: int, power: float = 1.0) -> PcaWhitening:
-    """Learn whitening from vectors (N, D), float32, which are overwritten: they may be large.
+    """Learn whitening from vectors (N, D), float32, which are overwritten.
 
-    A map has fewer images than its vectors have dimensions. The deviations along the last
-    components are then noise, and N vectors in N - 1 dimensions divided by them are all equally
-    unlike. So the deviation that each is divided by may be taken to a power below one, as AP-GeM's
-    published whitening does (Revaud et al., ICCV 2019: the variance to the power 0.25, which is 0.5
-    here). At most so many dimensions are kept, and never more than the vectors vary in, which is
-    less than N.
+    With fewer images than dimensions the last components are noise, and full whitening would make
+    all vectors equally dissimilar. So the deviations are raised to ``power`` below one (Revaud et
+    al., ICCV 2019: the variance to the power 0.25, which is 0.5 here). The rank, less than N,
+    limits the number of dimensions.
     """
     mean = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)
     vectors -= mean
     count, size = vectors.shape
-    # N x N: its eigenvectors give those of the D x D covariance
+    # N x N Gram matrix: its eigenvectors give those of the D x D covariance
     gram = np.zeros((count, count))
     for start in range(0, size, _COLUMNS):
         part = vectors[:, start : start + _COLUMNS].astype(np.float64)
         gram += part @ part.T
     variances, axes = np.linalg.eigh(gram / count)
-    variances, axes = variances[::-1], axes[:, ::-1]  # the strongest first
+    variances, axes = variances[::-1], axes[:, ::-1]
     kept = min(dimensions, count - 1, int((variances > _LEAST * variances[0]).sum()))
     if kept < 1 or variances[0] <= 0:
         raise DataError(
@@ -119,13 +113,13 @@ def learn_whitening(vectors: Float32, dimensions: int, power: float = 1.0) -> Pc
             "or no whitening"
         )
     variances, axes = variances[:kept], axes[:, :kept]
-    # rows of unit length in the vectors' space, then divided by the deviations
+    # rows of unit length in the vectors' space, divided by the deviations
     rows = (axes / np.sqrt(count * variances) / variances ** (power / 2)).T
     projection = np.empty((kept, size), dtype=np.float32)
     for start in range(0, size, _COLUMNS):
         part = vectors[:, start : start + _COLUMNS].astype(np.float64)
         projection[:, start : start + _COLUMNS] = rows @ part
-    # an axis may point either way: its largest entry is positive
+    # fix the sign of an axis: its largest entry is positive
     largest = np.take_along_axis(projection, np.abs(projection).argmax(axis=1)[:, None], axis=1)
     projection *= np.where(largest < 0, np.float32(-1), np.float32(1))
     return PcaWhitening(mean, projection)
@@ -133,20 +127,17 @@ def learn_whitening(vectors: Float32, dimensions: int, power: float = 1.0) -> Pc
 
 @dataclass(frozen=True, eq=False)
 class Vocabulary:
-    """Visual words float32 (V, K, D), clusters of each vocabulary, and their vectors' whitening."""
+    """Visual words float32 (V, K, D) of V vocabularies, and an optional whitening."""
 
     centres: Float32
     whitening: PcaWhitening | None = None
 
     @property
     def size(self) -> int:
-        """Length of an image's vector."""
         return self.centres.size if self.whitening is None else len(self.whitening.projection)
 
 
 class Each(Protocol):
-    """Applies a function to items, results in their order; ``map``, or something parallel."""
-
     def __call__(
         self, function: Callable[[Item], Result], items: Iterable[Item], /
     ) -> Iterable[Result]: ...
@@ -160,12 +151,13 @@ def train_vlad(
     *,
     each: Each = map,
 ) -> Vocabulary:
-    """Train vocabularies, and their whitening where it is wanted, on the images of a map.
+    """Train vocabularies, and optionally their whitening, on the images of a map.
 
     Parameters
     ----------
-    length, read : how many descriptors an image has, and these (N, D).
-    each : what shares the description of the images, which whitening is learnt from.
+    length, read : functions for the number of an image's descriptors, and for the descriptors (N,
+        D).
+    each : parallel map for the vectors that whitening is learnt from.
     """
     options = options or VladOptions()
     rows = sample_rows(map(length, images), options.training_descriptors, options.seed)
@@ -182,7 +174,7 @@ def train_vlad(
     del sampled
     most = min(_WHITENING_IMAGES, max(2, _WHITENING_NUMBERS // vocabulary.size))
     described = [image for image, chosen in zip(images, rows, strict=True) if len(chosen)]
-    if len(described) > most:  # spread over the names, and so over sequences
+    if len(described) > most:  # evenly over the names, and so over sequences
         picks = np.linspace(0, len(described) - 1, most).round().astype(np.int64)
         described = [described[pick] for pick in picks]
     vectors = np.empty((len(described), vocabulary.size), dtype=np.float32)
@@ -202,7 +194,6 @@ def _read_and_aggregate(
 def train_vocabulary(
     descriptors: NDArray[np.floating[Any]], options: VladOptions | None = None
 ) -> Vocabulary:
-    """Cluster descriptors (N, D) by k-means (k-means++), once per vocabulary, unwhitened."""
     options = options or VladOptions()
     data = np.ascontiguousarray(descriptors, dtype=np.float32)
     if len(data) < options.num_clusters:
@@ -218,7 +209,6 @@ def train_vocabulary(
 
 
 def _cluster(data: Float32, options: VladOptions, number: int) -> Float32:
-    """The centres of one vocabulary; each draws numbers of its own."""
     rng = np.random.default_rng([options.seed, number])
     centres = _plus_plus(data, options.num_clusters, rng)
     previous = np.full(len(data), -1, dtype=np.int64)
@@ -231,13 +221,12 @@ def _cluster(data: Float32, options: VladOptions, number: int) -> Float32:
         counts = np.bincount(labels, minlength=len(centres))
         filled = counts > 0
         centres[filled] = (sums[filled] / counts[filled, None]).astype(np.float32)
-        for k in np.flatnonzero(~filled):  # a cluster that lost all starts anew somewhere else
+        for k in np.flatnonzero(~filled):  # an empty cluster restarts elsewhere
             centres[k] = data[rng.integers(len(data))]
     return centres
 
 
 def _plus_plus(data: Float32, num_clusters: int, rng: np.random.Generator) -> Float32:
-    """k-means++ seeding on a subsample: the start needs no more than that."""
     sample = data
     if len(sample) > 20_000:
         sample = data[np.sort(rng.choice(len(data), 20_000, replace=False))]
@@ -276,7 +265,7 @@ def _sum_by_label(
 
 
 def sample_rows(counts: Iterable[int], total: int, seed: int) -> list[NDArray[np.int64]]:
-    """Descriptor rows of each image that train the vocabulary; about ``total`` rows in all."""
+    """Sample about ``total`` descriptor rows of all images to train the vocabulary."""
     counts = list(counts)
     rng = np.random.default_rng(seed)
     everything = sum(counts)
@@ -291,10 +280,10 @@ def sample_rows(counts: Iterable[int], total: int, seed: int) -> list[NDArray[np
 def aggregate(
     descriptors: NDArray[Any], vocabulary: Vocabulary, options: VladOptions | None = None
 ) -> Float32:
-    """VLAD of descriptors (N, D): float32 (``vocabulary.size``,), unit length.
+    """Compute the VLAD of descriptors (N, D): float32 (``vocabulary.size``,), unit length.
 
-    Without whitening vocabulary after vocabulary, in each cluster after cluster. An image without
-    descriptors gets the zero vector: it is similar to nothing.
+    Without whitening the order is vocabulary, cluster, dimension. An image without descriptors gets
+    the zero vector.
     """
     options = options or VladOptions()
     data = np.ascontiguousarray(descriptors, dtype=np.float32)
@@ -311,7 +300,6 @@ def aggregate(
 
 
 def _aggregate_one(data: Float32, centres: Float32, options: VladOptions) -> NDArray[np.float64]:
-    """VLAD by one vocabulary: float64 (K * D,), unit length."""
     if options.assignment == "hard":
         labels = _nearest(data, centres)
         sums = _sum_by_label(data, labels, len(centres))
@@ -334,10 +322,10 @@ def _aggregate_one(data: Float32, centres: Float32, options: VladOptions) -> NDA
 def soft_assignment(
     descriptors: NDArray[np.floating[Any]], centres: NDArray[np.floating[Any]], alpha: float
 ) -> NDArray[np.float64]:
-    """``a_k(x_i)`` of NetVLAD's equation 1: (N, K) float64, rows sum to one."""
+    """Return ``a_k(x_i)`` of NetVLAD's equation 1: (N, K) float64, rows sum to one."""
     data = np.asarray(descriptors, dtype=np.float64)
     centres = np.asarray(centres, dtype=np.float64)
-    # |x|^2 is common to a row and cancels
+    # |x|^2 cancels within a row
     logits = alpha * (2.0 * data @ centres.T - np.einsum("kd,kd->k", centres, centres))
     logits -= logits.max(axis=1, keepdims=True)
     weights = np.exp(logits)

@@ -1,4 +1,4 @@
-"""Cameras of COLMAP's models: their parameters, their images' sizes, and projection."""
+"""COLMAP camera models: parameters, image sizes and projection."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PINHOLE_MODELS = frozenset({"PINHOLE", "SIMPLE_PINHOLE"})
 RADIAL_MODELS = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"})
 
 
-# the model with two focal lengths that has each one's distortion among its own, in the same order
+# models with two focal lengths whose distortion begins with that of the key, in the same order
 _TWO_FOCAL_MODEL = {
     "SIMPLE_PINHOLE": "PINHOLE",
     "SIMPLE_RADIAL": "OPENCV",
@@ -34,7 +34,6 @@ _TWO_FOCAL_MODEL = {
 
 
 def focal_px(camera: Camera) -> float:
-    """Mean focal length in pixels."""
     if camera.model in ONE_FOCAL_MODELS:
         return camera.params[0]
     return 0.5 * (camera.params[0] + camera.params[1])
@@ -45,13 +44,12 @@ def _principal_point_index(camera: Camera) -> int:
 
 
 def principal_point_px(camera: Camera) -> tuple[float, float]:
-    """Principal point (cx, cy) in pixels."""
     k = _principal_point_index(camera)
     return camera.params[k], camera.params[k + 1]
 
 
 def shift_principal_point(camera: Camera, x_px: float, y_px: float | None = None) -> Camera:
-    """The camera with its principal point moved, in y as in x unless ``y_px`` is given."""
+    """Shift the principal point by (``x_px``, ``y_px``); ``y_px`` is ``x_px`` by default."""
     k = _principal_point_index(camera)
     params = list(camera.params)
     params[k] += x_px
@@ -60,32 +58,30 @@ def shift_principal_point(camera: Camera, x_px: float, y_px: float | None = None
 
 
 def scale_focal(camera: Camera, factor: float) -> Camera:
-    """The camera with its focal length, or both of them, so many times as long."""
     k = _principal_point_index(camera)
     params = tuple(factor * value for value in camera.params[:k]) + camera.params[k:]
     return replace(camera, params=params)
 
 
 def radial_distortion(camera: Camera) -> float:
-    """The factor of the squared radius; of one of RADIAL_MODELS."""
+    """Return the factor of the squared radius, for RADIAL_MODELS."""
     return camera.params[_principal_point_index(camera) + 2]
 
 
 def with_distortion(camera: Camera, radial: float) -> Camera:
-    """The camera with this :func:`radial_distortion`."""
+    """Replace the :func:`radial_distortion`."""
     k = _principal_point_index(camera) + 2
     return replace(camera, params=(*camera.params[:k], radial, *camera.params[k + 1 :]))
 
 
 def swap_principal_point(camera: Camera) -> Camera:
-    """The camera with cx and cy exchanged."""
     k = _principal_point_index(camera)
     cx, cy = camera.params[k : k + 2]
     return replace(camera, params=(*camera.params[:k], cy, cx, *camera.params[k + 2 :]))
 
 
 def with_two_focals(camera: Camera) -> Camera:
-    """The same camera in a model with two focal lengths; itself where it has them already."""
+    """Return the same camera in a model with two focal lengths."""
     if camera.model not in ONE_FOCAL_MODELS:
         return camera
     model = _TWO_FOCAL_MODEL[camera.model]
@@ -95,17 +91,13 @@ def with_two_focals(camera: Camera) -> Camera:
 
 
 def same_lens(first: Camera, second: Camera) -> bool:
-    """True if two cameras differ by their focal lengths and principal points at most."""
+    """Return whether two cameras differ at most in focal lengths and principal points."""
     a, b = with_two_focals(first), with_two_focals(second)
     return a.model == b.model and a.params[4:] == b.params[4:]
 
 
 def scaled_camera(camera: Camera, scale: float) -> Camera:
-    """The same view in an image of another size, rounded to whole pixels, at least one.
-
-    Everything scales by what its side really scales by; one focal length for both sides by the
-    mean of the two.
-    """
+    """Scale to another image size, rounded to whole pixels; parameters follow the rounded sides."""
     width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
     x, y = width / camera.width, height / camera.height
     params = list(camera.params)
@@ -115,23 +107,20 @@ def scaled_camera(camera: Camera, scale: float) -> Camera:
 
 
 def reduced_camera(camera: Camera, max_side_px: int) -> Camera:
-    """The camera of the image reduced to a longer side; itself where it is no larger."""
+    """Scale a camera down to a longer side; a smaller one is returned unchanged."""
     longer = max(camera.width, camera.height)
     return camera if longer <= max_side_px else scaled_camera(camera, max_side_px / longer)
 
 
 def bearing_rays(camera: Camera, points_px: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Homogeneous rays (x/z, y/z, 1) in the camera frame of pixels (N, 2); float64 (N, 3)."""
+    """Return rays (x/z, y/z, 1) in the camera frame of pixels (N, 2); float64 (N, 3)."""
     xy = normalized_from_px(camera, points_px)
     return np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
 
 
 @lru_cache(maxsize=8)
 def pixel_rays(camera: Camera) -> NDArray[np.float64]:
-    """Rays (H * W, 3) with z = 1 through the centres of a camera's pixels, row by row; read-only.
-
-    Kept, for images share few cameras, and distortion is slow to undo.
-    """
+    """Return rays (H * W, 3), z = 1, through the pixel centres, row by row; cached, read-only."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = bearing_rays(camera, np.stack([x.ravel(), y.ravel()], axis=1))
     rays.flags.writeable = False
@@ -141,11 +130,11 @@ def pixel_rays(camera: Camera) -> NDArray[np.float64]:
 def project(
     camera: Camera, cam_from_world: RigidTransform, points_world: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Pixels (N, 2) float64 of world points (N, 3); NaN for points behind the camera."""
+    """Project world points (N, 3) to pixels (N, 2) float64; NaN behind the camera."""
     return px_from_cam(camera, cam_from_world.apply(points_world))
 
 
 def in_image(camera: Camera, px: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
-    """Mask (N,) of the pixels (N, 2) that are inside of a camera's image; NaN is not."""
+    """Return the mask (N,) of pixels (N, 2) inside the camera's image; NaN is outside."""
     with np.errstate(invalid="ignore"):
         return np.asarray(((px >= 0) & (px < (camera.width, camera.height))).all(axis=1))

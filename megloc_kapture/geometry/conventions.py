@@ -1,4 +1,4 @@
-"""The classic mistakes in the convention of poses, and the one that explains given poses.
+"""Common mistakes in pose conventions, and detection of the convention of given poses.
 
 The package's poses are ``cam_from_world`` with x right, y down and z forward. Other tools export
 camera-to-world (NeRF, SLAM), OpenGL's axes (ARKit, Blender), or camera centres.
@@ -10,9 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 from megloc_kapture.values import RigidTransform
 
-# y up and z back, against y down and z forward
 _COLMAP_FROM_OPENGL = RigidTransform((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-# a convention explains poses that it fits for this share, by so much more than as they are given
+# a convention needs this share of explained data, and this gain over the poses as given
 _MIN_SHARE, _MIN_GAIN = 0.4, 0.25
 _TIE = 0.05
 
@@ -42,9 +41,7 @@ CONVENTIONS: Mapping[str, Callable[[RigidTransform], RigidTransform]] = {
 def better_conventions(shares: Sequence[float]) -> list[str]:
     """Return the names of the conventions that explain far more than the poses as given.
 
-    ``shares`` has the explained share of the data (matches, or poses near the map) for the poses
-    as given, then for each of :data:`CONVENTIONS`. Several names cannot be told apart; none means
-    that the given convention is right or that no classic mistake explains the poses.
+    ``shares`` of explained data are for the poses as given, then for :data:`CONVENTIONS`.
     """
     given, *others = shares
     best = max(others)

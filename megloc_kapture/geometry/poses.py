@@ -1,9 +1,8 @@
-"""Pose algebra on arrays, and alignment with positions on earth.
+"""Pose algebra on arrays, and alignment of maps.
 
-Quaternions (..., 4) are ordered w x y z, translations (..., 3), both float64.
-
-The conventions are those of :class:`megloc_kapture.values.RigidTransform`: ``a_from_b`` maps
-``x_a = R x_b + t``, transforms compose right to left, and ``q`` and ``-q`` are one rotation.
+Quaternions (..., 4) are ordered w x y z, translations (..., 3), both float64. As in
+:class:`megloc_kapture.values.RigidTransform`, ``a_from_b`` maps ``x_a = R x_b + t``, transforms
+compose right to left, and ``q`` and ``-q`` are one rotation.
 """
 
 from __future__ import annotations
@@ -22,26 +21,26 @@ Floats = NDArray[np.float64]
 GeoPosition = tuple[float, float, float]
 """Latitude and longitude in degrees, height in metres above the ellipsoid."""
 
-# the standard deviation of normal values over the median of their magnitudes: 1 / (quantile of 3/4)
+# standard deviation over median magnitude of normal values: 1 / (quantile of 3/4)
 _DEVIATION_OF_MEDIAN = 1.482602218505602
-# of the ellipsoid WGS84
+# WGS84 ellipsoid
 _SEMI_MAJOR_M = 6378137.0
 _FLATTENING = 1 / 298.257223563
 _ECCENTRICITY_SQUARED = _FLATTENING * (2 - _FLATTENING)
-_LATITUDE_ROUNDS = 8  # each gains more than two digits
+_LATITUDE_ROUNDS = 8
 _ALIGNING_ROUNDS = 50
 _ALIGNING_PAIRS = 200  # with half of the poses right, every fourth pair is
-# of a pose with an alignment; by chance one of 30,000 rotations is as near
+# between aligned poses; one of 30,000 random rotations agrees by chance
 _AGREEMENT_DEG = 5.0
 _AGREEMENT_OF_SPREAD = 0.1  # of the centres' median distance from their median
-# how far the positions have to spread in two directions, in residuals, to tell scale and axes
+# required spread of the positions in two directions, in residuals, to determine scale and axes
 _MIN_SPREAD = 3.0
-# receivers of phones claim no better; residuals of three positions may be smaller by chance
+# phone receivers claim no better; residuals of three positions may be smaller by chance
 _MIN_RESIDUAL_M = 1.0
 
 
 def stack_poses(poses: Iterable[RigidTransform]) -> tuple[Floats, Floats]:
-    """Quaternions (N, 4) and translations (N, 3) of N transforms, in their order."""
+    """Stack transforms into quaternions (N, 4) and translations (N, 3)."""
     listed = list(poses)
     quats = np.array([p.quat_wxyz for p in listed], dtype=np.float64).reshape(-1, 4)
     translations = np.array([p.translation for p in listed], dtype=np.float64).reshape(-1, 3)
@@ -49,7 +48,7 @@ def stack_poses(poses: Iterable[RigidTransform]) -> tuple[Floats, Floats]:
 
 
 def unstack_poses(quats_wxyz: Floats, translations: Floats) -> list[RigidTransform]:
-    """The transforms of quaternions (N, 4) and translations (N, 3); undoes :func:`stack_poses`."""
+    """Build transforms of quaternions (N, 4) and translations (N, 3)."""
     return [
         RigidTransform((w, x, y, z), (tx, ty, tz))
         for (w, x, y, z), (tx, ty, tz) in zip(
@@ -59,18 +58,17 @@ def unstack_poses(quats_wxyz: Floats, translations: Floats) -> list[RigidTransfo
 
 
 def normalize_quats(quats_wxyz: Floats) -> Floats:
-    """Quaternions (..., 4) at unit length; a zero quaternion gives NaN."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return quats_wxyz / np.linalg.norm(quats_wxyz, axis=-1, keepdims=True)
 
 
 def invert_quats(quats_wxyz: Floats) -> Floats:
-    """The inverses ``conj(q) / |q|^2`` of quaternions (..., 4)."""
+    """Return the inverses ``conj(q) / |q|^2`` of quaternions (..., 4)."""
     return _conjugate(quats_wxyz) / _squared_length(quats_wxyz)[..., None]
 
 
 def multiply_quats(first: Floats, second: Floats) -> Floats:
-    """Hamilton products ``first * second`` of quaternions (..., 4); shapes broadcast."""
+    """Return Hamilton products ``first * second`` of quaternions (..., 4); shapes broadcast."""
     w1, x1, y1, z1 = np.moveaxis(np.asarray(first), -1, 0)
     w2, x2, y2, z2 = np.moveaxis(np.asarray(second), -1, 0)
     return np.stack(
@@ -85,11 +83,11 @@ def multiply_quats(first: Floats, second: Floats) -> Floats:
 
 
 def rotation_matrices(quats_wxyz: Floats) -> Floats:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4), whose length does not matter."""
+    """Return rotation matrices (..., 3, 3) of quaternions (..., 4) of any length."""
     quats = np.asarray(quats_wxyz, dtype=np.float64)
     w, x, y, z = np.moveaxis(quats, -1, 0)
     squared = _squared_length(quats)
-    # a length that is 1 to rounding is 1: dividing by it would only add rounding of its own
+    # dividing by a length that is 1 up to rounding would only add rounding
     s = 2.0 / np.where(np.abs(squared - 1.0) < 1e-14, 1.0, squared)
     rows = [
         [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
@@ -100,39 +98,34 @@ def rotation_matrices(quats_wxyz: Floats) -> Floats:
 
 
 def rotate(quats_wxyz: Floats, vectors: Floats) -> Floats:
-    """Vectors (..., 3) turned by quaternions (..., 4); shapes broadcast."""
+    """Rotate vectors (..., 3) by quaternions (..., 4); shapes broadcast."""
     return np.matmul(rotation_matrices(quats_wxyz), vectors[..., None])[..., 0]
 
 
 def compose(
     quats_ab: Floats, translations_ab: Floats, quats_bc: Floats, translations_bc: Floats
 ) -> tuple[Floats, Floats]:
-    """``a_from_c`` of ``a_from_b`` and ``b_from_c``: quaternions (..., 4), translations (..., 3).
-
-    The result's quaternions are normalised, so that long chains do not drift off unit length.
-    """
+    """Compose ``a_from_b`` and ``b_from_c``; the result's quaternions (..., 4) are normalised."""
     quats = normalize_quats(multiply_quats(quats_ab, quats_bc))
     return quats, rotate(quats_ab, translations_bc) + translations_ab
 
 
 def invert(quats_wxyz: Floats, translations: Floats) -> tuple[Floats, Floats]:
-    """``b_from_a`` of ``a_from_b``: quaternions (..., 4), translations (..., 3)."""
+    """Return ``b_from_a`` of ``a_from_b``: quaternions (..., 4), translations (..., 3)."""
     inverse = invert_quats(quats_wxyz)
     return inverse, -rotate(inverse, translations)
 
 
 def camera_centers(quats_wxyz: Floats, translations: Floats) -> Floats:
-    """Centres ``-R^T t`` in the world (..., 3) of ``cam_from_world`` transforms."""
+    """Return camera centres ``-R^T t`` in the world (..., 3) of ``cam_from_world`` transforms."""
     return -rotate(invert_quats(quats_wxyz), translations)
 
 
 def rotation_angles_deg(quats_a: Floats, quats_b: Floats) -> Floats:
-    """Angles (...) in degrees, 0 to 180, of the rotations ``a b^-1`` of quaternions (..., 4).
+    """Return angles (...) in degrees, 0 to 180, of rotations ``a b^-1`` of quaternions (..., 4).
 
-    The half angle is ``atan2(|v|, |w|)``. The usual arccos, of the scalar part or of the matrix'
-    trace, is flat at zero and cannot resolve below about 1e-6 degrees; this keeps full precision
-    there and at 180 degrees, needs no clipping, and takes ``q`` and ``-q`` as the same. Lengths
-    other than 1 do not matter.
+    The half angle is ``atan2(|v|, |w|)``: unlike arccos of the scalar part or the trace, it keeps
+    full precision near 0 and 180 degrees. Quaternions need not have unit length.
     """
     relative = multiply_quats(quats_a, _conjugate(quats_b))
     relative = relative / _squared_length(quats_b)[..., None]
@@ -144,14 +137,14 @@ def rotation_angles_deg(quats_a: Floats, quats_b: Floats) -> Floats:
 
 
 def movement(old: RigidTransform, new: RigidTransform) -> tuple[float, float]:
-    """Movement of a camera between two ``cam_from_world``: of its centre in metres, and degrees."""
+    """Return the motion of a camera between two ``cam_from_world``: metres and degrees."""
     moved_m = float(np.linalg.norm(new.center() - old.center()))
     turned_deg = rotation_angles_deg(np.array(new.quat_wxyz), np.array(old.quat_wxyz))
     return moved_m, float(turned_deg)
 
 
 def cross_matrix(vector: Floats) -> Floats:
-    """``[v]_x`` (3, 3) with ``[v]_x w = v x w``."""
+    """Return ``[v]_x`` (3, 3) with ``[v]_x w = v x w``."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
@@ -161,21 +154,17 @@ def _conjugate(quats: Floats) -> Floats:
 
 
 def _squared_length(quats: Floats) -> Floats:
-    """``|q|^2`` (...) of quaternions (..., 4)."""
     w, x, y, z = np.moveaxis(quats, -1, 0)
     return w * w + x * x + y * y + z * z
 
 
 def deviation_by_median(residuals: NDArray[np.floating[Any]]) -> np.float64:
-    """Standard deviation of normal values around 0, by the median of their magnitudes.
-
-    Up to half of the values cannot spoil it (Rousseeuw and Croux, JASA 1993). NaN of none.
-    """
+    """Estimate a standard deviation by the median magnitude (Rousseeuw and Croux, JASA 1993)."""
     return _DEVIATION_OF_MEDIAN * np.median(np.abs(residuals))
 
 
 def earth_from_enu(latitude_deg: float, longitude_deg: float, height_m: float) -> RigidTransform:
-    """From the frame east, north, up at a position to earth-centred, earth-fixed (ECEF) metres."""
+    """Return the transform from east, north, up at a position to ECEF, in metres."""
     lat, lon = np.radians(latitude_deg), np.radians(longitude_deg)
     east = np.array([-np.sin(lon), np.cos(lon), 0.0])
     up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
@@ -187,7 +176,7 @@ def earth_from_enu(latitude_deg: float, longitude_deg: float, height_m: float) -
 
 
 def geodetic(ecef_m: Floats) -> tuple[float, float, float]:
-    """Latitude and longitude in degrees and height in metres of an ECEF position (3,)."""
+    """Return latitude and longitude in degrees and height in metres of an ECEF position (3,)."""
     x, y, z = (float(value) for value in ecef_m)
     across = np.hypot(x, y)
     lat = np.arctan2(z, across * (1 - _ECCENTRICITY_SQUARED))
@@ -201,7 +190,7 @@ def geodetic(ecef_m: Floats) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class EarthAlignment:
-    """Where a map lies on earth: ``enu = enu_from_map(scale * x)``, East, North, Up at the origin.
+    """The position of a map on earth: ``enu = enu_from_map(scale * x)``, ENU axes at ``origin``.
 
     ``residual_m`` is the median distance of the aligned camera centres from their positions.
     """
@@ -216,12 +205,10 @@ class EarthAlignment:
 def align_to_earth(
     centers: Mapping[str, Floats], positions: Mapping[str, GeoPosition]
 ) -> EarthAlignment:
-    """Scale and axes of a map by the positions of its cameras on earth.
+    """Estimate scale and axes of a map from its camera centres (3,) and their positions on earth.
 
-    Of camera centres (3,) in the map, by image, and positions of some images. Least squares
-    (Umeyama 1991), reweighted by Cauchy's weights, so that single bad positions of a receiver do
-    not count. Raises DataError for fewer than three images, or where these lie too near to each
-    other or on a line.
+    Least squares (Umeyama 1991), reweighted by Cauchy's weights against outliers. Raises DataError
+    for fewer than three images, or images too near to each other or on a line.
     """
     names = sorted(centers.keys() & positions.keys())
     if len(names) < 3:
@@ -266,14 +253,9 @@ class PoseAlignment:
 def align_poses(
     source: tuple[Floats, Floats], target: tuple[Floats, Floats], *, with_scale: bool = True
 ) -> PoseAlignment:
-    """Align ``cam_from_source`` with ``cam_from_target``, robustly.
+    """Align ``cam_from_source`` with ``cam_from_target``: quaternions (N, 4), translations (N, 3).
 
-    The similarity (without scale: the rigid transform) through a pair of poses that most poses
-    agree with, in rotation as well as in position, is fitted again to these poses.
-
-    Parameters
-    ----------
-    source, target : quaternions (N, 4) and translations (N, 3) of the same cameras.
+    The similarity (or rigid transform) through the pair with the most inliers is refitted to these.
     """
     number = len(source[0])
     if number < 3:
@@ -292,7 +274,7 @@ def align_poses(
 
     def agreeing(scale: float, rotation: Floats, translation: Floats) -> NDArray[np.bool_]:
         apart = np.linalg.norm(scale * centers[0] @ rotation.T + translation - centers[1], axis=1)
-        # the trace of rotation^T target_from_cam cam_from_source
+        # trace of rotation^T target_from_cam cam_from_source
         cosines = (np.einsum("nij,jk,nik->n", axes[1], rotation, axes[0]) - 1) / 2
         turned = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
         near = apart <= _AGREEMENT_OF_SPREAD * spread
@@ -327,10 +309,7 @@ def _similarity(
     weights: Floats,
     directions: tuple[Floats, ...] = (np.zeros((0, 3)), np.zeros((0, 3))),
 ) -> tuple[float, Floats, Floats]:
-    """``target = scale * rotation @ source + translation`` in weighted least squares.
-
-    ``directions`` (K, 3) in both frames also determine the rotation.
-    """
+    """Fit ``target = scale * rotation @ source + translation``; ``directions`` fit the rotation."""
     from scipy.spatial.transform import Rotation
 
     means = [np.average(points, axis=0, weights=weights) for points in (source, target)]
@@ -349,12 +328,9 @@ def _similarity(
 
 
 def perturbed(cam_from_world: RigidTransform, step: NDArray[np.float64]) -> RigidTransform:
-    """Return ``exp(omega) R`` and ``exp(omega) t + v`` for a step (omega, v).
-
-    Omega in radians, v in the unit of the pose.
-    """
+    """Return ``exp(omega) R`` and ``exp(omega) t + v`` for a step (omega, v), omega in radians."""
     angle = float(np.linalg.norm(step[:3]))
-    # sin(x / 2) / x, through its limit
+    # sin(x / 2) / x, also at 0
     half_sinc = 0.5 * float(np.sinc(0.5 * angle / np.pi))
     x, y, z = (half_sinc * step[:3]).tolist()
     tx, ty, tz = step[3:].tolist()

@@ -1,8 +1,7 @@
-"""Projection under COLMAP's camera models with its derivatives, and of depth maps; compiled.
+"""Compiled projection of points with derivatives, and of depth maps, in COLMAP's camera models.
 
-The models are those of COLMAP's ``sensor/models.h``, with the same expansions near the axis.
-Imported only when needed: numba costs half a second to import. Loops elsewhere call
-:func:`project_point` or :func:`distorted`.
+The models follow COLMAP's ``sensor/models.h``, including its expansions near the axis. Import this
+module lazily: numba takes half a second.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
@@ -22,29 +21,25 @@ from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, ONE_FOCAL_MODELS, Cam
 NUM_PARAMS = 12
 
 _NUMBERS = {name: number for number, name in enumerate(CAMERA_MODEL_NUM_PARAMS)}
-# models up to this number have no distortion
 PINHOLES = _NUMBERS["PINHOLE"]
 _SIMPLE_RADIAL, _RADIAL = _NUMBERS["SIMPLE_RADIAL"], _NUMBERS["RADIAL"]
 _OPENCV, _FULL_OPENCV, _FOV = _NUMBERS["OPENCV"], _NUMBERS["FULL_OPENCV"], _NUMBERS["FOV"]
 _THIN_PRISM_FISHEYE = _NUMBERS["THIN_PRISM_FISHEYE"]
 
 _FOV_EPSILON = 1e-4  # COLMAP's
-# below this radius the angle is its series to double precision
+# below this radius the series of the angle has double precision
 _NEAR_AXIS = 1e-3
-# a pixel's centre that lies on an edge belongs to both triangles, whatever rounding says
+# a pixel centre on an edge belongs to both triangles despite rounding
 _ON_EDGE = 1e-6
 
 
 def model_id(camera: Camera) -> int:
-    """The number by which :func:`project_point` knows a camera's model."""
+    """Return the model number for :func:`project_point`."""
     return _NUMBERS[camera.model]
 
 
 def packed_params(camera: Camera) -> NDArray[np.float64]:
-    """Parameters as :func:`project_point` takes them: float64 (12,) fx, fy, cx, cy, then the rest.
-
-    Two focal lengths for every model, and zeros behind the model's own.
-    """
+    """Return parameters for :func:`project_point`: float64 (12,) fx, fy, cx, cy, others, zeros."""
     packed = np.zeros(NUM_PARAMS)
     params = camera.params
     if camera.model in ONE_FOCAL_MODELS:
@@ -56,11 +51,7 @@ def packed_params(camera: Camera) -> NDArray[np.float64]:
 def packed_views(
     cameras: Sequence[Camera], cams_from_world: Sequence[RigidTransform]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-    """Posed cameras as compiled loops take them.
-
-    Rotations float64 (I, 3, 3) and translations (I, 3) of ``cams_from_world``, :func:`model_id`
-    int64 (I,) and :func:`packed_params` float64 (I, 12).
-    """
+    """Return rotations (I, 3, 3), translations (I, 3), models (I,) and parameters (I, 12)."""
     return (
         np.array([pose.rotation_matrix() for pose in cams_from_world]).reshape(-1, 3, 3),
         np.array([pose.translation for pose in cams_from_world], np.float64).reshape(-1, 3),
@@ -72,9 +63,9 @@ def packed_views(
 def project_with_jacobian(
     camera: Camera, points_in_cam: NDArray[np.floating[Any]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pixels of points (N, 3) in the camera frame, and their derivatives by the points.
+    """Project points (N, 3) in the camera frame: pixels (N, 2), derivatives (N, 2, 3).
 
-    float64 (N, 2), the first pixel's centre at (0.5, 0.5), and (N, 2, 3); NaN behind the camera.
+    The first pixel's centre is (0.5, 0.5); NaN behind the camera.
     """
     points = np.ascontiguousarray(points_in_cam, dtype=np.float64).reshape(-1, 3)
     out = np.empty((len(points), 8))
@@ -84,7 +75,7 @@ def project_with_jacobian(
 
 @compiled_loop
 def _angle(r):
-    """``atan(r) / r`` and its derivative by r, divided by r."""
+    """Return ``atan(r) / r`` and its derivative by r, divided by r."""
     if r < _NEAR_AXIS:
         r2 = r * r
         return 1.0 - r2 / 3.0 + r2 * r2 / 5.0, -2.0 / 3.0 + 0.8 * r2
@@ -94,7 +85,7 @@ def _angle(r):
 
 @compiled_loop
 def _radial_factor(model, p, r):
-    """The factor that radially symmetric models put on (u, v), and its derivative by r over r."""
+    """Return the factor of (u, v) in radially symmetric models and its derivative by r over r."""
     r2 = r * r
     if model in (_SIMPLE_RADIAL, _RADIAL):
         return 1.0 + r2 * (p[4] + r2 * p[5]), 2.0 * p[4] + 4.0 * p[5] * r2
@@ -111,20 +102,20 @@ def _radial_factor(model, p, r):
         angle = math.atan(scaled)
         slope = 2.0 * tan_half / (1.0 + scaled * scaled)
         return angle / (r * omega), (slope - angle / r) / (r2 * omega)
-    # the fisheye models: theta (1 + k1 theta^2 + ...) / r
+    # fisheye models: theta (1 + k1 theta^2 + ...) / r
     per_r, slope = _angle(r)
     theta = per_r * r
     t2 = theta * theta
     k1, k2, k3, k4 = p[4], p[5], p[6], p[7]
     scale = 1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))
     scale_slope = 2.0 * k1 + t2 * (4.0 * k2 + t2 * (6.0 * k3 + t2 * 8.0 * k4))
-    # d theta / d r = 1 / (1 + r^2); the slope of the scale by r is scale_slope * theta * that
+    # d theta / d r = 1 / (1 + r^2)
     return per_r * scale, slope * scale + per_r * scale_slope * per_r / (1.0 + r * r)
 
 
 @compiled_loop
 def _not_radial(model, p, u, v):
-    """Distorted (x, y) of models that are not radially symmetric, and the four derivatives."""
+    """Return distorted (x, y) of models without radial symmetry, and the four derivatives."""
     u2, v2, uv = u * u, v * v, u * v
     r2 = u2 + v2
     if model == _OPENCV:
@@ -144,7 +135,7 @@ def _not_radial(model, p, u, v):
         p1, p2, s1, s2 = p[6], p[7], p[10], p[11]
     x = u * radial + 2.0 * p1 * uv + p2 * (r2 + 2.0 * u2) + s1 * r2
     y = v * radial + 2.0 * p2 * uv + p1 * (r2 + 2.0 * v2) + s2 * r2
-    # slope is the derivative by r^2, whose own are 2u and 2v
+    # slope is the derivative by r^2, whose derivatives are 2u and 2v
     cross = 2.0 * uv * slope
     xu = radial + 2.0 * u2 * slope + 2.0 * p1 * v + 6.0 * p2 * u + 2.0 * s1 * u
     xv = cross + 2.0 * p1 * u + 2.0 * p2 * v + 2.0 * s1 * v
@@ -155,11 +146,10 @@ def _not_radial(model, p, u, v):
 
 @compiled_loop
 def distorted(model, p, u, v):
-    """Distorted normalised coordinates a, b of undistorted ones, and the four derivatives.
+    """Distort normalised coordinates ``u = x / z``, ``v = y / z`` to a, b; return the derivatives.
 
-    Of ``u = x / z`` and ``v = y / z`` of a point in the camera frame. The derivatives are those of
-    a by u and v and of b by u and v; the pixel is ``(p[0] a + p[2], p[1] b + p[3])``. For ``model``
-    and ``p`` see :func:`model_id` and :func:`packed_params`.
+    They are those of a by u and v, then of b by u and v; the pixel is ``(p[0] a + p[2], p[1] b +
+    p[3])``. ``model`` and ``p`` are :func:`model_id` and :func:`packed_params`.
     """
     if model <= PINHOLES:
         return u, v, 1.0, 0.0, 0.0, 1.0
@@ -177,11 +167,9 @@ def distorted(model, p, u, v):
 
 @compiled_loop
 def project_point(model, p, x, y, z, out):
-    """Pixel of one point in the camera frame, and its derivatives.
+    """Write px, py and their derivatives by x, y, z to ``out`` (8,); NaN behind the camera.
 
-    ``out`` float64 (8,) is filled with px, py, then the derivatives of px by x, y, z and of py by
-    x, y, z; NaN behind the camera. For ``model`` and ``p`` see :func:`model_id` and
-    :func:`packed_params`.
+    ``model`` and ``p`` are :func:`model_id` and :func:`packed_params`.
     """
     if not z > 0.0:
         for i in range(8):
@@ -198,7 +186,7 @@ def project_point(model, p, x, y, z, out):
 
 @compiled_loop
 def moved(r, t, points, k):
-    """Point ``k`` by a rotation and a translation; slices and small arrays would cost more."""
+    """Transform point ``k`` by rotation and translation, without slices or small arrays."""
     px, py, pz = points[k, 0], points[k, 1], points[k, 2]
     return (
         r[0, 0] * px + r[0, 1] * py + r[0, 2] * pz + t[0],
@@ -225,22 +213,16 @@ def draw_depth_surface(
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Draw a depth map as a surface of small triangles into another view's depth buffer.
 
-    Neighbouring pixels of the depth map are joined by triangles, which makes a surface without
-    holes at any zoom. It is cut where depth jumps. Inverse depth is linear in the pixels of a plane
-    without distortion, so it is what is interpolated.
+    The triangles join neighbouring pixels and leave no holes at any zoom; jumps in depth cut the
+    surface. Inverse depth is interpolated: it is linear in the pixels of an undistorted plane.
+    Return depth (H, W), infinite without a surface, and a mask (H, W) of its front side.
 
     Parameters
     ----------
-    depth_m : float32 (R, C), the depth map; 0, less or not finite where unknown.
-    rays : float64 (R * C, 3), through its pixels' centres, z = 1, in the depth camera's frame.
-    max_jump : depths of neighbours may differ by this share of the nearer.
-    near_m, field : what is nearer to the view along its axis, or farther off the axis (tangent of
-        the angle), is left out.
-
-    Returns
-    -------
-    depth : float64 (H, W) in the view at the pixels' centres, metres; infinite without a surface.
-    front : bool (H, W), whether the surface is seen from the side that the depth map saw.
+    depth_m : float32 (R, C); 0, negative or not finite where unknown.
+    rays : (R * C, 3) through its pixel centres, z = 1, in the depth camera's frame.
+    max_jump : largest difference between neighbouring depths, as a share of the nearer.
+    near_m, field : smallest depth in the view, largest tangent of the angle off its axis.
     """
     rows, columns = depth_m.shape
     depth = np.ascontiguousarray(depth_m, np.float64)
@@ -257,7 +239,7 @@ def draw_depth_surface(
 
 @compiled_loop
 def _project(depth, rays, rotation, translation, model, params, near_m, field, px, z):
-    """Pixels and depths in the view of the depth map's points; NaN where it cannot see one."""
+    """Project the points of a depth map into the view; NaN where it cannot see one."""
     rows, columns = depth.shape
     out = np.empty(8)
     for r in range(rows):
@@ -284,12 +266,12 @@ def _joined(a, b, max_jump):
 
 @compiled_loop
 def _triangle(px, z, ar, ac, br, bc, cr, cc, inverse, front):
-    """Draw one triangle whose corners run clockwise as the depth map sees them (y down)."""
+    """Draw one triangle; the depth map sees its corners clockwise (y down)."""
     ax, ay = px[ar, ac, 0], px[ar, ac, 1]
     bx, by = px[br, bc, 0], px[br, bc, 1]
     cx, cy = px[cr, cc, 0], px[cr, cc, 1]
     area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-    if not abs(area) > 1e-12:  # seen edge on, or not at all
+    if not abs(area) > 1e-12:  # seen edge on, or NaN
         return
     height, width = inverse.shape
     left = max(0, math.ceil(min(ax, bx, cx) - 0.5 - _ON_EDGE))
@@ -321,7 +303,7 @@ def _draw(depth, px, z, max_jump, inverse, front):
             there[r, c] = math.isfinite(px[r, c, 0] + px[r, c, 1])
     for r in range(rows - 1):
         for c in range(columns - 1):
-            # the quad's other diagonal where this one crosses an edge or a hole
+            # use the quad's other diagonal where this one crosses an edge or a hole
             falling = abs(depth[r, c] - depth[r + 1, c + 1])
             rising = abs(depth[r, c + 1] - depth[r + 1, c])
             whole = there[r, c] and there[r + 1, c + 1]

@@ -1,8 +1,7 @@
 """Warping of reference images with depth into another view, with a z-buffer.
 
-Each reference's depth map is drawn as a surface into the view; the nearest surface of all of them
-is what the view sees. Every pixel of the view then looks its colour up, bilinearly, in the
-references that see that surface.
+Each reference's depth map is drawn as a surface into the view. Every pixel then takes the colour of
+the nearest surface, bilinearly, from the references that see it.
 """
 
 from __future__ import annotations
@@ -28,31 +27,24 @@ from megloc_kapture.geometry.cameras import (
 from megloc_kapture.values import Camera, RigidTransform
 
 _NEAR_M = 0.02
-# two references see one surface where their depths in the view differ by less
+# references see the same surface if their depths in the view differ by less
 _SAME_SURFACE = 0.02
-_MAX_JUMP = 0.05  # of neighbouring depths, share of the nearer
-# rays this much farther off the axis than the image's corners are not projected: distortion is
-# only known inside the image and may fold beyond
+_MAX_JUMP = 0.05  # between neighbouring depths, share of the nearer
+# rays this much farther off the axis than the image's corners are not projected: distortion may
+# fold outside the image
 _FIELD_MARGIN = 1.2
-_SAME_CENTRE_M = 1e-9  # an offset that is left over from composing transforms
+_SAME_CENTRE_M = 1e-9  # rounding of composed transforms
 _PER_ROW = 1024
-_WHOLE = 0.999  # of a bilinear lookup, the weight on usable pixels
+_WHOLE = 0.999  # minimum bilinear weight on usable pixels
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class WarpSource:
-    """A reference image with depth and pose.
+    """A reference image uint8 (H, W, 3) with depth, pose and a mask (H, W), True = use.
 
-    Raises DataError where an array's size is not its camera's.
-
-    Parameters
-    ----------
-    image : uint8 (H, W, 3), and ``camera``, ``cam_from_world``, its camera and pose.
-    depth_m : float32, along the axis of ``depth_camera``; 0, less or NaN where unknown.
-    image_from_depth : from the depth camera's frame to the image camera's, metres.
-    mask : bool (H, W), True = use; None without one.
+    ``depth_m`` is along the axis of ``depth_camera``; 0, negative or NaN where unknown.
     """
 
     image: NDArray[np.uint8]
@@ -78,15 +70,10 @@ class WarpSource:
 
 @dataclass(frozen=True, eq=False)
 class WarpedView:
-    """A view as references show it.
+    """A view rendered from references: RGB uint8 (H, W, 3), depth float32 (H, W).
 
-    Attributes
-    ----------
-    image : uint8 (H, W, 3), RGB; 0 where not valid.
-    valid : bool (H, W), False in holes, behind surfaces and where only a back side is seen.
-    depth_m : float32 (H, W), along the view's axis at the pixels' centres; 0 where nothing is known
-        of what lies there. Back sides of surfaces have depth.
-    source : int16 (H, W), the reference that the colour is of; -1 where not valid.
+    ``source`` is the index of the reference that gives the colour. Pixels that are not ``valid``
+    (holes, hidden surfaces, back sides) are 0 with source -1; back sides have depth.
     """
 
     image: NDArray[np.uint8]
@@ -102,11 +89,10 @@ def warp_to_view(
     *,
     scale: float = 1.0,
 ) -> WarpedView:
-    """Bring reference images to a view, of any model, in an image ``scale`` times its size.
+    """Warp reference images into a view of any camera model, ``scale`` times its size.
 
-    Of several references that see a surface, each pixel takes the one that looks at it most as the
-    view does: least angle between the two rays, and not from much farther away; of equals the
-    first. Raises DataError where the scale is not positive.
+    Of the references that see a surface, each pixel takes the one with the smallest angle between
+    the rays and a distance not much larger; ties go to the first.
     """
     if not scale > 0:
         raise DataError(f"scale {scale:g} of a view is not positive")
@@ -140,7 +126,7 @@ def warp_to_view(
 def _seen_depth(
     source: WarpSource, camera: Camera, cam_from_world: RigidTransform
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Depth (H, W) of a reference's surface in a view, and where its front is seen."""
+    """Return the depth (H, W) of a reference's surface in a view, and its front side."""
     from megloc_kapture.geometry.projection import draw_depth_surface
 
     return draw_depth_surface(
@@ -156,7 +142,6 @@ def _seen_depth(
 
 @lru_cache(maxsize=8)
 def _field(camera: Camera) -> float:
-    """Tangent of the angle off the axis beyond which nothing is projected."""
     # corners and middles of the border
     grid = np.stack(np.meshgrid([0.0, 0.5, 1.0], [0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2)
     border = np.delete(grid, 4, axis=0) * (camera.width, camera.height)
@@ -168,7 +153,7 @@ def _field(camera: Camera) -> float:
 def _look_up(
     source: WarpSource, points: Floats, focal: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Colours uint8 (N, 3) of world points in a reference, and which it sees, bool (N,)."""
+    """Return colours uint8 (N, 3) of world points in a reference, and a visibility mask (N,)."""
     image, mask, shrink = _at_resolution(source, focal)
     in_camera = source.cam_from_world.apply(points)
     px = px_from_cam(source.camera, in_camera)
@@ -179,7 +164,7 @@ def _look_up(
     in_array = np.where(usable[:, None], px, -1e4) * shrink - 0.5
     x, y = np.ascontiguousarray(in_array.T, np.float32)
     height, width = image.shape[:2]
-    # beyond the outer centres there is half a pixel that belongs to the image still
+    # half a pixel beyond the outer centres still belongs to the image
     usable &= (x >= -0.5) & (y >= -0.5) & (x <= width - 0.5) & (y <= height - 0.5)
     colour = _remap(image, x, y)
     if mask is not None:
@@ -188,7 +173,7 @@ def _look_up(
 
 
 def _remap(array: NDArray[Any], x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[Any]:
-    """Values (N, ...) of an array (H, W, ...) at N positions, bilinear."""
+    """Sample an array (H, W, ...) bilinearly at N positions."""
     if not len(x):
         return np.zeros((0, *array.shape[2:]), array.dtype)
     # OpenCV takes no more than 32767 rows or columns
@@ -201,7 +186,7 @@ def _remap(array: NDArray[Any], x: NDArray[np.float32], y: NDArray[np.float32]) 
 def _at_resolution(
     source: WarpSource, focal: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32] | None, Floats]:
-    """Image and mask, reduced where their pixels are finer than the view's; by how much (2,)."""
+    """Return image and mask, reduced where finer than the view's pixels, and the scale (2,)."""
     height, width = source.image.shape[:2]
     factor = min(1.0, focal / focal_px(source.camera))
     mask = None if source.mask is None else source.mask.astype(np.float32)
@@ -215,7 +200,7 @@ def _at_resolution(
 
 
 def _not_hidden(source: WarpSource, in_camera: Floats, px: Floats) -> NDArray[np.bool_]:
-    """Mask of the points (N, 3) of the depth sensor beside an image that the image sees too."""
+    """Return a mask of the depth sensor's points (N, 3) that the image also sees."""
     own, _ = _seen_depth(source, source.camera, source.cam_from_world)
     inside = in_image(source.camera, px)
     columns, rows = np.floor(np.where(inside[:, None], px, 0)).astype(np.int64).T
@@ -223,7 +208,7 @@ def _not_hidden(source: WarpSource, in_camera: Floats, px: Floats) -> NDArray[np
 
 
 def _cost(points: Floats, view_centre: Floats, source_centre: Floats) -> Floats:
-    """Angle between two rays to points (N, 3), radians, and how much coarser the other sees it."""
+    """Return the angle between rays to points (N, 3) plus the log of the loss of resolution."""
     to_view, to_source = view_centre - points, source_centre - points
     near, far = np.linalg.norm(to_view, axis=1), np.linalg.norm(to_source, axis=1)
     sine = np.linalg.norm(np.cross(to_view, to_source), axis=1)

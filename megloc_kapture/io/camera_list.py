@@ -1,4 +1,4 @@
-"""Lists of cameras: one per image, as Aachen's and hloc's, or one for all, as COLMAP's cameras.txt.
+"""Camera lists with one row per image (Aachen, hloc) or one for all (COLMAP's cameras.txt).
 
 A row is ``NAME MODEL WIDTH HEIGHT PARAMS...``, separated by blanks or commas.
 """
@@ -21,8 +21,8 @@ _ROW = re.compile(
 class CameraList:
     """Cameras by the names of their images.
 
-    An image has the row whose name its path ends as, by whole folders, the longest of several;
-    else the only row whose name ends as the image's.
+    An image gets the row with the longest name that its path ends with, by whole folders; else the
+    only row whose name ends with the image's.
     """
 
     def __init__(self, cameras: Mapping[str, Camera]) -> None:
@@ -32,7 +32,7 @@ class CameraList:
             self._by_file.setdefault(PurePosixPath(name).name, []).append(name)
 
     def of(self, image: str, path: Path) -> Camera | None:
-        """The camera of an image by its name and file; None where there is no row of it."""
+        """Return the camera of an image by name and file; None without a row."""
         names = self._by_file.get(PurePosixPath(image).name, [])
         file = path.absolute().as_posix()
         ending = [name for name in names if file.endswith(f"/{name}")]
@@ -44,7 +44,7 @@ class CameraList:
 
 
 def read_cameras(path: Path) -> Camera | CameraList:
-    """Read a list; a single row whose name is a number, as COLMAP's ids are, is of all images."""
+    """Read a list; a single row with a number as its name (COLMAP's id) applies to all images."""
     cameras: dict[str, Camera] = {}
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):

@@ -1,7 +1,6 @@
 """COLMAP through pycolmap: cameras, databases, models, triangulation with known poses.
 
-pycolmap changes its names between releases and has traps of its own (see docs/architecture.md);
-this module and ``colmap_mapping.py`` keep both away from the rest of the package.
+pycolmap's changing names and pitfalls (docs/architecture.md) stay in the modules of ``io``.
 """
 
 from __future__ import annotations
@@ -32,20 +31,20 @@ NEVER = 2**31 - 1
 
 @lru_cache(maxsize=1)
 def load_pycolmap() -> Any:
-    """pycolmap, imported when it is first needed; for the modules of ``io`` alone."""
+    """Import pycolmap on first use; for the modules of ``io`` only."""
     before = signal.getsignal(signal.SIGTERM)
     import pycolmap
 
-    # its import takes SIGTERM over, and would end a run that is asked to end with a stack trace
+    # importing it replaces the SIGTERM handler: a terminated run would end with a stack trace
     if before is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, before)
-    pycolmap.logging.minloglevel = 2  # its INFO lines are no concern of our users
+    pycolmap.logging.minloglevel = 2  # hide INFO lines
     return pycolmap
 
 
 @contextmanager
 def quiet_stderr() -> Iterator[None]:
-    # COLMAP writes progress to the file descriptor whatever its log level says
+    # COLMAP writes progress to the file descriptor at every log level
     if os.environ.get("MEGLOC_COLMAP_LOG"):
         yield
         return
@@ -64,7 +63,6 @@ def quiet_stderr() -> Iterator[None]:
 
 
 def new_colmap_camera(camera: Camera) -> Any:
-    """COLMAP's camera; a new one, which may be written to."""
     return load_pycolmap().Camera(
         model=camera.model,
         width=camera.width,
@@ -77,7 +75,7 @@ colmap_camera = lru_cache(maxsize=4096)(new_colmap_camera)
 
 
 def normalized_from_px(camera: Camera, points_px: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Undistorted normalised image coordinates (x/z, y/z) of pixels; (N, 2) to (N, 2) float64."""
+    """Undistort pixels (N, 2) to normalised image coordinates (x/z, y/z), float64 (N, 2)."""
     points = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1, 2)
     if len(points) == 0:
         return np.zeros((0, 2))
@@ -85,7 +83,7 @@ def normalized_from_px(camera: Camera, points_px: NDArray[np.floating[Any]]) -> 
 
 
 def px_from_cam(camera: Camera, points_in_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels of points in the camera frame; (N, 3) to (N, 2) float64, NaN behind the camera."""
+    """Project points (N, 3) in the camera frame to pixels (N, 2); NaN behind the camera."""
     points = np.ascontiguousarray(points_in_cam, dtype=np.float64).reshape(-1, 3)
     out = np.full((len(points), 2), np.nan)
     front = points[:, 2] > 0
@@ -95,12 +93,9 @@ def px_from_cam(camera: Camera, points_in_cam: NDArray[np.float64]) -> NDArray[n
 
 
 def undistorted_pinhole(camera: Camera, *, blank_pixels: float = 0.0) -> Camera:
-    """The PINHOLE camera with the same focal lengths that COLMAP undistorts an image to.
+    """Return the PINHOLE camera of COLMAP's undistorted image, with the same focal lengths.
 
-    Parameters
-    ----------
-    blank_pixels : 0: no pixel that the distorted image does not show; 1: all that it shows; in
-        between, in between. The sides stay between 0.2 and 2 times the old ones.
+    ``blank_pixels`` ranges from 0 (no pixel outside the distorted image) to 1 (all of its content).
     """
     pycolmap = load_pycolmap()
     options = pycolmap.UndistortCameraOptions()
@@ -110,7 +105,7 @@ def undistorted_pinhole(camera: Camera, *, blank_pixels: float = 0.0) -> Camera:
 
 
 def focal_from_exif(jpeg: bytes) -> float | None:
-    """Focal length in pixels that COLMAP finds in the EXIF of a JPEG file; None without one."""
+    """Return COLMAP's focal length in pixels from the EXIF of a JPEG file; None without one."""
     pycolmap = load_pycolmap()
     with tempfile.TemporaryDirectory(prefix=f".{owned_name()}") as folder:
         path = Path(folder) / "blank.jpg"
@@ -126,13 +121,9 @@ def focal_from_matches(
     max_error_px: float,
     seed: int,
 ) -> float | None:
-    """Focal length in pixels of a camera of which the rest is known: P4Pf in a RANSAC.
+    """Estimate the focal length in pixels of an otherwise known camera by P4Pf in a RANSAC.
 
-    None where no pose agrees with enough matches.
-
-    Parameters
-    ----------
-    points_px, points : (N, 2) and (N, 3), matched; not finite ones count as none.
+    Matches (N, 2), (N, 3) that are not finite are ignored. None without a pose of enough inliers.
     """
     usable = np.isfinite(points_px).all(axis=1) & np.isfinite(points).all(axis=1)
     if np.count_nonzero(usable) < 4:
@@ -142,7 +133,7 @@ def focal_from_matches(
     options.estimate_focal_length = True
     options.ransac.max_error = max_error_px
     options.ransac.random_seed = seed
-    changed = new_colmap_camera(camera)  # the RANSAC writes into it
+    changed = new_colmap_camera(camera)
     found = pycolmap.estimate_absolute_pose(points_px[usable], points[usable], changed, options)
     return None if found is None else float(changed.mean_focal_length())
 
@@ -151,7 +142,7 @@ def focal_from_matches(
 
 
 class TriangulationOptions(Options):
-    """Options of COLMAP's triangulation with known poses; defaults are COLMAP's but where said."""
+    """Options of COLMAP's triangulation with known poses, with COLMAP's defaults."""
 
     max_reprojection_error_px: float = Field(
         default=4.0, gt=0, description="of an observation; one that is farther off is left out"
@@ -166,7 +157,7 @@ class TriangulationOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class MapImage:
-    """One mapping image as triangulation needs it; keypoints are (N, 2), first pixel (0.5, 0.5)."""
+    """A mapping image; keypoints (N, 2), the first pixel's centre at (0.5, 0.5)."""
 
     name: str
     camera: Camera
@@ -176,14 +167,10 @@ class MapImage:
 
 @dataclass(frozen=True, eq=False)
 class TriangulatedPoints:
-    """Points and their observations, in arrays.
+    """Points float64 (N, 3) in the world frame, mean reprojection errors and observations.
 
-    Attributes
-    ----------
-    xyz : float64 (N, 3) in the world frame.
-    errors_px : float64 (N,), mean reprojection error.
-    point_ids, image_ids, keypoint_ids : int64 (O,) rows of ``xyz``, indices into the images
-        given, rows of their keypoints; sorted by point, then image, then keypoint.
+    ``point_ids``, ``image_ids`` and ``keypoint_ids`` int64 (O,) are rows of points, images and
+    keypoints, sorted in this order.
     """
 
     xyz: NDArray[np.float64]
@@ -201,16 +188,10 @@ def triangulate(
     num_threads: int = 1,
     scratch: Path | None = None,
 ) -> TriangulatedPoints:
-    """Triangulate verified matches between images of known pose; poses and cameras stay fixed.
+    """Triangulate verified matches between images with fixed poses and cameras.
 
-    The world is recentred on the cameras' mean while COLMAP works, so that maps far from the
-    origin (ECEF) lose no digits.
-
-    Parameters
-    ----------
-    images : the mapping images.
-    matches : (M, 2) keypoint rows for pairs (i, j) of indices into ``images``.
-    scratch : folder for COLMAP's database meanwhile, the system's unless given.
+    ``matches`` are (M, 2) keypoint rows of pairs (i, j) of images. The world is centred on the
+    cameras while COLMAP works, so that maps far from the origin (ECEF) lose no digits.
     """
     options = options or TriangulationOptions()
     empty = np.zeros(0, dtype=np.int64)
@@ -240,9 +221,9 @@ def triangulate(
         reconstruction = _posed_reconstruction(recentred, cameras, camera_ids)
         pipeline = pycolmap.IncrementalPipelineOptions()
         pipeline.num_threads = num_threads
-        # with many residuals its threads add them up in whatever order they come: other last bits
+        # threads sum many residuals in varying order, which changes the last bits
         pipeline.ba_min_num_residuals_for_cpu_multi_threading = NEVER
-        # drawn from in tracks of many images only, and never seen to change a point
+        # used for tracks of many images only; no effect on a point is known
         pipeline.random_seed = pipeline.triangulation.random_seed = 0
         pipeline.triangulation.ignore_two_view_tracks = not options.two_view_tracks
         pipeline.triangulation.min_angle = options.min_angle_deg
@@ -264,9 +245,9 @@ def database_folder(
     num_keypoints: Sequence[int],
     matches: Mapping[tuple[int, int], NDArray[np.integer[Any]]],
 ) -> Iterator[str]:
-    """A folder for a database. COLMAP ends the process without room, so the disk is asked first."""
+    """Yield a folder for a database after a check of the free space: COLMAP aborts without."""
     place = tempfile.gettempdir() if scratch is None else scratch
-    # matches are written twice, keypoints as float32; the rest is what SQLite and its journal take
+    # matches are written twice, keypoints as float32; the rest is SQLite and its journal
     needed = 16 * sum(map(len, matches.values())) + 8 * sum(num_keypoints)
     needed = 2 * needed + 2048 * (len(num_keypoints) + len(matches)) + (1 << 20)
     try:
@@ -287,14 +268,14 @@ def database_folder(
 
 
 def _cameras_of(images: Sequence[MapImage]) -> tuple[list[Any], list[int]]:
-    """COLMAP's cameras, equal ones once, and the number of each image's."""
+    """Return the distinct COLMAP cameras and the camera id of each image."""
     numbers: dict[Camera, int] = {}
     camera_ids = [numbers.setdefault(image.camera, len(numbers) + 1) for image in images]
     return numbered_cameras(numbers), camera_ids
 
 
 def numbered_cameras(cameras: Iterable[Camera]) -> list[Any]:
-    """COLMAP's cameras, numbered from 1 on."""
+    """Convert cameras to COLMAP's, numbered from 1."""
     found = [new_colmap_camera(camera) for camera in cameras]
     for camera_id, camera in enumerate(found, start=1):
         camera.camera_id = camera_id
@@ -308,14 +289,10 @@ def write_database(
     matches: Mapping[tuple[int, int], NDArray[np.integer[Any]]],
     geometry: Callable[[int, int, NDArray[np.uint32]], Any] | None = None,
 ) -> None:
-    """Write COLMAP's database; every camera is a rig of its own.
+    """Write a COLMAP database in which every camera is its own rig.
 
-    Parameters
-    ----------
-    cameras : COLMAP's, with their numbers.
-    images : name, number of the camera and keypoints (N, 2) of each; they are numbered from 1 on.
-    matches : (M, 2) keypoint rows of pairs (i, j) of indices into ``images``.
-    geometry : COLMAP's two-view geometry of a pair; a verified one unless given.
+    ``images`` are name, camera id and keypoints (N, 2), numbered from 1; ``matches`` are (M, 2)
+    keypoint rows of pairs (i, j) of images, all inliers unless ``geometry`` verifies them.
     """
     pycolmap = load_pycolmap()
     database = pycolmap.Database.open(str(path))
@@ -344,7 +321,7 @@ def write_database(
             if geometry is None:
                 found = pycolmap.TwoViewGeometry()
                 found.inlier_matches = rows
-                # left UNDEFINED, pycolmap 4.2 triangulates nothing, silently
+                # with UNDEFINED, pycolmap 4.2 silently triangulates nothing
                 found.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
             else:
                 found = geometry(i, j, rows)
@@ -355,7 +332,6 @@ def write_database(
 def _posed_reconstruction(
     images: Sequence[MapImage], cameras: Sequence[Any], camera_ids: Sequence[int]
 ) -> Any:
-    """The reconstruction of the poses, without points; images are numbered from 1 on."""
     pycolmap = load_pycolmap()
     reconstruction = pycolmap.Reconstruction()
     for camera in cameras:
@@ -373,7 +349,7 @@ def _posed_reconstruction(
 
 
 def _collect(reconstruction: Any, offset: NDArray[np.float64]) -> TriangulatedPoints:
-    # COLMAP numbers points in an order that depends on its threads; order them by their tracks
+    # COLMAP's point order depends on its threads; sort by track
     found = [
         (sorted((e.image_id - 1, e.point2D_idx) for e in point.track.elements), point)
         for _, point in sorted(reconstruction.points3D.items())
@@ -397,14 +373,9 @@ def write_model(
     xyz: NDArray[np.float64],
     colours: NDArray[np.floating],
 ) -> None:
-    """Write a model in COLMAP's binary format; every camera is a rig of its own.
+    """Write a binary COLMAP model, numbered by row from 1, in which every camera is its own rig.
 
-    Images, cameras and points have the numbers of their rows, from 1 on.
-
-    Parameters
-    ----------
-    observed : of each image rows of its keypoints and of the points that they observe.
-    xyz, colours : (N, 3), the latter from 0 to 255. A point that no image observes is written too.
+    ``observed`` holds rows of keypoints and of points by image; unobserved points are written too.
     """
     pycolmap = load_pycolmap()
     model = _posed_reconstruction(images, *_cameras_of(images))
@@ -424,12 +395,12 @@ def write_model(
 
 
 def read_model_poses(model: Path) -> dict[str, RigidTransform]:
-    """Read ``cam_from_world`` by image name of a binary model, whose points need not be there."""
+    """Read ``cam_from_world`` by image name from a binary model; its points may be missing."""
     with tempfile.TemporaryDirectory(prefix=f".{owned_name()}") as folder:
         for file in model.glob("*.bin"):
             if file.name != "points3D.bin":
                 (Path(folder) / file.name).symlink_to(file.resolve())
-        (Path(folder) / "points3D.bin").write_bytes(bytes(8))  # of no point
+        (Path(folder) / "points3D.bin").write_bytes(bytes(8))  # no points
         try:
             images = load_pycolmap().Reconstruction(folder).images.values()
         except (OSError, RuntimeError, ValueError, IndexError) as error:
@@ -445,12 +416,11 @@ def read_model_poses(model: Path) -> dict[str, RigidTransform]:
 
 
 def undistort_model(model: Path, images: Path, output: Path) -> None:
-    """Write ``images/`` and ``sparse/0`` without distortion, keypoints included."""
+    """Undistort a model with its keypoints into ``sparse/0`` and its images into ``images/``."""
     pycolmap = load_pycolmap()
     try:
         with quiet_stderr():
             pycolmap.undistort_images(str(output), str(model), str(images))
-        # only for COLMAP's own stereo
         rmtree(output / "stereo")
         for script in output.glob("run-colmap-*.sh"):
             script.unlink()

@@ -1,12 +1,9 @@
-"""COLMAP's SIFT, its mappers and its stereo: photographs to poses, posed images to depth.
+"""SIFT, structure from motion and dense stereo of COLMAP, through pycolmap.
 
-The mappers find poses, cameras and points of photographs from their verified matches. The
-incremental one is that of Schoenberger and Frahm, Structure-from-Motion Revisited (CVPR 2016), the
-global one GLOMAP (Pan et al., ECCV 2024); both are pycolmap's.
-
-Stereo has a workspace, which is written, run where there is CUDA, and read:
-``images/NAME``, ``sparse/`` and ``stereo/{depth_maps,normal_maps}/NAME.KIND.bin``; a map is
-``W&H&C&`` and float32 by channels. Images are pinholes without distortion.
+The mappers are COLMAP's incremental one (Schoenberger and Frahm, CVPR 2016) and GLOMAP (Pan et al.,
+ECCV 2024). A stereo workspace holds ``images/NAME``, ``sparse/`` and
+``stereo/{depth_maps,normal_maps}/NAME.KIND.bin``: ``W&H&C&``, then float32 by channels. Its images
+are undistorted pinholes.
 """
 
 from __future__ import annotations
@@ -43,12 +40,12 @@ from megloc_kapture.values import Camera, RigidTransform
 Mapper = Literal["incremental", "global"]
 _FOLDERS = {"depth": "depth_maps", "normal": "normal_maps"}
 MIN_IMAGES = 3
-# fewer are what RANSAC finds in anything; as many inliers COLMAP asks of an image it adds
+# RANSAC finds fewer by chance; COLMAP requires as many inliers to register an image
 _MIN_POINTS = 30
-# a photograph of another zoom, or of a part of an image: with a camera of its own the focal length
-# is off the others' median by more than this, and its points' errors are at most this share
+# a photograph with another zoom, or a crop: its separately estimated focal length differs from the
+# median by more than this, and its reprojection error falls to at most this share
 _OTHER_ZOOM, _SMALLER_ERROR = 0.08, 0.95
-# matches that move less than this in the median are of one image twice
+# median motion below which two images are the same
 _SAME_PX = 0.5
 
 
@@ -59,19 +56,11 @@ def extract_sift(
     first_octave: int = -1,
     peak_threshold: float = 0.02 / 3,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """COLMAP's SIFT on the CPU, all else at its defaults, in its order (fine scales first).
+    """Extract SIFT with COLMAP on the CPU from an RGB image, uint8 (H, W, 3).
 
-    Parameters
-    ----------
-    image : uint8 (H, W, 3), RGB; made grey as COLMAP does when it reads a file.
-    max_keypoints : COLMAP keeps whole scale levels, the coarsest first, up to and with the one that
-        exceeds this number; so there may be half as many again.
-
-    Returns
-    -------
-    keypoints : float32 (N, 4): x, y (the first pixel's centre is (0.5, 0.5)), scale in px,
-        orientation in radians.
-    descriptors : uint8 (N, 128): 512 times the square roots of the L1-normalised histograms.
+    COLMAP keeps whole scale levels, coarsest first, up to the one that exceeds ``max_keypoints``.
+    Return keypoints float32 (N, 4): x, y (first pixel's centre at (0.5, 0.5)), scale in px and
+    orientation in radians, fine scales first; and RootSIFT descriptors uint8 (N, 128), times 512.
     """
     pycolmap = load_pycolmap()
     options = pycolmap.FeatureExtractionOptions()
@@ -80,7 +69,7 @@ def extract_sift(
     options.sift.first_octave = first_octave
     options.sift.peak_threshold = peak_threshold
     bitmap = pycolmap.Bitmap.from_array(np.ascontiguousarray(image)).clone_as_grey()
-    # made anew each time: one has a pyramid of its own, which two threads would share
+    # not cached: an extractor holds a pyramid, which two threads would share
     extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
     found, descriptors = extractor.extract(bitmap)
     rows = [(k.x, k.y, k.compute_scale(), k.compute_orientation()) for k in found]
@@ -90,7 +79,7 @@ def extract_sift(
 
 @dataclass(frozen=True, eq=False)
 class DatabaseFeatures:
-    """One image of a COLMAP database: keypoints float32 (N, 2 or 4), descriptors uint8 (N, 128)."""
+    """An image of a COLMAP database: keypoints float32 (N, 2 or 4), descriptors uint8 (N, 128)."""
 
     name: str
     camera: Camera
@@ -99,7 +88,7 @@ class DatabaseFeatures:
 
 
 def write_feature_database(path: Path, images: Iterable[DatabaseFeatures]) -> None:
-    """Write COLMAP's database of images with SIFT features; equal cameras are one."""
+    """Write a COLMAP database of images with SIFT features; equal cameras are shared."""
     pycolmap = load_pycolmap()
     path = Path(path)
     if path.exists():
@@ -129,13 +118,10 @@ def write_feature_database(path: Path, images: Iterable[DatabaseFeatures]) -> No
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """An image without a pose.
+    """An image without a pose; images of one sensor share an estimated camera.
 
-    Attributes
-    ----------
-    sensor : images of one sensor have one camera, which is estimated for all of them.
-    keypoints_px : (N, 2), the first pixel's centre is (0.5, 0.5).
-    doubtful : nothing but its size tells that it is of that sensor.
+    Keypoints have the first pixel's centre at (0.5, 0.5). A ``doubtful`` image belongs to its
+    sensor by its size alone.
     """
 
     name: str
@@ -147,15 +133,9 @@ class Photograph:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What a mapper found of images that hang together, in a world of its own without unit.
+    """A connected reconstruction in its own world frame, without scale.
 
-    Attributes
-    ----------
-    cameras : of the sensors, refined. Photographs that turned out to have another camera than
-        their sensor's are of one that bears the name of the first of them.
-    sensors : of each image.
-    poses : ``cam_from_world`` by image.
-    error_px : mean reprojection error of its points.
+    Images whose camera differs from their sensor's share one named after the first of them.
     """
 
     cameras: dict[str, Camera]
@@ -174,20 +154,11 @@ def reconstruct(
     seed: int = 0,
     scratch: Path | None = None,
 ) -> list[Model]:
-    """Find poses and cameras; models that do not hang together are several, the largest first.
+    """Estimate poses and cameras from matches; return connected models, the largest first.
 
-    Images hang together that share 30 points, or are linked by images that do.
-
-    Photographs that share a sensor without anything to tell so get other cameras where their focal
-    lengths differ, one for those that agree, and everything is found anew.
-
-    In one thread, so that the same photographs and seed give the same model.
-
-    Parameters
-    ----------
-    matches : (M, 2) keypoint rows for pairs (i, j) of indices into ``photographs``.
-    known_cameras : the cameras stay as they are; else focal length and distortion are estimated.
-    scratch : folder for COLMAP's database meanwhile, the system's unless given.
+    ``matches`` are (M, 2) keypoint rows of pairs (i, j) of photographs. Connected images share 30
+    points. Doubtful images whose focal lengths differ get separate cameras, and the reconstruction
+    is repeated. It runs in one thread to be deterministic.
     """
     pycolmap = load_pycolmap()
     sensors = sorted({photograph.sensor for photograph in photographs})
@@ -260,7 +231,7 @@ def _options(mapper: Mapper, cameras: Sequence[Any], seed: int, known_cameras: b
         options.ba_min_num_residuals_for_cpu_multi_threading = NEVER
         options.min_model_size = MIN_IMAGES
         options.extract_colors = False
-        # minutes of trying where two scenes are mixed
+        # takes minutes where two scenes are mixed
         options.structure_less_registration_fallback = False
         if known_cameras:
             options.constant_cameras = {camera.camera_id for camera in cameras}
@@ -270,12 +241,9 @@ def _options(mapper: Mapper, cameras: Sequence[Any], seed: int, known_cameras: b
 
 
 def _other_cameras(reconstruction: Any, doubtful: Collection[str]) -> dict[str, str]:
-    """Of the doubtful images those whose camera is not the one that they share with others.
+    """Map doubtful images with another focal length to the first image of their group.
 
-    Each with the first of those whose focal lengths agree.
-
-    A wrong camera hides in poses and points, and an image's own estimate from these says nothing;
-    adjusted with a camera for each image, the focal lengths part.
+    Poses and points absorb a wrong camera; it shows in an adjustment with one camera per image.
     """
     pycolmap = load_pycolmap()
     images = [reconstruction.images[number] for number in sorted(reconstruction.reg_image_ids())]
@@ -327,7 +295,6 @@ def _other_cameras(reconstruction: Any, doubtful: Collection[str]) -> dict[str, 
 
 
 def _errors_px(reconstruction: Any) -> dict[int, float]:
-    """Mean error of the points of each image, by its number."""
     reconstruction.update_point_3d_errors()
     errors: dict[int, list[float]] = {number: [] for number in reconstruction.reg_image_ids()}
     for _, point in sorted(reconstruction.points3D.items()):
@@ -337,17 +304,12 @@ def _errors_px(reconstruction: Any) -> dict[int, float]:
 
 
 def connected_models(reconstruction: Any, sensors: Sequence[str]) -> list[Model]:
-    """Split what a mapper made into the parts that hang together, each with at least one point.
+    """Split a reconstruction into connected models; connected images share 30 points.
 
-    Images hang together that share 30 points, or are linked by images that do. A few wrong matches
-    between things that look alike join parts wherever they please: the mappers, above all the
-    global one, do not mind.
-
-    Parameters
-    ----------
-    reconstruction : pycolmap.Reconstruction, in whose cameras' order of ids ``sensors`` are.
+    The mappers accept the few wrong matches that join unrelated parts. ``sensors`` are in the order
+    of the camera ids of the pycolmap.Reconstruction.
     """
-    reconstruction.update_point_3d_errors()  # the global mapper's are of rays
+    reconstruction.update_point_3d_errors()  # the global mapper's are those of rays
     points = [point for _, point in sorted(reconstruction.points3D.items())]
     images = [reconstruction.images[number] for number in sorted(reconstruction.reg_image_ids())]
     if not images or not points:
@@ -385,7 +347,7 @@ def connected_models(reconstruction: Any, sensors: Sequence[str]) -> list[Model]
 
 
 def _why_none(seen: Sequence[tuple[Any, float]]) -> str:
-    """Why there is no model, by the verified pairs: their two-view geometry and median motion."""
+    """Explain the failure from the two-view geometries and median motions of verified pairs."""
     if not seen:
         return "no two photographs show enough of the same things to be matched"
     if all(moved_px < _SAME_PX for _, moved_px in seen):
@@ -408,7 +370,7 @@ def _why_none(seen: Sequence[tuple[Any, float]]) -> str:
 
 
 def has_cuda() -> bool:
-    """True where the installed pycolmap can run COLMAP's stereo."""
+    """Return whether the installed pycolmap can run COLMAP's stereo."""
     return bool(load_pycolmap().has_cuda)
 
 
@@ -419,13 +381,9 @@ def write_workspace(
     observed: Sequence[tuple[NDArray[np.integer[Any]], NDArray[np.integer[Any]]]],
     xyz: NDArray[np.float64],
 ) -> None:
-    """Write images and model of a workspace; ``root`` is an empty folder.
+    """Write images and model of a stereo workspace (PINHOLE cameras) to the empty folder ``root``.
 
-    Parameters
-    ----------
-    images : of PINHOLE cameras; keypoints, ``observed`` and ``xyz`` as of
-        :func:`~megloc_kapture.io.colmap.write_model`: fusion finds an image's neighbours by them.
-    pixels : uint8 (H, W, 3), RGB, of each.
+    Fusion finds an image's neighbours by the points.
     """
     for image, shown in zip(images, pixels, strict=True):
         path = root / "images" / image.name
@@ -441,24 +399,23 @@ def write_workspace(
 def run_patch_match(
     root: Path, name: str, sources: Sequence[str], depth_range_m: tuple[float, float]
 ) -> None:
-    """Depth of one image of a workspace, compared with the sources; see :func:`has_cuda`."""
+    """Estimate the depth of one image of a workspace by comparison with ``sources``; needs CUDA."""
     pycolmap = load_pycolmap()
     text = f"{name}\n{', '.join(sources)}\n"
     write_bytes(root / "stereo" / "patch-match.cfg", text.encode())
     options = pycolmap.PatchMatchOptions()
-    # one image by itself: what its neighbours say is looked at later, for all estimators alike
+    # geometric consistency is checked later, for all estimators alike
     options.geom_consistency = False
     options.depth_min, options.depth_max = depth_range_m
     pycolmap.patch_match_stereo(str(root), options=options)
 
 
 def map_path(root: Path, kind: Literal["depth", "normal"], name: str) -> Path:
-    """Where a workspace has the depth or normals of an image, compared with nothing but pixels."""
     return root / "stereo" / _FOLDERS[kind] / f"{name}.photometric.bin"
 
 
 def read_map(path: Path) -> NDArray[np.float32]:
-    """Read depth (H, W), 0 unknown, or normals (H, W, 3), camera frame; raises DataError."""
+    """Read depth (H, W), 0 where unknown, or normals (H, W, 3) in the camera frame."""
     try:
         content = path.read_bytes()
         *sizes, values = content.split(b"&", 3)

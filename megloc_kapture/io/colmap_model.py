@@ -1,4 +1,4 @@
-"""COLMAP's sparse models, read through pycolmap, and points of structure-from-motion models."""
+"""Reader of COLMAP's sparse models, through pycolmap."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransfor
 TEXT_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 BINARY_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 _RIG_FILES = ("rigs", "frames")  # since COLMAP 4
-# camera models without distortion that kapture has under another name, and its extra zeros
+# distortion-free models with another name in kapture, and the zeros to append
 _SAME_AS = {"SIMPLE_FISHEYE": ("SIMPLE_RADIAL_FISHEYE", 1), "FISHEYE": ("OPENCV_FISHEYE", 4)}
-# records of variable length: bytes before the number of items, its type, bytes of an item
+# records of variable length: bytes before the item count, its type, bytes per item
 _RECORDS = {
     "images.bin": (64, "<Q", 24),
     "points3D.bin": (43, "<Q", 8),
@@ -36,15 +36,9 @@ _RECORDS = {
 class SparsePoints:
     """Points of a model and their observations.
 
-    Parameters
-    ----------
-    xyz : float64 (P, 3) in the model's world.
-    rgb : uint8 (P, 3).
-    point_ids : int64 (O,), rows of ``xyz``, ascending.
-    image_ids : int32 (O,), positions in the model's list of images.
-    feature_ids : int32 (O,), index of the feature in its image. They have gaps: a model may name
-        only features that observe a point. An image may observe a point twice.
-    xy_px : float32 (O, 2); the centre of the first pixel is (0.5, 0.5).
+    ``point_ids`` are ascending rows of ``xyz``, ``image_ids`` positions in the model's images,
+    ``feature_ids`` may have gaps and repeat a point; ``xy_px`` has the first pixel's centre at
+    (0.5, 0.5).
     """
 
     xyz: NDArray[np.float64]
@@ -59,21 +53,13 @@ class SparsePoints:
 
     @classmethod
     def none(cls) -> SparsePoints:
-        """No points."""
         return cls.of_rows(np.empty((0, 6)), np.empty(0), np.empty((0, 4)))
 
     @classmethod
     def of_rows(
         cls, heads: NDArray[Any], lengths: NDArray[Any], observations: NDArray[Any]
     ) -> SparsePoints:
-        """Points in the order of a file.
-
-        Parameters
-        ----------
-        heads : (P, 6): X Y Z R G B.
-        lengths : (P,), number of observations of each point.
-        observations : (O, 4): image, feature, x, y.
-        """
+        """Build points from heads (X Y Z R G B), track lengths and rows image, feature, x, y."""
         return cls(
             heads[:, :3].copy(),
             heads[:, 3:].astype(np.uint8),
@@ -85,10 +71,7 @@ class SparsePoints:
 
     @classmethod
     def joined(cls, parts: Sequence[SparsePoints]) -> SparsePoints:
-        """Concatenate the points of several models of one list of images.
-
-        An image in several models must have the same feature ids in all of them.
-        """
+        """Concatenate points of models with one image list and consistent feature ids."""
         firsts = np.cumsum([0, *(len(part) for part in parts)])
         moved = [
             replace(part, point_ids=part.point_ids + first)
@@ -100,8 +83,6 @@ class SparsePoints:
 
 @dataclass(frozen=True, slots=True)
 class ColmapImage:
-    """A registered image of a model."""
-
     image_id: int
     name: str
     camera_id: int
@@ -110,15 +91,10 @@ class ColmapImage:
 
 @dataclass(frozen=True, eq=False)
 class ColmapModel:
-    """One reconstruction.
+    """One reconstruction, with images sorted by id.
 
-    Parameters
-    ----------
-    cameras : by camera id; images may share one.
-    images : sorted by ``image_id``.
-    points : ``image_ids`` are positions in ``images``, not COLMAP's ids.
-    cams_from_rig : rig id -> camera id -> ``cam_from_rig``, for cameras whose pose is known.
-    frames : image id -> id of its frame, the images that a rig took at one time.
+    ``points.image_ids`` are positions in ``images``, not COLMAP's ids. ``cams_from_rig`` is by rig
+    and camera id; ``frames`` maps image ids to frames, the images of a rig at one time.
     """
 
     cameras: dict[int, Camera]
@@ -129,7 +105,7 @@ class ColmapModel:
 
 
 def colmap_model_files(folder: Path, *, with_points: bool = True) -> tuple[Path, ...]:
-    """Return the files of the model in a folder, the binary ones where there are both."""
+    """Return the files of the model in a folder; binary ones are preferred."""
     folder = Path(folder)
     names = next((n for n in (BINARY_FILES, TEXT_FILES) if (folder / n[1]).exists()), None)
     if names is None:
@@ -142,12 +118,7 @@ def colmap_model_files(folder: Path, *, with_points: bool = True) -> tuple[Path,
 
 
 def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
-    """Read the model of a folder.
-
-    Parameters
-    ----------
-    with_points : False reads cameras and poses only; the file of points need not exist.
-    """
+    """Read the model of a folder; without points, their file need not exist."""
     paths = colmap_model_files(folder, with_points=with_points)
     for path in paths:
         if not path.is_file():
@@ -158,7 +129,7 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
         for path in paths:
             link = Path(links) / path.name
             if path.name == TEXT_FILES[1]:
-                # pycolmap drops the last image where its empty line of features is missing
+                # pycolmap drops the last image if its empty line of features is missing
                 link.write_bytes(path.read_bytes() + b"\n\n")
             else:
                 link.symlink_to(path.resolve())
@@ -192,10 +163,7 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
 
 
 def _check_complete(path: Path) -> None:
-    """Compare the records of a binary file with its size.
-
-    pycolmap 4 does not: of a file that was cut short it allocates memory until the machine stops.
-    """
+    """Check a binary file's size: on a truncated one pycolmap 4 allocates memory without limit."""
     head, length_type, item = _RECORDS[path.name]
     length_size = struct.calcsize(length_type)
     try:

@@ -1,8 +1,7 @@
-"""CSV tables with a header row, as MegLoc keeps beside kapture: records in, records out.
+"""CSV tables with a header row, mapped to records.
 
-Comma separated, UTF-8, a header row that names the columns. A reader takes the columns in any
-order, so that a table edited by hand in a spreadsheet still reads; DataError names file, line and
-column. A :class:`Table` takes its columns from the annotations of a record type.
+The header names the columns, in any order, so that a table edited in a spreadsheet still reads. A
+:class:`Table` takes its columns from the annotations of a record type.
 """
 
 from __future__ import annotations
@@ -32,16 +31,13 @@ from megloc_kapture.io.files import check_relative, first_problem, named, read_t
 from megloc_kapture.values import RigidTransform
 
 RowT = TypeVar("RowT")
-_MAX_UNIT_ERROR = 1e-6  # of the length of a quaternion that is written with every digit
+_MAX_UNIT_ERROR = 1e-6  # of the length of a quaternion written with all digits
 
 
 def read_csv_table(
     path: Path | str, columns: Sequence[str], *, optional: Sequence[str] = ()
 ) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield ``(line, row)`` for each row of the table; ``row`` maps every column to its text.
-
-    Columns that are ``optional`` may be absent, and then are in no row. Empty lines are skipped.
-    """
+    """Yield ``(line, row)`` for each non-empty row, without absent ``optional`` columns."""
     reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
     try:
         header = next(reader, [])
@@ -63,7 +59,6 @@ def read_csv_table(
 def write_csv_table(
     path: Path | str, columns: Sequence[str], rows: Iterable[Sequence[str]]
 ) -> None:
-    """Write header and rows, atomically, with ``\\n`` line ends."""
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)
@@ -75,7 +70,7 @@ def write_csv_table(
 
 
 class Column(NamedTuple):
-    """The text of one field of a record; ``read`` raises ValueError for an invalid cell."""
+    """Text format of one field; ``read`` raises ValueError for an invalid cell."""
 
     expected: str
     read: Callable[[str], Any] = str
@@ -100,7 +95,6 @@ def _pose_text(pose: RigidTransform) -> str:
 
 
 def flag(yes: str, no: str) -> Column:
-    """A bool by its two texts."""
     return _choice({no: False, yes: True}, lambda value: yes if value else no)
 
 
@@ -114,7 +108,7 @@ def _choice(values: Mapping[str, Any], write: Callable[[Any], str] = str) -> Col
 
 
 def list_of(separator: str) -> Column:
-    """A tuple of texts in one cell, which must not contain the separator."""
+    """Return a column of tuples of texts, which must not contain the separator."""
     return Column(
         f"a list separated by {separator!r}",
         lambda text: tuple(text.split(separator)) if text else (),
@@ -123,12 +117,11 @@ def list_of(separator: str) -> Column:
 
 
 def number(format_spec: str) -> Column:
-    """A float, written as the format says."""
     return Column("a number", float, lambda value: format(value, format_spec))
 
 
 def or_empty(column: Column, empty: Any = None) -> Column:
-    """The same, where an empty cell stands for ``empty`` (None or NaN)."""
+    """Return the same column, with empty cells for ``empty`` (None or NaN)."""
     return Column(
         f"{column.expected}, or empty",
         lambda text: column.read(text) if text else empty,
@@ -140,7 +133,7 @@ ImageName = Annotated[str, Column("a plain relative path", check_relative, check
 _BY_TYPE: dict[Any, Column] = {
     str: Column("text"),
     int: Column("a whole number from 0 on", _count),
-    # the comma is the one character that kapture allows in no image name
+    # kapture forbids the comma in image names
     tuple[str, ...]: list_of(","),
     RigidTransform: Column(
         "a pose qw qx qy qz tx ty tz: a unit quaternion and finite numbers", _pose, _pose_text
@@ -149,7 +142,6 @@ _BY_TYPE: dict[Any, Column] = {
 
 
 def _column(hint: Any) -> Column:
-    """The column in the annotation of a field, else that of its type."""
     arguments = get_args(hint)
     if get_origin(hint) is Annotated:
         columns = [part for part in arguments if isinstance(part, Column)]
@@ -162,14 +154,10 @@ def _column(hint: Any) -> Column:
 
 
 class Table(Generic[RowT]):
-    """A CSV table whose rows are records of one type.
+    """A CSV table whose rows are records of one type, with annotated fields.
 
-    Parameters
-    ----------
-    row : makes a record of the values by column: a dataclass, a named tuple or a pydantic model,
-        whose annotations give the columns.
-    keys : groups of columns; no two rows may have the same in all columns of one.
-    later : columns that older files lack; the record's own defaults stand for them.
+    ``keys`` are groups of columns that must be unique; ``later`` columns, which older files lack,
+    get the record's defaults.
     """
 
     def __init__(
@@ -184,7 +172,6 @@ class Table(Generic[RowT]):
         self._columns = {name: _column(hints[name]) for name in inspect.signature(row).parameters}
 
     def read(self, path: Path | str) -> list[RowT]:
-        """The records of a file, in its order."""
         known: set[tuple[tuple[str, ...], ...]] = set()
         rows = []
         for line, cells in read_csv_table(path, tuple(self._columns), optional=self._later):
@@ -198,11 +185,11 @@ class Table(Generic[RowT]):
         return rows
 
     def read_if_there(self, path: Path) -> list[RowT]:
-        """The records of a file, none of one that is absent."""
+        """Read the records of a file, none if it is absent."""
         return self.read(path) if path.exists() else []
 
     def write(self, path: Path | str, rows: Iterable[Any]) -> None:
-        """Write records, or anything with their attributes, in the order given."""
+        """Write records, or objects with their attributes, in the given order."""
         known: set[tuple[tuple[str, ...], ...]] = set()
         lines = []
         for row in rows:

@@ -1,22 +1,18 @@
-"""The ``megloc/`` folder of a workspace: what kapture cannot say about a dataset.
+"""The ``megloc/`` folder of a workspace: tables of a dataset that kapture has no room for.
 
 ==================  ================================================================================
 groups.csv          image, condition, frame, location, scored: one row per image
-priors.csv          query, permitted: a group or map image the query may be matched with; several
-                    rows per query
-names.csv           image, name: what each scored query is called in the pose file, in the order of
-                    the challenge's list, where no rule says it
-relocalization.csv  file, reference, query: the pairs an MLAD challenge asks for, in its order;
-                    ``file`` is the name of the pose file to hand in
-unreadable.csv      image, reason: queries whose image cannot be used, which were left out
+priors.csv          query, permitted: group or map image the query may be matched with, row by row
+names.csv           image, name: names of scored queries in the pose file, in the challenge's order
+relocalization.csv  file, reference, query: pairs of an MLAD challenge; ``file`` names the pose file
+unreadable.csv      image, reason: queries left out because their image cannot be used
 unregistered.csv    image, reason: photographs that are not in the map made of them
-world.json          ``official_from_local``, the unit of the local frame, where it lies on earth
-protocol.json       thresholds, the pose file's format and names, conditions and how they are pooled
+world.json          ``official_from_local``, unit and position on earth of the local frame
+protocol.json       thresholds, format and names of the pose file, conditions and their pools
 ==================  ================================================================================
 
-Written by datasets, read by stages and evaluation. A file that is absent stands for its default:
-no groups, no priors, names by the protocol's rule, no pairs, one metric frame without offset, the
-default protocol.
+Datasets write them; stages and evaluation read them. A missing file means its default: no rows, one
+metric frame without offset, the default protocol.
 """
 
 from __future__ import annotations
@@ -52,12 +48,11 @@ NAMES_FILE = "names.csv"
 RELOCALIZATION_FILE = "relocalization.csv"
 UNREADABLE_FILE = "unreadable.csv"
 UNREGISTERED_FILE = "unregistered.csv"
-# in the folder of the true poses
 NOWHERE_FILE = "nowhere.txt"
-# units of the local frame: a map that nobody knows the scale of has units of its own
+# units of the local frame; a map of unknown scale has its own
 METRES, NO_METRES = "m", "units"
 
-# how far a quaternion may be off unit length before it is refused; below, it is normalised
+# a quaternion's length may differ from 1 by less than this; it is then normalised
 MAX_QUATERNION_NORM_ERROR = 1e-3
 
 PoseFileNames = Literal["full", "basename"]
@@ -65,15 +60,7 @@ PoseFileFormat = Literal["ltvl", "mlad"]
 
 
 class ImageGroup(Options):
-    """Condition, frame and location of one image; the empty string means "not said".
-
-    Parameters
-    ----------
-    condition : what it is reported under (``day``, ``night-rain``).
-    frame : the coordinate frame its pose stands in, where a dataset has several.
-    location : the part of the map it belongs to.
-    scored : whether the benchmark counts it as a query.
-    """
+    """Condition (as reported: ``day``, ``night-rain``), frame and location of one image."""
 
     condition: str = ""
     frame: str = ""
@@ -104,15 +91,13 @@ class SimilarityTransform(Options):
         return translation
 
     def rotation(self) -> RigidTransform:
-        """The rotation alone."""
         return RigidTransform(self.quat_wxyz, (0.0, 0.0, 0.0))
 
 
 class World(Options):
-    """The frame the workspace works in, and the way back to the dataset's official one.
+    """The local frame of a workspace, recentred at import if the official one is far from zero.
 
-    Dataset frames far from zero are recentred at import; poses are handed in, and compared with
-    published ones, in the official frame.
+    Poses are submitted and evaluated in the official frame.
     """
 
     official_from_local: SimilarityTransform = SimilarityTransform()
@@ -124,7 +109,7 @@ class World(Options):
     )
 
     def pose_in_official(self, cam_from_local: RigidTransform) -> RigidTransform:
-        """``cam_from_official`` of a ``cam_from_local``; lengths become the official ones."""
+        """Convert ``cam_from_local`` to ``cam_from_official``, lengths included."""
         similarity = self.official_from_local
         local_from_official = similarity.rotation().inverse()
         rotation = RigidTransform(cam_from_local.quat_wxyz, (0.0, 0.0, 0.0)) @ local_from_official
@@ -133,7 +118,7 @@ class World(Options):
         return RigidTransform(rotation.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
 
     def pose_in_local(self, cam_from_official: RigidTransform) -> RigidTransform:
-        """``cam_from_local`` of a ``cam_from_official``; undoes :meth:`pose_in_official`."""
+        """Convert ``cam_from_official`` to ``cam_from_local``; inverts :meth:`pose_in_official`."""
         similarity = self.official_from_local
         offset = cam_from_official.rotation_matrix() @ np.array(similarity.translation)
         t = (np.array(cam_from_official.translation) + offset) / similarity.scale
@@ -143,22 +128,16 @@ class World(Options):
 
 
 class Protocol(Options):
-    """The rules by which a dataset is scored.
+    """The evaluation rules of a dataset.
 
     Parameters
     ----------
-    dataset : its name, as on the command line.
-    thresholds : pairs (position in metres, angle in degrees); a query counts when both of its
-        errors are at or below. An angle of null leaves the rotation out.
+    thresholds : pairs (position in metres, angle in degrees or null), upper limits for both errors.
     pose_file : ``ltvl``, one file of absolute poses (visuallocalization.net), or ``mlad``, one
         file per relocalization file with poses relative to reference keyframes.
-    pose_file_names : how an image is called in the pose file: its whole path, or its last part;
-        ``names.csv`` overrules it.
-    pose_file_stem : what the pose file's own name begins with by the server's convention,
-        ``STEM_eval_METHOD.txt``; empty where there is none, and ``dataset`` stands there.
-    truth : who knows the true poses of the queries, where they are not published.
-    conditions : in the order they are reported; conditions not listed follow, sorted.
-    pools : name -> conditions that are pooled under it, as "day" pools dawn and noon.
+    pose_file_stem : STEM of the server's ``STEM_eval_METHOD.txt``; empty means ``dataset``.
+    truth : owner of the ground truth where it is not published.
+    pools : name -> conditions reported together, as "day" pools dawn and noon.
     """
 
     dataset: str = Field(default="kapture", min_length=1)
@@ -225,7 +204,7 @@ class _UnreadableRow(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RelocalizationPair:
-    """One row of an MLAD relocalization file: both images by their kapture names."""
+    """One row of an MLAD relocalization file, with kapture's image names."""
 
     file: ImageName
     reference: ImageName
@@ -241,17 +220,7 @@ _RELOCALIZATION = Table(RelocalizationPair)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SideTables:
-    """The tables that describe a dataset; an empty one has no file.
-
-    Parameters
-    ----------
-    groups : of all images, the queries' and the map's.
-    priors : query -> map images or groups (``location`` of map images) it may be matched with.
-    names : scored query -> its name in the pose file, in the order of the challenge's list; empty
-        where the protocol's rule says it all.
-    relocalization : the pairs of an MLAD challenge, in order.
-    world : None: nothing is said of the frame.
-    """
+    """The tables that describe a dataset; an empty one has no file."""
 
     protocol: Protocol
     groups: Mapping[str, ImageGroup] = field(default_factory=dict)
@@ -262,7 +231,6 @@ class SideTables:
 
 
 def read_side_tables(folder: Path) -> SideTables:
-    """Read all tables that describe a dataset."""
     return SideTables(
         protocol=read_protocol(folder),
         groups=read_groups(folder),
@@ -274,7 +242,6 @@ def read_side_tables(folder: Path) -> SideTables:
 
 
 def write_side_tables(folder: Path, tables: SideTables) -> None:
-    """Write the tables that have anything to say."""
     write_protocol(folder, tables.protocol)
     if tables.world is not None:
         write_world(folder, tables.world)
@@ -289,12 +256,10 @@ def write_side_tables(folder: Path, tables: SideTables) -> None:
 
 
 def table_path(folder: Path | str, name: str) -> Path:
-    """The path of a table, which need not exist."""
     return Path(folder) / name
 
 
 def read_groups(folder: Path | str) -> dict[str, ImageGroup]:
-    """Read ``groups.csv``: image -> group, sorted by image."""
     names = tuple(ImageGroup.model_fields)
     return {
         row.image: ImageGroup(**{name: getattr(row, name) for name in names})
@@ -303,16 +268,12 @@ def read_groups(folder: Path | str) -> dict[str, ImageGroup]:
 
 
 def write_groups(folder: Path | str, groups: Mapping[str, ImageGroup]) -> None:
-    """Write ``groups.csv``, sorted by image."""
     rows = [_GroupRow(image, **group.model_dump()) for image, group in sorted(groups.items())]
     _GROUPS.write(Path(folder) / GROUPS_FILE, rows)
 
 
 def read_priors(folder: Path | str) -> dict[str, tuple[str, ...]]:
-    """Read ``priors.csv``: query -> what it may be matched with, both sorted.
-
-    A query that is not in the table is not restricted.
-    """
+    """Read ``priors.csv``: query -> permitted names, sorted; other queries are unrestricted."""
     permitted: dict[str, tuple[str, ...]] = {}
     for query, group in sorted(_PRIORS.read_if_there(Path(folder) / PRIORS_FILE)):
         permitted[query] = (*permitted.get(query, ()), group)
@@ -320,10 +281,7 @@ def read_priors(folder: Path | str) -> dict[str, tuple[str, ...]]:
 
 
 def write_priors(folder: Path | str, priors: Mapping[str, Sequence[str]]) -> None:
-    """Write ``priors.csv``, sorted by query and permitted name.
-
-    A query with nothing permitted is refused: without a row everything is permitted.
-    """
+    """Write ``priors.csv``, sorted; every query needs a permitted name."""
     for query, groups in priors.items():
         if not groups or not all(groups):
             raise DataError(f"the prior of {query!r} permits nothing")
@@ -332,30 +290,26 @@ def write_priors(folder: Path | str, priors: Mapping[str, Sequence[str]]) -> Non
 
 
 def read_names(folder: Path | str) -> dict[str, str]:
-    """Read ``names.csv``: image -> its name in the pose file, in the table's order."""
     return dict(_NAMES.read_if_there(Path(folder) / NAMES_FILE))
 
 
 def write_names(folder: Path | str, names: Mapping[str, str]) -> None:
-    """Write ``names.csv`` in the order of ``names``."""
     _NAMES.write(Path(folder) / NAMES_FILE, [_NameRow(*item) for item in names.items()])
 
 
 def read_unreadable(folder: Path | str, name: str = UNREADABLE_FILE) -> dict[str, str]:
-    """Read ``unreadable.csv``, or another such table: image -> reason, sorted by image."""
     return dict(sorted(_UNREADABLE.read_if_there(Path(folder) / name)))
 
 
 def write_unreadable(
     folder: Path | str, reasons: Mapping[str, str], name: str = UNREADABLE_FILE
 ) -> None:
-    """Write ``unreadable.csv``, or another such table, sorted by image."""
     rows = [_UnreadableRow(*row) for row in sorted(reasons.items())]
     _UNREADABLE.write(Path(folder) / name, rows)
 
 
 def tables_of(root: Path | str) -> Path | None:
-    """The tables of a kapture folder: its own, else those of the workspace that it lies in."""
+    """Return the table folder of a kapture folder, or of its parent workspace."""
     root = Path(root)
     for folder in (root, root.resolve().parent):
         if (folder / SIDE_TABLES / PROTOCOL_FILE).is_file():
@@ -364,39 +318,34 @@ def tables_of(root: Path | str) -> Path | None:
 
 
 def write_unit(root: Path, unit: str) -> None:
-    """Say in tables of its own that a kapture folder is in another unit than metres."""
+    """Write tables for a kapture folder whose unit is not metres."""
     write_protocol(root / SIDE_TABLES, Protocol())
     write_world(root / SIDE_TABLES, World(unit=unit))
 
 
 def unit_of(root: Path | str) -> str:
-    """The unit of a map, or of results in it: m, or :data:`NO_METRES`."""
+    """Return the unit of a map or of results in it: m or :data:`NO_METRES`."""
     tables = tables_of(root)
     return METRES if tables is None else read_world(tables).unit
 
 
 def read_relocalization(folder: Path | str) -> list[RelocalizationPair]:
-    """Read ``relocalization.csv`` in its order."""
     return _RELOCALIZATION.read_if_there(Path(folder) / RELOCALIZATION_FILE)
 
 
 def write_relocalization(folder: Path | str, pairs: Iterable[RelocalizationPair]) -> None:
-    """Write ``relocalization.csv`` in the order of ``pairs``."""
     _RELOCALIZATION.write(Path(folder) / RELOCALIZATION_FILE, pairs)
 
 
 def read_world(folder: Path | str) -> World:
-    """Read ``world.json``."""
     return _read_model(folder, WORLD_FILE, World)
 
 
 def write_world(folder: Path | str, world: World) -> None:
-    """Write ``world.json`` atomically."""
     write_json_model(Path(folder) / WORLD_FILE, world)
 
 
 def read_protocol(folder: Path | str) -> Protocol:
-    """Read ``protocol.json``."""
     return _read_model(folder, PROTOCOL_FILE, Protocol)
 
 
@@ -406,12 +355,11 @@ def _read_model(folder: Path | str, name: str, model: type[ModelT]) -> ModelT:
 
 
 def write_protocol(folder: Path | str, protocol: Protocol) -> None:
-    """Write ``protocol.json`` atomically."""
     write_json_model(Path(folder) / PROTOCOL_FILE, protocol)
 
 
 def read_nowhere(truth: Path | str) -> tuple[str, ...]:
-    """Queries that show nothing of the map, one a line in ``nowhere.txt`` beside the true poses."""
+    """Read ``nowhere.txt`` next to the ground truth: queries that show nothing of the map."""
     path = Path(truth) / NOWHERE_FILE
     if not path.is_file():
         return ()
@@ -425,5 +373,4 @@ def read_nowhere(truth: Path | str) -> tuple[str, ...]:
 
 
 def write_nowhere(truth: Path, names: Iterable[str]) -> None:
-    """Write ``nowhere.txt`` of a folder of true poses."""
     write_bytes(truth / NOWHERE_FILE, "".join(f"{name}\n" for name in names).encode("utf-8"))

@@ -1,13 +1,7 @@
-"""Files: their paths checked, read whole, written atomically, linked, kept as JSON.
+"""File access: checked paths, atomic writes, links, JSON.
 
-Paths that data names (image names, type names) come from files that somebody else wrote, and may
-only lead to something below the folder they belong to.
-
-A file is written beside its final path under a name that no reader lists and then renamed over it:
-a killed run or a full disk leaves the old state or the new one. There is no fsync: after a power
-cut the file system decides, and a thousand small feature files would pay for it. Temporary names
-say which process they belong to, so that the next run can clear what a killed one has left. Images
-are linked, never copied or changed.
+Files are written under a hidden temporary name and renamed, so that a killed run leaves the old
+state or the new one; fsync would be too slow for thousands of small files.
 """
 
 from __future__ import annotations
@@ -36,16 +30,12 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 def read_content(path: Path | str) -> bytes:
-    """Return all bytes of a file; DataError where it is missing or cannot be read."""
     with reading(path):
         return Path(path).read_bytes()
 
 
 def read_text(path: Path | str) -> str:
-    """Return the text of a UTF-8 file without its byte order mark; line ends stay as they are.
-
-    Raises DataError: missing, not UTF-8 (names the line), or with a NUL character.
-    """
+    """Return the text of a UTF-8 file without its byte order mark; line ends stay as they are."""
     content = read_content(path)
     try:
         text = content.decode("utf-8-sig")
@@ -73,7 +63,7 @@ def reading(path: Path | str) -> Iterator[None]:
 def named(
     path: Path | str | None = None, line: int | None = None, *, about: str = ""
 ) -> Iterator[None]:
-    """Add the file, the line and what it is about to a DataError that names no file yet."""
+    """Add file, line and subject to a DataError that names no file yet."""
     try:
         yield
     except DataError as error:
@@ -87,19 +77,15 @@ def named(
 
 
 def has_control_characters(text: str) -> bool:
-    """True for a text with characters that no name or line should have (NUL, tab, ...)."""
+    """Return whether a text has characters that are invalid in names and lines (NUL, tab, ...)."""
     return not text.isprintable() and any(
         ord(c) < 32 or ord(c) == 127 or 0xD800 <= ord(c) <= 0xDFFF for c in text
     )
 
 
-@lru_cache(maxsize=1 << 12)  # the text alone decides, and the same names come in a row
+@lru_cache(maxsize=1 << 12)
 def check_relative(text: str) -> str:
-    """Return ``text`` if it is a plain relative path (``a/b.jpg``), else raise DataError.
-
-    A ``.`` or an empty component is refused too: harmless, but it would give one file two names,
-    and names are identities in kapture.
-    """
+    """Return ``text`` if it is a plain relative path (``a/b.jpg``), else raise DataError."""
     if not text:
         raise DataError("empty path")
     if "\\" in text:
@@ -117,7 +103,7 @@ def check_relative(text: str) -> str:
 
 
 def check_component(text: str) -> str:
-    """Return ``text`` if it can be the name of one folder and one CSV field, as types have it."""
+    """Return ``text`` if it is a valid type name: one folder name and one CSV field."""
     check_relative(text)
     if "/" in text or "," in text or text != text.strip():
         raise DataError(f"{text!r} cannot be a type name (slash, comma or space at the end)")
@@ -125,12 +111,12 @@ def check_component(text: str) -> str:
 
 
 def safe_join(root: Path, relative_text: str) -> Path:
-    """``root / relative_text`` where :func:`check_relative` takes the text; it need not exist."""
+    """Return ``root / relative_text`` after :func:`check_relative`."""
     return Path(root) / check_relative(relative_text)
 
 
 def check_no_escape(roots: Sequence[Path], path: Path) -> Path:
-    """Return ``path`` if it lies in one of the ``roots`` with all links followed, or DataError."""
+    """Return ``path`` if it is in one of the ``roots``, links followed, else raise DataError."""
     real = Path(os.path.realpath(path))
     if not any(real.is_relative_to(os.path.realpath(root)) for root in roots):
         raise DataError(
@@ -146,26 +132,23 @@ def check_no_escape(roots: Sequence[Path], path: Path) -> Path:
 
 
 def owned_name() -> str:
-    """The beginning of a temporary name, which says that it belongs to this process."""
+    """Return a prefix of temporary names that identifies this process."""
     return f"megloc-{_machine()}.{os.getpid()}-"
 
 
 @lru_cache(maxsize=1)
 def _machine() -> str:
-    """Short for the machine, or container: names of sockets may have 100 characters in all."""
+    """Return a short id of the machine or container: socket names have at most 100 characters."""
     return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:6]
 
 
 def temporary_name() -> str:
-    """A temporary name that nothing has yet, hidden from all readers."""
+    """Return an unused temporary name, hidden from all readers."""
     return f".{owned_name()}{secrets.token_hex(8)}.tmp"
 
 
 def clear_leftovers(folder: Path) -> None:
-    """Remove what processes of this machine that live no more have left in a folder.
-
-    Known by :func:`owned_name` behind a dot or ``sem.``; what cannot be removed stays.
-    """
+    """Remove stale temporary files of dead processes of this machine from a folder."""
     pattern = re.compile(rf"(\.|sem\.)?megloc-{_machine()}\.([0-9]+)-.*")
     try:
         names = os.listdir(folder)
@@ -178,13 +161,13 @@ def clear_leftovers(folder: Path) -> None:
 
 
 def clear_temporary(folder: Path) -> None:
-    """Remove unfinished files below a folder, which nothing may write to any more; OSError."""
+    """Remove unfinished files below a folder that has no other writers."""
     for path in list(Path(folder).rglob(".megloc-*.tmp")):
         remove(path)
 
 
 def remove(path: Path) -> None:
-    """Remove a file, a link or a whole folder, where there is one; raises OSError."""
+    """Remove a file, a link or a whole folder if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -197,7 +180,7 @@ def _lives(pid: int) -> bool:
     except (ProcessLookupError, OverflowError):
         return False
     except OSError:
-        pass  # somebody else's
+        pass  # another user's process
     return True
 
 
@@ -205,26 +188,22 @@ def _lives(pid: int) -> bool:
 
 
 def output_error(path: Path | str, error: OSError) -> OutputError:
-    """The :class:`OutputError` for an ``OSError`` met while writing ``path``."""
+    """Return the :class:`OutputError` for an ``OSError`` from writing ``path``."""
     reason = error.strerror or str(error) or type(error).__name__
     return OutputError(f"{path}: cannot write: {reason}")
 
 
 @contextlib.contextmanager
 def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
-    """Open a binary file that replaces ``path`` when the block ends well.
-
-    Missing parent folders are made. When the block raises, the temporary file is removed and
-    ``path`` is as it was; OutputError where the file cannot be written.
-    """
-    # plain text: a stage writes a file for each of its pairs, and a Path takes as long as writing
+    """Open a binary file that replaces ``path`` when the block succeeds; creates parent folders."""
+    # not a Path: making one takes as long as writing the small file of a pair
     folder = os.path.dirname(path)
     temporary = os.path.join(folder, temporary_name())
     try:
         if folder and not os.path.isdir(folder):
             os.makedirs(folder, exist_ok=True)
         try:
-            # mode "x" and not mkstemp, whose files are closed to everybody else
+            # mode "x", as files of mkstemp are private
             with open(temporary, "xb") as file:
                 yield file
             os.replace(temporary, path)
@@ -235,12 +214,11 @@ def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
     except OSError as error:
         ours = {os.fspath(path), temporary, *map(os.fspath, Path(path).parents)}
         if error.filename is not None and os.fspath(error.filename) not in ours:
-            raise  # not from writing: the block met it while reading something else
+            raise  # from reading another file in the block
         raise output_error(path, error) from error
 
 
 def write_bytes(path: Path | str, content: bytes) -> None:
-    """Write a whole file atomically; see :func:`atomic_write`."""
     with atomic_write(path) as file:
         file.write(content)
 
@@ -249,12 +227,12 @@ def write_bytes(path: Path | str, content: bytes) -> None:
 
 
 def user_cache() -> Path:
-    """The folder of what is kept for a user between commands; it need not be there."""
+    """Return the user's cache folder, which may not exist."""
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(cache) / "megloc-kapture"
 
 
-# -------------------------------------------------------- links; OutputError where one cannot be
+# -------------------------------------------------------------------------------------- links
 
 
 def link_images(
@@ -264,10 +242,7 @@ def link_images(
     *,
     below: str = "",
 ) -> None:
-    """Make ``output_root/sensors/records_data`` (and masks) a link to ``source_root``'s.
-
-    ``below`` is a folder of it that becomes the link instead.
-    """
+    """Link ``output_root/sensors/records_data`` and masks, or folders ``below``, to the source."""
     for name in folders:
         source = Path(source_root).resolve() / "sensors" / name
         link = Path(output_root) / "sensors" / name / below
@@ -279,13 +254,7 @@ def link_images(
 
 
 def link_records(output_root: Path, links: Mapping[str, Path]) -> None:
-    """Make folders or images below ``output_root/sensors/records_data`` links to a dataset's.
-
-    Parameters
-    ----------
-    links : path below ``records_data`` -> the folder or file it shows; ``""`` is ``records_data``
-        itself.
-    """
+    """Link folders or images below ``sensors/records_data`` (``""``: itself) to a dataset."""
     records = Path(output_root) / "sensors" / "records_data"
     for name, target in links.items():
         link = records / name if name else records
@@ -294,14 +263,13 @@ def link_records(output_root: Path, links: Mapping[str, Path]) -> None:
 
 
 def link_file(source: Path, link: Path) -> None:
-    """Make ``link`` a link to one file; a file or link of that name is replaced."""
     with _new_link(link):
         link.unlink(missing_ok=True)
         link.symlink_to(Path(source).resolve())
 
 
 def hard_link(source: Path, link: Path) -> None:
-    """Make ``link`` another name of a file, or a copy of it where the file system has no such."""
+    """Hard-link a file, or copy it where the file system has no hard links."""
     with _new_link(link):
         link.unlink(missing_ok=True)
         try:
@@ -312,7 +280,6 @@ def hard_link(source: Path, link: Path) -> None:
 
 @contextlib.contextmanager
 def _new_link(link: Path) -> Iterator[None]:
-    """Make the folder of a link; an OutputError names the link."""
     try:
         link.parent.mkdir(parents=True, exist_ok=True)
         yield
@@ -324,7 +291,7 @@ def _new_link(link: Path) -> Iterator[None]:
 
 
 def read_json_model(path: Path | str, model: type[ModelT]) -> ModelT:
-    """Read one JSON file as ``model``; DataError names the file and the line or the field."""
+    """Read one JSON file as ``model``; errors name the field."""
     text = read_text(path)
     try:
         return model.model_validate_json(text)
@@ -333,18 +300,18 @@ def read_json_model(path: Path | str, model: type[ModelT]) -> ModelT:
 
 
 def write_json_model(path: Path | str, model: BaseModel) -> None:
-    """Write ``model`` as indented JSON, atomically; the same model gives the same bytes."""
+    """Write ``model`` as indented JSON, atomically and deterministically."""
     write_json(path, model.model_dump(mode="json"))
 
 
 def write_json(path: Path | str, content: Any) -> None:
-    """Write plain JSON data, indented and atomically; ValueError for NaN and infinity."""
+    """Write plain JSON data, indented and atomically; NaN and infinity raise ValueError."""
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
     write_bytes(path, f"{text}\n".encode())
 
 
 def first_problem(error: ValidationError) -> str:
-    """The first problem of a validation in one line: ``field: what is wrong``."""
+    """Return the first problem of a validation in one line: ``field: message``."""
     problem = error.errors(include_url=False)[0]
     field = ".".join(map(str, problem["loc"]))
     message = problem["msg"].removeprefix("Value error, ").replace("Input should", "it should")

@@ -1,11 +1,7 @@
-"""Images, depth maps, frames of videos and headers of photographs, read the same way everywhere.
+"""Images, depth maps, video frames and headers of photographs.
 
-kapture and COLMAP know pixels as they are stored, and so do the cameras here;
-:func:`turned_upright` rotates pixels by the EXIF orientation.
-
-The focal length is COLMAP's reading of the EXIF (35 mm equivalent, COLMAP's database of sensors,
-resolution of the focal plane, in this order). Digital zoom, stabilisation and rounding make it
-uncertain.
+Cameras describe pixels as stored, as in kapture and COLMAP; :func:`turned_upright` applies the EXIF
+orientation. Focal lengths from EXIF are uncertain because of zoom, stabilisation and rounding.
 """
 
 from __future__ import annotations
@@ -34,35 +30,29 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 WRITABLE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".tif", ".tiff", ".webp")
-# pillow's names of the formats that photographs are read from
+# pillow's names of the supported photograph formats
 _FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM", "JPEG2000")
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp"}
 )
-# named when a folder has them: they are photographs, and nothing here reads them
 UNREAD_SUFFIXES = frozenset({".heic", ".heif", ".avif", ".dng", ".nef", ".cr2", ".cr3", ".arw"})
-# relative standard deviations of focal lengths: of one from EXIF, and of a guess
+# relative standard deviations of focal lengths, from EXIF and guessed
 EXIF_DEVIATION, GUESS_DEVIATION = 0.1, 0.7
-# COLMAP's guess, times the larger side
+# COLMAP's guess of the focal length, over the larger side
 _GUESS = 1.2
 _ORIENTATION, _MAKE, _MODEL, _EXIF, _GPS = 0x0112, 0x010F, 0x0110, 0x8769, 0x8825
-# what COLMAP reads of the focal length: its millimetres, those of 35 mm film, pixels per unit of
-# the focal plane, the unit, and the size of the image
+# focal length in mm and 35 mm equivalent, focal plane resolution (x, y) and unit, image size
 _FOCAL_TAGS = (0x920A, 0xA405, 0xA20E, 0xA20F, 0xA210, 0xA002, 0xA003)
 _JPEG = (".jpg", ".jpeg")
-# files of other suffixes are written in the nearest of these formats; readers look at the content
+# other suffixes become PNG if lossless, else JPEG; readers look at the content
 _LOSSLESS = (".pgm", ".pnm", ".gif", ".jp2")
-# an image that uses more than this share of the range of its numbers is scaled, else stretched
+# images that use more than this share of their range are scaled, others are stretched
 _MIN_RANGE = 0.5
 _STRETCHED_PERCENT = (0.1, 99.9)
 
 
 def read_image_rgb(path: Path | str) -> NDArray[np.uint8]:
-    """Read an image as uint8 (H, W, 3), RGB.
-
-    Grey images are repeated over three channels, transparency is dropped, and more than 8 bits
-    become 8, see :func:`with_8_bits`.
-    """
+    """Read an image as uint8 (H, W, 3), RGB, without transparency; see :func:`with_8_bits`."""
     check_image_file(Path(path))
     content = read_content(path)
     if not content:
@@ -86,7 +76,7 @@ def decode_image_rgb(content: bytes, path: Path | str | None = None) -> NDArray[
 def _decoded_by_opencv(content: bytes) -> NDArray[Any] | None:
     import cv2  # 0.1 s, and most commands that import io never read an image
 
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # errors are ours to say
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # callers report errors
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
@@ -103,18 +93,17 @@ def _decoded_by_pillow(content: bytes) -> NDArray[Any]:
 
 
 def pillow_pixels(image: Image.Image) -> NDArray[np.uint8]:
-    """The pixels of an image that pillow has opened, as :func:`read_image_rgb` gives them."""
+    """Convert an image opened by pillow, as :func:`read_image_rgb` does."""
     if image.mode[0] in "IF":  # more than 8 bits, which pillow would cut off
         return with_8_bits(np.repeat(np.asarray(image)[:, :, None], 3, axis=2))
     return np.ascontiguousarray(image.convert("RGB"))
 
 
 def with_8_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
-    """An image (H, W, 3) of any numbers as uint8.
+    """Convert an image (H, W, 3) of any number type to uint8.
 
-    16 bits that use more than half of their range are scaled (``value / 257`` rounded), and so are
-    fractions between 0 and 1. What uses less of it, as 12 bits in 16, counts of a thermal camera or
-    other floats, is stretched: percentiles 0.1 and 99.9 of all channels become 0 and 255.
+    Values of uint16 or from 0 to 1 that use more than half of their range are scaled; others, such
+    as 12 bits in 16 or thermal counts, are stretched from percentiles 0.1 and 99.9.
     """
     if pixels.dtype == np.uint8:
         return np.ascontiguousarray(pixels)
@@ -130,14 +119,13 @@ def with_8_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def image_size(path: Path | str) -> tuple[int, int]:
-    """``(width, height)`` in pixels as stored, from the header only."""
+    """Return ``(width, height)`` in pixels as stored, from the header only."""
     with _opened(Path(path)) as image:
         return int(image.width), int(image.height)
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence pillow's warnings about broken EXIF."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -145,22 +133,20 @@ def _quiet() -> Iterator[None]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
-    """The header of an image file, by pillow."""
     from PIL import Image
 
     check_image_file(path)
     try:
         with _quiet(), Image.open(path) as image:
             yield image
-    except Exception as error:  # pillow raises many kinds on broken headers
+    except Exception as error:
         raise DataError("not an image, or broken", path=path) from error
 
 
 def write_image(path: Path | str, image: NDArray[np.uint8], *, jpeg_quality: int = 95) -> None:
-    """Write uint8 (H, W, 3) RGB or (H, W) grey as its suffix says, atomically.
+    """Write uint8 (H, W, 3) RGB or (H, W) grey in the format of the suffix, atomically.
 
-    The same pixels give the same bytes: no dates, no metadata. Other suffixes than
-    WRITABLE_SUFFIXES become JPEG, or PNG where their format is lossless.
+    The bytes are deterministic. Suffixes not in WRITABLE_SUFFIXES give JPEG, or PNG if lossless.
     """
     path = Path(path)
     write_bytes(path, _encoded(path, image, jpeg_quality))
@@ -169,7 +155,7 @@ def write_image(path: Path | str, image: NDArray[np.uint8], *, jpeg_quality: int
 def image_as_read_back(
     image: NDArray[np.uint8], name: str, *, jpeg_quality: int = 95
 ) -> NDArray[np.uint8]:
-    """The image that reading gives after :func:`write_image` to a file of this name."""
+    """Return the image as it reads back after :func:`write_image` to a file of this name."""
     if _format_suffix(name) not in _JPEG:
         return image
     import cv2
@@ -182,7 +168,6 @@ def image_as_read_back(
 
 
 def _format_suffix(name: str) -> str:
-    """The suffix of the format that an image of this name is written in."""
     suffix = Path(name).suffix.lower()
     if suffix in WRITABLE_SUFFIXES:
         return suffix
@@ -208,7 +193,7 @@ def _encoded(path: Path, image: NDArray[np.uint8], jpeg_quality: int) -> bytes:
 
 
 def check_image_file(path: Path) -> None:
-    """Raise DataError unless this is a file; its content is not looked at."""
+    """Raise DataError unless the path is a file; its content is not checked."""
     try:
         if path.is_file():
             return
@@ -221,11 +206,7 @@ def check_image_file(path: Path) -> None:
 
 
 def _check_complete(path: Path | str | None, content: bytes) -> None:
-    """Refuse a truncated file; OpenCV fills what is missing with grey and says nothing.
-
-    The end mark shows completeness without decoding twice; only where it is not found (other
-    formats, data after the end) Pillow, which is strict, decodes once more.
-    """
+    """Refuse a truncated file, which OpenCV silently fills with grey; Pillow is strict."""
     if content.startswith(b"\xff\xd8"):
         # entropy-coded data cannot hold these pairs, and a thumbnail's pair precedes both
         complete = content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")
@@ -238,12 +219,12 @@ def _check_complete(path: Path | str | None, content: bytes) -> None:
     try:
         with Image.open(BytesIO(content)) as image:
             image.load()
-    except Exception as error:  # pillow raises many kinds on broken data
+    except Exception as error:
         raise DataError(f"not an image, or truncated ({error})", path=path) from error
 
 
 def read_depth_map(path: Path | str, *, width: int, height: int) -> NDArray[np.float32]:
-    """Read a depth map as float32 (H, W) in metres; the size is its depth sensor's."""
+    """Read a depth map, float32 (H, W) in metres, of its sensor's size."""
     path = Path(path)
     content = read_content(path)
     expected = 4 * width * height
@@ -255,7 +236,6 @@ def read_depth_map(path: Path | str, *, width: int, height: int) -> NDArray[np.f
 
 
 def write_depth_map(path: Path | str, depth_m: ArrayLike) -> None:
-    """Write a depth map (H, W) in metres, atomically."""
     pixels = np.asarray(depth_m, dtype="<f4")
     if pixels.ndim != 2:
         raise ValueError(f"expected a depth map of shape (H, W), got {pixels.shape}")
@@ -263,11 +243,7 @@ def write_depth_map(path: Path | str, depth_m: ArrayLike) -> None:
 
 
 def extract_frames(video: Path, folder: Path, every: int) -> Iterator[str]:
-    """Write every n-th frame of a video, the first included, as a JPEG file; yield their names.
-
-    The names are the frames' numbers from 0: ``000120.jpg``. OpenCV rotates frames as the file
-    says.
-    """
+    """Write every n-th frame of a video, upright, as ``000120.jpg``; yield the names."""
     import cv2
 
     check_image_file(video)
@@ -294,14 +270,10 @@ def extract_frames(video: Path, folder: Path, every: int) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class Photo:
-    """The header of a photograph.
+    """The header of a photograph; ``camera`` describes the stored pixels.
 
-    Attributes
-    ----------
-    camera : of the pixels as they are stored; its focal length is uncertain.
-    orientation : EXIF's, 1 to 8: how the stored pixels are rotated or mirrored; 1: not at all.
-    make : make and model of the camera; may be empty.
-    gps : latitude and longitude in degrees, height in metres (0 if unknown).
+    ``orientation`` is EXIF's, 1 (upright) to 8; ``make`` includes the model and may be empty;
+    ``gps`` is latitude and longitude in degrees and height in metres (0 if unknown).
     """
 
     camera: Camera
@@ -311,7 +283,7 @@ class Photo:
 
     @property
     def upright_camera(self) -> Camera:
-        """The camera of the pixels after :func:`turned_upright`."""
+        """Camera of the pixels after :func:`turned_upright`."""
         width, height = self.camera.width, self.camera.height
         if self.orientation >= 5:
             width, height = height, width
@@ -320,12 +292,12 @@ class Photo:
 
 
 def guessed_camera(width: int, height: int) -> Camera:
-    """COLMAP's guess for a camera of which only the image size is known."""
+    """Guess a camera from its image size, as COLMAP does."""
     return _centred(width, height, _GUESS * max(width, height), GUESS_DEVIATION)
 
 
 def is_image(path: Path) -> bool:
-    """Whether a file is an image of a format that is read, by its content."""
+    """Return whether a file is an image of a supported format, by its content."""
     from PIL import Image
 
     try:
@@ -333,12 +305,11 @@ def is_image(path: Path) -> bool:
             return False
         with _quiet(), Image.open(path) as image:
             return image.format in _FORMATS
-    except Exception:  # pillow raises many kinds on broken headers
+    except Exception:
         return False
 
 
 def read_photo(path: Path | str) -> Photo:
-    """Read the header of a photograph; DataError for a format that is not read."""
     path = Path(path)
     check_image_file(path)
     known = f"cannot be read; {', '.join(WRITABLE_SUFFIXES)} can"
@@ -352,7 +323,6 @@ def read_photo(path: Path | str) -> Photo:
 
 
 def photo_of(image: Image.Image) -> Photo:
-    """The header of an image that pillow has opened."""
     import PIL.Image
 
     width, height = image.size
@@ -362,7 +332,7 @@ def photo_of(image: Image.Image) -> Photo:
         make, model = _text(_tried(lambda: exif[_MAKE])), _text(_tried(lambda: exif[_MODEL]))
         gps = _tried(lambda: _position(exif.get_ifd(_GPS)))
         focal = _tried(lambda: focal_from_exif(_blank_with_exif(exif, make, model, image.size)))
-    # pillow and OpenCV have turned TIFF files already
+    # pillow and OpenCV apply the orientation of TIFF files themselves
     turned = orientation in range(2, 9) and image.format != "TIFF"
     if focal is None:
         camera = guessed_camera(width, height)
@@ -380,7 +350,7 @@ def _tried(read: Callable[[], T]) -> T | None:
 
 
 def _numbers(value: Any) -> list[float]:
-    """The numbers in an EXIF tag of any type, up to the first that is not finite."""
+    """Return the numbers in an EXIF tag of any type, up to the first that is not finite."""
     if isinstance(value, bytes):
         text = value.decode("latin-1")
         value = text if re.search(r"\d", text) else list(value)
@@ -401,7 +371,6 @@ def _number(value: Any) -> float | None:
 
 
 def _text(value: Any) -> str:
-    """The printable text of an EXIF tag, up to its first NUL; empty where it is none."""
     if isinstance(value, bytes):
         value = value.decode("latin-1")
     if not isinstance(value, str):
@@ -411,7 +380,7 @@ def _text(value: Any) -> str:
 
 
 def turned_upright(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
-    """Stored pixels (H, W, ...) the right way up, by EXIF's orientation (EXIF 2.3, tag 0x0112)."""
+    """Rotate stored pixels (H, W, ...) upright by the EXIF orientation (EXIF 2.3, tag 0x0112)."""
     if orientation >= 5:
         pixels = pixels.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
@@ -427,10 +396,7 @@ def _centred(width: int, height: int, focal: float, deviation: float) -> Camera:
 
 
 def _position(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
-    """Latitude, longitude and height of EXIF's GPS table (EXIF 2.3, table 15).
-
-    Also of angles that are not degrees, minutes and seconds but fewer numbers, or text.
-    """
+    """Return latitude, longitude and height from EXIF's GPS table (EXIF 2.3, table 15)."""
     found = []
     for reference, tag, sides, limit in ((1, 2, "NS", 90), (3, 4, "EW", 180)):
         side, parts = _text(gps.get(reference))[:1].upper(), _numbers(gps.get(tag))
@@ -446,11 +412,7 @@ def _position(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
 
 
 def _blank_with_exif(exif: Image.Exif, make: str, model: str, size: tuple[int, int]) -> bytes:
-    """A JPEG of that size that has nothing but what the EXIF says of the camera.
-
-    COLMAP reads EXIF from files only, and decodes them; a blank file takes a tenth of the time and
-    serves formats that COLMAP does not read.
-    """
+    """Return a blank JPEG with the EXIF: COLMAP reads few formats, and decodes the files."""
     from PIL import Image
     from PIL.TiffImagePlugin import IFDRational
 

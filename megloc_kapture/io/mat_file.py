@@ -1,4 +1,4 @@
-"""Variables of MATLAB's MAT files up to version 7, through SciPy."""
+"""MATLAB's MAT files up to version 7, through SciPy."""
 
 from __future__ import annotations
 
@@ -20,12 +20,7 @@ _HEADER_TEXT = b"MATLAB 5.0 MAT-file".ljust(116)
 
 
 def read_mat(content: bytes, names: list[str] | None = None) -> dict[str, MatValue]:
-    """Return the variables of a MAT file by name.
-
-    Parameters
-    ----------
-    names : the variables to read; None means all.
-    """
+    """Return the variables of a MAT file by name; ``names`` None means all."""
     from scipy.io import loadmat
 
     try:
@@ -37,7 +32,7 @@ def read_mat(content: bytes, names: list[str] | None = None) -> dict[str, MatVal
 
 
 def read_mat_array(path: Path | str, name: str) -> NDArray[np.float64]:
-    """Return the array ``name`` of real numbers, float64, in MATLAB's shape."""
+    """Return a real array as float64 in MATLAB's shape."""
     with named(path):
         array = read_mat(read_content(path), [name]).get(name)
         if array is None:
@@ -48,12 +43,12 @@ def read_mat_array(path: Path | str, name: str) -> NDArray[np.float64]:
 
 
 def write_mat_arrays(path: Path | str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write real arrays as MATLAB's save does (v7, compressed), the same bytes each time."""
+    """Write real arrays as MATLAB's save does (v7, compressed), deterministically."""
     from scipy.io import savemat
 
     out = io.BytesIO()
     savemat(out, dict(arrays), do_compression=True)
-    write_bytes(path, _HEADER_TEXT + out.getvalue()[len(_HEADER_TEXT) :])  # SciPy's has the date
+    write_bytes(path, _HEADER_TEXT + out.getvalue()[len(_HEADER_TEXT) :])  # without SciPy's date
 
 
 def _plain(value: Any) -> MatValue:

@@ -1,8 +1,7 @@
-"""Folders that a command writes: whose they are, and output that comes only when all went well.
+"""Output folders of commands: ownership, and output that appears only on success.
 
-A folder is ours when it is new, empty, or carries our mark; nothing that a user owns is written
-over unasked. The mark names the kind of the folder in its first line and the files of the last
-command behind it, which the next command replaces.
+A command may write to a folder that is new, empty, or marked. The mark file names the kind of the
+folder, then the files of the last command, which the next command replaces.
 """
 
 from __future__ import annotations
@@ -29,20 +28,14 @@ MARKER = ".megloc"
 
 @dataclass(frozen=True)
 class Claim:
-    """A folder that was made ours, and what it was before.
-
-    Attributes
-    ----------
-    made : the folders that had to be made for it, innermost first.
-    old_mark : content of the mark that stood there; None without a mark.
-    """
+    """A claimed folder, the folders created for it, innermost first, and its former mark."""
 
     folder: Path
     made: tuple[Path, ...]
     old_mark: bytes | None
 
     def undo(self) -> None:
-        """Restore the mark and remove the folders that were made; written files stay."""
+        """Restore the mark and remove the created folders; written files stay."""
         mark = self.folder / MARKER
         with contextlib.suppress(OSError, OutputError):
             if self.old_mark is None:
@@ -55,10 +48,9 @@ class Claim:
 
 
 def claim_folder(folder: Path, *, kind: str, force: bool = False) -> Claim:
-    """Make a folder ours, or refuse it with an OutputError.
+    """Claim a folder that is new, empty or of the same ``kind`` (one word), or any by ``force``.
 
-    A folder is ours when it is new, empty, or carries our mark with the same ``kind`` (one word).
-    With ``force`` any folder will do; what it holds and is not written anew stays.
+    Others raise OutputError.
     """
     folder = Path(folder)
     mark = folder / MARKER
@@ -101,11 +93,9 @@ def _mark_of(kind: str, names: Iterable[str] = ()) -> bytes:
 def staged_output(
     folder: Path, *, kind: str, force: bool = False, adds: bool = False
 ) -> Iterator[Path]:
-    """A folder to write a command's output to, which is moved to ``folder`` when the block ends.
+    """Yield a staging folder whose content moves to ``folder`` when the block succeeds.
 
-    Files of the last command of the same kind are removed, unless commands of this kind add to
-    each other (``adds``); what else stands in the folder stays. When the block raises, ``folder``
-    is as it was. Raises OutputError: see :func:`claim_folder`.
+    Files of the last command of the same kind are removed, unless ``adds`` is set; others stay.
     """
     folder = Path(folder)
     claim = claim_folder(folder, kind=kind, force=force)
@@ -125,7 +115,7 @@ def staged_output(
             shutil.rmtree(staging, ignore_errors=True)
     except OSError as error:
         claim.undo()
-        # an error that names no file comes from writing: the disk is full, or a quota met
+        # an error without a file name comes from writing: full disk or exceeded quota
         if error.filename is not None and not _lies_in(error.filename, folder):
             raise
         raise output_error(folder, error) from error
@@ -135,7 +125,6 @@ def staged_output(
 
 
 def _files_below(folder: Path) -> set[str]:
-    """Files and links below a folder, as paths from it."""
     found = set()
     for place, folders, files in os.walk(folder):
         links = [name for name in folders if os.path.islink(os.path.join(place, name))]
@@ -144,14 +133,13 @@ def _files_below(folder: Path) -> set[str]:
 
 
 def _listed(mark: bytes | None, kind: str) -> set[str]:
-    """The files that a mark of this kind lists."""
     if mark is None or _kind(mark) != kind:
         return set()
     return {os.fsdecode(line) for line in mark.split(b"\n")[1:] if line}
 
 
 def _remove_old_files(folder: Path, names: Iterable[str]) -> None:
-    """Remove files and links below a folder, never through a link, and folders left empty."""
+    """Remove listed files and links and emptied folders, without following links."""
     for name in names:
         with contextlib.suppress(DataError, OSError):
             path = folder / check_relative(name)
@@ -183,10 +171,7 @@ def _merge(source: Path, target: Path) -> None:
 def replace_directory(new: Path, path: Path) -> None:
     """Replace folder ``path``, which need not exist, by folder ``new`` on the same file system.
 
-    A run killed in between leaves the old folder under a temporary name and none at ``path``.
-
-    Raises OutputError: ``path`` is a file or a link (a user's link is not ours to replace), or the
-    file system refuses.
+    A run killed in between leaves the old folder under a temporary name.
     """
     new, path = Path(new), Path(path)
     if path.is_symlink() or (path.exists() and not path.is_dir()):

@@ -1,14 +1,14 @@
 """The tables of a workspace as records: one type, one reader and one writer each.
 
 ==================== =============================================================================
-status.csv           the outcome of every query, beside the localized poses
-clusters.csv         the clusters of candidates that every query was tried in
-covariance.csv       how uncertain every localized pose is, beside the poses
-refinement.csv       the outcome of refining each query's pose, step by step
-map_consistency.csv  how far a map's own images would move, by coordinate frame
-depth.csv            depth of the map's images by stereo
-match_counts.csv     matches of each pair, found and verified, beside the matches of a type
-masked.csv           keypoints that masks removed, by image, beside the features of a type
+status.csv           outcome of every query, with the localized poses
+clusters.csv         clusters of candidates in which every query was localized
+covariance.csv       uncertainty of every localized pose
+refinement.csv       outcome of refining each query's pose, step by step
+map_consistency.csv  displacement of a map's own images by refinement, by coordinate frame
+depth.csv            stereo depth of the map's images
+match_counts.csv     matches and verified matches of each pair, with the matches of a type
+masked.csv           keypoints removed by masks, by image, with the features of a type
 ==================== =============================================================================
 
 Readers and writers take the file itself and keep its order, unless they say otherwise.
@@ -55,18 +55,14 @@ class QueryStatus(Options):
 
     Parameters
     ----------
-    image : the query.
-    status : ``localized``: the pose was estimated from the image; ``failed``: it was not.
-    reason : why it failed; empty for a localized query.
-    num_matches, num_inliers : 2D-3D matches of the solver, and those that agree with the pose.
-    confidence : probability that the pose is right, or that the rejected pose of a failed query
-        was; None without one.
-    cluster : index of the candidate cluster the pose comes from; None without clusters.
-    fallback : ``retrieval``: a failed query was given the pose of the best retrieved map image, a
-        guess; ``rig``: its pose comes through the rig from another camera.
-    candidates : the map images the pose comes from, best first.
-    refinement : by method, whether a refined pose was accepted or why not; may be empty.
-    remarks : steps that were skipped because the query or the map lacks what they need.
+    num_matches, num_inliers : 2D-3D matches of the solver and inliers of the pose.
+    confidence : probability that the pose, or the rejected pose of a failed query, is right.
+    cluster : index of the candidate cluster of the pose; None without clusters.
+    fallback : pose of a failed query: ``retrieval``, that of the best retrieved map image, a guess;
+        ``rig``, that of another camera through the rig.
+    candidates : map images that the pose comes from, best first.
+    refinement : acceptance or rejection of the refined pose, by method.
+    remarks : skipped steps for which the query or the map lacks data.
     """
 
     image: ImageName
@@ -86,12 +82,10 @@ _STATUS = Table(QueryStatus, keys=[("image",)], later=("confidence", "remarks"))
 
 
 def read_status(path: Path | str) -> dict[str, QueryStatus]:
-    """Read ``status.csv``: image -> status, sorted by image."""
     return {row.image: row for row in sorted(_STATUS.read(path), key=lambda row: row.image)}
 
 
 def write_status(path: Path | str, statuses: Iterable[QueryStatus]) -> None:
-    """Write ``status.csv``, sorted by image."""
     ordered = sorted(statuses, key=lambda status: status.image)
     _STATUS.write(path, ordered)
 
@@ -102,10 +96,7 @@ _COVARIANCE_COLUMNS = ("image", *(f"{_AXES[i]}_{_AXES[j]}" for i, j in zip(*_UPP
 
 
 def read_covariances(path: Path | str) -> dict[str, NDArray[np.float64]]:
-    """Read ``covariance.csv``: image -> covariance (6, 6), as ``Pose`` has it.
-
-    A row has the upper triangle: ``rx_rx, rx_ry, ... tz_tz``.
-    """
+    """Read covariances (6, 6) by image from their upper triangles ``rx_rx, rx_ry, ... tz_tz``."""
     found = {}
     for line, row in read_csv_table(path, _COVARIANCE_COLUMNS):
         with named(path, line):
@@ -122,7 +113,7 @@ def read_covariances(path: Path | str) -> dict[str, NDArray[np.float64]]:
 
 
 def write_covariances(path: Path, poses: Mapping[str, Pose]) -> None:
-    """Write ``covariance.csv`` of the poses that have a covariance, by image."""
+    """Write ``covariance.csv`` of the poses that have a covariance, sorted by image."""
     rows = [
         (image, *map(repr, pose.covariance[_UPPER].tolist()))
         for image, pose in sorted(poses.items())
@@ -133,16 +124,9 @@ def write_covariances(path: Path, poses: Mapping[str, Pose]) -> None:
 
 @dataclass(frozen=True)
 class ClusterRow:
-    """One row of ``clusters.csv``.
+    """One row of ``clusters.csv``; the pose is that before the final refinement.
 
-    Parameters
-    ----------
-    image : the query.
-    cluster : its number; ``status.csv`` names the one a pose comes from.
-    chosen : ``yes``: the pose comes from this one.
-    score : of the ranking; None without a pose, ``reason`` then says why.
-    images : map images of the cluster that match the query, best first.
-    cam_from_world : its pose before the final refinement; None without one.
+    ``images`` are the cluster's map images that match the query, best first.
     """
 
     image: str
@@ -160,7 +144,6 @@ _CLUSTERS = Table(ClusterRow)
 
 
 def read_clusters(path: Path | str) -> dict[str, list[ClusterRow]]:
-    """Read ``clusters.csv``: query -> its clusters."""
     clusters: dict[str, list[ClusterRow]] = {}
     for row in _CLUSTERS.read(path):
         clusters.setdefault(row.image, []).append(row)
@@ -170,7 +153,7 @@ def read_clusters(path: Path | str) -> dict[str, list[ClusterRow]]:
 def write_clusters(
     path: Path, rows: Iterable[tuple[str, tuple[ClusterPose, ...], int | None]]
 ) -> None:
-    """Write the clusters of every query: (image, its clusters, number of the chosen one)."""
+    """Write ``clusters.csv`` from rows (image, its clusters, number of the chosen one)."""
     records = [
         ClusterRow(image, index, "yes" if index == chosen else "no", **vars(cluster))
         for image, clusters, chosen in sorted(rows, key=lambda row: row[0])
@@ -195,12 +178,11 @@ _REFINEMENT = Table(_RefinementRecord)
 
 
 def refinement_text(rows: Sequence[RefinementRow]) -> str:
-    """The outcome of refining a query's pose, as ``status.csv`` has it."""
     return "; ".join(f"{row.method}: {'accepted' if row.accepted else row.reason}" for row in rows)
 
 
 def read_refinement(path: Path | str) -> list[RefinementRow]:
-    """Read ``refinement.csv``; a row is accepted if it has no reason."""
+    """Read ``refinement.csv``; a row without a reason is accepted."""
     return [
         RefinementRow(r.image, r.method, r.reason, r.moved_m, r.turned_deg, r.measures, r.before)
         for r in _REFINEMENT.read(path)
@@ -208,7 +190,7 @@ def read_refinement(path: Path | str) -> list[RefinementRow]:
 
 
 def write_refinement(path: Path, rows: Iterable[RefinementRow]) -> None:
-    """Write ``refinement.csv`` by image; the steps of one stay in order."""
+    """Write ``refinement.csv`` sorted by image; the steps of an image stay in order."""
     ordered = sorted(rows, key=lambda row: row.image)
     _REFINEMENT.write(path, ordered)
 
@@ -220,12 +202,8 @@ _Median = Annotated[float, or_empty(number(".6g"), math.nan)]
 class ConsistencyRow:
     """One row of ``map_consistency.csv``: a refiner's test of one coordinate frame of a map.
 
-    Attributes
-    ----------
-    images, contradicting : map images whose displacement is known, and those that contradict.
-    moved_m, turned_deg, moved_px, claimed_m, claimed_deg, squared_distance : their medians, as of
-        ``megloc_kapture.refinement.references.Displacement``; NaN where there is none.
-    reason : why poses of queries are not refined there; empty where they are.
+    The measures are medians of ``megloc_kapture.refinement.references.Displacement``; NaN if none.
+    ``reason`` is set where query poses are not refined.
     """
 
     frame: str
@@ -247,14 +225,9 @@ read_consistency, write_consistency = _CONSISTENCY.read, _CONSISTENCY.write
 
 @dataclass(frozen=True)
 class DepthRow:
-    """One row of ``reconstruction/depth.csv``: depth of a map image by stereo.
+    """One row of ``reconstruction/depth.csv``: stereo depth of a map image.
 
-    Attributes
-    ----------
-    sources : the images it was compared with, best first.
-    near_m, far_m : depths that were looked at.
-    fill : share of the pixels that have depth.
-    reason : why there is none; empty where there is.
+    ``sources`` are the compared images, best first; ``fill`` is the share of pixels with depth.
     """
 
     image: str
@@ -271,8 +244,6 @@ read_depth_rows, write_depth_rows = _DEPTH.read, _DEPTH.write
 
 @dataclass(frozen=True)
 class PairCount:
-    """One row of ``match_counts.csv``: matches that were found, and that verification left."""
-
     image: str
     other: str
     matches: int
@@ -283,23 +254,18 @@ _MATCH_COUNTS = Table(PairCount)
 
 
 def match_counts_path(features_dir: Path, type_name: str) -> Path:
-    """``match_counts.csv`` of a keypoints type in a features folder (orphan layout)."""
     return features_dir / "local_features" / type_name / "match_counts.csv"
 
 
 def read_match_counts(features_dir: Path, type_name: str) -> list[PairCount]:
-    """Read ``match_counts.csv`` of a keypoints type, in its order."""
     return _MATCH_COUNTS.read(match_counts_path(features_dir, type_name))
 
 
 def write_match_counts(features_dir: Path, type_name: str, counts: Iterable[PairCount]) -> None:
-    """Write ``match_counts.csv`` of a keypoints type, in the order given."""
     _MATCH_COUNTS.write(match_counts_path(features_dir, type_name), counts)
 
 
 class MaskCount(NamedTuple):
-    """One row of ``masked.csv``."""
-
     image: str
     num_masked: int
 
@@ -308,17 +274,16 @@ _MASK_COUNTS = Table(MaskCount)
 
 
 def mask_counts_path(features_dir: Path, type_name: str) -> Path:
-    """``masked.csv`` of a keypoints type in a feature folder (orphan layout)."""
     return features_dir / "local_features" / type_name / "masked.csv"
 
 
 def read_mask_counts(features_dir: Path, type_name: str) -> dict[str, int]:
-    """Read ``masked.csv`` of a keypoints type: image -> keypoints; empty where there is none."""
+    """Read ``masked.csv``: image -> removed keypoints; empty without the file."""
     path = mask_counts_path(features_dir, type_name)
     return dict(_MASK_COUNTS.read_if_there(path))
 
 
 def write_mask_counts(features_dir: Path, type_name: str, counts: Mapping[str, int]) -> None:
-    """Write ``masked.csv`` of a keypoints type: image that has a mask -> keypoints it removed."""
+    """Write ``masked.csv``: image with a mask -> removed keypoints."""
     rows = (MaskCount(*row) for row in sorted(counts.items()))
     _MASK_COUNTS.write(mask_counts_path(features_dir, type_name), rows)

@@ -1,20 +1,13 @@
 """Absolute pose of a camera or a rig: LO-RANSAC by poselib, then refinement with covariance.
 
-P3P where the matches of one camera have to do, GP3P where several cameras of a rig have some. The
-same seed gives the same pose, from however many threads.
-
-The refinement is Levenberg-Marquardt on the reprojection errors in pixels of all cameras of the rig
-together, under each camera's real model. A residual counts by the uncertainty of its pixel and its
-point: where the map knows the point's covariance C for a noise of 1 px, the residual's is
-``sigma^2 (I + m^2 J C J^T)``, and its distance is Mahalanobis'; m is the noise of the map's
-keypoints as a share of sigma, which also has what viewpoint, calibration and the map's poses do to
-a query. The Cauchy loss' scale follows the residuals: a map that is good to a tenth of a pixel and
-one that is good to three need different ones (figures in docs/experiments/pose.md).
-
-The covariance is by first-order propagation (Hartley and Zisserman, Multiple View Geometry, section
-5.2.2): with J the Jacobian of the whitened reprojections with respect to the pose it is
-``sigma^2 (J^T J)^-1``, sigma estimated from the residuals. A pose that its inliers do not
-determine, or place too badly to be of use, is a failure.
+The minimal solver is P3P for one camera and GP3P for several. A seed determines the pose for any
+number of threads. The refinement is Levenberg-Marquardt with a Cauchy loss on the reprojection
+errors in pixels of all cameras under their own models. With the covariance C of a map point for a
+noise of 1 px, the covariance of a residual is ``sigma^2 (I + m^2 J C J^T)``; m is the noise of the
+map's keypoints relative to sigma. The scale of the loss follows the residuals, because maps differ
+in accuracy (docs/experiments/pose.md). The covariance of the pose is ``sigma^2 (J^T J)^-1``, with J
+the Jacobian of the whitened reprojections (Hartley and Zisserman, Multiple View Geometry, section
+5.2.2).
 """
 
 from __future__ import annotations
@@ -34,21 +27,21 @@ from megloc_kapture.geometry.poses import cross_matrix, perturbed, unstack_poses
 from megloc_kapture.localization.map_index import PoseProblem, View, undo_recentring
 from megloc_kapture.values import Camera, Failure, Options, Pose, RigidTransform
 
-# GP3P draws from C's rand(), one state for the whole process
+# GP3P uses C's rand(), whose state is global
 _RAND = threading.Lock()
 _ROUNDS = 2
 _MIN_SIGMA_PX = 0.1
-# the median of the length of a normal vector in two dimensions (Rayleigh), of deviation 1
+# median of the Rayleigh distribution
 _RAYLEIGH_MEDIAN = 1.1774100225154747
-# the scale at which the Cauchy loss has 95 % of least squares' efficiency under Gaussian noise
+# scale of the Cauchy loss for 95 % efficiency under Gaussian noise
 _CAUCHY_EFFICIENT = 2.385
-# a handful of perfect matches is no proof of perfection
+# a few perfect matches do not prove that there is no noise
 _MIN_VARIANCE_PX2 = 0.1**2
 _MAX_CONDITION = 1e12
 _MAX_STEPS = 20
-# squared length in standard deviations (for one pixel) of a step that is the last one
+# squared length of the last step, in standard deviations
 _LAST_STEP = 1e-5
-# the first damping after a step that did not help
+# initial damping after a rejected step
 _DAMPING = 1e-4
 Floats = NDArray[np.float64]
 
@@ -78,7 +71,7 @@ class AbsolutePoseOptions(Options):
     seed: int = Field(default=0, ge=0, description="of RANSAC's samples")
 
     def for_poselib(self) -> dict[str, Any]:
-        """The RANSAC options in poselib's names."""
+        """Return the RANSAC options under poselib's names."""
         return {
             "max_reproj_error": self.max_error_px,
             "min_iterations": self.min_iterations,
@@ -90,13 +83,12 @@ class AbsolutePoseOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """A pose that enough matches agree with, before its refinement.
+    """A pose with enough inliers, before its refinement.
 
     Attributes
     ----------
-    rig_from_world : the pose; ``cam_from_world`` where the only view is at the rig's origin.
-    usable, inliers : bool (N,) over the matches of all views in order: point and ray are finite;
-        the error under the camera's model is allowed as well.
+    rig_from_world : equals ``cam_from_world`` for a single view at the rig's origin.
+    usable, inliers : bool (N,) over the matches of all views; usable if point and ray are finite.
     errors_px : float64 (N,) reprojection errors; infinite behind a camera and where not usable.
     """
 
@@ -119,9 +111,8 @@ def absolute_pose(
 ) -> Pose | Failure:
     """Estimate ``cam_from_world`` of one camera, with inlier mask and covariance.
 
-    Of pixels (N, 2), the first one's centre at (0.5, 0.5), matched with world points float64 (N,
-    3), whose covariances (N, 6) are as :class:`View` has them, or None. Raises DataError for arrays
-    of other shapes.
+    Pixels (N, 2) have the first pixel's centre at (0.5, 0.5). World points are float64 (N, 3);
+    their covariances (N, 6) are as in :class:`View`.
     """
     view = View(camera, RigidTransform.identity(), points_px, points_world, point_covariances)
     return rig_pose([view], options)
@@ -138,16 +129,16 @@ def rig_pose(views: Sequence[View], options: AbsolutePoseOptions | None = None) 
 
 
 def estimate_pose(problem: PoseProblem, options: AbsolutePoseOptions) -> PoseEstimate | Failure:
-    """Estimate ``rig_from_world`` from the matches of one camera or several.
+    """Estimate ``rig_from_world`` from the matches of one or more cameras.
 
-    A view without matches, or whose matches are all wrong, is no harm.
+    Views without matches, or with outliers only, are allowed.
     """
     count = len(problem.points)
     if count < options.min_inliers:
         return Failure(
             f"{count} 2D-3D matches, at least {options.min_inliers} are needed", num_matches=count
         )
-    # a camera's distortion cannot be undone everywhere: such rays are NaN
+    # rays are NaN where the distortion is not invertible
     rays = np.concatenate([normalized_from_px(v.camera, v.points_px) for v in problem.views])
     usable = np.isfinite(rays).all(axis=1) & np.isfinite(problem.points).all(axis=1)
     num_usable = int(np.count_nonzero(usable))
@@ -176,10 +167,10 @@ def _too_few_agree(num_inliers: int, count: int, options: AbsolutePoseOptions) -
 
 
 def match_errors(problem: PoseProblem, rig_from_world: RigidTransform) -> tuple[Floats, Floats]:
-    """Errors in pixels (N,) of all matches, and their Mahalanobis distances (N,).
+    """Return the errors in pixels (N,) of all matches and their Mahalanobis distances (N,).
 
-    In the latter an error has the variance of one pixel, plus that of the point's covariance.
-    Infinite behind the camera and where a point is not finite.
+    The variance is one pixel plus the point's covariance. Both are infinite behind the camera and
+    for points that are not finite.
     """
     pose = undo_recentring(rig_from_world, -problem.offset)
     projected = _Projected.of(problem, pose)
@@ -190,13 +181,13 @@ def match_errors(problem: PoseProblem, rig_from_world: RigidTransform) -> tuple[
 
 @dataclass(frozen=True, eq=False)
 class _Projected:
-    """Some of a problem's points, projected by a pose in the recentred world.
+    """Points of a problem projected in the recentred world.
 
     Attributes
     ----------
-    residuals : float64 (N, 2), pixels; NaN behind a camera and where a point is not finite.
-    slopes : float64 (N, 2, 3), derivatives by the points in the rig.
-    in_rig, depths : float64 (N, 3) the points in the rig, (N,) their depths in the camera.
+    residuals : float64 (N, 2), pixels; NaN behind a camera and for points that are not finite.
+    slopes : float64 (N, 2, 3), derivatives with respect to the points in the rig frame.
+    in_rig, depths : float64 (N, 3) points in the rig frame, (N,) depths in the camera.
     """
 
     residuals: Floats
@@ -246,10 +237,7 @@ class _Projected:
 def _whitening(
     problem: PoseProblem, projected: _Projected, rig_from_world: RigidTransform, map_noise: float
 ) -> Floats:
-    """Inverse Cholesky factors of the residuals' covariances ``I + m^2 J C J^T``.
-
-    float64 (N, 3), the elements (0, 0), (1, 0) and (1, 1).
-    """
+    """Inverse Cholesky factors of ``I + m^2 J C J^T``: float64 (N, 3), elements 00, 10, 11."""
     whitening = np.tile([1.0, 0.0, 1.0], (len(problem.points), 1))
     if len(problem.covariances) == 0 or map_noise == 0:
         return whitening
@@ -259,7 +247,7 @@ def _whitening(
         s00 = 1.0 + _quadratic(problem.covariances, u, u)
         s01 = _quadratic(problem.covariances, u, v)
         left = 1.0 + _quadratic(problem.covariances, v, v) - s01**2 / s00
-    # an unknown covariance counts as none
+    # unknown covariances count as zero
     known = (s00 > 0) & (s00 < np.inf) & (left > 0) & (left < np.inf)
     s00, s01, left = s00[known], s01[known], left[known]
     whitening[known] = np.stack([s00**-0.5, -s01 / s00 * left**-0.5, left**-0.5], axis=1)
@@ -277,7 +265,7 @@ def _quadratic(covariances: Floats, u: Floats, v: Floats) -> Floats:
 
 
 def _whitened(values: Floats, whitening: Floats) -> Floats:
-    """Residuals (N, 2), or their derivatives (N, 2, K), times the inverse Cholesky factors."""
+    """Multiply residuals (N, 2), or their derivatives (N, 2, K), by inverse Cholesky factors."""
     w00, w10, w11 = whitening.T.reshape(3, -1, *(1,) * (values.ndim - 2))
     first, second = values[:, 0], values[:, 1]
     return np.stack([w00 * first, w10 * first + w11 * second], axis=1)
@@ -286,11 +274,11 @@ def _whitened(values: Floats, whitening: Floats) -> Floats:
 def _ransac(
     problem: PoseProblem, rays: Floats, usable: NDArray[np.bool_], options: AbsolutePoseOptions
 ) -> RigidTransform:
-    """``rig_from_world`` in the recentred world."""
+    """Estimate ``rig_from_world`` in the recentred world."""
     import poselib
 
-    # its last bundle adjustment takes longer than the whole refinement that follows instead; the
-    # local optimisations of the RANSAC are not concerned
+    # skip poselib's final bundle adjustment, which is slower than our refinement; the local
+    # optimisation of LO-RANSAC is not affected
     bundle = {"max_iterations": 0}
     points_2d, points_3d, extrinsics, pinholes, cams_from_rig = [], [], [], [], []
     starts = problem.starts.tolist()
@@ -298,8 +286,7 @@ def _ransac(
         rows = first + np.flatnonzero(usable[first:last])
         if len(rows) == 0:
             continue
-        # undistorted pixels of a pinhole with the same focal length: poselib's own list of camera
-        # models is shorter than COLMAP's
+        # pass undistorted pinhole pixels: poselib has fewer camera models than COLMAP
         focal = focal_px(view.camera)
         points_2d.append(rays[rows] * focal)
         points_3d.append(problem.points[rows])
@@ -316,8 +303,8 @@ def _ransac(
             points_2d[0], points_3d[0], pinholes[0], options.for_poselib(), bundle
         )
         return cams_from_rig[0].inverse() @ _rigid_from_poselib(found)
-    # GP3P draws from C's rand() whatever poselib's own seed is, and the last digits follow; other
-    # threads must not draw in between, for the lock of the interpreter is not held
+    # GP3P ignores poselib's seed and uses C's rand(); poselib releases the GIL, so lock out other
+    # threads
     with _RAND:
         ctypes.CDLL(None).srand(ctypes.c_uint(options.seed))
         found, _ = poselib.estimate_generalized_absolute_pose(
@@ -327,7 +314,6 @@ def _ransac(
 
 
 def _rigid_from_poselib(found: Any) -> RigidTransform:
-    """poselib's pose as ours, its quaternion of unit length."""
     quat = np.asarray(found.q, dtype=np.float64)
     quat = quat / np.linalg.norm(quat)
     return unstack_poses(quat[None], np.asarray(found.t, dtype=np.float64)[None])[0]
@@ -340,9 +326,8 @@ def refine_pose(
 
     Returns
     -------
-    Pose whose ``cam_from_world`` is ``rig_from_world``, with its covariance and the inlier mask
-    over the matches of all views in order (inliers by their error in pixels, whatever their
-    points' uncertainty); or Failure with the reason.
+    Pose with ``rig_from_world`` as its ``cam_from_world``, its covariance, and the inlier mask over
+    the matches of all views (by errors in pixels, without the points' covariances); or Failure.
     """
     count = len(problem.points)
     pose = undo_recentring(estimate.rig_from_world, -problem.offset)
@@ -367,7 +352,7 @@ def refine_pose(
             num_matches=count,
             num_inliers=len(rows),
         )
-    # a left perturbation acts in the camera frame: the covariance does not see the offset
+    # a left perturbation acts in the camera frame: the offset does not change the covariance
     found = Pose(
         cam_from_world=undo_recentring(pose, problem.offset),
         num_matches=count,
@@ -388,8 +373,8 @@ def _minimised(
     """Minimise the Cauchy loss of whitened residuals by Levenberg-Marquardt.
 
     With the weight ``w = 1 / (1 + e^2 / c^2)`` of a residual of length e, the gradient sums
-    ``w J^T r`` and the Hessian ``w^2 J^T J``: the expectation of the loss' second derivative over
-    the directions of r. Steps by it converge faster than reweighted least squares.
+    ``w J^T r`` and the Hessian ``w^2 J^T J``, the expected second derivative over the directions
+    of r. It converges faster than reweighted least squares.
     """
     squared_scale = (_CAUCHY_EFFICIENT * sigma) ** 2
     best, least, damping = pose, np.inf, 0.0
@@ -398,7 +383,7 @@ def _minimised(
         projected = _Projected.of(problem, pose, rows)
         whitened = _whitened(projected.residuals, whitening)
         growth = 1.0 + (whitened**2).sum(axis=1) / squared_scale
-        # a point that a step has put behind the camera makes the cost NaN
+        # the cost is NaN if a point moved behind the camera
         cost = float(np.log(growth).sum())
         if cost < least:
             best, least, damping = pose, cost, 0.1 * damping
@@ -421,9 +406,9 @@ def _minimised(
 def check_stable(
     pose: Pose, covariance: Floats, depth: float, options: AbsolutePoseOptions
 ) -> Pose | Failure:
-    """The pose, or a Failure where its covariance says that the centre may be anywhere.
+    """Return the pose, or a Failure if the covariance of its centre is too large.
 
-    ``depth`` is the median of the inliers', in the unit of the map.
+    ``depth`` is the inliers' median depth in the unit of the map.
     """
     deviation = center_deviation(covariance) / depth
     if deviation <= options.max_center_deviation:
@@ -437,12 +422,10 @@ def check_stable(
 
 
 def _variance(squared: Floats, squared_scale: float) -> float:
-    """Variance by which the inverse normal matrix becomes the covariance of the Cauchy estimate.
+    """Return the variance factor of the Cauchy estimate's covariance, of squared residuals (M,).
 
-    Of squared whitened residuals (M,). Huber's proposal (Robust Statistics, section 7.6) with
-    expectations over the directions of residuals in the plane: ``E[w^2 e^2] / 2`` over
-    ``E[w^2]^2``, w the weight of the loss. It is the variance of the noise, over the efficiency of
-    the loss, where the noise is Gaussian.
+    Huber's proposal (Robust Statistics, section 7.6) with expectations over the directions of
+    residuals in the plane: ``E[w^2 e^2] / 2`` over ``E[w^2]^2``, w the weight of the loss.
     """
     squared_weights = 1.0 / (1.0 + squared / squared_scale) ** 2
     degrees_of_freedom = max(2 * len(squared) - 6, 1)
@@ -450,7 +433,7 @@ def _variance(squared: Floats, squared_scale: float) -> float:
 
 
 def _median(values: Floats) -> float:
-    # np.median takes ten times as long for so few
+    # np.median is ten times slower for small arrays
     upper = len(values) // 2
     lower = (len(values) - 1) // 2
     parted = np.partition(values, (lower, upper))
@@ -458,15 +441,14 @@ def _median(values: Floats) -> float:
 
 
 def pose_covariance(information: Floats, variance_px2: float) -> Floats | None:
-    """Covariance (6, 6) of a pose from its normal matrix ``J^T J`` (6, 6) for a noise of 1 px.
+    """Return the pose covariance (6, 6) from the normal matrix ``J^T J`` for a noise of 1 px.
 
-    Order: rotation in radians, then translation in the unit of the map, both of a left
-    perturbation: ``cam_from_world_true = exp(rotation, translation) cam_from_world``.
-    None when the matrix does not determine the pose.
+    Order: rotation in radians, then translation in the unit of the map, of a left perturbation
+    ``cam_from_world_true = exp(rotation, translation) cam_from_world``. None if singular.
     """
     if not np.isfinite(information).all() or not (np.diagonal(information) > 0).all():
         return None
-    # columns differ by the scene's scale: equilibrate before judging the condition
+    # equilibrate first: the columns differ by the scale of the scene
     scale = np.sqrt(np.diagonal(information))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     if values[0] * _MAX_CONDITION <= values[-1]:
@@ -476,19 +458,19 @@ def pose_covariance(information: Floats, variance_px2: float) -> Floats | None:
 
 
 def center_deviation(covariance: Floats) -> float:
-    """Largest standard deviation of the camera's centre over all directions, in the map's unit.
+    """Return the largest standard deviation of the camera centre over all directions.
 
-    Of a ``covariance`` (6, 6) as :func:`pose_covariance` has it: a left perturbation moves the
-    centre by its translation, seen in the camera, to first order.
+    It is in the map's unit. To first order, a left perturbation moves the centre by its translation
+    in the camera frame.
     """
     return float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
 
 
 def transform_covariance(covariance: Floats, cam_from_rig: RigidTransform) -> Floats:
-    """Covariance (6, 6) of ``cam_from_rig @ rig_from_world`` of one of ``rig_from_world``.
+    """Transform a covariance (6, 6) of ``rig_from_world`` to ``cam_from_rig @ rig_from_world``.
 
-    Both of left perturbations, rotation first: with ``C exp(xi) = exp(Ad_C xi) C`` it is
-    ``Ad_C covariance Ad_C^T`` (Barfoot, State Estimation for Robotics, section 7.1.4).
+    Both are of left perturbations, rotation first: ``Ad_C covariance Ad_C^T`` (Barfoot, State
+    Estimation for Robotics, section 7.1.4).
     """
     rotation = cam_from_rig.rotation_matrix()
     adjoint = np.zeros((6, 6))

@@ -1,10 +1,8 @@
-"""Cluster-wise localization: a pose for each cluster of candidates, the best of them refined.
+"""Cluster-wise localization: one pose per cluster of candidates, the best one refined.
 
-MegLoc, section "Cluster-wise localization": retrieval returns images of several places that look
-alike, and the matches of one place are outliers to the pose of another. So the retrieved images are
-clustered by the proximity of their centres, whatever they look at, or by co-visibility, and each
-cluster is localized in by itself. One view or the views of a rig are treated alike, and matches of
-several keypoints types.
+MegLoc, section "Cluster-wise localization": retrieval returns images of several similar locations,
+and matches of one are outliers to the pose of another. The candidates are therefore clustered by
+their camera centres or by co-visibility, and each cluster is localized separately.
 """
 
 from __future__ import annotations
@@ -77,7 +75,7 @@ class ClusterOptions(Options):
 
 
 def cluster_by_centers(centers: NDArray[np.float64], radius: float) -> NDArray[np.int64]:
-    """Single linkage of centres (N, 3): labels int64 (N,), in the order of their first members."""
+    """Cluster centres (N, 3) by single linkage; labels int64 (N,) in order of first members."""
     if len(centers) == 0:
         return np.zeros(0, np.int64)
     pairs = cKDTree(centers).query_pairs(radius, output_type="ndarray")
@@ -87,10 +85,9 @@ def cluster_by_centers(centers: NDArray[np.float64], radius: float) -> NDArray[n
 def cluster_by_shared_points(
     shared: NDArray[np.int64], min_shared_points: int
 ) -> NDArray[np.int64]:
-    """Images joined by the points they share (N, N): labels int64 (N,), as of centres.
+    """Cluster images by their shared points (N, N); labels int64 (N,) in order of first members.
 
-    Where no two images share a point at all (a map lifted from depth) co-visibility says nothing,
-    and all are one cluster.
+    If no two images share a point (a map lifted from depth), all are one cluster.
     """
     apart = shared - np.diag(np.diag(shared))
     if not apart.any():
@@ -110,10 +107,10 @@ def cluster_candidates(
 
     Parameters
     ----------
-    images, frames : the candidates, best first, and the coordinate frame of each; different frames
-        are never joined.
-    centers : of the images in the world, (3,) each.
-    indices : the map's points by keypoints type; shared points of all types add up.
+    images, frames : candidates, best first, with their coordinate frames; clusters do not span
+        frames.
+    centers : camera centres in the world, (3,) each.
+    indices : map points by keypoints type; shared points of all types add up.
     """
     clusters: list[list[int]] = []
     for frame in dict.fromkeys(frames):
@@ -145,7 +142,7 @@ def _components(count: int, pairs: NDArray[np.integer]) -> NDArray[np.int64]:
 
 
 def interleave(rankings: Sequence[Sequence[str]]) -> list[str]:
-    """One ranking of several: the first of each, then the second of each; each name once."""
+    """Merge rankings by rank, each name once."""
     ranks = zip_longest(*rankings)
     return list(dict.fromkeys(name for rank in ranks for name in rank if name is not None))
 
@@ -162,26 +159,25 @@ def localize_in_clusters(
     min_confidence: float | None = None,
     scene: RankingScene | None = None,
 ) -> tuple[Pose | Failure, PoseProblem | None]:
-    """Localize a query in each cluster by itself, rank the poses, and refine the best.
+    """Estimate one pose per cluster of candidate images and refine the best.
 
-    Clusters whose poses explain each other are joined (images that look to different sides share no
-    points), and are localized in together. The pose of a rig is ``rig_from_world``; the mask of its
-    inliers runs over the views, and in each over the keypoints types, in their order.
+    Clusters whose poses explain each other's inliers are merged first: images that look in
+    different directions share no points but may show the same location. For a rig, the pose is
+    ``rig_from_world`` and the inlier mask runs over views, then keypoints types.
 
     Parameters
     ----------
-    views : one camera, or those of a rig.
     clusters : map images of each, see :func:`cluster_candidates`.
     rank : scores of poses, higher is better.
-    max_clusters : only those with the most matches are tried.
-    frames : the coordinate frame of each cluster; clusters of different ones are never joined.
+    max_clusters : number of clusters tried, those with the most matches.
+    frames : coordinate frame of each cluster; clusters of different frames are not merged.
     centers : of the map images, (3,) each; needed for ``min_confidence``.
-    min_confidence : a pose of less is a failure; None: poses have no confidence.
-    scene : looked at where the confidence is in doubt; None: nothing is.
+    min_confidence : lower confidences are failures; None computes no confidence.
+    scene : images used if the confidence is in doubt.
 
     Returns
     -------
-    The pose and the problem that it solves; or why there is none, and None.
+    The pose and its problem, or a Failure and None.
     """
     clock = Clock()
     matched = interleave([view.matched_images() for view in views])
@@ -255,8 +251,6 @@ def localize_in_clusters(
 
 @dataclass(frozen=True, eq=False)
 class _Attempt:
-    """One cluster, its 2D-3D matches, and what they came to."""
-
     cluster: tuple[str, ...]
     frame: str
     found: Found
@@ -265,7 +259,6 @@ class _Attempt:
     hypothesis: PoseHypothesis | None
 
     def as_cluster_pose(self, score: float | None) -> ClusterPose:
-        """The attempt as it is reported."""
         images, estimate = self.cluster, self.estimate
         if isinstance(estimate, Failure):
             counted = (estimate.num_matches, estimate.num_inliers)
@@ -279,7 +272,7 @@ def _join_agreeing(
     attempt: Callable[[Sequence[str], str], _Attempt],
     rank_of: Callable[[str], int],
 ) -> list[_Attempt]:
-    """Join attempts whose poses agree, where that does not lose inliers; in their order."""
+    """Merge attempts with agreeing poses unless that loses inliers; keep the order."""
     groups: list[list[_Attempt]] = []
     for each in attempts:
         for group in groups:
@@ -306,7 +299,7 @@ def _join_agreeing(
 
 
 def _best(clusters: Sequence[ClusterPose]) -> int:
-    """The first of the highest score; without any score the one that came nearest to a pose."""
+    """Return the index of the best score; without scores, that of the most inliers."""
 
     def key(at: int) -> tuple[bool, float, int, int, int]:
         cluster = clusters[at]
@@ -342,14 +335,14 @@ def _hypothesis(
 
 
 class Clock:
-    """Seconds by step."""
+    """Elapsed seconds by step."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self._last = time.perf_counter()
 
     def start(self) -> None:
-        """Begin a lap; what has passed since the last one was something else."""
+        """Start a lap; discard the time since the last one."""
         self._last = time.perf_counter()
 
     def lap(self, step: str) -> None:
@@ -362,11 +355,10 @@ class Clock:
 def poses_of_cameras(
     views: Sequence[QueryView], rig: Pose, problem: PoseProblem
 ) -> list[Pose | Failure]:
-    """One result per camera of a localized rig, with its own matches and inliers.
+    """Return one result per camera of a localized rig, with its own matches and inliers.
 
-    Of the rig's pose and the problem that it solves, see :func:`localize_in_clusters`. A camera
-    without any inlier has not been localized, whatever the others say: it fails, and it is for who
-    asked to give it its pose through the rig.
+    ``rig`` and ``problem`` come from :func:`localize_in_clusters`. A camera without inliers fails,
+    even though the rig has a pose.
     """
     if rig.inliers is None:
         raise ValueError("the inliers of the rig's pose are not known")

@@ -1,18 +1,12 @@
-"""Focal length and other intrinsics of a query's camera, from the matches of its pose.
+"""Focal length and other intrinsics of a query's camera, estimated from the inliers of its pose.
 
-A wrong focal length hides in the pose: the camera moves nearer or farther, and most matches still
-agree; only perspective contradicts it. So the focal length is set free once a pose is known
-(Gauss-Newton on rays with Cauchy weights):
-
-- A calibrated camera stays as it is. Where another focal length fits better by far more than its
-  uncertainty (:func:`focal_misfit`), the pose gets a remark and a lower confidence.
-- A camera with an uncertain focal length (``Camera.focal_deviation``) gets the most probable focal
-  length, principal point and radial distortion, with EXIF, the image's centre and no distortion as
-  a prior. The covariance of the pose contains the uncertainty of the intrinsics. pycolmap's
-  refinement has no prior, and returns no covariance of the focal length.
-- Photographs of one camera share their estimates (:func:`solve_with_shared_camera`).
-
-Matches with a flat scene seen straight on do not determine the focal length: then the prior stays.
+A wrong focal length moves the camera along its axis while most matches still agree, so the focal
+length is freed once a pose is known (Gauss-Newton on rays, Cauchy weights). A calibrated camera is
+kept; if another focal length fits far better, the pose gets a remark and a lower confidence. A
+camera with an uncertain focal length (``Camera.focal_deviation``) gets the most probable focal
+length, principal point and radial distortion given a prior (EXIF, the image centre, no distortion),
+and the pose covariance includes their uncertainty; pycolmap's refinement has no prior. A flat scene
+seen frontally does not determine the focal length; the prior is kept then.
 """
 
 from __future__ import annotations
@@ -47,50 +41,48 @@ from megloc_kapture.localization.map_index import PoseProblem, View
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 Floats = NDArray[np.float64]
-# errors of a map are alike in neighbouring points, and lenses are no pinholes: deviations that
-# take every match for independent are too small by a factor (measured: docs/photos.md)
+# map errors of neighbouring points are correlated: deviations that assume independent matches are
+# too small by this factor (measured: docs/photos.md)
 _CORRELATED, _MIN_ERROR_PX = 5.0, 0.5
 _MIN_SIGMAS = 3.0
 _MIN_INLIERS = 30
 _DOES_NOT_FIT = "does not fit"
 _ROUNDS = 12
 _SMALL_STEP = 1e-4
-# intrinsics are settled when the focal length moves by less, as a share
+# relative change of the focal length at convergence
 _SETTLED = 1e-4
 _MAX_UPDATES = 8
-# P4Pf's focal length may differ by as many deviations from the prior; beyond, the prior is doubted
+# the prior is doubted if P4Pf's focal length differs by more deviations
 _MAX_DEVIATIONS = 3.0
-# the prior of a focal length that the matches contradict, and the least deviation of one that may
-# be doubted: one that was calibrated, or estimated from several images, is not
+# prior deviation of a focal length that the matches contradict; smaller deviations are never
+# doubted: they come from calibration or several images
 _DOUBTED_DEVIATION, _MIN_DOUBTED = 0.7, 0.1
-# prior standard deviations: of the principal point as a share of the larger side, and of the
-# radial distortion
+# prior standard deviations: principal point as a share of the larger side, radial distortion
 _PRINCIPAL_POINT_DEVIATION, _DISTORTION_DEVIATION = 0.01, 0.1
-# a calibrated camera may be off by as much: the focal length, and the radial distortion
+# deviations of a calibrated focal length (relative) and radial distortion
 _CALIBRATED, _CALIBRATED_DISTORTION = 0.01, 0.02
-# errors of neighbouring points are alike: they average out as those of so many matches would
+# effective number of independent matches
 _INDEPENDENT = 30
-# matches were verified with the given focal length: the better one is uncertain by such a share of
-# the difference
+# matches were verified with the given focal length, which biases the free one: deviation as a share
+# of the difference
 _BIASED_BY = 0.1
-# an estimate this many standard deviations off is of another zoom
+# beyond this many standard deviations, the zoom differs
 _MAX_SIGMAS = 3.0
-# errors of a map, and a lens that is none of the model, are alike in photographs: their number
-# averages less out than if they were independent (measured: docs/photos.md)
+# map and lens model errors are correlated between photographs (measured: docs/photos.md)
 _ALIKE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """The best change of a camera, and the pose that goes with it.
+    """Best correction of a camera and the corresponding pose.
 
     Attributes
     ----------
-    change : float64 (1, 3 or 4,): logarithm of the focal length's factor; the principal point's
-        shift, as a share of the focal length; the radial distortion's.
-    deviations : of the change, float64, of its shape.
-    pose_covariance : float64 (6, 6), what the uncertainty of the camera adds to that of the pose.
-    depth : median of the inliers', unit of the map.
+    change : float64 (1, 3 or 4,): logarithm of the focal length factor; shift of the principal
+        point over the focal length; radial distortion.
+    deviations : standard deviations of ``change``.
+    pose_covariance : float64 (6, 6), contribution of the camera's uncertainty.
+    depth : median depth of the inliers in the unit of the map.
     """
 
     change: Floats
@@ -101,12 +93,12 @@ class _Fit:
 
     @property
     def deviation(self) -> float:
-        """Of the focal length, as a share of it."""
+        """Relative deviation of the focal length."""
         return float(self.deviations[0])
 
 
 def is_uncertain(problem: PoseProblem) -> bool:
-    """True if the problem is of one camera whose focal length is not known for certain."""
+    """Return True for a single camera with an uncertain focal length."""
     return len(problem.views) == 1 and problem.views[0].camera.focal_deviation > 0
 
 
@@ -114,10 +106,7 @@ def is_uncertain(problem: PoseProblem) -> bool:
 class FocalMisfit:
     """A focal length that fits the matches far better than the given one.
 
-    Attributes
-    ----------
-    remark : names both.
-    shift : how far the camera moves with the better one, as a share of the distance to the points.
+    ``shift`` is the resulting motion of the camera as a share of the distance to the points.
     """
 
     remark: str
@@ -127,15 +116,14 @@ class FocalMisfit:
 def focal_misfit(
     problem: PoseProblem, pose: Pose, options: AbsolutePoseOptions
 ) -> FocalMisfit | None:
-    """Find another focal length that fits better; None where the given one may be right, where the
-    matches do not tell, or of a rig."""
+    """Find another focal length that fits far better; None for rigs and undetermined cases."""
     if len(problem.views) != 1 or pose.inliers is None or pose.num_inliers < _MIN_INLIERS:
         return None
     given = problem.views[0].camera
     found = _freed(problem, pose.cam_from_world, pose.inliers, options.max_error_px)
     if found is None or not found.contradicts(given):
         return None
-    # the inliers of a focal length that is far off hide the right one
+    # inliers of a grossly wrong focal length hide the right one
     free = focal_from_matches(
         problem.points_px, problem.points, given, options.max_error_px, options.seed
     )
@@ -160,13 +148,13 @@ def focal_misfit(
 
 @dataclass(frozen=True)
 class _Freed:
-    """A pose whose focal length was free.
+    """Pose with a free focal length.
 
     Attributes
     ----------
-    deviation : of the focal length, as a share of it.
-    cost : sum of the squared errors of all matches, each at most that of an outlier.
-    distance : median of the inliers'.
+    deviation : relative deviation of the focal length.
+    cost : sum of squared errors of all matches, truncated at the inlier threshold.
+    distance : median distance of the inliers.
     """
 
     focal_px: float
@@ -176,15 +164,13 @@ class _Freed:
     distance: float
 
     def change_from(self, given: Camera) -> float:
-        """Logarithm of the factor to the given focal length."""
         return math.log(self.focal_px / focal_px(given))
 
     def deviation_from(self, given: Camera) -> float:
-        """Standard deviation of that, with the calibration's and what verification left out."""
+        """Return the deviation of the logarithm, with calibration error and verification bias."""
         return math.hypot(self.deviation, _CALIBRATED, _BIASED_BY * self.change_from(given))
 
     def contradicts(self, given: Camera) -> bool:
-        """Whether the given focal length is off by more than can be explained."""
         return abs(self.change_from(given)) >= _MIN_SIGMAS * self.deviation_from(given)
 
 
@@ -194,10 +180,9 @@ def _freed(
     inliers: NDArray[np.bool_],
     max_error_px: float,
 ) -> _Freed | None:
-    """Set the focal length free, and principal point and radial distortion as far as a calibrated
-    camera may be off; None where the matches do not determine it.
+    """Free the focal length, and the other intrinsics within their calibration error.
 
-    What agrees with the camera is decided again each time.
+    Return None if the matches do not determine it. Inliers are selected again in each round.
     """
     (view,) = problem.views
     focal = focal_px(view.camera)
@@ -235,7 +220,7 @@ def _freed(
 
 
 def misfits_text(remarks: Iterable[str], where: str) -> str | None:
-    """Say how many queries have a focal length that does not fit, by the remarks of each."""
+    """Summarize how many queries have a misfitting focal length, given their remarks."""
     count = sum(_DOES_NOT_FIT in of_query for of_query in remarks)
     if not count:
         return None
@@ -243,7 +228,7 @@ def misfits_text(remarks: Iterable[str], where: str) -> str | None:
 
 
 def estimate_remark(camera: Camera, given: Camera) -> str:
-    """Name the focal length that was estimated for an uncertain camera."""
+    """Return a remark on the estimated focal length."""
     found_px, given_px = focal_px(camera), focal_px(given)
     return (
         f"focal length estimated: {found_px:.0f} +- {camera.focal_deviation * found_px:.0f} px "
@@ -254,10 +239,10 @@ def estimate_remark(camera: Camera, given: Camera) -> str:
 def estimate_with_intrinsics(
     problem: PoseProblem, options: AbsolutePoseOptions
 ) -> tuple[PoseProblem, PoseEstimate | Failure]:
-    """Estimate pose and intrinsics of an uncertain camera; the problem returned has that camera.
+    """Estimate pose and intrinsics of an uncertain camera.
 
-    The camera of the problem has a larger ``focal_deviation`` where the matches contradict the
-    given focal length, as with the EXIF of another lens.
+    The returned problem has the estimated camera. Its ``focal_deviation`` is increased if the
+    matches contradict the given focal length, for example EXIF of another lens.
     """
     given = problem.views[0].camera
     found = estimate_pose(problem, options)
@@ -284,7 +269,7 @@ def estimate_with_intrinsics(
 
 
 def _scaled(given: Camera, focal: float) -> Camera:
-    """The camera with another focal length; its prior is weak where that contradicts it."""
+    """Set the focal length; weaken the prior if it is contradicted."""
     camera = scale_focal(given, focal / focal_px(given))
     if abs(math.log(focal / focal_px(given))) > _MAX_DEVIATIONS * given.focal_deviation:
         return replace(camera, focal_deviation=max(_DOUBTED_DEVIATION, given.focal_deviation))
@@ -292,7 +277,7 @@ def _scaled(given: Camera, focal: float) -> Camera:
 
 
 def _is_possible(problem: PoseProblem, found: PoseEstimate, given: Camera) -> bool:
-    """Whether the prior allows the focal length, or the matches certainly contradict the prior."""
+    """Return True if the prior allows the focal length or the matches contradict it."""
     camera = problem.views[0].camera
     change = math.log(focal_px(camera) / focal_px(given))
     if abs(change) <= _MAX_DEVIATIONS * given.focal_deviation:
@@ -309,11 +294,10 @@ def _is_possible(problem: PoseProblem, found: PoseEstimate, given: Camera) -> bo
 def refine_with_intrinsics(
     problem: PoseProblem, estimate: PoseEstimate, options: AbsolutePoseOptions, given: Camera
 ) -> tuple[PoseProblem, Pose | Failure]:
-    """Refine pose and intrinsics of an uncertain camera, in turns.
+    """Refine pose and intrinsics of an uncertain camera in alternation.
 
-    ``given`` is the camera as it was given, with the deviation of its focal length. The problem is
-    then that of the refined camera, which is the Pose's ``camera``, with the deviation that
-    remains.
+    ``given`` is the camera with its prior deviation. The returned problem and Pose have the refined
+    camera with the posterior deviation.
     """
     updates = 0
     while True:
@@ -351,13 +335,11 @@ def _changed(camera: Camera, change: Floats) -> Camera:
 
 
 def _prior_of(camera: Camera, given: Camera) -> tuple[Floats, Floats]:
-    """The change that turns a camera into the given one, and its standard deviations."""
+    """Return the change from a camera to the given one, and its standard deviations."""
     focal = focal_px(camera)
     shift = np.subtract(principal_point_px(given), principal_point_px(camera)) / focal
-    # larger where the matches contradict the given focal length
     known = max(given.focal_deviation, camera.focal_deviation)
-    # a focal length that is known this well was calibrated, or estimated from several images: the
-    # rest is known as well then
+    # a well-known focal length comes from calibration or several images, and so does the rest
     deviation = min(_PRINCIPAL_POINT_DEVIATION, known) * max(camera.width, camera.height) / focal
     change = [math.log(focal_px(given) / focal), *shift]
     deviations = [known, deviation, deviation]
@@ -373,10 +355,7 @@ def _fit(
     inliers: NDArray[np.bool_],
     given: Camera,
 ) -> _Fit | None:
-    """The camera that fits the inliers best; None where they do not determine it.
-
-    ``given``: the prior, with its deviation.
-    """
+    """Fit the camera to the inliers; None if they do not determine it. ``given`` is the prior."""
     (view,) = problem.views
     expected, deviations = _prior_of(view.camera, given)
     start = view.cam_from_rig @ rig_from_world
@@ -411,19 +390,19 @@ def _free_camera(
     deviations: Floats,
     correlated: float,
 ) -> tuple[Floats, RigidTransform, float, Floats] | None:
-    """Fit a pose and a change of the camera to inliers; None where these do not determine it.
+    """Fit a pose and a camera change to inliers; None if they do not determine it.
 
     Parameters
     ----------
-    rays, points : (N, 2) undistorted, (N, 3) in the camera.
-    change : of the camera to begin with, see :class:`_Fit`.
-    expected, deviations : of the change before the matches are looked at.
-    correlated : deviations are this much larger than of independent errors.
+    rays, points : (N, 2) undistorted, (N, 3) in the camera frame.
+    change : initial value, see :class:`_Fit`.
+    expected, deviations : prior of the change.
+    correlated : factor by which correlated errors increase the deviations.
 
     Returns
     -------
-    The change, the motion of the points, their median depth, and the covariance of a left
-    perturbation of the motion and of the change.
+    The change, the motion of the points, their median depth, and the covariance of motion (left
+    perturbation) and change.
     """
     rotation, translation = np.eye(3), np.zeros(3)
     prior_weight = (correlated / deviations) ** 2
@@ -438,7 +417,7 @@ def _free_camera(
         weights = 1 / (1 + squared / (5.7 * variance))
         information = np.einsum("nik,n,nil->kl", jacobian, weights, jacobian)
         gradient = np.einsum("nik,n,ni->k", jacobian, weights, residuals)
-        # what lenses do is not noise: more matches do not average it out
+        # lens model errors do not average out with more matches
         trusted = max(variance, (_MIN_ERROR_PX / focal) ** 2)
         information[own, own] += trusted * prior_weight
         gradient[own] += trusted * prior_weight * (change - expected)
@@ -462,10 +441,10 @@ def _free_camera(
 
 
 def _linearized(rays: Floats, points: Floats, change: Floats) -> tuple[Floats, Floats]:
-    """Residuals (N, 2) of points in front of the camera, and derivatives (N, 2, 6 + changes).
+    """Return residuals (N, 2) of points in front of the camera and their derivatives (N, 2, 6 + C).
 
-    By a left rotation and a translation of the points (without the distortion's own slope, which
-    changes nothing where the change is small), then by ``change``, see :class:`_Fit`.
+    The columns are a left rotation, a translation of the points, and ``change`` (:class:`_Fit`).
+    The slope of the distortion is ignored in the pose columns: the change is small.
     """
     x, y, z = points.T
     u, v = x / z, y / z
@@ -491,9 +470,9 @@ def _linearized(rays: Floats, points: Floats, change: Floats) -> tuple[Floats, F
 
 
 def shared_camera(cameras: Sequence[Camera]) -> Camera:
-    """The camera that estimates of one camera agree on: medians, weighted by their certainty.
+    """Average estimates of one camera by medians weighted with their inverse variances.
 
-    They are of one model and size, with their ``focal_deviation``; at least one.
+    The cameras have one model and size, and each has a ``focal_deviation``.
     """
     weights = np.array([camera.focal_deviation**-2.0 for camera in cameras])
     params = np.array([camera.params for camera in cameras])
@@ -506,12 +485,10 @@ def shared_camera(cameras: Sequence[Camera]) -> Camera:
 
 
 def solve_with_shared_camera(poses: Sequence[Pose], options: AbsolutePoseOptions) -> list[Pose]:
-    """Poses of photographs of one camera, solved again with what all of them tell of it.
+    """Re-solve poses of photographs of one camera with a shared estimate of its intrinsics.
 
-    A photograph whose own estimate contradicts the others', as at another zoom, keeps it; and so
-    does one whose pose was refined by other means.
-
-    The poses come with the camera that was estimated of each, and their inliers.
+    A pose is kept if its own focal length contradicts the others (another zoom) or if it was
+    refined by other means. Each pose has its estimated camera and its inliers.
     """
     usable = [p.camera for p in poses if p.camera is not None and p.camera.focal_deviation > 0]
     if len(usable) < 2:
@@ -535,7 +512,7 @@ def solve_with_shared_camera(poses: Sequence[Pose], options: AbsolutePoseOptions
 
 
 def _solved(pose: Pose, shared: Camera, number: int, options: AbsolutePoseOptions) -> Pose:
-    """The pose with the shared camera; the pose itself where its inliers do not allow it."""
+    """Solve a pose with the shared camera; keep it if its inliers do not allow that."""
     if pose.inlier_points_px is None or pose.inlier_points_world is None:
         return pose
     inliers = pose.inlier_points_px, pose.inlier_points_world

@@ -1,7 +1,6 @@
-"""Compiled loops of stereo: correlation under planes, semi-global paths, agreement of views.
+"""Compiled loops of stereo: correlation under planes, semi-global paths, view consistency.
 
-Imported only when depth is estimated: numba costs half a second to import. Images are float32
-(H, W), NaN where nothing may be compared (outside, masked).
+Import only when needed: numba takes half a second. Images are float32 (H, W), NaN where invalid.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
@@ -14,17 +13,13 @@ import numpy as np
 
 from megloc_kapture.compiling import compiled_loop
 
-_FAR = np.float32(1e9)  # of labels that are none
+_FAR = np.float32(1e9)
 _FLAT = np.float32(1e-6)
 
 
 @compiled_loop
 def window_sums(image, other, radius, row, columns, sums):
-    """Sums over a window around each pixel of a row of image, image^2 and image * other.
-
-    ``columns``: float32 (3, W), scratch; ``sums``: float32 (3, W), filled; of windows that leave
-    the image NaN.
-    """
+    """Sum image, image^2 and image * other over windows of a row into float32 (3, W)."""
     height, width = image.shape
     for x in range(width):
         columns[0, x] = columns[1, x] = columns[2, x] = np.float32(0)
@@ -50,13 +45,13 @@ def window_sums(image, other, radius, row, columns, sums):
 
 @compiled_loop
 def correlate(reference, warped, radius, costs):
-    """Matching cost of every pixel under one plane: 1 - the mean of the two best correlations.
+    """Compute the matching cost under one plane: 1 - the mean of the two best correlations.
 
     Parameters
     ----------
     reference : float32 (H, W).
-    warped : float32 (S, H, W), the sources as that plane would show them.
-    costs : uint8 (H, W), filled: 255 times 1 - ZNCC, at most 255; 255 where nothing is seen.
+    warped : float32 (S, H, W), the sources warped by the plane.
+    costs : uint8 (H, W), filled: 255 times 1 - ZNCC, at most 255, also where invisible.
     """
     height, width = reference.shape
     num_sources = len(warped)
@@ -116,7 +111,6 @@ def add_path(cost, grey, p1, p2, edge, dy, dx, total):
             here = after[x]
             least = _FAR
             if inside:
-                # along a row the pixel before is of this row
                 last = after[at] if dy == 0 else before[at]
                 low = least_after[at] if dy == 0 else least_before[at]
                 step = abs(grey[y, x] - grey[y - dy, at])
@@ -142,7 +136,7 @@ def add_path(cost, grey, p1, p2, edge, dy, dx, total):
 
 @compiled_loop
 def best_labels(total, labels):
-    """Fractional label (H, W) of the least total, by a parabola through it and its neighbours."""
+    """Find the fractional label (H, W) of the least total, by a parabola."""
     height, width, depth = total.shape
     for y in range(height):
         for x in range(width):
@@ -164,14 +158,14 @@ def best_labels(total, labels):
 def count_agreeing(
     inverse, other, infinity, baseline, back_infinity, back_baseline, max_px, max_share, counts
 ):
-    """Add 1 where another view's depth agrees with a pixel's own, forth and back.
+    """Count another view whose depth agrees in both directions.
 
     Parameters
     ----------
-    inverse, other : float32 (H, W) and that of the other view, inverse depth, 0 where unknown.
+    inverse, other : float32 (H, W), inverse depth of both views, 0 where unknown.
     infinity, baseline : into the other view; ``back_infinity``, ``back_baseline``: back.
-    max_px : distance at which a pixel may come back.
-    max_share : difference in depth, as a share of it.
+    max_px : largest round-trip error.
+    max_share : largest relative depth difference.
     counts : uint8 (H, W), added to.
     """
     height, width = inverse.shape
@@ -193,7 +187,7 @@ def count_agreeing(
             there = float(other[row, column])
             if there <= 0.0:
                 continue
-            # the other's depth, carried to where the pixel is seen along the tangent of 1 / depth
+            # the other's depth, extrapolated to the projection along the tangent of 1 / depth
             if 0 < column < columns - 1 and 0 < row < rows - 1:
                 left, right = other[row, column - 1], other[row, column + 1]
                 top, bottom = other[row - 1, column], other[row + 1, column]

@@ -1,7 +1,7 @@
 """Compiled loops of stereo: slanted planes, and the deviations of their depth.
 
-As :mod:`megloc_kapture.mvs.kernels`. A plane is what inverse depth is on it: ``w + wx dx + wy dy``
-at an offset in pixels, for inverse depth is linear in a pinhole's pixels.
+A plane is the inverse depth ``w + wx dx + wy dy`` at an offset in pixels, linear in a pinhole
+image.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
@@ -19,7 +19,7 @@ _FLAT = np.float32(1e-6)
 
 @compiled_loop
 def _part_score(values, weights, reach, source, u, v, ux, uy, vx, vy):
-    """Weighted ZNCC of what a source shows of a window; -2 where that is less than half of it."""
+    """Return the weighted ZNCC of a window part in a source; -2 if less than half is visible."""
     height, width = source.shape
     total, r, r2, s, s2, sr = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     k = 0
@@ -56,11 +56,7 @@ def _part_score(values, weights, reach, source, u, v, ux, uy, vx, vy):
 
 @compiled_loop
 def _plane_score(values, weights, reach, y, x, plane, source, infinity, baseline):
-    """Weighted ZNCC of a window under a plane in one source; -2 where less than half is seen.
-
-    The window is carried over by the homography's derivative at its centre: over a few pixels the
-    rest is far below what bilinear interpolation leaves.
-    """
+    """Return a window's ZNCC in one source, by a linearised homography; -2 if invisible."""
     w, wx, wy = plane[0], plane[1], plane[2]
     h = infinity
     px = h[0, 0] * x + h[0, 1] * y + h[0, 2] + baseline[0] * w
@@ -108,7 +104,7 @@ def _plane_score(values, weights, reach, y, x, plane, source, infinity, baseline
 
 @compiled_loop
 def _plane_cost(values, weights, reach, y, x, plane, sources, infinities, baselines):
-    """1 - mean of the best scores over the sources; 2 where none sees the window."""
+    """Return 1 - mean of the best scores over the sources; 2 where invisible."""
     first, second = np.float32(-2), np.float32(-2)
     for s in range(len(sources)):
         score = _plane_score(
@@ -125,11 +121,7 @@ def _plane_cost(values, weights, reach, y, x, plane, sources, infinities, baseli
 
 @compiled_loop
 def _window(reference, reach, y, x, tone, values, weights):
-    """Values and weights of a window, normalised: weights sum to 1, values have mean 0, spread 1.
-
-    Weights fall with the distance in tone (bilateral), so that a window stays on its surface; they
-    are 0 outside the image. False where the window is flat.
-    """
+    """Normalise a window with bilateral weights: mean 0, deviation 1; False if flat."""
     height, width = reference.shape
     centre = reference[y, x]
     k, total = 0, np.float32(0)
@@ -163,7 +155,6 @@ def _window(reference, reach, y, x, tone, values, weights):
 
 @compiled_loop
 def _noise(y, x, turn, k):
-    """A number in [-1, 1) that is the same for the same arguments (an integer hash)."""
     state = np.uint32(y * 73856093) ^ np.uint32(x * 19349663) ^ np.uint32(turn * 83492791 + k)
     state = np.uint32((state ^ (state >> np.uint32(16))) * np.uint32(0x7FEB352D))
     state = np.uint32((state ^ (state >> np.uint32(15))) * np.uint32(0x846CA68B))
@@ -175,18 +166,17 @@ def _noise(y, x, turn, k):
 def refine_planes(
     reference, sources, infinities, baselines, planes, costs, reach, tone, turn, step, limits
 ):
-    """One pass of PatchMatch over slanted planes (Bleyer et al., BMVC 2011), in place.
+    """Run one pass of PatchMatch over slanted planes (Bleyer et al., BMVC 2011), in place.
 
-    Rows go down on even turns and up on odd ones. A pixel tries the planes of its two neighbours
-    that were done before it, continued to it, and three changes of its own plane: at random in
-    depth, at random in slope, and both half as large.
+    Rows are traversed alternately down and up. Candidates are the planes of two previous neighbours
+    and three random changes: depth, slope, and both at half size.
 
     Parameters
     ----------
     sources : float32 (S, H, W).
     infinities, baselines : float64 (S, 3, 3) and (S, 3), see :mod:`megloc_kapture.mvs.sweep`.
     planes : float64 (H, W, 3).
-    costs : float32 (H, W); on turn 0 they are worked out first.
+    costs : float32 (H, W), computed on turn 0.
     turn : number of the pass.
     step : inverse depth, about a pixel's motion.
     limits : least and greatest inverse depth.
@@ -239,14 +229,12 @@ def refine_planes(
 def plane_deviations(
     reference, sources, infinities, baselines, planes, reach, tone, calibration, out
 ):
-    """Standard deviation of inverse depth of every pixel, from its matching.
+    """Estimate the standard deviation of every pixel's inverse depth from its matching.
 
-    A window of N pixels that correlates by rho, with gradient g and motion m per inverse depth,
-    both along the epipolar line, knows inverse depth to ``(1 - rho^2) Var / (N mean((g m)^2))``:
-    the bound of least squares. What the sources know is averaged and not added up: they share the
-    window's noise and its plane's misfit. To ``calibration[1]`` times the root is added a matching
-    error of ``calibration[0]`` pixels, over the motion. ``out``: float32 (H, W), filled; 0 where no
-    source sees the window.
+    The least-squares bound for a window of N pixels with correlation rho, gradient g and motion m
+    per inverse depth along the epipolar line is ``(1 - rho^2) Var / (N mean((g m)^2))``, averaged
+    over the sources, which share noise and misfit. A matching error of ``calibration[0]`` pixels is
+    added to ``calibration[1]`` times its root. ``out``: float32 (H, W), filled; 0 where invisible.
     """
     height, width = reference.shape
     count = (2 * reach + 1) ** 2
@@ -299,7 +287,6 @@ def plane_deviations(
                 determinant = ux * vy - uy * vx
                 if abs(determinant) < 1e-9:
                     continue
-                # the motion as the reference's own pixels see it
                 mx, my = (vy * du - uy * dv) / determinant, (ux * dv - vx * du) / determinant
                 slope = gxx * mx * mx + 2.0 * gxy * mx * my + gyy * my * my
                 noise = max(1.0 - float(rho) ** 2, 1e-3) * variance

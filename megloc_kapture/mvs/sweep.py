@@ -1,12 +1,10 @@
-"""Depth by plane sweep, semi-global matching and slanted planes; COLMAP's, judged alike.
+"""Depth by plane sweep, semi-global matching and slanted planes, or by COLMAP.
 
-The sweep needs no network and no GPU. The reference is compared with its sources under planes
-parallel to it, evenly spaced in inverse depth (Collins, CVPR 1996; Gallup et al., CVPR 2007), by
-the mean of the two best zero-mean normalised cross-correlations of small windows. Semi-global
-matching (Hirschmueller, PAMI 2008) makes a surface of it, at half the size; PatchMatch (Bleyer et
-al., BMVC 2011) tilts and sharpens it at the whole. A pixel ``p`` (homogeneous) of inverse depth
-``w`` lies in a source at
-``infinity p + w baseline``, with ``infinity = K_s R K^-1`` and ``baseline = K_s t``.
+Planes parallel to the reference (Collins, CVPR 1996; Gallup et al., CVPR 2007) are scored by the
+two best normalised cross-correlations, regularised by semi-global matching (Hirschmueller, PAMI
+2008) at half size, and refined by PatchMatch (Bleyer et al., BMVC 2011) at full size. A pixel ``p``
+(homogeneous) of inverse depth ``w`` is in a source at ``infinity p + w baseline``, with ``infinity
+= K_s R K^-1`` and ``baseline = K_s t``.
 """
 
 from __future__ import annotations
@@ -30,14 +28,14 @@ from megloc_kapture.values import Camera, Options
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-_BLOCK = 16  # planes at a time
+_BLOCK = 16
 _MIN_PLANES = 16
 _REACH = 3  # half the side of a window
-_TONE = 20.0  # of 255, at which a pixel of a window counts 1/e
-# semi-global penalties of a step of one label, of more, and the contrast that halves the latter
+_TONE = 20.0  # of 255, with pixel weight 1/e
+# semi-global penalties for one label and for more, and the contrast that halves the latter
 _P1, _P2, _EDGE = 8.0, 40.0, 20.0
 _DIRECTIONS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)]
-# matching error in pixels, and multiple of the bound of least squares: docs/experiments/mvs.md
+# matching error in pixels, and multiple of the least-squares bound: docs/experiments/mvs.md
 CALIBRATION = np.array([0.15, 2.0])
 _MAX_COST = 0.7  # 1 - ZNCC
 
@@ -57,7 +55,7 @@ class SweepOptions(Options):
 
 
 class Sweep:
-    """Plane sweep at half the size, semi-global matching, slanted planes at the whole size."""
+    """Plane sweep at half size, semi-global matching, slanted planes at full size."""
 
     name = "sweep"
     Options = SweepOptions
@@ -71,7 +69,6 @@ class Sweep:
         sources: Sequence[StereoView],
         depth_range_m: tuple[float, float],
     ) -> DepthEstimate:
-        """Depth of the reference; see :class:`~megloc_kapture.plugins.DepthEstimator`."""
         near, far = depth_range_m
         limits = np.array([1.0 / far, 1.0 / near])
         half = [_halved(view) for view in (reference, *sources)]
@@ -79,16 +76,13 @@ class Sweep:
         size = reference.camera.width, reference.camera.height
         planes = tangent_planes(cv2.resize(inverse, size, interpolation=cv2.INTER_LINEAR))
         deviations = refine(reference, sources, planes, limits, 0.5 * step, self.options.passes)
-        # what lies at the far end may lie beyond it: the sky
+        # depth at the far limit may be beyond it, as the sky
         deviations[planes[..., 0] <= limits[0] + 0.5 * step] = 0.0
         return as_estimate(reference.camera, planes, deviations)
 
 
 class ColmapStereo:
-    """COLMAP's own PatchMatch (Schoenberger et al., ECCV 2016), where pycolmap has CUDA.
-
-    Deviations are as of the sweep, by the matching of its planes.
-    """
+    """COLMAP's PatchMatch (Schoenberger et al., ECCV 2016), for pycolmap with CUDA."""
 
     name = "colmap"
 
@@ -107,7 +101,6 @@ class ColmapStereo:
         sources: Sequence[StereoView],
         depth_range_m: tuple[float, float],
     ) -> DepthEstimate:
-        """Depth of the reference; see :class:`~megloc_kapture.plugins.DepthEstimator`."""
         from megloc_kapture.io.colmap import MapImage
         from megloc_kapture.io.colmap_mapping import (
             map_path,
@@ -138,7 +131,7 @@ class ColmapStereo:
 
 
 def as_estimate(camera: Camera, planes: Floats, deviations: NDArray[np.floating]) -> DepthEstimate:
-    """Depth, its deviation and normals of planes (H, W, 3), where deviations (H, W) are not 0."""
+    """Convert planes (H, W, 3) to depth, deviation and normals where deviations are not 0."""
     known = deviations > 0
     inverse = np.where(known, planes[..., 0], 1.0)
     depth = np.where(known, 1.0 / inverse, 0.0)
@@ -153,7 +146,7 @@ def as_estimate(camera: Camera, planes: Floats, deviations: NDArray[np.floating]
 
 
 def planes_of(camera: Camera, depth_m: NDArray[Any], normals: NDArray[Any]) -> Floats:
-    """Planes float64 (H, W, 3) of depth (H, W) and normals (H, W, 3); undoes ``as_estimate``."""
+    """Convert depth (H, W) and normals (H, W, 3) to planes float64 (H, W, 3)."""
     matrix = pinhole_matrix(camera)
     y, x = np.mgrid[: depth_m.shape[0], : depth_m.shape[1]]
     covector = normals.astype(np.float64) @ np.linalg.inv(matrix)
@@ -166,7 +159,7 @@ def planes_of(camera: Camera, depth_m: NDArray[Any], normals: NDArray[Any]) -> F
 
 
 def stereo_image(view: StereoView) -> Image:
-    """Grey float32 (H, W) around 0; NaN where the mask says so."""
+    """Return grey float32 (H, W) around 0; NaN where masked."""
     grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     grey -= np.float32(grey.mean(dtype=np.float64))
     if view.mask is not None:
@@ -186,7 +179,7 @@ def _halved(view: StereoView) -> StereoView:
 def sweep(
     reference: StereoView, sources: Sequence[StereoView], limits: Floats, max_planes: int
 ) -> tuple[Image, float]:
-    """Inverse depth float32 (H, W) between limits (far, near), and the step between planes."""
+    """Return inverse depth float32 (H, W) between limits (far, near), and the plane step."""
     projections = [relative_projection(reference, source) for source in sources]
     step = pixel_step(projections, reference.camera, limits)
     wanted = int(np.ceil((limits[1] - limits[0]) / step)) + 1
@@ -200,7 +193,7 @@ def sweep(
 def cost_volume(
     reference: Image, sources: Sequence[Image], projections: Projections, inverse_depths: Floats
 ) -> NDArray[np.uint8]:
-    """Matching cost uint8 (H, W, D) under planes of inverse depths (D,); see ``correlate``."""
+    """Return matching cost uint8 (H, W, D) for inverse depths (D,); see ``correlate``."""
     from megloc_kapture.mvs.kernels import correlate
 
     height, width = reference.shape
@@ -225,7 +218,7 @@ def cost_volume(
 
 
 def semi_global(volume: NDArray[np.uint8], grey: Image) -> Floats:
-    """Fractional labels float64 (H, W) of the least sum of the path costs of eight directions."""
+    """Find fractional labels float64 (H, W) of the least path costs in eight directions."""
     from megloc_kapture.mvs.kernels import add_path, best_labels
 
     total = np.zeros(volume.shape, np.uint16)
@@ -238,7 +231,7 @@ def semi_global(volume: NDArray[np.uint8], grey: Image) -> Floats:
 
 
 def tangent_planes(inverse: NDArray[Any]) -> Floats:
-    """Planes float64 (H, W, 3) of inverse depth (H, W): its value, and its slopes when smoothed."""
+    """Return planes float64 (H, W, 3) of inverse depth (H, W), with smoothed slopes."""
     smooth = cv2.GaussianBlur(cv2.medianBlur(inverse, 5), (0, 0), 2)
     slopes = [cv2.Scharr(smooth, cv2.CV_32F, *axis) / 32 for axis in ((1, 0), (0, 1))]
     return np.stack([inverse, *slopes], axis=-1).astype(np.float64)
@@ -252,10 +245,7 @@ def refine(
     step: float,
     passes: int,
 ) -> Image:
-    """Move planes (H, W, 3), in place, to where they match best, by so many passes.
-
-    Returns float32 (H, W), the standard deviation of inverse depth; 0 where nothing matches.
-    """
+    """Refine planes (H, W, 3) in place; return float32 deviations (H, W), 0 without a match."""
     from megloc_kapture.mvs.plane_kernels import refine_planes
 
     grey = stereo_image(reference)
@@ -271,10 +261,7 @@ def refine(
 def matching_deviations(
     reference: StereoView, sources: Sequence[StereoView], planes: Floats, calibration: Floats
 ) -> Image:
-    """Standard deviation (H, W) of the inverse depth of planes, by how they match.
-
-    0 where nothing matches; ``calibration``: see ``plane_deviations`` of the kernels.
-    """
+    """Return deviations (H, W) of the planes' inverse depth by matching; 0 without a match."""
     from megloc_kapture.mvs.plane_kernels import plane_deviations
 
     grey = stereo_image(reference)
@@ -285,14 +272,12 @@ def matching_deviations(
 
 
 def _compared(reference: StereoView, sources: Sequence[StereoView]) -> tuple[Image, Floats, Floats]:
-    """Sources as the kernels take them: images (S, H, W), ``infinity`` and ``baseline`` of each."""
     projections = [relative_projection(reference, source) for source in sources]
     infinities, baselines = (np.array(each) for each in zip(*projections, strict=True))
     return _stacked([stereo_image(source) for source in sources]), infinities, baselines
 
 
 def _stacked(images: Sequence[Image]) -> Image:
-    """Images of any sizes as one array (S, H, W), NaN beyond each."""
     height, width = np.max([image.shape for image in images], axis=0)
     stacked = np.full((len(images), height, width), np.nan, np.float32)
     for image, place in zip(images, stacked, strict=True):

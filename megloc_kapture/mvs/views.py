@@ -1,4 +1,4 @@
-"""Views for stereo: images without distortion, which go together, and depth that they confirm."""
+"""Views for stereo: undistortion, choice of sources, and consistency of depth."""
 
 from __future__ import annotations
 
@@ -23,29 +23,27 @@ from megloc_kapture.values import Camera, Options, RigidTransform
 Floats = NDArray[np.float64]
 Projections = Sequence[tuple[Floats, Floats]]
 
-# angles between two rays to a point, degrees: below the first depth is weak, beyond the second
-# surfaces look different; after Schoenberger et al., ECCV 2016, section 4.1, and MVSNet
+# triangulation angles, degrees: depth is weak below, surfaces look different above; after
+# Schoenberger et al., ECCV 2016, section 4.1, and MVSNet
 _BEST_ANGLES_DEG = (5.0, 20.0)
 _WIDENED = (0.8, 1.25)
-_MIN_REGION_PX = 40  # smaller islands of one surface are chance agreements
+_MIN_REGION_PX = 40  # smaller islands are chance agreements
 
 
 def stereo_camera(camera: Camera, max_size_px: int) -> Camera:
-    """The PINHOLE camera of the undistorted image whose longer side is at most ``max_size_px``."""
     if camera.model not in PINHOLE_MODELS:
         camera = undistorted_pinhole(camera)
     return replace(reduced_camera(with_two_focals(camera), max_size_px), focal_deviation=0.0)
 
 
 def pinhole_matrix(camera: Camera) -> Floats:
-    """K (3, 3) of a PINHOLE camera for array coordinates: the first pixel's centre at (0, 0)."""
+    """Return K (3, 3) of a PINHOLE camera with the first pixel's centre at (0, 0)."""
     fx, fy, cx, cy = camera.params
     return np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
 
 
 def relative_projection(reference: StereoView, source: StereoView) -> tuple[Floats, Floats]:
-    """``infinity`` (3, 3) and ``baseline`` (3,): a pixel p of inverse depth w lies in the source
-    at ``infinity p + w baseline``, in array coordinates."""
+    """Return ``infinity`` (3, 3) and ``baseline`` (3,) of :mod:`megloc_kapture.mvs.sweep`."""
     source_from_reference = source.cam_from_world @ reference.cam_from_world.inverse()
     k, k_source = pinhole_matrix(reference.camera), pinhole_matrix(source.camera)
     infinity = k_source @ source_from_reference.rotation_matrix() @ np.linalg.inv(k)
@@ -53,9 +51,9 @@ def relative_projection(reference: StereoView, source: StereoView) -> tuple[Floa
 
 
 def pixel_step(projections: Projections, camera: Camera, limits: Floats) -> float:
-    """Difference of inverse depth that moves a pixel by one in the source where it moves most.
+    """Return the inverse depth step that moves a pixel by one in the most sensitive source.
 
-    The mean between the limits (far, near), of the median over the image; ``projections``: see
+    The median over the image, averaged over the limits (far, near); ``projections``: see
     :func:`relative_projection`.
     """
     x, y = np.meshgrid(*(np.linspace(0.1, 0.9, 5) * n for n in (camera.width, camera.height)))
@@ -78,11 +76,7 @@ def stereo_view(
     mask: NDArray[np.bool_] | None,
     max_size_px: int,
 ) -> StereoView:
-    """An image, its distortion undone, as stereo takes it.
-
-    ``image`` and ``camera``: uint8 (H, W, 3), RGB; any of COLMAP's models; ``mask``: bool (H, W),
-    True = use; None without one.
-    """
+    """Undistort an image for stereo; mask bool (H, W), True = use."""
     pinhole = stereo_camera(camera, max_size_px)
     size = pinhole.width, pinhole.height
     if camera.model in PINHOLE_MODELS:
@@ -92,7 +86,7 @@ def stereo_view(
         if mask is not None:
             mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
         return StereoView(small, pinhole, cam_from_world, mask)
-    # reduced first, so that nothing is aliased
+    # reduced first, against aliasing
     lens = reduced_camera(camera, max(size))
     x, y = _undistortion(lens, pinhole)
     reduced = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
@@ -105,7 +99,7 @@ def stereo_view(
 
 
 def _undistortion(lens: Camera, pinhole: Camera) -> tuple[NDArray[np.float32], ...]:
-    """Array coordinates float32 (H, W) in the lens' image, x and y, of a pinhole's pixels."""
+    """Return distorted array coordinates x and y, float32 (H, W), of a pinhole's pixels."""
     fx, fy, cx, cy = pinhole.params
     u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
     rays = np.stack([(u.ravel() - cx) / fx, (v.ravel() - cy) / fy, np.ones(u.size)], axis=1)
@@ -122,18 +116,17 @@ def choose_sources(
     centers: Floats,
     count: int,
 ) -> list[int]:
-    """The images that tell most of an image's depth, best first: by shared points and angles.
+    """Choose sources for an image, best first, by shared points and angles.
 
-    A shared point counts by the angle between the two rays to it: fully within 5 to 20 degrees,
-    less by the square of the ratio outside.
+    A shared point has weight 1 at 5 to 20 degrees, decreasing with the squared ratio outside.
 
     Parameters
     ----------
-    candidates : bool (I,), images that may serve.
-    points_of : rows of ``xyz`` that each image observes.
+    candidates : bool (I,), allowed images.
+    points_of : rows of ``xyz`` observed per image.
     images_of : first observation of each point (N + 1,), and the images (O,) in that order.
     centers : float64 (I, 3), of the cameras.
-    count : at most so many.
+    count : at most.
     """
     starts, images = images_of
     points = points_of[image]
@@ -154,10 +147,7 @@ def choose_sources(
 
 
 def depth_range(depths: Floats) -> tuple[float, float] | None:
-    """Nearest and farthest depth to look at, from those of sparse points (N,); None: too few.
-
-    The 1st and the 99th percentile, the range widened to 0.8 and 1.25 of them.
-    """
+    """Return the depth range of sparse points (N,), widened 1st and 99th percentiles, or None."""
     depths = depths[depths > 0]
     if len(depths) < 8:
         return None
@@ -166,8 +156,6 @@ def depth_range(depths: Floats) -> tuple[float, float] | None:
 
 
 class AgreementOptions(Options):
-    """Options of the consistency between views."""
-
     min_views: int = Field(
         default=1, ge=0, description="other views whose depth agrees, for a pixel to keep its own"
     )
@@ -191,11 +179,7 @@ def agreeing_views(
     others: Sequence[tuple[StereoView, NDArray[np.float32]]],
     options: AgreementOptions,
 ) -> NDArray[np.uint8]:
-    """Number of other views (H, W) whose depth agrees with a view's own, forth and back.
-
-    ``others`` have depth float32 (H, W), 0 where unknown; of a view only the camera and the pose
-    count.
-    """
+    """Count other views (H, W) whose depth agrees in both directions."""
     from megloc_kapture.mvs.kernels import count_agreeing
 
     counts = np.zeros(depth_m.shape, np.uint8)
@@ -214,11 +198,7 @@ def with_pose_errors(
     depth_range_m: tuple[float, float],
     error_px: float,
 ) -> DepthEstimate:
-    """An estimate whose deviations also cover the errors of the poses of a view and its sources.
-
-    ``error_px`` is the standard deviation of where the poses put a point in a source, along an
-    axis.
-    """
+    """Add the effect of pose errors, ``error_px`` along an axis, to an estimate's deviations."""
     limits = 1.0 / np.array(depth_range_m)[::-1]
     paths = [relative_projection(view, source) for source in sources]
     # any of the sources may have decided
@@ -233,14 +213,14 @@ def confirmed(
     others: Sequence[tuple[StereoView, NDArray[np.float32]]],
     options: AgreementOptions,
 ) -> DepthEstimate:
-    """What of an estimate other views confirm, that is sure enough, not masked, and no island."""
+    """Keep depths that are confirmed by other views, certain, unmasked and no island."""
     counts = agreeing_views(view, estimate.depth_m, others, options)
     known = (estimate.depth_m > 0) & (counts >= options.min_views)
     known &= estimate.sigma_m <= options.max_relative_sigma * estimate.depth_m
     if view.mask is not None:
         known &= view.mask
     if known.any():
-        # depths that differ by less than a hundredth are of one surface
+        # depths within a hundredth are one surface
         logs = np.log(estimate.depth_m, out=np.zeros(known.shape), where=known)
         levels = np.where(known, 1 + 1000 * (logs - logs[known].min()), 0)
         levels = np.clip(levels, 0, 32767).astype(np.int16)

@@ -1,18 +1,14 @@
 """DELG's global branch (Cao et al., ECCV 2020): a ResNet, generalized-mean pooling and a layer.
 
-Two forms of its ResNet exist in TensorFlow; convolutions with a bias tell the first:
+Its ResNet has two forms in TensorFlow; convolutions with bias identify the first::
 
-    keras   the authors' public training code: strides on the first 1x1 convolution of a stage and
-            its shortcut, convolutions with bias, epsilon 1e-3, margins as TensorFlow's SAME, a
-            maximum pooling without margin (VALID)
-    slim    TF-Slim's resnet_v1: strides on the 3x3 convolution of a stage's last block, of all
-            stages but the last, convolutions without bias, epsilon 1e-5, margins of half a kernel,
-            a maximum pooling padded as SAME
+    keras   the authors' training code: strides on the first 1x1 convolution of a stage and its
+            shortcut, bias, epsilon 1e-3, padding SAME, a maximum pooling without padding (VALID)
+    slim    TF-Slim's resnet_v1: strides on the 3x3 convolution of a stage's last block except in
+            the last stage, no bias, epsilon 1e-5, padding by half a kernel, pooling SAME
 
-Both have stride 32 and 2048 channels at the end. What the training code calls ``block3_strides``
-moves a stride from two 1x1 convolutions to a subsampling before them and changes nothing here.
-The module's keys are those of torchvision's ResNet, and ``embedding`` for the last layer;
-``scripts/convert_weights.py`` knows the names of TensorFlow's variables.
+Both have stride 32 and 2048 channels. The keys are torchvision's, see
+``scripts/convert_weights.py``.
 """
 
 from __future__ import annotations
@@ -41,14 +37,12 @@ from megloc_kapture.nets.trunks import (
 
 Form = Literal["keras", "slim"]
 DESCRIPTOR_SIZE = 2048
-_POWER = 3.0  # section 3.2 of the paper: fixed
+_POWER = 3.0  # fixed in section 3.2 of the paper
 _EPSILONS: dict[Form, float] = {"keras": 1e-3, "slim": 1e-5}
-_LEAST_PX = 5  # a smaller side leaves the pooling without margin nothing
+_LEAST_PX = 5  # smaller sides vanish in the unpadded pooling
 
 
 class DelgNet(nn.Module):
-    """Image to a vector at one scale; :func:`describe` joins several."""
-
     def __init__(self, depth: Depth, form: Form) -> None:
         super().__init__()
         self.form = form
@@ -58,7 +52,6 @@ class DelgNet(nn.Module):
         bottleneck = partial(Bottleneck, strided_first=keras, bias=keras, epsilon=epsilon)
         channels, blocks_of = 64, RESNET_BLOCKS[depth]
         for stage, (width, blocks) in enumerate(zip(RESNET_WIDTHS, blocks_of, strict=True), 1):
-            # a stage and the block of it that has the stride
             strided = (stage > 1, 0) if keras else (stage < 4, blocks - 1)
             layers = nn.Sequential()
             for block in range(blocks):
@@ -69,11 +62,10 @@ class DelgNet(nn.Module):
         self.embedding = nn.Linear(channels, DESCRIPTOR_SIZE)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Vectors (B, 2048), of any length, of RGB images (B, 3, H, W) in [-1, 1]."""
+        """Compute vectors (B, 2048), not normalised, of RGB images (B, 3, H, W) in [-1, 1]."""
         for number in range(1, 5):
             layer = self.get_submodule(f"layer{number}")
             image = layer(self._stem(image) if number == 1 else image)
-        # in half precision the convolutions alone
         with torch.autocast(image.device.type, enabled=False):
             return self.embedding(generalized_mean(image, _POWER))
 
@@ -85,22 +77,22 @@ class DelgNet(nn.Module):
             x = functional.conv2d(image, weight, bias, 2, padding=3)
         x = functional.relu(self.bn1(x), inplace=True)
         if self.form == "slim":
-            # SAME: one margin less on the left and at the top where a side is even
+            # SAME: one column or row less on the left and at the top of an even side
             height, width = x.shape[-2:]
-            x = functional.pad(x, (width % 2, 1, height % 2, 1))  # 0 is the least after a ReLU
+            x = functional.pad(x, (width % 2, 1, height % 2, 1))  # 0 is the minimum after a ReLU
         return functional.max_pool2d(x, 3, stride=2)
 
 
 def describe(net: DelgNet, image: torch.Tensor, scales: Sequence[float]) -> torch.Tensor:
-    """Unit vectors, float32 (B, 2048): the sum of those at several scales (section 4.1).
+    """Sum the vectors of several scales (section 4.1) to unit vectors, float32 (B, 2048).
 
-    ``image`` is RGB (B, 3, H, W) in 0 to 255; at each scale it is resized bilinearly, without
-    smoothing, to sides rounded to whole pixels, halves to even ones.
+    ``image`` is RGB (B, 3, H, W) in 0 to 255, resized bilinearly without smoothing; sides are
+    rounded half to even.
     """
     normalised = (image - 128.0) / 128.0
     total = image.new_zeros(len(image), DESCRIPTOR_SIZE)
     for scale in scales:
-        # in the precision of TensorFlow's own product, on which a half can depend
+        # in TensorFlow's precision, which can decide the rounding of a half
         sides = [round(float(np.float32(n) * np.float32(scale))) for n in image.shape[-2:]]
         if min(sides) < _LEAST_PX:
             raise DataError(
@@ -115,7 +107,6 @@ def describe(net: DelgNet, image: torch.Tensor, scales: Sequence[float]) -> torc
 
 
 def delg_from(tensors: Mapping[str, torch.Tensor], where: str) -> DelgNet:
-    """Build the network from a converted checkpoint, ready for inference."""
     blocks = {key.split(".")[1] for key in tensors if key.startswith("layer3.")}
     if len(blocks) not in RESNET_DEPTHS:
         raise DataError(

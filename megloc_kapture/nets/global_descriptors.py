@@ -1,11 +1,9 @@
 """Global descriptors of convolutional trunks: NetVLAD, OpenIBL and AP-GeM.
 
-NetVLAD (Arandjelovic et al., CVPR 2016) and OpenIBL (Ge et al., ECCV 2020) are one network on
-VGG-16, trained in two ways. Both end in a whitening that is part of the weights; they differ in the
-order of its inputs and in the colour that is subtracted. AP-GeM (Revaud et al., ICCV 2019) is a
-ResNet, generalized-mean pooling with a learnt power, and a linear layer. All have the keys of the
-authors' checkpoints; ``scripts/convert_weights.py`` adds what AP-GeM's and NetVLAD's hold beside
-them under names of our own.
+NetVLAD (Arandjelovic et al., CVPR 2016) and OpenIBL (Ge et al., ECCV 2020) share a network on
+VGG-16 with whitening; the order of its inputs and the mean colour differ. AP-GeM (Revaud et al.,
+ICCV 2019) is a ResNet with generalized-mean pooling and a linear layer. Keys are those of the
+authors' checkpoints, with additions by ``scripts/convert_weights.py``.
 """
 
 from __future__ import annotations
@@ -31,29 +29,29 @@ from megloc_kapture.nets.trunks import (
 
 Order = Literal["dk", "kd"]
 
-STRIDE_PX = 16  # of the trunk: an image must have as many pixels a side
-_CONV5_3 = 28  # the last layer that is used, without its ReLU: features have either sign
+STRIDE_PX = 16  # of the trunk, and the least image side
+_CONV5_3 = 28  # the last layer, without its ReLU: features have either sign
 _CHANNELS = 512
-_NUM_CLUSTERS, _OUTPUT_SIZE = 64, 4096  # of all published weights
-# in converted files of NetVLAD's authors only; OpenIBL's have no such key
+_NUM_CLUSTERS, _OUTPUT_SIZE = 64, 4096
+# only in converted files of NetVLAD's authors
 _AVERAGE_IMAGE = "average_image"
-# 255 times the mean that OpenIBL subtracts of colours in [0, 1], before it divides by 1 / 255
+# 255 times OpenIBL's mean for colours in [0, 1]
 _OPENIBL_MEAN_RGB = (123.68, 116.779, 103.939)
-DESCRIPTOR_SIZE = 2048  # of AP-GeM, and the channels of a ResNet
-# what a checkpoint may hold beside the state dict; the names of scikit-learn's attributes
+DESCRIPTOR_SIZE = 2048
+# optional whitening in a checkpoint, under scikit-learn's names
 PCA_PARTS = ("mean", "components", "explained_variance", "whiten")
 
 
 class NetVladLayer(nn.Module):
-    """NetVLAD's layer: sums of differences to centres, by soft assignment.
+    """NetVLAD's layer: residuals to centres, summed by soft assignment.
 
-    With unit features x_i, assignment weights w_k and centres c_k (equations 3 and 4, without the
-    bias, which the published weights have not)::
+    With unit features x_i, assignment weights w_k and centres c_k (equations 3 and 4 without
+    bias)::
 
         V(d, k) = sum_i a_k(x_i) (x_i(d) - c_k(d)),   a_k(x) = exp(w_k . x) / sum_k' exp(w_k' . x)
 
-    Each cluster's sum is brought to unit length, then the whole vector. ``order`` says how V
-    becomes one: "dk": clusters run fastest, as in MATLAB's code; "kd": features, as in OpenIBL's.
+    Each cluster is normalised, then the whole vector. ``order`` "dk": clusters run fastest, as in
+    MATLAB's code; "kd": features, as in OpenIBL's.
     """
 
     def __init__(self, num_clusters: int, size: int, *, order: Order) -> None:
@@ -63,10 +61,10 @@ class NetVladLayer(nn.Module):
         self.centroids = nn.Parameter(torch.rand(num_clusters, size))
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """Vectors (B, K D) of unit length, of features (B, D, h, w) of any length but zero."""
+        """Aggregate non-zero features (B, D, h, w) to unit vectors (B, K D)."""
         unit = functional.normalize(features, dim=1)
         weights = self.conv(unit).flatten(2).softmax(dim=1)
-        # the sum of the differences, without a (B, K, D, h w) array of them
+        # avoids the (B, K, D, h w) array of residuals
         sums = weights @ unit.flatten(2).mT
         residuals = sums - weights.sum(dim=2)[:, :, None] * self.centroids
         residuals = functional.normalize(residuals, dim=2)
@@ -76,11 +74,7 @@ class NetVladLayer(nn.Module):
 
 
 class VggNetVlad(nn.Module):
-    """VGG-16 to conv5_3, NetVLAD's layer, and whitening; keys are those of OpenIBL.
-
-    ``order``: of the whitening's inputs, see :class:`NetVladLayer`; ``mean_rgb``: colour of 0 to
-    255 that is subtracted of every pixel.
-    """
+    """VGG-16 to conv5_3, NetVLAD's layer (``order``) and whitening, with OpenIBL's keys."""
 
     def __init__(
         self,
@@ -97,19 +91,17 @@ class VggNetVlad(nn.Module):
         self.pca_layer = nn.Conv2d(num_clusters * _CHANNELS, output_size, 1)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Vectors (B, output size) of unit length, of RGB images (B, 3, H, W) in [0, 1]."""
+        """Return unit vectors (B, output size) of RGB images (B, 3, H, W) in [0, 1]."""
         return self.vectors(self.features(image))
 
     def features(self, image: torch.Tensor) -> torch.Tensor:
-        """Features (B, 512, H // 16, W // 16) of RGB images (B, 3, H, W) in [0, 1]."""
+        """Return features (B, 512, H // 16, W // 16) of RGB images (B, 3, H, W) in [0, 1]."""
         mean = image.new_tensor(self.mean_rgb)[:, None, None]
         found: torch.Tensor = self.base_model["base"](255.0 * image - mean)
         return found
 
     def vectors(self, features: torch.Tensor) -> torch.Tensor:
-        """Vectors (B, output size) of unit length, of what :meth:`features` found."""
-        # as a product, not as the convolution the weights are stored for, which would first
-        # bring half a gigabyte of them into another order
+        # a convolution would first reorder half a gigabyte of weights
         weight = self.pca_layer.weight.flatten(1)
         return functional.normalize(
             functional.linear(self.net_vlad(features), weight, self.pca_layer.bias), dim=1
@@ -117,7 +109,6 @@ class VggNetVlad(nn.Module):
 
 
 def netvlad(tensors: Mapping[str, torch.Tensor], where: str) -> VggNetVlad:
-    """The network of weights of NetVLAD's authors, as they are read out of MATLAB's file."""
     if _AVERAGE_IMAGE not in tensors:
         raise DataError(
             f"no weights of NetVLAD's authors: no {_AVERAGE_IMAGE} in it (OpenIBL's are for "
@@ -133,7 +124,6 @@ def netvlad(tensors: Mapping[str, torch.Tensor], where: str) -> VggNetVlad:
 
 
 def openibl(tensors: Mapping[str, torch.Tensor], where: str) -> VggNetVlad:
-    """The network of weights of OpenIBL; raises DataError as :func:`netvlad`."""
     if _AVERAGE_IMAGE in tensors:
         raise DataError(
             "weights of NetVLAD's authors, which are for the plugin netvlad, not OpenIBL's",
@@ -148,7 +138,7 @@ def _filled(
     order: Order,
     mean_rgb: tuple[float, float, float],
 ) -> VggNetVlad:
-    # nothing is drawn at random: half a gigabyte of numbers would be thrown away
+    # no random initialisation of half a gigabyte
     with torch.device("meta"):
         module = VggNetVlad(
             order=order,
@@ -161,13 +151,10 @@ def _filled(
 
 
 def _length(tensors: Mapping[str, torch.Tensor], key: str, default: int) -> int:
-    """Length of a tensor's first axis; the usual one where the weights will be refused anyway."""
     return tensors[key].shape[0] if key in tensors and tensors[key].ndim else default
 
 
 class GeneralizedMean(nn.Module):
-    """Generalized-mean pooling with a learnt power."""
-
     def __init__(self) -> None:
         super().__init__()
         self.p = nn.Parameter(torch.full((1,), 3.0))
@@ -177,10 +164,10 @@ class GeneralizedMean(nn.Module):
 
 
 class ApGemNet(ResNet):
-    """Image to a vector of unit length; 46,696,513 weights at depth 101.
+    """Network from image to unit vector, AP-GeM.
 
-    ``mean`` and ``deviation``: of the images it was trained on, RGB in [0, 1];
-    ``normalised_features``: scale pooled features to unit length before the last layer.
+    ``mean`` and ``deviation``: of the training images, RGB in [0, 1]; ``normalised_features``:
+    normalise pooled features before the last layer.
     """
 
     mean: torch.Tensor
@@ -202,9 +189,8 @@ class ApGemNet(ResNet):
             self.register_buffer(name, torch.tensor(list(values)).view(3, 1, 1), persistent=False)
 
     def describe(self, image: torch.Tensor) -> torch.Tensor:
-        """Unit vectors, float32 (B, 2048), of RGB images (B, 3, H, W) in [0, 1]."""
+        """Return unit vectors, float32 (B, 2048), of RGB images (B, 3, H, W) in [0, 1]."""
         features = self((image - self.mean) / self.deviation)[-1]
-        # in half precision the convolutions alone
         with torch.autocast(image.device.type, enabled=False):
             pooled = self.adpool(features)
             if self.normalised_features:
@@ -213,11 +199,10 @@ class ApGemNet(ResNet):
 
 
 class Whitening(nn.Module):
-    """Principal components, each scaled by a power of its variance, then unit length.
+    """PCA whitening by a power of the variance, then unit length.
 
-    Equal to scikit-learn's whitening at ``power`` 0.5; the authors evaluate at 0.25, and 0 keeps
-    the components' scales. ``mean`` (D,), ``components`` (K, D) and ``variance`` (K,) are of the
-    principal component analysis.
+    ``power`` 0.5 is scikit-learn's whitening, 0.25 the authors', 0 none. ``mean`` (D,),
+    ``components`` (K, D) and ``variance`` (K,) are of the PCA.
     """
 
     mean: torch.Tensor
@@ -232,15 +217,12 @@ class Whitening(nn.Module):
         self.register_buffer("weight", (scale[:, None] * components.double()).float())
 
     def forward(self, vectors: torch.Tensor) -> torch.Tensor:
-        """Whitened vectors of unit length, float32 (B, K), of vectors (B, D)."""
+        """Whiten vectors (B, D): unit length, float32 (B, K)."""
         return functional.normalize(functional.linear(vectors.float() - self.mean, self.weight))
 
 
 def apgem_from(tensors: Mapping[str, torch.Tensor], where: str) -> ApGemNet:
-    """The network of a checkpoint's tensors, ready for inference.
-
-    ``tensors`` are as ``scripts/convert_weights.py`` writes them.
-    """
+    """Build the network from the tensors of ``scripts/convert_weights.py``, for inference."""
     beside = ("preprocess.", "model_options.", "pca.")
     state = {key: value for key, value in tensors.items() if not key.startswith(beside)}
     blocks = {key.split(".")[1] for key in state if key.startswith("layer3.")}
@@ -261,7 +243,6 @@ def apgem_from(tensors: Mapping[str, torch.Tensor], where: str) -> ApGemNet:
 def whitening_from(
     tensors: Mapping[str, torch.Tensor], name: str, where: str, *, power: float
 ) -> Whitening:
-    """The whitening that a checkpoint keeps under a name."""
     known = sorted({key.split(".")[1] for key in tensors if key.startswith("pca.")})
     if name not in known:
         raise OptionError(

@@ -1,7 +1,6 @@
-"""Networks of kornia, filled from local weight files: XFeat, DISK, LightGlue and LighterGlue.
+"""Networks of kornia with local weight files: XFeat, DISK, LightGlue and LighterGlue.
 
-kornia's own ``from_pretrained`` downloads, so it is never called: each module is built without
-weights and loaded strictly.
+kornia's ``from_pretrained`` downloads, so each module is built without weights and loaded strictly.
 """
 
 from __future__ import annotations
@@ -22,13 +21,12 @@ from megloc_kapture.nets.runtime import batch_counters, load_strictly
 
 Tensors = Mapping[str, torch.Tensor]
 _BLOCK = re.compile(r"^(self_attn|cross_attn)\.(\d+)\.")
-# the authors' file of LighterGlue has the matcher, and the XFeat it was trained with
+# the authors' file of LighterGlue also contains its XFeat
 _MATCHER, _EXTRACTOR = "matcher.", "extractor.model.net."
 _building = Lock()
 
 
 def require_kornia(what: str) -> None:
-    """Raise OptionError where kornia is not installed."""
     if importlib.util.find_spec("kornia") is None:
         raise OptionError(f"{what} needs kornia: pip install 'megloc-kapture[kornia]'")
 
@@ -43,10 +41,7 @@ def load_xfeat(tensors: Tensors, where: str) -> nn.Module:
 
 
 def xfeat_descriptors(network: Any, images: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
-    """Describe keypoints (N, 2) of an image (1, 3, H, W) by XFeat: unit vectors (N, 64).
-
-    The keypoints are kornia's: pixels of the resized image times the ratio of the sizes.
-    """
+    """Describe kornia's keypoints (N, 2) of an image (1, 3, H, W): unit vectors (N, 64)."""
     resized, *ratio_yx = network._preprocess_tensor(images)
     dense = functional.normalize(network.net(resized)[0], dim=1)
     places = xy / xy.new_tensor(ratio_yx[::-1])
@@ -61,7 +56,7 @@ def load_disk(tensors: Tensors, where: str) -> nn.Module:
 
 
 def load_lighterglue(tensors: Tensors, where: str, *options: Any) -> nn.Module:
-    """Build LighterGlue, the LightGlue of XFeat, from the authors' ``xfeat-lighterglue.pt``."""
+    """Build LighterGlue, XFeat's LightGlue, from the authors' ``xfeat-lighterglue.pt``."""
     named = {
         key.removeprefix(_MATCHER): value
         for key, value in tensors.items()
@@ -83,9 +78,8 @@ def load_lightglue(
 ) -> nn.Module:
     """Build LightGlue (Lindenberger et al., ICCV 2023) from one of the authors' files.
 
-    The number of layers and the size of the descriptors are the checkpoint's. What only early
-    stopping (``depth_confidence``) and pruning (``width_confidence``) use may be absent where both
-    are off (-1). In half precision positions and the assignment stay in float32.
+    Layers for early stopping (``depth_confidence``) and pruning (``width_confidence``) may be
+    missing if both are off (-1). Half precision excludes positions and assignment.
     """
     tensors = {_BLOCK.sub(r"transformers.\2.\1.", key): value for key, value in tensors.items()}
     layers = {int(key.split(".")[1]) for key in tensors if key.startswith("transformers.")}
@@ -93,7 +87,7 @@ def load_lightglue(
         raise DataError("this file does not fit LightGlue: it has no layers", path=where)
     projection = tensors.get("input_proj.weight")
     with _building:
-        # kornia's attention sets it for the whole process
+        # kornia's attention changes it for the whole process
         flash = torch.backends.cuda.flash_sdp_enabled()  # type: ignore[no-untyped-call]
         try:
             network = _features().LightGlue(

@@ -1,5 +1,4 @@
-"""LPIPS 0.1: a learned distance of two images (Zhang et al., "The Unreasonable Effectiveness of
-Deep Features as a Perceptual Metric", CVPR 2018, eq. 1), over those of their pixels that count."""
+"""LPIPS 0.1 (Zhang et al., CVPR 2018, eq. 1): a learned image distance, over valid pixels."""
 
 from __future__ import annotations
 
@@ -17,11 +16,7 @@ Trunk = Literal["alex", "vgg", "squeeze"]
 
 
 class AlexNetFeatures(nn.Sequential):
-    """AlexNet up to the ReLU of its fifth convolution, layer 11 of torchvision's ``features``.
-
-    Krizhevsky, "One weird trick for parallelizing convolutional neural networks", arXiv 1404.5997,
-    one tower. Takes (B, 3, H, W), at least 63 x 63 pixels.
-    """
+    """AlexNet (Krizhevsky, arXiv 1404.5997) up to layer 11 of torchvision's ``features``."""
 
     def __init__(self) -> None:
         layers = [
@@ -34,7 +29,7 @@ class AlexNetFeatures(nn.Sequential):
 
 
 class Fire(nn.Module):
-    """A fire module: 1x1 convolutions to few channels, then 1x1 and 3x3 beside each other."""
+    """A fire module: 1x1 convolutions to few channels, then parallel 1x1 and 3x3 ones."""
 
     def __init__(self, channels: int, squeezed: int, expanded: int) -> None:
         super().__init__()
@@ -48,10 +43,7 @@ class Fire(nn.Module):
 
 
 class SqueezeNetFeatures(nn.Sequential):
-    """SqueezeNet 1.1 up to its eighth fire module, layer 12 of torchvision's ``features``.
-
-    Iandola et al., arXiv 1602.07360. Takes (B, 3, H, W), at least 17 x 17 pixels.
-    """
+    """SqueezeNet 1.1 (Iandola et al., arXiv 1602.07360) up to layer 12 of ``features``."""
 
     def __init__(self) -> None:
         first = nn.Conv2d(3, 64, 3, stride=2), nn.ReLU()
@@ -61,7 +53,7 @@ class SqueezeNetFeatures(nn.Sequential):
         super().__init__(*first, pool, *middle, pool, *last)
 
 
-# layers whose outputs are compared, by their numbers, and their channels
+# compared layers and their channels
 _TAPS: dict[Trunk, tuple[tuple[int, int], ...]] = {
     "alex": ((1, 64), (4, 192), (7, 384), (9, 256), (11, 256)),
     "vgg": ((3, 64), (8, 128), (15, 256), (22, 512), (29, 512)),
@@ -74,16 +66,14 @@ _TRUNKS: dict[Trunk, Callable[[], nn.Sequential]] = {
 }
 # of the published module, for RGB in [-1, 1]
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-_MIN_LENGTH = 1e-10  # added to a feature's length
-SMALLEST_PX = 64  # of the shorter side: AlexNet pools down to nothing below
+_MIN_LENGTH = 1e-10
+SMALLEST_PX = 64  # of the shorter side, for AlexNet's poolings
 
 
 class _Head(nn.Module):
-    """Weights of one layer's channels, under the key of the published files."""
-
     def __init__(self, channels: int) -> None:
         super().__init__()
-        # the published heads have a dropout first, which does nothing once trained
+        # follows a dropout in the published heads
         self.model = nn.Sequential(nn.Identity(), nn.Conv2d(channels, 1, 1, bias=False))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -93,9 +83,8 @@ class _Head(nn.Module):
 class Lpips(nn.Module):
     """LPIPS with one of the three published trunks.
 
-    Keys of the state dict are torchvision's ``features.*`` of the trunk and the published heads'
-    ``lin{k}.model.1.weight``. The stored weights multiply squared differences; the paper's are
-    their roots.
+    Keys are torchvision's ``features.*`` and the published ``lin{k}.model.1.weight``, which are
+    squares of the paper's weights.
     """
 
     def __init__(self, trunk: Trunk) -> None:
@@ -106,21 +95,17 @@ class Lpips(nn.Module):
             self.add_module(f"lin{number}", _Head(channels))
 
     def forward(self, a: torch.Tensor, b: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-        """Distances (B,) of pairs of images; 0 for equal ones, NaN where nothing is valid.
+        """Return distances (B,) of pairs of images; NaN without valid pixels.
 
-        The mean over the image in the published formula is one over the valid pixels, whose share
-        in each feature's cell is its weight. Other pixels are the same in both images. ``a`` and
-        ``b``: (B, 3, H, W), RGB in [0, 1], at least 64 pixels on either side; ``valid``: (B, 1, H,
-        W), 1 where both images count, else 0.
+        Each feature is weighted by its cell's share of valid pixels. ``a`` and ``b``: (B, 3, H, W),
+        RGB in [0, 1], at least 64 pixels on either side; ``valid``: (B, 1, H, W), 1 where both
+        images are valid, else 0.
         """
         return self.between(self.described(a, valid), self.described(b, valid), valid)
 
     def described(self, image: torch.Tensor, valid: torch.Tensor) -> list[torch.Tensor]:
-        """Features of the valid pixels of images: per layer (B, C, h, w), of unit length.
-
-        ``image`` and ``valid`` are those of :meth:`forward`.
-        """
-        # channels beside each other: the same convolutions and lengths, faster on a processor
+        """Return unit features of the valid pixels, per layer (B, C, h, w); see :meth:`forward`."""
+        # channels last: the same convolutions and lengths, faster on a CPU
         x = (self._normalised(image) * valid).contiguous(memory_format=torch.channels_last)
         found = []
         for number, layer in enumerate(self.features):
@@ -134,7 +119,7 @@ class Lpips(nn.Module):
     def between(
         self, one: Sequence[torch.Tensor], other: Sequence[torch.Tensor], valid: torch.Tensor
     ) -> torch.Tensor:
-        """Distances (B,) of images as :meth:`described`, over the same valid pixels."""
+        """Return distances (B,) between results of :meth:`described` with the same valid pixels."""
         total = torch.zeros(len(valid), dtype=valid.dtype, device=valid.device)
         for layer, (a, b) in enumerate(zip(one, other, strict=True)):
             different = self.get_submodule(f"lin{layer}")((a - b) ** 2)
@@ -153,10 +138,6 @@ def lpips_from(
     of_heads: Mapping[str, torch.Tensor],
     where: str,
 ) -> Lpips:
-    """LPIPS from a torchvision checkpoint of a trunk, and a published file of heads.
-
-    The trunk's classifier, and layers after the last one compared, are left out.
-    """
     module = Lpips(trunk)
     features = {key: value for key, value in of_trunk.items() if not key.startswith("classifier.")}
     return load_strictly(module, {**features, **of_heads}, where).eval()

@@ -1,10 +1,8 @@
 """MegaLoc (Berton and Masone, CVPR Workshops 2025): DINOv2 ViT-B/14, SALAD, a linear layer.
 
-The keys are those of the published ``model.safetensors``. The older ``megaloc.torch`` has the
-trunk's under ``backbone.model``, and DINOv2's ``mask_token``; it is read too. The trunk is DINOv2's
-vision transformer (Oquab et al., TMLR 2024) under its own keys, without registers: patches of 14
-pixels, one class token, learnt positions, layer scale. SALAD (Izquierdo and Civera, CVPR 2024)
-aggregates patches in clusters by optimal transport; what tells nothing goes to a dustbin.
+Keys are those of ``model.safetensors``; the older ``megaloc.torch``, with ``backbone.model`` and
+``mask_token``, is accepted too. DINOv2 (Oquab et al., TMLR 2024) is without registers. SALAD
+(Izquierdo and Civera, CVPR 2024) assigns patches to clusters and a dustbin by optimal transport.
 """
 
 from __future__ import annotations
@@ -22,20 +20,17 @@ from megloc_kapture.nets.runtime import load_strictly
 from megloc_kapture.nets.trunks import imagenet_normalised
 
 _OLDER_TRUNK = "backbone.model."
-_ITERATIONS = 3  # the network was trained with so few
+_ITERATIONS = 3  # as in training
 PATCH_PX = 14
 
-_EPSILON = 1e-6  # of the layer norms
+_EPSILON = 1e-6
 _MLP_RATIO = 4
-# in patches; it keeps a size from being rounded down, and moves every position that is read
+# in patches; prevents rounding a size down, and shifts all sampled positions
 _OFFSET = 0.1
 
 
 class MegaLocNet(nn.Module):
-    """An image to one vector of unit length, of ``descriptor_size`` components.
-
-    ``backbone`` is ViT-B/14 unless given; the other sizes are those of :class:`Salad`.
-    """
+    """Network from image to unit vector of ``descriptor_size`` components; ViT-B/14 by default."""
 
     def __init__(
         self,
@@ -54,43 +49,38 @@ class MegaLocNet(nn.Module):
         self.aggregator = nn.ModuleDict({"agg": salad, "linear": linear})
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Vectors, float32 (B, 8448), of RGB images (B, 3, H, W) in [0, 1].
+        """Return vectors, float32 (B, 8448), of RGB images (B, 3, H, W) in [0, 1].
 
-        Both sides are multiples of 14, of more patches than there are clusters.
+        Both sides are multiples of 14, with more patches than clusters.
         """
         aggregated = self.aggregator["agg"](*self.backbone(imagenet_normalised(image)))
         return functional.normalize(self.aggregator["linear"](aggregated).float(), dim=1)
 
 
 def squared(image: torch.Tensor, size_px: int) -> torch.Tensor:
-    """Images (B, 3, H, W) of any size, made (B, 3, size, size).
-
-    Bilinear with a filter against aliasing; width and height are scaled each by its own factor, as
-    in the evaluation of the paper (section 4).
-    """
+    """Resize (B, 3, H, W) to (B, 3, size, size) with antialiasing, ignoring the aspect ratio."""
     return functional.interpolate(
         image, size=(size_px, size_px), mode="bilinear", align_corners=False, antialias=True
     )
 
 
 def megaloc_from(tensors: Mapping[str, torch.Tensor], where: str) -> MegaLocNet:
-    """The network of a checkpoint, ready to describe."""
     renamed = {
         key.replace(_OLDER_TRUNK, "backbone.", 1) if key.startswith(_OLDER_TRUNK) else key: value
         for key, value in tensors.items()
         if key != _OLDER_TRUNK + "mask_token"
     }
-    with torch.device("meta"):  # 229 million numbers are not drawn only to be overwritten
+    with torch.device("meta"):  # avoids drawing 229 million random numbers
         network = MegaLocNet()
     network.to_empty(device="cpu")
     return load_strictly(network, renamed, where).eval()
 
 
 class Salad(nn.Module):
-    """Features of patches and of the whole image to one vector of unit length.
+    """SALAD: features of patches and of the image to one unit vector.
 
-    Of ``channels`` that come in, by projections whose middle layer is ``hidden`` wide, the vector
-    has ``token_size + cluster_size * clusters`` components.
+    ``channels`` in, ``hidden`` channels in the projections, and ``token_size + cluster_size *
+    clusters`` components out.
     """
 
     def __init__(
@@ -111,13 +101,9 @@ class Salad(nn.Module):
         self.dust_bin = nn.Parameter(torch.tensor(1.0))
 
     def forward(self, patches: torch.Tensor, whole: torch.Tensor) -> torch.Tensor:
-        """Vectors float32 (B, D) of patches (B, C, h, w) and of the whole (B, C): section 3.3.
-
-        The image's own part first, then the clusters', the clusters running fastest; each of these
-        parts was normalised before, and at last all of it.
-        """
+        """Aggregate patches (B, C, h, w) and the whole (B, C) to float32 (B, D): section 3.3."""
         features = self.cluster_features(patches).flatten(2)
-        # in half precision a share would keep two digits after the exponentials
+        # half precision would leave two digits after the exponentials
         shares = assignment(self.score(patches).flatten(2).float(), self.dust_bin)
         summed = torch.matmul(features, shares.to(features).mT).float()
         summed = functional.normalize(summed, dim=1)
@@ -126,11 +112,10 @@ class Salad(nn.Module):
 
 
 def assignment(scores: torch.Tensor, dust_bin: torch.Tensor) -> torch.Tensor:
-    """Share (B, K, N) of each of N patches that goes to each of K clusters, of scores (B, K, N).
+    """Assign N patches to K clusters by scores (B, K, N); return the shares (B, K, N).
 
-    Sinkhorn's algorithm in the logarithm, three times. A patch gives the mass 1; a cluster takes
-    the mass 1, the dustbin, of score ``dust_bin`` (), takes what is left. Unlike in SuperGlue there
-    is no dustbin for clusters.
+    Three Sinkhorn iterations in the log domain. Patches and clusters have mass 1; the dustbin, with
+    score ``dust_bin`` (), takes the rest.
     """
     batch, clusters, patches = scores.shape
     if patches <= clusters:
@@ -150,18 +135,14 @@ def assignment(scores: torch.Tensor, dust_bin: torch.Tensor) -> torch.Tensor:
 def _per_patch(channels: int, hidden: int, out: int) -> nn.Sequential:
     return nn.Sequential(
         nn.Conv2d(channels, hidden, 1),
-        nn.Identity(),  # in its place values are dropped out while training; it counts for the keys
+        nn.Identity(),  # placeholder of a dropout, for the keys
         nn.ReLU(),
         nn.Conv2d(hidden, out, 1),
     )
 
 
 class DinoV2(nn.Module):
-    """An image to one feature per patch, and one of the whole.
-
-    ``channels``, ``depth`` and ``heads`` are those of ViT-B unless given; ``grid`` is the side, in
-    patches, of the square image that the positions are learnt for (37 are 518 pixels).
-    """
+    """DINOv2: an image to one feature per patch and one for the whole; ViT-B by default."""
 
     def __init__(
         self, *, channels: int = 768, depth: int = 12, heads: int = 12, grid: int = 37
@@ -178,10 +159,10 @@ class DinoV2(nn.Module):
         self.norm = nn.LayerNorm(channels, eps=_EPSILON)
 
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Features of the last block, of patches (B, C, H // 14, W // 14) and the whole (B, C).
+        """Return features of patches (B, C, H // 14, W // 14) and of the whole (B, C).
 
-        ``image`` is (B, 3, H, W), see :func:`megloc_kapture.nets.trunks.imagenet_normalised`.
-        Pixels at the right and at the bottom that fill no patch are left out.
+        ``image`` is (B, 3, H, W), see :func:`megloc_kapture.nets.trunks.imagenet_normalised`;
+        incomplete patches are cropped.
         """
         patches = self.patch_embed["proj"](image)
         rows, columns = patches.shape[-2:]
@@ -194,12 +175,10 @@ class DinoV2(nn.Module):
         return tokens[:, 1:].mT.reshape(patches.shape), tokens[:, 0]
 
     def positions(self, rows: int, columns: int) -> torch.Tensor:
-        """Position embeddings of the tokens of so many patches, (1, 1 + rows * columns, C).
+        """Return position embeddings, (1, 1 + rows * columns, C).
 
-        Learnt positions are scaled bicubically, without a filter against aliasing, as DINOv2 does
-        it: by ``(rows + 0.1) / grid``, from which the positions read follow too, instead of
-        by ``rows / grid``, as transformers does. At 23 patches of 37 they lie up to 0.16 learnt
-        positions beside those.
+        Bicubic without antialiasing by ``(rows + 0.1) / grid``, as in DINOv2, not ``rows / grid``,
+        as in transformers; they differ by up to 0.16 learnt positions at 23 patches of 37.
         """
         if rows == columns == self.grid:
             return self.pos_embed
@@ -222,8 +201,6 @@ class LayerScale(nn.Module):
 
 
 class Block(nn.Module):
-    """Attention, then a perceptron, each on normalised tokens, scaled, and added to them."""
-
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(channels, eps=_EPSILON)
@@ -243,8 +220,6 @@ class Block(nn.Module):
 
 
 class Attention(nn.Module):
-    """Every token attends to all; queries, keys and values are made in one layer, head by head."""
-
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
         self.heads = heads

@@ -1,10 +1,9 @@
-"""Radiance fields: rays in; colour, depth, opacity and uncertainty out.
+"""Radiance fields: rays to colour, depth, opacity and uncertainty.
 
-Volume rendering as in NeRF (Mildenhall et al., ECCV 2020, eq. 3), with the transient part and the
-loss of NeRF-W (Martin-Brualla et al., CVPR 2021, eqs. 8 to 13). Rays are ``origin + t direction``;
-where directions have z = 1 in their camera, t is depth along its optical axis. Two fields:
-:class:`NerfW`, under the names of kwea123/nerf_pl's branch ``nerfw``, and :class:`TriPlane`, small
-enough to train on a processor.
+Volume rendering as in NeRF (Mildenhall et al., ECCV 2020, eq. 3), with transient part and loss of
+NeRF-W (Martin-Brualla et al., CVPR 2021, eqs. 8 to 13). Rays are ``origin + t direction``; with z =
+1 in the camera, t is depth along the optical axis. :class:`NerfW` has the keys of kwea123/nerf_pl's
+branch ``nerfw``; :class:`TriPlane` is small enough to train on a CPU.
 """
 
 from __future__ import annotations
@@ -14,52 +13,47 @@ from dataclasses import dataclass, replace
 import torch
 from torch import nn
 
-_DEPTH_SPREAD = 0.03  # of samples about a known depth, share of it
+_DEPTH_SPREAD = 0.03  # of samples around a known depth, relative
 _EPSILON = 1e-10
-_BETA_MIN = 0.03  # uncertainty of a ray that meets nothing transient
-# of NeRF-W: layers, their width, where the points come in again; frequencies of points and
-# directions; sizes of the embeddings; samples of a ray by the coarse network, and more by the fine
+_BETA_MIN = 0.03  # uncertainty of a ray without transient density
+# NeRF-W: layers, width, skip connection; frequencies of points and directions; embedding sizes;
+# coarse and additional fine samples per ray
 _LAYERS, _WIDTH, _SKIP = 8, 256, 4
 _NERF_POINT_FREQUENCIES, _NERF_DIRECTION_FREQUENCIES = 10, 4
 _NERF_APPEARANCE, _NERF_TRANSIENT = 48, 16
 _COARSE, _FINE = 64, 64
-# of tri-planes: their sides and channels, and the same as above
+# tri-planes: sides and channels, then as above
 _RESOLUTIONS, _CHANNELS = (64, 128, 256), 12
 _GEOMETRY, _HIDDEN = 15, 64
 _POINT_FREQUENCIES, _DIRECTION_FREQUENCIES = 3, 2
 _APPEARANCE, _TRANSIENT = 8, 16
-# samples of a ray: to look where something is, in training and in rendering, where coarse ones
-# miss what training has made thin; then spread evenly, then where it is
+# samples per ray: search in training, and in rendering, where surfaces are thin; then even, then
+# importance samples
 _LOOKING, _CLOSELY, _SPREAD, _THERE = 32, 96, 8, 16
-_REACH = 1.25  # beyond 1 space is contracted, to this at infinity
+_REACH = 1.25  # limit of contracted space, whose uncontracted part ends at 1
 _MAX_LOG_DENSITY = 12.0
 _AXES = ((0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays of one or several images."""
-
-    # origins, directions: float32 (N, 3), in the field's own units
+    # origins, directions: float32 (N, 3), in field units
     origins: torch.Tensor
     directions: torch.Tensor
-    # near, far: t at which a ray begins and ends; in the unit of the directions' z
+    # near, far: t of a ray's ends
     near: float
     far: float
-    # appearance, transient: embeddings (N, A) and (N, T) of the images that the rays are of; None:
-    # the field's mean appearance, and nothing transient
+    # appearance, transient: embeddings (N, A) and (N, T) per image; None: the mean appearance, and
+    # no transients
     appearance: torch.Tensor | None = None
     transient: torch.Tensor | None = None
-    # float32 (N,), t at which the surface is known to be, 0 where it is not; samples are taken
-    # about it
+    # float32 (N,), t of the known surface, sampled around; 0 where unknown
     depth: torch.Tensor | None = None
 
     def points(self, t: torch.Tensor) -> torch.Tensor:
-        """Points (N, S, 3) at t (N, S)."""
         return self.origins[:, None] + t[..., None] * self.directions[:, None]
 
     def light(self, embedding: nn.Embedding) -> torch.Tensor:
-        """The appearance (N, A), or the mean of all."""
         if self.appearance is not None:
             return self.appearance
         return embedding.weight.mean(0).expand(len(self.origins), -1)
@@ -67,13 +61,11 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What a field says at S samples of each ray."""
-
-    # sigma, rgb: (N, S) density of the static part, and its colour (N, S, 3) in 0 to 1
+    # sigma, rgb: static density (N, S), and colour (N, S, 3) in 0 to 1
     sigma: torch.Tensor
     rgb: torch.Tensor
     # transient_sigma, transient_rgb, transient_beta: the same of the transient part, and its
-    # uncertainty (N, S); None where it is off
+    # uncertainty (N, S), or None
     transient_sigma: torch.Tensor | None = None
     transient_rgb: torch.Tensor | None = None
     transient_beta: torch.Tensor | None = None
@@ -81,23 +73,21 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """Rays as a field renders them."""
-
-    rgb: torch.Tensor  # (N, 3) in 0 to 1; black where nothing is
-    depth: torch.Tensor  # (N,), mean t of what is seen; 0 where nothing is
-    opacity: torch.Tensor  # (N,), share of the light that the field stops
-    # (N,), standard deviation of the colour by NeRF-W's transient part; the least one without
+    rgb: torch.Tensor  # (N, 3) in 0 to 1; black where empty
+    depth: torch.Tensor  # (N,), mean t; 0 where empty
+    opacity: torch.Tensor  # (N,), absorbed share of the light
+    # (N,), standard deviation of the colour by NeRF-W's transient part, or the minimum
     beta: torch.Tensor
     weights: torch.Tensor  # (N, S), share of each sample
-    transient_density: torch.Tensor  # mean over all samples; 0 without
-    coarse_rgb: torch.Tensor | None = None  # of a field's coarse network, or None
+    transient_density: torch.Tensor  # mean over all samples; 0 without transients
+    coarse_rgb: torch.Tensor | None = None
 
 
 def composite(t: torch.Tensor, deltas: torch.Tensor, samples: Samples) -> Rendered:
-    """Composite samples along rays: NeRF's eq. 3, with a transient part NeRF-W's eqs. 8 to 10.
+    """Composite samples along rays: NeRF's eq. 3, or with a transient part NeRF-W's eqs. 8 to 10.
 
-    ``t`` (N, S) says where the samples are, ascending; ``deltas`` (N, S) the length of the piece of
-    the ray that each stands for, in the unit of 1/density.
+    ``t`` (N, S) is ascending; ``deltas`` (N, S) are lengths of ray pieces, in the unit of
+    1/density.
     """
     total = samples.sigma
     if samples.transient_sigma is not None:
@@ -121,14 +111,14 @@ def composite(t: torch.Tensor, deltas: torch.Tensor, samples: Samples) -> Render
 
 
 def spacings(t: torch.Tensor, rays: Rays) -> torch.Tensor:
-    """Lengths (N, S) of the pieces between samples, the last one up to the ray's end."""
+    """Return lengths (N, S) between samples, the last one up to the ray's end."""
     ends = torch.full_like(t[:, :1], rays.far)
     steps = torch.diff(torch.cat([t, ends], dim=1), dim=1).clamp_min(0)
     return steps * torch.linalg.vector_norm(rays.directions, dim=1, keepdim=True)
 
 
 def stratified(rays: Rays, count: int, generator: torch.Generator | None) -> torch.Tensor:
-    """Samples (N, count), one in each of ``count`` pieces of a ray, which grow with t."""
+    """Sample one t in each of ``count`` pieces of a ray, which grow with t: (N, count)."""
     number = len(rays.origins)
     shares = torch.arange(count, device=rays.origins.device, dtype=rays.origins.dtype)
     within = _uniform((number, count), generator, rays.origins)
@@ -139,7 +129,7 @@ def stratified(rays: Rays, count: int, generator: torch.Generator | None) -> tor
 def importance(
     t: torch.Tensor, weights: torch.Tensor, count: int, generator: torch.Generator | None
 ) -> torch.Tensor:
-    """Samples (N, count) where the weights (N, S) of samples at t (N, S) are: NeRF, section 5.2."""
+    """Sample (N, count) by the weights (N, S) at t (N, S): NeRF, section 5.2."""
     edges = 0.5 * (t[:, 1:] + t[:, :-1])
     inner = weights[:, 1:-1].detach() + 1e-5
     shares = torch.cumsum(inner / inner.sum(1, keepdim=True), dim=1)
@@ -155,7 +145,7 @@ def importance(
 def about_depth(
     depth: torch.Tensor, instead: torch.Tensor, generator: torch.Generator | None
 ) -> torch.Tensor:
-    """Samples (N, S) about known depths (N,), evenly; ``instead`` (N, S) where there is none."""
+    """Sample (N, S) evenly around known depths (N,); elsewhere use ``instead`` (N, S)."""
     count = instead.shape[1]
     drawn = torch.arange(count, device=depth.device, dtype=depth.dtype)
     drawn = (drawn + _uniform(tuple(instead.shape), generator, depth)) / count
@@ -167,17 +157,13 @@ def about_depth(
 def _uniform(
     shape: tuple[int, ...], generator: torch.Generator | None, like: torch.Tensor
 ) -> torch.Tensor:
-    """Numbers in 0 to 1, drawn on the processor so that a seed is one on every device."""
     if generator is None:
         return torch.full(shape, 0.5, dtype=like.dtype, device=like.device)
     return torch.rand(shape, generator=generator, dtype=like.dtype).to(like.device)
 
 
 def frequencies(values: torch.Tensor, count: int) -> torch.Tensor:
-    """Positional encoding of (..., 3): the values, then sines and cosines of 1, 2, 4, ... times.
-
-    NeRF's eq. 4 in the order of nerf_pl: (..., 3 + 6 count).
-    """
+    """Encode (..., 3) by position: NeRF's eq. 4 in nerf_pl's order, (..., 3 + 6 count)."""
     parts = [values]
     for power in range(count):
         parts += [torch.sin(2.0**power * values), torch.cos(2.0**power * values)]
@@ -185,11 +171,7 @@ def frequencies(values: torch.Tensor, count: int) -> torch.Tensor:
 
 
 def nerf_w_loss(rendered: Rendered, rgb: torch.Tensor) -> torch.Tensor:
-    """NeRF-W's loss (eq. 13) with the public code's constants; rgb (N, 3) is what was seen.
-
-    Half the coarse network's squared error, where there is one; without a transient part beta is
-    constant and this is, up to factor and offset, the squared error.
-    """
+    """Compute NeRF-W's loss (eq. 13) with the public code's constants; rgb (N, 3) is observed."""
     squared = torch.square(rendered.rgb - rgb).mean(1)
     loss = (squared / (2 * torch.square(rendered.beta))).mean() + torch.log(rendered.beta).mean()
     loss = loss + 3.0 + 0.01 * rendered.transient_density
@@ -199,11 +181,7 @@ def nerf_w_loss(rendered: Rendered, rgb: torch.Tensor) -> torch.Tensor:
 
 
 class NerfMlp(nn.Module):
-    """One of NeRF-W's two networks: eight layers, the heads for colour and for what is transient.
-
-    ``appearance_size`` and ``transient_size`` are of the embeddings; 0: not conditioned, no
-    transient head.
-    """
+    """One of NeRF-W's two networks: eight layers, a colour head and a transient head."""
 
     def __init__(self, appearance_size: int = 0, transient_size: int = 0) -> None:
         super().__init__()
@@ -234,7 +212,7 @@ class NerfMlp(nn.Module):
         appearance: torch.Tensor | None = None,
         transient: torch.Tensor | None = None,
     ) -> Samples:
-        """Samples at points (N, S, 3), seen along unit directions (N, 3)."""
+        """Evaluate points (N, S, 3) with unit view directions (N, 3)."""
         count = points.shape[1]
         xyz = frequencies(points, _NERF_POINT_FREQUENCIES)
         hidden = xyz
@@ -259,10 +237,9 @@ class NerfMlp(nn.Module):
 class NerfW(nn.Module):
     """NeRF-W's coarse and fine network, and the embeddings of the images.
 
-    A checkpoint of nerf_pl has ``nerf_coarse.*``, ``nerf_fine.*``, ``embedding_a.weight`` and
-    ``embedding_t.weight``. As there, appearance and what is transient are of the fine network
-    alone. ``num_images`` and ``num_lights`` are rows of the transient and of the appearance
-    embedding; as many of the second as of the first unless given.
+    nerf_pl's keys: ``nerf_coarse.*``, ``nerf_fine.*``, ``embedding_a.weight`` and
+    ``embedding_t.weight``. Only the fine network has appearance and transients. ``num_images`` and
+    ``num_lights`` are rows of the transient and the appearance embedding, equal by default.
     """
 
     def __init__(self, num_images: int, num_lights: int | None = None) -> None:
@@ -274,16 +251,14 @@ class NerfW(nn.Module):
 
     @property
     def appearance(self) -> nn.Embedding:
-        """The embeddings of light and exposure."""
         return self.embedding_a
 
     @property
     def transient(self) -> nn.Embedding:
-        """The embeddings of what is in one image only."""
         return self.embedding_t
 
     def render(self, rays: Rays, generator: torch.Generator | None = None) -> Rendered:
-        """Render rays; samples are drawn by the generator, evenly spaced without one."""
+        """Render rays; the generator draws samples, else they are evenly spaced."""
         unit = nn.functional.normalize(rays.directions, dim=1)
         t = stratified(rays, _COARSE, generator)
         coarse = composite(t, spacings(t, rays), self.nerf_coarse(rays.points(t), unit))
@@ -297,12 +272,10 @@ class NerfW(nn.Module):
 class TriPlane(nn.Module):
     """Three planes at three resolutions, and the embeddings of the images.
 
-    Features of a point are products of what three planes say (K-Planes, Fridovich-Keil et al., CVPR
-    2023, eq. 1); two small networks turn them into density and colour, a third into what is
-    transient. Samples lie about the known depth where there is one, else where a first pass through
-    the density alone finds something. Space from -1 to 1 is as it is, what lies beyond is
-    contracted. ``num_images`` and ``num_lights``: see :class:`NerfW`; ``unconstrained``: the images
-    differ in light and show what moves; without, one appearance and nothing transient.
+    A point's features are products of three planes (K-Planes, Fridovich-Keil et al., CVPR 2023, eq.
+    1); small networks turn them into density, colour and transients. Samples lie around the known
+    depth, or are found by a density pass. Space beyond -1 to 1 is contracted. ``num_images`` and
+    ``num_lights``: see :class:`NerfW`; ``unconstrained``: with varying light and moving objects.
     """
 
     def __init__(
@@ -327,7 +300,7 @@ class TriPlane(nn.Module):
             self.moving = _mlp(3 + 6 * _POINT_FREQUENCIES + transient, 5)
 
     def density(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Density (N, S) at points (N, S, 3), and features (N, S, 15) of what is there."""
+        """Return density (N, S) and features (N, S, 15) at points (N, S, 3)."""
         inside = _contracted(points).reshape(-1, 3) / _REACH
         grid = torch.stack([inside[:, axes] for axes in _AXES])[:, :, None]
         features = [
@@ -340,7 +313,6 @@ class TriPlane(nn.Module):
         return torch.exp(found[..., 0].clamp(max=_MAX_LOG_DENSITY)), found[..., 1:]
 
     def render(self, rays: Rays, generator: torch.Generator | None = None) -> Rendered:
-        """See :meth:`NerfW.render`."""
         t = self._where(rays, generator)
         count = t.shape[1]
         points = rays.points(t)
@@ -363,7 +335,6 @@ class TriPlane(nn.Module):
 
     @torch.no_grad()
     def _where(self, rays: Rays, generator: torch.Generator | None) -> torch.Tensor:
-        """Samples (N, S) of rays, ascending."""
         depth = rays.depth
         spread = stratified(rays, _SPREAD, generator)
         there = spread.new_zeros(len(spread), _THERE)
@@ -390,7 +361,7 @@ def _repeated(values: torch.Tensor, count: int) -> torch.Tensor:
 
 
 def _contracted(points: torch.Tensor) -> torch.Tensor:
-    """Each coordinate beyond 1 brought below the reach, smoothly (as mip-NeRF 360, eq. 10)."""
+    """Contract coordinates beyond 1 smoothly (as mip-NeRF 360, eq. 10)."""
     size = points.abs()
     margin = _REACH - 1.0
     outside = _REACH - margin**2 / (size.clamp_min(1.0) - 1.0 + margin)

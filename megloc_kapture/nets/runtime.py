@@ -1,4 +1,4 @@
-"""Networks as they are used: devices, precision, inputs, checkpoints, and plugins made of them."""
+"""Runtime of networks: devices, precision, inputs, checkpoints, and plugins with a network."""
 
 from __future__ import annotations
 
@@ -28,8 +28,6 @@ _making = Lock()
 
 
 class NetworkOptions(Options):
-    """Options that every network has."""
-
     device: Device = Field(default="auto", description="auto, cpu, cuda or cuda:N")
     half_precision: bool = Field(
         default=False, description="float16 on a GPU, bfloat16 on a processor; keypoints never"
@@ -38,7 +36,7 @@ class NetworkOptions(Options):
 
 @cache
 def pick_device(device: Device) -> torch.device:
-    """The device that is meant; raises OptionError for a GPU that is not there."""
+    """Return the chosen device; OptionError without the GPU."""
     count = torch.cuda.device_count() if device != "cpu" and torch.cuda.is_available() else 0
     if device == "cpu" or (device == "auto" and not count):
         return torch.device("cpu")
@@ -51,10 +49,7 @@ def pick_device(device: Device) -> torch.device:
 
 @contextmanager
 def inference(device: torch.device, half_precision: bool = False) -> Iterator[None]:
-    """No gradients; in half precision float16 on a GPU and bfloat16 on a processor.
-
-    float32 stays float32 on a GPU: convolutions and products in TF32 would move keypoints.
-    """
+    """Disable gradients; half precision is float16 on a GPU, bfloat16 on a CPU, and never TF32."""
     half = torch.float16 if device.type == "cuda" else torch.bfloat16
     exact = _without_tf32() if device.type == "cuda" else nullcontext()
     autocast = torch.autocast(device.type, dtype=half, enabled=half_precision)
@@ -64,7 +59,7 @@ def inference(device: torch.device, half_precision: bool = False) -> Iterator[No
 
 @contextmanager
 def _without_tf32() -> Iterator[None]:
-    """That is a setting of the process, so of its threads one computes at a time."""
+    """TF32 is a setting of the process, so only one thread computes at a time."""
     with _computing:
         convolutions = torch.backends.cudnn.allow_tf32
         products = torch.backends.cuda.matmul.allow_tf32
@@ -77,7 +72,7 @@ def _without_tf32() -> Iterator[None]:
 
 
 def image_tensor(image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
-    """An RGB image, uint8 (H, W, 3), as float32 (1, 3, H, W) in [0, 1]."""
+    """Convert an RGB image, uint8 (H, W, 3), to float32 (1, 3, H, W) in [0, 1]."""
     planes = torch.from_numpy(np.array(image.transpose(2, 0, 1), order="C"))
     return planes.to(device)[None].float() / 255.0
 
@@ -85,10 +80,10 @@ def image_tensor(image: NDArray[np.uint8], device: torch.device) -> torch.Tensor
 def sized_tensor(
     image: NDArray[np.uint8], max_size_px: int | None, device: torch.device
 ) -> torch.Tensor:
-    """An RGB image, uint8 (H, W, 3), as float32 (1, 3, h, w) in [0, 1]; never larger than it was.
+    """Convert an RGB image, uint8 (H, W, 3), to float32 (1, 3, h, w) in [0, 1], with a size limit.
 
-    Beyond ``max_size_px`` pixels are the means of the areas they cover, not rounded, as hloc makes
-    them. Sides are rounded to whole pixels, halves to even ones, and are at least 1.
+    Beyond ``max_size_px`` pixels are unrounded area means, as in hloc. Sides round half to even,
+    and are at least 1.
     """
     height, width = image.shape[:2]
     if max_size_px is None or max(height, width) <= max_size_px:
@@ -100,17 +95,14 @@ def sized_tensor(
 
 
 def batch_counters(module: nn.Module) -> set[str]:
-    """Keys of batch normalisation's counters: torch before 0.4.1 and ONNX keep none of them."""
+    """Return keys of batch counters, missing in ONNX and torch before 0.4.1."""
     return {key for key in module.state_dict() if key.endswith("num_batches_tracked")}
 
 
 def load_strictly(
     module: Net, tensors: Mapping[str, torch.Tensor], where: str, *, may_lack: Collection[str] = ()
 ) -> Net:
-    """The module, with a state dict loaded; every key and shape as the module has it.
-
-    Keys that ``may_lack`` names may be missing.
-    """
+    """Load a state dict with matching keys and shapes; only ``may_lack`` may be missing."""
     expected = module.state_dict()
     missing = sorted(set(expected) - set(tensors) - set(may_lack))
     unexpected = sorted(set(tensors) - set(expected))
@@ -135,7 +127,7 @@ def load_strictly(
     if not any(getattr(tensor, "is_shared_file", False) for tensor in tensors.values()):
         module.load_state_dict(dict(tensors), strict=False)
         return module
-    # the parameters are the file's own memory, which all processes that read it have once
+    # memory-mapped parameters, shared by all processes
     own = {
         key: value
         if getattr(value, "is_shared_file", False) and value.dtype == expected[key].dtype
@@ -147,16 +139,12 @@ def load_strictly(
 
 
 def first_few(keys: Sequence[str], count: int = 5) -> str:
-    """The first keys, for a message that says how many more there are."""
     more = len(keys) - count
     return ", ".join(keys[:count]) + (f" and {more} more" if more > 0 else "")
 
 
 class Checkpointed(Generic[AnyOptions]):
-    """A plugin that is a network; the option ``weights`` names its file, a name or a path.
-
-    Raises MissingWeightsError for a checkpoint that is not there.
-    """
+    """A plugin with a network; the option ``weights`` is a file name or path."""
 
     Options: ClassVar[Any]
 
@@ -168,7 +156,6 @@ class Checkpointed(Generic[AnyOptions]):
         self._descriptor_weights: WeightsFile | None = other and find_weights(other)
 
     def weights(self) -> dict[str, str]:
-        """sha256 of each checkpoint by its file's name."""
         files = [file for file in (self._weights, self._descriptor_weights) if file is not None]
         return {file.path.name: sha256_of(file) for file in files}
 
@@ -179,21 +166,20 @@ class Checkpointed(Generic[AnyOptions]):
         file: WeightsFile | None = None,
         channels_last: bool = False,
     ) -> tuple[Any, torch.device]:
-        """The network, made once per process, and the device it is on.
+        """Return the network, made once per process, and its device.
 
         Parameters
         ----------
-        load : makes it of a checkpoint's tensors, the file's name, and the arguments.
-        file : another checkpoint than the option's.
-        channels_last : it is faster so on a processor.
+        load : builds it from a checkpoint's tensors, the file's name and the arguments.
+        file : replaces the option's checkpoint.
+        channels_last : faster so on a CPU.
         """
         wanted: Any = self.options
         device = pick_device(wanted.device)
-        with _making:  # threads that share it do not make one each
+        with _making:
             return _made(load, file or self._weights, device, channels_last, *arguments), device
 
 
-# a run may use as many
 @lru_cache(maxsize=12)
 def _made(load: Any, file: WeightsFile, device: Any, channels_last: bool, *arguments: Any) -> Any:
     network = load(read_weights(file), str(file.path), *arguments).eval().to(device)
@@ -205,7 +191,7 @@ def _made(load: Any, file: WeightsFile, device: Any, channels_last: bool, *argum
 def state_bytes(
     model: torch.nn.Module, optimizer: torch.optim.Optimizer, more: Mapping[str, Any]
 ) -> bytes:
-    """The state as a file; ``more`` are numbers, texts and lists of them, among them ``step``."""
+    """Serialise the state; ``more`` has numbers, texts and lists of them, including ``step``."""
     stream = io.BytesIO()
     content = {**more, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
     torch.save(content, stream)
@@ -215,7 +201,6 @@ def state_bytes(
 def load_state(
     state: bytes, path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer
 ) -> dict[str, Any]:
-    """Put a state into networks and optimizer; what else it has."""
     try:
         content = torch.load(io.BytesIO(state), map_location="cpu", weights_only=True)
         model.load_state_dict(content.pop("model"))

@@ -1,18 +1,14 @@
-"""Dense maps of networks: maxima of scores, readings between pixels, special convolutions.
+"""Dense score maps: non-maximum suppression, interpolation, special convolutions.
 
-Non-maximum suppression is SuperPoint's as SuperGlue's authors publish it (and ALIKED's and others'
-after it): local maxima stay, their neighbourhoods are struck out, and what is a maximum of the rest
-stays too, twice over. With no further rounds it is the plain test against the window's maximum.
-
-In deformable convolution (Dai et al., ICCV 2017; with amplitudes: Zhu et al., CVPR 2019, eq. 1)
-every tap reads the input bilinearly at its own position plus an offset, zero outside:
+Non-maximum suppression is SuperPoint's as published by SuperGlue's authors: maxima suppress their
+neighbourhood, and maxima of the rest are added, twice. In deformable convolution (Dai et al., ICCV
+2017; with amplitudes: Zhu et al., CVPR 2019, eq. 1) every tap reads the input bilinearly, zero
+outside::
 
     y(p) = sum_k w_k m_k(p) x(p + p_k + offset_k(p))
 
-A bilinear reading is the weighted sum of four rows of a table that has one row of channels per
-pixel, which is what ``embedding_bag`` computes, one contiguous row after the other; a product with
-the kernel as a matrix follows. On a processor this is several times faster than ``grid_sample``,
-whose channels lie far apart.
+``embedding_bag`` reads the four rows of a pixel-by-channel table, then follows a matrix product; on
+a CPU this is several times faster than ``grid_sample``.
 """
 
 from __future__ import annotations
@@ -24,9 +20,9 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
-CELL_PX = 8  # side of the cells that detectors tell the scores of
-_EDGE_STEP = 3  # pixels between the samples of the second differences that tell edges
-# values gathered at once: what a processor's cache holds; on a GPU what is worth a launch
+CELL_PX = 8
+_EDGE_STEP = 3  # pixels between the samples of the edge test's second differences
+# values gathered at once: cache size of a CPU, worthwhile launch on a GPU
 _VALUES_AT_ONCE = {"cpu": 1 << 20, "cuda": 1 << 27}
 
 
@@ -34,28 +30,24 @@ _VALUES_AT_ONCE = {"cpu": 1 << 20, "cuda": 1 << 27}
 class SelectedPixels:
     """Pixels of one score map, best first; ties by y, then x."""
 
-    # xy, scores: int64 (N, 2), columns and rows of the map, and (N,), of the map's type
+    # xy, scores: int64 (N, 2), columns and rows of the map, and (N,)
     xy: torch.Tensor
     scores: torch.Tensor
-    num_masked: int  # pixels that would have been candidates but for the mask
+    num_masked: int
 
 
 def pixel_scores(logits: torch.Tensor) -> torch.Tensor:
-    """Scores (B, 8h, 8w) from a detector's logits (B, 65, h, w) of cells of 8 x 8 pixels.
+    """Convert a detector's logits (B, 65, h, w) of 8 x 8 cells to scores (B, 8h, 8w).
 
-    SuperPoint's, and XFeat's after it. Channel c of a cell is its pixel (c // 8, c % 8), row first;
-    the last channel is "no keypoint".
+    As in SuperPoint and XFeat: channel c is pixel (c // 8, c % 8) of a cell, the last is "no
+    keypoint".
     """
     probabilities = functional.softmax(logits.float(), dim=1)
     return functional.pixel_shuffle(probabilities[:, :-1], CELL_PX)[:, 0]
 
 
 def window_maximum(values: torch.Tensor, radius: int) -> torch.Tensor:
-    """Maximum over the square of side 2 radius + 1 around each pixel, clipped to the map.
-
-    Equal to a max pooling of stride 1 of (..., H, W), floating point or bool, but separable and by
-    doubling, so that its cost grows with the logarithm of the radius.
-    """
+    """Return the maximum over the square of side 2 radius + 1 around each pixel of (..., H, W)."""
     lowest = False if values.dtype == torch.bool else -float("inf")
     for axis in (-1, -2):
         padding = [radius, radius] if axis == -1 else [0, 0, radius, radius]
@@ -72,13 +64,13 @@ def window_maximum(values: torch.Tensor, radius: int) -> torch.Tensor:
 
 
 def suppress_non_maxima(scores: torch.Tensor, radius: int, *, rounds: int = 2) -> torch.Tensor:
-    """Scores where they are the largest within a square of the radius, zero elsewhere.
+    """Keep scores that are maximal within a square; set the others to zero.
 
     Parameters
     ----------
-    scores : (..., H, W), not negative. Equal neighbours that are both largest are both kept.
+    scores : (..., H, W), not negative. Equal neighbouring maxima are both kept.
     radius : pixels; 0 keeps every score.
-    rounds : how often, after the first maxima, those of what they do not suppress are added.
+    rounds : rounds of adding maxima among unsuppressed pixels.
     """
     if radius == 0:
         return scores
@@ -98,16 +90,15 @@ def select_pixels(
     mask: NDArray[np.bool_] | None = None,
     max_keypoints: int | None = None,
 ) -> SelectedPixels:
-    """The best pixels of a score map that the mask allows.
+    """Select the best unmasked pixels of a score map.
 
     Parameters
     ----------
     scores : (H, W), after non-maximum suppression.
-    threshold : a candidate's score is larger than it.
-    border : columns and rows at each side of the map that hold no candidates.
-    mask : bool (H or more, W or more), True where pixels may be used, or None; applied before the
-        best are selected.
-    max_keypoints : the best that are kept; None keeps all.
+    threshold : lower bound (exclusive).
+    border : columns and rows at each side of the map without candidates.
+    mask : bool (H or more, W or more), True = use, applied before the selection.
+    max_keypoints : None keeps all.
     """
     height, width = scores.shape
     inner = scores[border : max(height - border, border), border : max(width - border, border)]
@@ -126,25 +117,25 @@ def select_pixels(
 def soft_argmax(
     scores: torch.Tensor, xy: torch.Tensor, radius: int, temperature: float
 ) -> torch.Tensor:
-    """Mean position in the square around each pixel, weighted by exp(score / temperature).
+    """Average positions around each pixel, weighted by exp(score / temperature).
 
-    ALIKED's (Zhao et al., TIM 2023) differentiable keypoint detection. ``scores`` are (H, W);
-    ``xy`` int64 (N, 2), columns and rows, lie no closer to the map's border than the radius of the
-    square. Returns (N, 2) of the scores' type; a pixel's centre is an integer.
+    ALIKED's differentiable keypoint detection (Zhao et al., TIM 2023). ``scores`` are (H, W);
+    ``xy`` int64 (N, 2), columns and rows, at least ``radius`` from the border. Returns (N, 2);
+    pixel centres are integers.
     """
     side = torch.arange(-radius, radius + 1, device=scores.device)
-    steps = torch.cartesian_prod(side, side)  # (dy, dx)
+    steps = torch.cartesian_prod(side, side)
     around = scores[xy[:, 1:] + steps[:, 0], xy[:, :1] + steps[:, 1]]
     weights = torch.softmax(around / temperature, dim=1)
     return xy + weights @ steps.flip(1).to(scores.dtype)
 
 
 def parabola_peak(scores: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
-    """Peak of the paraboloid through the pixels around each, at most half a pixel away per axis.
+    """Find the paraboloid's peak around each pixel, at most half a pixel away per axis.
 
-    One Newton step, -H^-1 g, with the central differences of the score map (H, W) (Lowe, IJCV 2004,
-    section 4); none where the Hessian is singular. ``xy`` is int64 (N, 2), columns and rows, none
-    at the map's border. Returns (N, 2) of the scores' type; a pixel's centre is an integer.
+    One Newton step of the score map (H, W) with central differences (Lowe, IJCV 2004, section 4),
+    zero for a singular Hessian. ``xy`` is int64 (N, 2), columns and rows, off the border. Returns
+    (N, 2); pixel centres are integers.
     """
     x, y = xy.unbind(1)
     gradient_x = (scores[y, x + 1] - scores[y, x - 1]) / 2
@@ -158,7 +149,7 @@ def parabola_peak(scores: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
 
 
 def on_no_edge(scores: torch.Tensor, xy: torch.Tensor, max_ratio: float) -> torch.Tensor:
-    """Mask (N,) of the pixels where the score map peaks both ways (Lowe, IJCV 2004, section 4.1).
+    """Return a mask (N,) of pixels off edges of the score map (Lowe, IJCV 2004, section 4.1).
 
     Parameters
     ----------
@@ -175,7 +166,6 @@ def on_no_edge(scores: torch.Tensor, xy: torch.Tensor, max_ratio: float) -> torc
 def _second_differences(
     scores: torch.Tensor, xy: torch.Tensor, step: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Along x, along y and mixed, (N,) each, between samples that are ``step`` pixels apart."""
     x, y = xy.unbind(1)
 
     def at(dx: int, dy: int) -> torch.Tensor:
@@ -190,10 +180,9 @@ def _second_differences(
 def corners_around(
     y: torch.Tensor, x: torch.Tensor, size: tuple[int, int], amplitude: torch.Tensor | None = None
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The four pixels around each position and their weights; what lies outside weighs nothing.
+    """Return flat indices and weights, (number of S, 4) each, for bilinear interpolation.
 
-    Returns ``indices`` and ``weights``: int64 (number of S, 4), row by row, always within the map;
-    and their weights, of the type of the positions.
+    Indices are always within the map; weights are zero outside.
 
     Parameters
     ----------
@@ -204,7 +193,7 @@ def corners_around(
     height, width = size
     top, left = torch.floor(y), torch.floor(x)
     below, right = y - top, x - left
-    # more than a pixel off the map all weights are zero, however far; so that no integer overflows
+    # weights are zero beyond a pixel off the map; clamping prevents integer overflow
     row = top.clamp(-2, height).long()
     column = left.clamp(-2, width).long()
     weights_y = [
@@ -232,17 +221,13 @@ def read_bilinear(
     size: tuple[int, int],
     amplitude: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Readings (number of S, C) of a map, bilinear, zero outside.
-
-    ``table`` is (H W, C), the channels of each pixel, row by row, of the type of the positions; the
-    rest is as of :func:`corners_around`.
-    """
+    """Interpolate a table (H W, C) bilinearly, zero outside; see :func:`corners_around`."""
     indices, weights = corners_around(y, x, size, amplitude)
     return functional.embedding_bag(indices, table, mode="sum", per_sample_weights=weights)
 
 
 def pixel_table(values: torch.Tensor) -> torch.Tensor:
-    """A map (C, H, W) as (H W, C), at least float32; no copy if it lies channels-last."""
+    """Reshape (C, H, W) to (H W, C), at least float32; no copy if channels-last."""
     exact = values.to(torch.promote_types(values.dtype, torch.float32))
     return exact.permute(1, 2, 0).reshape(-1, len(values))
 
@@ -250,11 +235,7 @@ def pixel_table(values: torch.Tensor) -> torch.Tensor:
 def conv_same(
     x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, stride: int
 ) -> torch.Tensor:
-    """Convolution with TensorFlow's padding SAME, which depends on the image's size.
-
-    A 3x3 kernel of stride 2 pads an odd size at both ends, an even one only at the lower and the
-    right end.
-    """
+    """Convolve with TensorFlow's padding SAME: with stride 2, even sides only at their end."""
     margins: list[int] = []
     for size, kernel in zip(x.shape[:1:-1], weight.shape[:1:-1], strict=True):
         total = max((-(-size // stride) - 1) * stride + kernel - size, 0)
@@ -272,17 +253,14 @@ def deform_conv2d(
     bias: torch.Tensor | None = None,
     mask: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Deformable convolution by a kernel of 3x3, padded by one, as torchvision's.
-
-    Returns (B, D, H, W). Positions and weights of the readings are never in half precision.
+    """Apply a 3x3 deformable convolution, padded by one, as torchvision's; return (B, D, H, W).
 
     Parameters
     ----------
-    x : (B, C, H, W); fastest in channels-last memory, which is also that of the result.
-    offset : (B, 18, H, W), pixels of the input: (dy, dx) of one tap after the other, the nine taps
-        of the kernel row by row.
+    x : (B, C, H, W); fastest in channels-last memory, like the result.
+    offset : (B, 18, H, W), pixels: (dy, dx) per tap, taps row by row.
     weight, bias : (D, C, 3, 3), and (D,) or None.
-    mask : (B, 9, H, W) or None, the amplitude that each reading is multiplied by.
+    mask : (B, 9, H, W) or None, amplitudes.
     """
     batch, channels, height, width = x.shape
     exact = torch.promote_types(x.dtype, torch.float32)

@@ -1,18 +1,10 @@
-"""SuperGlue (Sarlin, DeTone, Malisiewicz and Rabinovich, CVPR 2020).
+"""SuperGlue (Sarlin, DeTone, Malisiewicz and Rabinovich, CVPR 2020), with the official keys.
 
-State-dict keys are those of Magic Leap's ``superglue_outdoor.pth`` and ``superglue_indoor.pth``.
-The keypoints of all images of a batch stand in one tensor, one after the other: only attention and
-transport know which belong together, so images of different sizes need no padding in the network.
-
-Optimal transport with dustbins (Sarlin et al., SuperGlue, CVPR 2020, section 3.2).
-
-Sinkhorn's algorithm is defined in the logarithm, where nothing overflows, and costs an exponential
-per entry and half step there. Here the two potentials are kept in the logarithm and everything
-between is a matrix-vector product: exp(Z + u + v) is made once, its rows and columns are scaled,
-and the scales go into the potentials before they grow (Schmitzer, "Stabilized sparse scaling
-algorithms", SIAM J. Sci. Comput. 2019, section 3.1). One iteration in the logarithm comes first.
-After it a half step changes no scale by more than a factor N + M, so that with the bounds below no
-product overflows, and what is left out of a sum is less than 1e-7 of it.
+All keypoints of a batch are in one tensor without padding; only attention and transport separate
+the images. Optimal transport (section 3.2) is Sinkhorn's algorithm with log potentials and
+matrix-vector products of exp(Z + u + v), whose scales are absorbed before they grow (Schmitzer,
+"Stabilized sparse scaling algorithms", SIAM J. Sci. Comput. 2019, section 3.1). After a first
+iteration in the log domain no product overflows, and omitted terms are less than 1e-7 of a sum.
 """
 
 from __future__ import annotations
@@ -29,25 +21,25 @@ from torch.nn import functional
 from megloc_kapture.nets.runtime import load_strictly
 
 _HEADS = 4
-_LARGEST_SCALE = 2.0e4  # beyond it, or below its inverse, scales go into the potentials
-_SMALLEST_ENTRY = 1e-30  # of the kernel; its products stay normal numbers, which are fast
-_PADDING = -1e30  # nothing, but with a gradient
+_LARGEST_SCALE = 2.0e4  # scales beyond it, or below its inverse, are absorbed into the potentials
+_SMALLEST_ENTRY = 1e-30  # of the kernel; avoids slow subnormal products
+_PADDING = -1e30  # zero mass, but with a gradient
 
 
 @dataclass(frozen=True, eq=False)
 class ImageKeypoints:
-    """The keypoints of one image, as the network takes them, all float32."""
+    """Keypoints of one image as the network's input, all float32."""
 
     xy: torch.Tensor  # (N, 2), normalised by :func:`normalise_keypoints`
-    scores: torch.Tensor  # (N,), of the detector, in (0, 1]
+    scores: torch.Tensor  # (N,), detector scores in (0, 1]
     descriptors: torch.Tensor  # (N, D)
 
 
 class SuperGlueNet(nn.Module):
-    """The network: keypoints of pairs of images to the logarithm of their assignment.
+    """SuperGlue's network: keypoints of image pairs to log assignments.
 
-    The last of ``encoder_sizes``, the outputs of the keypoint encoder's layers, is the descriptors'
-    size D; the ``num_layers`` of the graph network are self and cross attention in turn.
+    The last of ``encoder_sizes`` is the descriptor size D; ``num_layers`` alternate self and cross
+    attention.
     """
 
     def __init__(
@@ -63,11 +55,7 @@ class SuperGlueNet(nn.Module):
     def forward(
         self, pairs: Sequence[tuple[ImageKeypoints, ImageKeypoints]], iterations: int
     ) -> list[torch.Tensor]:
-        """Log assignments of pairs of images that have keypoints, all at once.
-
-        For each pair of N and M keypoints float32 (N + 1, M + 1), the dustbins last. ``iterations``
-        are of the optimal transport, which is float32 whatever the rest is.
-        """
+        """Return log assignments float32 (N + 1, M + 1) of pairs with keypoints, dustbins last."""
         return self.assignments(pairs, iterations, [len(self.gnn.layers)])[0]
 
     def assignments(
@@ -76,7 +64,7 @@ class SuperGlueNet(nn.Module):
         iterations: int,
         after: Collection[int],
     ) -> list[list[torch.Tensor]]:
-        """As :meth:`forward`, after each of several numbers of layers, ascending."""
+        """Return the assignments after each of several numbers of layers, ascending."""
         images = [image for pair in pairs for image in pair]
         lengths = [len(image.scores) for image in images]
         device = self.bin_score.device.type
@@ -105,8 +93,6 @@ class SuperGlueNet(nn.Module):
 
 
 class _Pointwise(nn.Conv1d):
-    """A convolution of size 1, in the checkpoints' shape, over the last axis of (..., C)."""
-
     def __init__(self, channels_in: int, channels_out: int) -> None:
         super().__init__(channels_in, channels_out, kernel_size=1)
 
@@ -115,7 +101,6 @@ class _Pointwise(nn.Conv1d):
 
 
 def _perceptron(sizes: Sequence[int]) -> nn.Sequential:
-    """Layers from size to size, all but the last with normalisation and activation."""
     layers: list[nn.Module] = []
     for size_in, size_out in pairwise(sizes):
         layers += [_Pointwise(size_in, size_out), nn.BatchNorm1d(size_out), nn.ReLU()]
@@ -129,16 +114,12 @@ class _KeypointEncoder(nn.Module):
 
 
 class _Attention(nn.Module):
-    """Multi-head attention between the keypoints of one image and those of a source.
-
-    In the checkpoints channel c belongs to head c mod 4. The weights are put in the order of heads
-    on their way: they are much smaller than what they are multiplied with.
-    """
+    """Multi-head attention; channel c of a checkpoint belongs to head c mod 4."""
 
     def __init__(self, size: int) -> None:
         super().__init__()
         self.merge = _Pointwise(size, size)
-        self.proj = nn.ModuleList([_Pointwise(size, size) for _ in range(3)])  # query, key, value
+        self.proj = nn.ModuleList([_Pointwise(size, size) for _ in range(3)])
 
     def forward(self, tokens: torch.Tensor, lengths: Sequence[int], *, cross: bool) -> torch.Tensor:
         size = tokens.shape[1]
@@ -161,7 +142,7 @@ class _Attention(nn.Module):
 
 
 class _Layer(nn.Module):
-    """Message that attention adds to the keypoints (equation 3)."""
+    """Message passing by attention (equation 3)."""
 
     def __init__(self, size: int) -> None:
         super().__init__()
@@ -180,7 +161,6 @@ class _GraphNetwork(nn.Module):
 
 
 def superglue(tensors: Mapping[str, torch.Tensor], where: str) -> SuperGlueNet:
-    """The network with the weights of a checkpoint, of the sizes that the checkpoint has."""
     encoder = _numbered(tensors, r"kenc\.encoder\.(\d+)\.weight", dimensions=3)
     layers = _numbered(tensors, r"gnn\.layers\.(\d+)\.attn\.merge\.weight", dimensions=3)
     net = SuperGlueNet(encoder, len(layers)) if encoder and layers else SuperGlueNet()
@@ -188,7 +168,6 @@ def superglue(tensors: Mapping[str, torch.Tensor], where: str) -> SuperGlueNet:
 
 
 def _numbered(tensors: Mapping[str, torch.Tensor], pattern: str, *, dimensions: int) -> list[int]:
-    """Number of outputs of the layers that the pattern names, in the order of their numbers."""
     found = {}
     for key, value in tensors.items():
         matched = re.fullmatch(pattern, key)
@@ -198,7 +177,7 @@ def _numbered(tensors: Mapping[str, torch.Tensor], pattern: str, *, dimensions: 
 
 
 def normalise_keypoints(xy: torch.Tensor, width: int, height: int) -> torch.Tensor:
-    """Pixels (N, 2), first pixel's centre at (0, 0), by the centre and larger side of the image."""
+    """Normalise pixels (N, 2), first centre (0, 0), by the image's centre and larger side."""
     size = torch.tensor([width, height], dtype=xy.dtype, device=xy.device)
     return (xy - size / 2) / (0.7 * size.max())
 
@@ -206,10 +185,7 @@ def normalise_keypoints(xy: torch.Tensor, width: int, height: int) -> torch.Tens
 def mutual_matches(
     log_assignment: torch.Tensor, threshold: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The matches of an assignment (N + 1, M + 1): largest of their row and of their column.
-
-    int64 (K, 2), sorted by row, and their scores (K,), larger than the threshold.
-    """
+    """Return mutual best matches of (N + 1, M + 1): int64 (K, 2), by row, and scores (K,)."""
     inner = log_assignment[:-1, :-1]
     values, columns = inner.max(dim=1)
     rows = torch.arange(len(inner), device=inner.device)
@@ -221,15 +197,14 @@ def mutual_matches(
 def log_optimal_transport(
     scores: Sequence[torch.Tensor], bin_score: torch.Tensor, iterations: int
 ) -> list[torch.Tensor]:
-    """Logarithms of partial assignments, by Sinkhorn's algorithm.
+    """Compute log partial assignments by Sinkhorn's algorithm, dustbins last.
 
-    Returns for each matrix (N + 1, M + 1), the dustbins last. The exponential sums to 1 over every
-    row and column but the dustbins', which sum to M over the row and to N over the column.
+    Rows and columns of the exponential sum to 1, the dustbins' to M (row) and N (column).
 
     Parameters
     ----------
     scores : matrices (N, M) of any sizes, N and M at least 1, all float32 or all float64.
-    bin_score : (), the score of matching nothing.
+    bin_score : (), the dustbin score.
     iterations : at least 1; each normalises the rows, then the columns.
     """
     like = scores[0]
@@ -253,11 +228,8 @@ def log_optimal_transport(
 def _potentials(
     couplings: torch.Tensor, row_mass: torch.Tensor, column_mass: torch.Tensor, iterations: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """u (B, N + 1) and v (B, M + 1), float64, such that exp(Z + u + v) has the masses.
-
-    Both are 0 at padding, where there is no mass.
-    """
-    # added there: 0 / (0 + 1) is no scale, and log(0 + 1) no potential
+    """Return u (B, N + 1) and v (B, M + 1), float64, with the masses of exp(Z + u + v)."""
+    # 1 at padding, to avoid 0 / 0 and log(0)
     row_padding = (row_mass == 0).to(couplings.dtype)
     column_padding = (column_mass == 0).to(couplings.dtype)
 
@@ -283,7 +255,7 @@ def _potentials(
 
 
 def _kernel(couplings: torch.Tensor, u: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-    # scores in the hundreds and their potentials cancel: float32 would keep four digits
+    # large scores and potentials cancel: float32 would keep four digits
     exponents = (couplings + u[:, :, None]) + v[:, None, :]
     return functional.threshold(exponents.to(couplings.dtype).exp(), _SMALLEST_ENTRY, 0.0)
 

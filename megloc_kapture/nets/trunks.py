@@ -1,8 +1,7 @@
-"""Trunks of published networks without their classifiers, and generalized-mean pooling.
+"""Trunks of published networks without classifiers, and generalized-mean pooling.
 
-VGG-16 (Simonyan and Zisserman, ICLR 2015) and ResNet (He et al., CVPR 2016), under torchvision's
-names. The ResNet is the variant with the stride on a bottleneck's 3x3 convolution, which
-torchvision and the networks trained on top of its weights use.
+VGG-16 (Simonyan and Zisserman, ICLR 2015) and ResNet (He et al., CVPR 2016) with torchvision's
+keys; the ResNet has its stride on a bottleneck's 3x3 convolution.
 """
 
 from __future__ import annotations
@@ -13,25 +12,23 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-# widths of the 3x3 convolutions of each of the five stages; a pooling ends each stage
+# channels of each stage's convolutions; a pooling ends each stage
 _VGG_STAGES = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
 Depth = Literal[50, 101]
 RESNET_BLOCKS: dict[Depth, tuple[int, int, int, int]] = {50: (3, 4, 6, 3), 101: (3, 4, 23, 3)}
-RESNET_DEPTHS: dict[int, Depth] = {6: 50, 23: 101}  # by the blocks of the third stage
+RESNET_DEPTHS: dict[int, Depth] = {6: 50, 23: 101}
 RESNET_WIDTHS, RESNET_EXPANSION = (64, 128, 256, 512), 4
-# of the images of ImageNet, RGB in [0, 1]
+# of ImageNet, RGB in [0, 1]
 IMAGENET_MEAN, IMAGENET_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-# smaller activations count as this, so that powers and their gradients stay finite
+# lower bound of activations: powers and gradients stay finite
 _MINIMUM = 1e-6
 
 
 class Vgg16Features(nn.Sequential):
-    """VGG-16 (configuration D) up to a layer, numbered as torchvision's ``features``.
+    """VGG-16 (configuration D) up to layer ``last``, numbered as torchvision's ``features``.
 
-    Every convolution is 3x3 with a border of zeros and a bias, followed by a ReLU; stages end in a
-    2x2 maximum with stride 2, which drops an odd last row or column. Keys of the state dict are
-    ``{i}.weight`` and ``{i}.bias``. ``last``: number of the last layer: 28 is conv5_3 without its
-    ReLU (512 channels, 1/16 of the size), 29 is that ReLU.
+    Layer 28 is conv5_3 without its ReLU (512 channels, 1/16 of the size), 29 its ReLU. Poolings
+    drop odd last rows and columns.
     """
 
     def __init__(self, *, last: int) -> None:
@@ -45,24 +42,24 @@ class Vgg16Features(nn.Sequential):
         super().__init__(*layers[: last + 1])
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Activation (B, C, h, w) after the last layer, of (B, 3, H, W), which stays as it is."""
+        """Return the activation (B, C, h, w) of the last layer for (B, 3, H, W), left unchanged."""
         for layer in self:
-            # the maps of a large image have 200 MB: a ReLU needs none of its own
+            # in place: maps of a large image have 200 MB
             x = torch.relu_(x) if isinstance(layer, nn.ReLU) else layer(x)
         return x
 
 
 def imagenet_normalised(image: torch.Tensor) -> torch.Tensor:
-    """An RGB image (B, 3, H, W) in [0, 1], shifted and scaled as networks from ImageNet take it."""
+    """Normalise an RGB image (B, 3, H, W) in [0, 1] by ImageNet's mean and deviation."""
     mean = image.new_tensor(IMAGENET_MEAN)[:, None, None]
     return (image - mean) / image.new_tensor(IMAGENET_DEVIATION)[:, None, None]
 
 
 class Bottleneck(nn.Module):
-    """1x1, 3x3 and 1x1 convolution around a shortcut; the stride is on the 3x3.
+    """Bottleneck block of a ResNet, with the stride on the 3x3 convolution.
 
-    ``strided_first``: the stride is on the first 1x1 instead; ``bias`` and ``epsilon``: of the
-    convolutions, and of the normalisations after them.
+    ``strided_first``: stride on the first 1x1 instead; ``bias`` and ``epsilon``: of convolutions
+    and normalisations.
     """
 
     def __init__(
@@ -105,11 +102,7 @@ class Bottleneck(nn.Module):
 
 
 class ResNet(nn.Module):
-    """ResNet-50 or ResNet-101 without its classifier.
-
-    ``dilated``: the stride of the last stage is a dilation of its blocks but the first instead, so
-    that the output stride is 16, not 32.
-    """
+    """ResNet-50 or ResNet-101; ``dilated`` is output stride 16 instead of 32."""
 
     def __init__(self, depth: Depth, *, dilated: bool = False) -> None:
         super().__init__()
@@ -128,10 +121,7 @@ class ResNet(nn.Module):
             self.add_module(f"layer{number}", stage)
 
     def forward(self, image: torch.Tensor) -> list[torch.Tensor]:
-        """Features of the four stages, 256, 512, 1024 and 2048 channels.
-
-        ``image`` is (B, 3, H, W), see :func:`imagenet_normalised`.
-        """
+        """Return features of the four stages, with 256, 512, 1024 and 2048 channels."""
         x = F.relu(self.bn1(self.conv1(image)), inplace=True)
         x = F.max_pool2d(x, 3, stride=2, padding=1)
         features = []
@@ -142,11 +132,11 @@ class ResNet(nn.Module):
 
 
 def generalized_mean(features: torch.Tensor, power: torch.Tensor | float) -> torch.Tensor:
-    """The power mean (B, C) of each channel over all pixels: 1 is the mean, infinity the maximum.
+    """Compute the power mean (B, C) of each channel: 1 is the mean, infinity the maximum.
 
-    ``features`` (B, C, H, W) may be of any precision, and count as 1e-6 below it; the result is
-    float32, float64 where they are. ``power`` is one number, not 0.
+    ``features`` (B, C, H, W) are clamped to 1e-6; the result is at least float32. ``power`` is not
+    0.
     """
-    # a third power leaves the range of half precision at 41
+    # a third power overflows half precision at 41
     values = features if features.dtype == torch.float64 else features.float()
     return values.clamp(min=_MINIMUM).pow(power).mean(dim=(2, 3)).pow(1.0 / power)

@@ -1,7 +1,7 @@
-"""Work on a cluster of dask.distributed: a running one, or one of local processes.
+"""Executor on a running dask.distributed cluster, or on a local one.
 
-Items of work are paths and numbers, and workers read the files. The workspace, the data and this
-process's current folder must therefore be at the same paths on every machine.
+Items are paths and numbers and workers read the files, so the workspace, the data and the current
+folder must have the same paths on every machine.
 """
 
 from __future__ import annotations
@@ -25,20 +25,16 @@ from megloc_kapture.evaluation.pose_files import installed_version
 from megloc_kapture.pipeline.executors import enter_single_threaded
 
 _CONNECT_S = 10.0
-# a worker that died is no fault of the item it worked on; an item that kills ten workers is
+# tolerates dead workers, but not an item that kills ten of them
 _ALLOWED_FAILURES = 10
 _ITEMS_PER_WORKER = 4
 
 
 @contextmanager
 def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator[Executor]:
-    """Open an executor whose items run on dask workers.
+    """Open an executor on the dask ``scheduler`` (address), or on a local cluster of ``workers``.
 
-    Parameters
-    ----------
-    workers : processes of the local cluster.
-    scheduler : address of a running one, as ``tcp://10.0.0.1:8786``; None: a local cluster.
-    shared : folder that all workers must see as this process does.
+    All workers must see the folder ``shared``.
     """
     import dask
 
@@ -58,7 +54,7 @@ def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator
             client.register_plugin(_Preparation(_environment(), Path.cwd(), shared.absolute()))
             executor: Any = client.get_executor(pure=False)
             executor.window = _ITEMS_PER_WORKER * threads
-            executor.is_elsewhere = scheduler is not None  # its machines may have GPUs
+            executor.is_elsewhere = scheduler is not None  # remote machines may have GPUs
             yield executor
         except KilledWorker as error:
             raise MeglocError(
@@ -91,7 +87,7 @@ def _client(stack: ExitStack, workers: int, scheduler: str | None) -> Client:
         threads_per_worker=1,
         dashboard_address="127.0.0.1:0",
         local_directory=folder,
-        memory_limit=0,  # the system limits memory, as for other processes
+        memory_limit=0,
         silence_logs=logging.CRITICAL,
     )
     return stack.enter_context(Client(stack.enter_context(cluster), set_as_default=False))
@@ -103,10 +99,8 @@ def _workers(client: Client) -> list[dict[str, Any]]:
 
 @dataclass
 class _Preparation(WorkerPlugin):
-    """Makes a worker like the process that has the run, or refuses it."""
-
     environment: dict[str, str]
-    folder: Path  # the current one, which relative paths start from
+    folder: Path  # current folder, base of relative paths
     shared: Path
     name = "megloc"
 

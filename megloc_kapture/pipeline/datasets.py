@@ -1,8 +1,8 @@
-"""The datasets that ``megloc eval`` and ``megloc import`` know, by name, and their benchmark files.
+"""Datasets of ``megloc eval`` and ``megloc import`` by name, and their benchmark files.
 
-``kapture`` is any pair of kapture folders; an adapter (group ``megloc_kapture.datasets``) knows an
+``kapture`` is any pair of kapture folders; an adapter (group ``megloc_kapture.datasets``) reads an
 official layout; ``synthetic`` and ``synthetic-X`` (group ``megloc_kapture.rendered_datasets``) are
-rendered, the latter in the layout of X. A benchmark file says how a dataset is run.
+rendered, the latter in the layout of X. A benchmark file holds the options of a dataset.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ _log = logging.getLogger(__name__)
 KAPTURE, SYNTHETIC = "kapture", "synthetic"
 DATA_VARIABLE = "MEGLOC_DATA"
 SUMMARY_FILE = f"{SIDE_TABLES}/summary.txt"
-# an evaluation server counts a missing pose as a wrong one, so benchmarks keep every pose
+# evaluation servers count a missing pose as wrong, so benchmarks keep every pose
 EVERY_POSE = {"localization": {"min_confidence": 0.0}}
 
 _PACKAGE = Path(__file__).resolve().parent.parent
-# in a wheel the files lie inside the package, in a checkout beside it
+# inside the package in a wheel, next to it in a checkout
 _PLACES = (_PACKAGE / "benchmarks", _PACKAGE.parent / "benchmarks")
 
 ProtocolChange = Callable[[Protocol], Protocol]
@@ -55,15 +55,7 @@ ProtocolChange = Callable[[Protocol], Protocol]
 
 @dataclass(frozen=True)
 class DatasetChoice:
-    """A dataset and where it comes from.
-
-    Attributes
-    ----------
-    root : its folder; None where it is rendered.
-    adapter : of its official layout; None for kapture folders.
-    import_options : the adapter's, by name.
-    twin : what renders it; None for a dataset with a root.
-    """
+    """A dataset and its source: an adapter, a renderer (``twin``), or kapture folders (neither)."""
 
     name: str
     root: Path | None
@@ -74,26 +66,23 @@ class DatasetChoice:
     allow_missing: bool = False
 
     def check(self) -> None:
-        """Raise DataError when the folder cannot be the dataset's, before anything is written."""
+        """Raise DataError if the folder cannot hold the dataset."""
         if self.root is not None:
             (check_root if self.adapter is None else self.adapter.check)(self.root)
 
     def has_truth(self) -> bool:
-        """Whether true poses may lie beside the dataset; an adapter may know of more."""
+        """Return whether the dataset may have true poses; an adapter may know more."""
         if self.root is None or self.adapter is not None:
             return True
         return (self.root / QUERY_GT / "sensors" / "sensors.txt").is_file()
 
     def has_query_depth(self) -> bool:
-        """Whether the queries come with depth maps, of a sensor that a rig joins to their camera;
-        those of official datasets have none.
-        """
+        """Return whether a sensor in the rig gives query depth; official datasets have none."""
         if self.root is None or self.adapter is not None:
             return False
         return _has_depth(self.root / QUERY)
 
     def has_map_depth(self) -> bool:
-        """Whether the map's images come with depth maps, as far as options and folders tell."""
         if self.adapter is not None:
             return bool(getattr(getattr(self.adapter, "options", None), "depth", False))
         if self.root is None:
@@ -101,7 +90,6 @@ class DatasetChoice:
         return _has_depth(self.root / MAPPING)
 
     def settings(self) -> dict[str, Any]:
-        """What, beside the files, determines an import."""
         settings: dict[str, Any] = {"dataset": self.name, "query_prefix": self.query_prefix}
         if self.adapter is not None:
             settings["adapter"] = self.adapter.name
@@ -110,11 +98,10 @@ class DatasetChoice:
         return settings
 
     def input_files(self, root: Path) -> Iterator[Path]:
-        """Every file an import depends on."""
         return input_files(root) if self.adapter is None else self.adapter.input_files(root)
 
     def rehearse(self) -> None:
-        """Raise what an import of the root would refuse; nothing is written."""
+        """Raise the errors of an import without writing anything."""
         if self.root is None:
             return
         root = self.root.resolve()
@@ -127,10 +114,9 @@ class DatasetChoice:
     def import_to(
         self, root: Path, output: Path, change: ProtocolChange | None = None
     ) -> dict[str, float]:
-        """Import ``root`` into ``output``; returns counts for the log.
+        """Import ``root`` into ``output`` and return counts for the log.
 
-        Beside the kapture folders an official dataset leaves a summary of what was found and
-        what is published, ``megloc/summary.txt``.
+        Official datasets get ``megloc/summary.txt``, which compares found and published counts.
         """
         if self.adapter is None:
             return import_kapture_folders(
@@ -140,7 +126,6 @@ class DatasetChoice:
         if change is not None:
             dataset = replace(dataset, protocol=change(dataset.protocol))
         write_official(dataset, output, allow_missing=self.allow_missing)
-        # a twin is small on purpose: what is published says nothing about it
         if self.name.startswith(TWIN_PREFIX):
             bare = [replace(count, published=None) for count in dataset.summary]
             dataset = replace(dataset, summary=bare)
@@ -153,14 +138,12 @@ class DatasetChoice:
         }
 
     def render_options(self) -> dict[str, Any]:
-        """What determines the rendered dataset."""
         if self.twin is None:
             return {}
         return {"version": self.twin.version, "world": self.twin.options.model_dump(mode="json")}
 
 
 def summary_text(dataset: OfficialDataset) -> str:
-    """What an import found, beside what is published, and what a user should know."""
     lines = [str(count) for count in dataset.summary]
     if dataset.missing is not None and dataset.missing.files:
         lines += ["", f"{len(dataset.missing.files)} files are missing (--allow-missing):"]
@@ -171,13 +154,11 @@ def summary_text(dataset: OfficialDataset) -> str:
 
 
 def dataset_names() -> list[str]:
-    """Every name that :func:`choose_dataset` takes."""
     official = plugin_names(DATASETS)
     return [KAPTURE, *official, SYNTHETIC, *(f"{TWIN_PREFIX}{name}" for name in official)]
 
 
 def check_known(dataset: str) -> None:
-    """Refuse a dataset that nobody knows."""
     if dataset not in dataset_names():
         raise OptionError(f"unknown dataset {dataset!r}; {suggestion(dataset, dataset_names())}")
 
@@ -191,11 +172,9 @@ def choose_dataset(
     allow_missing: bool = False,
     find_root: bool = True,
 ) -> DatasetChoice:
-    """The dataset of a name; without ``root`` it is looked for below MEGLOC_DATA.
+    """Return a dataset by name; without ``root`` it is searched below MEGLOC_DATA.
 
-    Parameters
-    ----------
-    find_root : false: an official dataset may be without a root; it cannot be imported then.
+    If ``find_root`` is false, an official dataset may lack a root and then cannot be imported.
     """
     check_known(name)
     layout = name.removeprefix(TWIN_PREFIX)
@@ -217,11 +196,9 @@ def choose_dataset(
 
 
 def with_model(choice: DatasetChoice, *, features: bool = False) -> DatasetChoice | None:
-    """The dataset, imported with the model of points that it comes with; None where it has none.
+    """Return the dataset with import of its point model, or None if it has no model.
 
-    Parameters
-    ----------
-    features : of a twin, draw the model's features too, which localizing in it needs.
+    With ``features`` a twin's model features are rendered too, as localization needs them.
     """
     if choice.adapter is None:
         return None
@@ -238,7 +215,6 @@ def with_model(choice: DatasetChoice, *, features: bool = False) -> DatasetChoic
 
 
 def has_model(choice: DatasetChoice) -> bool:
-    """Whether the data have the model of points that the dataset comes with."""
     found = with_model(choice)
     try:
         if found is not None:
@@ -271,7 +247,6 @@ def _root_in_environment(name: str, adapter: DatasetAdapter | None) -> Path:
 
 
 def twin_of(layout: str, **options: Any) -> RenderedDataset:
-    """Return the rendered dataset of a layout, by its name, with changed options."""
     known = plugin_names(RENDERED_DATASETS)
     if not known:
         raise OptionError(
@@ -285,13 +260,7 @@ def twin_of(layout: str, **options: Any) -> RenderedDataset:
 
 
 class PublishedResult(Options):
-    """Figures of another method on the dataset, to be read beside ours.
-
-    Parameters
-    ----------
-    method, source : what was measured, and where it is published.
-    recall : condition -> percent at the dataset's thresholds, as papers print it.
-    """
+    """Published figures of another method; ``recall`` is in percent by condition."""
 
     method: str
     source: str
@@ -299,15 +268,7 @@ class PublishedResult(Options):
 
 
 class PresetOptions(Options):
-    """Changes that a dataset makes to presets.
-
-    Parameters
-    ----------
-    import_options : the adapter's.
-    options : changes in any case.
-    options_with_map_depth, options_with_query_depth, options_with_both_depths : further ones where
-        the images of the map, of the queries, or of both come with depth maps; in this order.
-    """
+    """Changes of a dataset to presets, some of them only for data with depth maps."""
 
     import_options: dict[str, Any] = Field(default_factory=dict)
     options: dict[str, Any] = Field(default_factory=dict)
@@ -325,13 +286,10 @@ class PresetOptions(Options):
 
 
 class BenchmarkFile(PresetOptions):
-    """``benchmarks/<dataset>.toml``: how one dataset is run, with changes to every preset.
+    """Options of one dataset, ``benchmarks/<dataset>.toml``, with changes to every preset.
 
-    Parameters
-    ----------
-    presets : further changes to the preset of a name.
-    thresholds, conditions, pools : instead of the dataset's own (see the side tables' Protocol).
-    published : what others have reached.
+    ``presets`` holds further changes by preset name; ``thresholds``, ``conditions`` and ``pools``
+    replace those of the dataset's Protocol.
     """
 
     dataset: str
@@ -351,26 +309,21 @@ class BenchmarkFile(PresetOptions):
         return presets
 
     def changes(self, preset: str, *, map_depth: bool, query_depth: bool) -> list[dict[str, Any]]:
-        """Changes to a preset, in order, for data with depth maps or without."""
+        """Return changes to a preset, in order, for data with or without depth maps."""
         layers = self, self.presets.get(preset, PresetOptions())
         changed = [one._changes(map_depth=map_depth, query_depth=query_depth) for one in layers]
         return [EVERY_POSE, *chain.from_iterable(changed)]
 
     def import_options_of(self, preset: str) -> dict[str, Any]:
-        """The adapter's options, where this preset is run."""
         return self.import_options | self.presets.get(preset, PresetOptions()).import_options
 
     def change(self, protocol: Protocol) -> Protocol:
-        """A dataset's protocol with what this file wants different."""
         wanted = {"thresholds": self.thresholds, "conditions": self.conditions, "pools": self.pools}
         return protocol.model_copy(update={k: v for k, v in wanted.items() if v is not None})
 
 
 def find_benchmark(dataset: str) -> BenchmarkFile:
-    """The benchmark file of a dataset that comes with the package; defaults where there is none.
-
-    A rendered twin runs as its dataset does, but nobody has published figures on it.
-    """
+    """Return the packaged benchmark file of a dataset or of a twin's dataset, or defaults."""
     for name in (dataset, dataset.removeprefix(TWIN_PREFIX)):
         for place in _PLACES:
             path = place / f"{name}.toml"
@@ -383,7 +336,6 @@ def find_benchmark(dataset: str) -> BenchmarkFile:
 
 
 def read_benchmark(path: Path) -> BenchmarkFile:
-    """Read a benchmark file."""
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
         return BenchmarkFile.model_validate(content)
@@ -398,8 +350,7 @@ def read_benchmark(path: Path) -> BenchmarkFile:
 
 
 def _has_depth(root: Path) -> bool:
-    """Whether images of a kapture folder have depth; warns of depth maps that are of none."""
-    # who chooses a dataset does not wait for the stages
+    # imported here so that choosing a dataset does not import the stages
     from megloc_kapture.stages.scene import depth_records
 
     data = KaptureFolder(root).read()

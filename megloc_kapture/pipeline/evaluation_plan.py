@@ -1,4 +1,4 @@
-"""The plan of ``megloc eval``: from a dataset to a pose file and a recall table."""
+"""Plan of ``megloc eval``, from a dataset to a pose file and a recall table."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ from megloc_kapture.stages.stage import (
 
 WORLD = "world"
 
-# between import and pose file, in this order; each is there where the options ask for it
+# in order, between import and pose file; options select the stages
 PIPELINE: tuple[type[PipelineStage], ...] = (
     *MAP_STAGES,
     PairQueries,
@@ -62,7 +62,7 @@ PIPELINE: tuple[type[PipelineStage], ...] = (
 
 
 def plan_evaluation(run: Run) -> list[Stage]:
-    """Return the stages of a run, in order; nothing has been written by then."""
+    """Return the stages of a run, in order, without writing anything."""
     options = run.options
     given = options.uses_given_map()
     if given or options.pairs_by_points():
@@ -87,7 +87,7 @@ def plan_evaluation(run: Run) -> list[Stage]:
 
 @dataclass(frozen=True)
 class StageLine:
-    """Whether a run has a stage, and the options that decide that."""
+    """A stage, its inclusion in a run, and the reason."""
 
     name: str
     on: bool
@@ -95,16 +95,14 @@ class StageLine:
 
 
 def explain(options: PipelineOptions) -> list[StageLine]:
-    """Return a line per stage of the pipeline; nothing is loaded."""
     lines: dict[str, StageLine] = {}
     for stage in (kind(options) for kind in PIPELINE):
-        if stage.is_wanted() or stage.name not in lines:  # one of several writes the points
+        if stage.is_wanted() or stage.name not in lines:  # alternative stages share a name
             lines[stage.name] = StageLine(stage.name, stage.is_wanted(), stage.explain())
     return list(lines.values())
 
 
 def explained(lines: Sequence[StageLine]) -> str:
-    """Return the lines as a table of text."""
     width = max(len(line.name) for line in lines)
     return "\n".join(
         f"{line.name:{width}s}  {'on' if line.on else 'off':3s}  {line.why}" for line in lines
@@ -112,7 +110,7 @@ def explained(lines: Sequence[StageLine]) -> str:
 
 
 def _insert(stages: list[Stage], stage: Stage) -> None:
-    """Put a stage of another package behind the last one that writes what it reads."""
+    """Insert a plugin stage after the last stage that writes one of its inputs."""
     if any(stage.name == one.name for one in stages):
         raise OptionError(f"stages.{stage.name}: there is a stage of this name")
     for path in stage.reads:
@@ -141,7 +139,7 @@ def _with_model(run: Run, given: bool) -> DatasetChoice:
 
 
 class _RunStage(Stage):
-    """A stage that needs to know of the run: its dataset, its preset, all of its options."""
+    """A stage that depends on the run: dataset, preset and all options."""
 
     def __init__(self, run: Run) -> None:
         super().__init__(run.options)
@@ -152,7 +150,7 @@ class _RunStage(Stage):
 
 
 class Render(_RunStage):
-    """Render a dataset that is made rather than given."""
+    """Render a synthetic dataset."""
 
     name = "render"
     writes = (WORLD,)
@@ -214,7 +212,7 @@ class Import(_RunStage):
 
 
 class Submit(_RunStage):
-    """Write the pose file, with its provenance beside it."""
+    """Write the pose file and its provenance."""
 
     name = "submission"
     version = 4
@@ -234,7 +232,7 @@ class Submit(_RunStage):
 
 
 class Evaluate(_RunStage):
-    """Measure recall where the true poses are known, else what can be known without them."""
+    """Measure recall if true poses are known, else compute statistics without them."""
 
     name = "evaluation"
     version = 4
@@ -249,7 +247,7 @@ class Evaluate(_RunStage):
         localized, truth, tables = map(work.path, (LOCALIZED, QUERY_GT, SIDE_TABLES))
         map_poses = work.folder(MAPPING).read().poses()
         provenance = self.settings() | {"versions": package_versions()}
-        del provenance[PROTOCOL]  # the report has it in words
+        del provenance[PROTOCOL]  # the report shows the protocol as text
         output = work.out / EVALUATION
         context = context_of(localized)
         if not truth.is_dir():
@@ -273,7 +271,7 @@ class Evaluate(_RunStage):
 
 
 def recall_rows(workspace: Path) -> dict[str, Any]:
-    """Rows of the recall table by name; none where no truth is known."""
+    """Return rows of the recall table by name; empty without true poses."""
     path = workspace / EVALUATION / RECALL_JSON
     if not path.is_file():
         return {}

@@ -1,4 +1,4 @@
-"""Where per-image and per-pair work runs: in this process, in local processes, or on dask."""
+"""Executors of per-image and per-pair work: inline, local processes, or dask."""
 
 from __future__ import annotations
 
@@ -23,21 +23,20 @@ ExecutorKind = Literal["inline", "processes", "dask"]
 
 
 def available_cores() -> int:
-    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 _lock = threading.Lock()
 _num_blocks = 0
-_before = ExitStack()  # restores the numbers of threads
+_before = ExitStack()  # restores the thread counts
 
 
 @contextmanager
 def single_threaded() -> Iterator[None]:
-    """Run matrix products with one thread: parallelism comes from the executor.
+    """Limit BLAS, OpenMP and torch to one thread, as executors provide the parallelism.
 
-    The last bits of a product may depend on how it is split among threads. Limits BLAS, OpenMP
-    and torch while any such block is open; blocks may overlap in several threads.
+    The last bits of a product may depend on the number of threads. Blocks may overlap in several
+    threads.
     """
     global _num_blocks
     with _lock:
@@ -58,26 +57,25 @@ def _limit_threads(stack: ExitStack) -> None:
 
     stack.enter_context(threadpool_limits(1))
     torch: Any = sys.modules.get("torch")
-    if hasattr(torch, "set_num_threads"):  # False while another thread imports it
+    if hasattr(torch, "set_num_threads"):  # missing while another thread imports torch
         stack.callback(torch.set_num_threads, torch.get_num_threads())
         torch.set_num_threads(1)
 
 
 def enter_single_threaded() -> None:
-    """Run matrix products with one thread in this process from now on."""
     import cv2
     import numpy  # noqa: F401  its thread pool must exist to be limited
     from threadpoolctl import threadpool_limits
 
     cv2.setNumThreads(1)
-    os.environ["OMP_NUM_THREADS"] = "1"  # for libraries that are loaded later, as torch
+    os.environ["OMP_NUM_THREADS"] = "1"  # for libraries that load later, such as torch
     threadpool_limits(1)
 
 
 def _start_worker(shared: Path) -> None:
     from megloc_kapture.io.weights import share_weights
 
-    # a terminal sends signals to every process of the run, which ends its workers itself
+    # the parent ends its workers when a terminal interrupts the process group
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     end_with_parent()
@@ -86,7 +84,7 @@ def _start_worker(shared: Path) -> None:
 
 
 def end_with_parent() -> None:
-    """End this process when its parent was killed: a worker would wait for work forever."""
+    """Stop this process if its parent was killed; a worker would wait for work forever."""
 
     def wait_for_parent() -> None:
         parent = multiprocessing.parent_process()
@@ -104,14 +102,10 @@ def open_executor(
     scheduler: str | None = None,
     shared: Path | None = None,
 ) -> Iterator[Executor | None]:
-    """Open the executor of a run; None means inline.
+    """Open the executor of a run, or None for inline work; kill workers on an exception.
 
-    Worker processes are killed when the block raises.
-
-    Parameters
-    ----------
-    scheduler : address of a running dask scheduler; None starts a local cluster.
-    shared : with dask, a folder that all workers must see; the current folder by default.
+    With dask, ``scheduler`` is an address (None starts a local cluster) and ``shared`` a folder
+    that all workers must see, the current one by default.
     """
     count = available_cores() if workers is None else workers
     if count < 1:
@@ -132,13 +126,13 @@ def open_executor(
 
 @contextmanager
 def _process_pool(count: int) -> Iterator[Executor]:
-    # never fork: BLAS and OpenCV have threads by now
+    # fork is unsafe with the threads of BLAS and OpenCV
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["megloc_kapture.stages.query_poses"])
     with ExitStack() as stack:
         try:
             clear_leftovers(Path(tempfile.gettempdir()))
-            folder = stack.enter_context(  # of the weights that workers share
+            folder = stack.enter_context(  # for weights shared by workers
                 tempfile.TemporaryDirectory(prefix=owned_name(), ignore_cleanup_errors=True)
             )
             pool = ProcessPoolExecutor(count, context, _start_worker, (Path(folder),))
@@ -161,5 +155,5 @@ def _kill(pool: ProcessPoolExecutor) -> None:
     for process in list((pool._processes or {}).values()):
         process.kill()
     if pool._result_queue is not None:
-        # or the pool's thread waits forever for the rest of a result that was being sent
+        # otherwise the pool's thread waits for the rest of a result
         pool._result_queue._writer.close()  # type: ignore[attr-defined]

@@ -1,12 +1,12 @@
-"""A map and localized queries in the formats of other tools.
+"""Export of maps and localized queries to the formats of other tools.
 
-colmap      a model, as COLMAP writes it
+colmap      model in COLMAP's format
 nerfstudio  ``transforms.json`` and ``sparse_pc.ply``
-tum         ``seconds tx ty tz qx qy qz qw``, as evo reads it
-ply         points and camera frusta, which every viewer of meshes opens
+tum         ``seconds tx ty tz qx qy qz qw``, for evo
+ply         points and camera frusta, for mesh viewers
 
-Trajectories hold ``world_from_cam`` in the camera axes of COLMAP and kapture: x right, y down, z
-ahead. nerfstudio's are OpenGL's: x right, y up, z back.
+Trajectories hold ``world_from_cam`` in the camera axes of COLMAP and kapture: x right, y down,
+z forward. nerfstudio uses OpenGL's axes: x right, y up, z back.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
 
 _log = logging.getLogger(__name__)
 _MAP_COLOUR, _QUERY_COLOUR = (120, 120, 120), (220, 50, 32)
-# fx fy cx cy and distortion, by COLMAP's order of parameters
+# fx fy cx cy and distortion, in COLMAP's parameter order
 _NERFSTUDIO: dict[str, tuple[str, tuple[str, ...]]] = {
     "SIMPLE_PINHOLE": ("OPENCV", ()),
     "PINHOLE": ("OPENCV", ()),
@@ -55,16 +55,9 @@ _NERFSTUDIO: dict[str, tuple[str, tuple[str, ...]]] = {
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """An image with its pose.
+    """An image with its pose, and a camera in COLMAP's convention.
 
-    Attributes
-    ----------
-    path : its file; None where there is none.
-    camera : in COLMAP's convention.
-    timestamp, sensor : of its record in kapture.
-    is_query : localized, not of the map.
-    keypoints_px : (K, 2); empty where nothing is observed.
-    rows, points : int (M,), rows of keypoints and of the scene's points that they observe.
+    ``rows`` and ``points``, int (M,), index ``keypoints_px`` (K, 2) and the scene's points.
     """
 
     name: str
@@ -81,17 +74,14 @@ class PosedImage:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is exported: images, and points float64 (N, 6) as X Y Z R G B."""
+    """Exported images and points, float64 (N, 6) as X Y Z R G B."""
 
     images: Sequence[PosedImage]
     points: NDArray[np.float64]
 
 
 def export_colmap(scene: Scene, output: Path) -> None:
-    """Write a model: cameras, rigs, frames, images, points3D, in COLMAP's binary format.
-
-    Every camera is a rig of its own. Queries bring no observations.
-    """
+    """Write a binary COLMAP model with one rig per camera; queries have no observations."""
     names = [image.name for image in scene.images]
     if len(set(names)) != len(names):
         twice = min(name for name in names if names.count(name) > 1)
@@ -102,9 +92,9 @@ def export_colmap(scene: Scene, output: Path) -> None:
 
 
 def export_undistorted(scene: Scene, output: Path) -> None:
-    """Write PINHOLE cameras, ``images/`` and ``sparse/0``, as Gaussian splatting reads them.
+    """Write PINHOLE cameras, ``images/`` and ``sparse/0`` for Gaussian splatting.
 
-    The original program ignores the folders in images' names, so ``/`` becomes ``_``.
+    ``/`` in image names becomes ``_``, as the original program ignores folders.
     """
     images = [replace(image, name=image.name.replace("/", "_")) for image in scene.images]
     for image in images:
@@ -121,12 +111,7 @@ def export_undistorted(scene: Scene, output: Path) -> None:
 
 
 def export_nerfstudio(scene: Scene, output: Path, *, beside: Path | None = None) -> None:
-    """Write ``transforms.json``, with intrinsics per frame, and ``sparse_pc.ply``.
-
-    Parameters
-    ----------
-    beside : folder that the images' paths are relative to, where it is not ``output``.
-    """
+    """Write ``transforms.json``, with paths relative to ``beside``, and ``sparse_pc.ply``."""
     frames = []
     for image in scene.images:
         if image.path is None or not image.path.is_file():
@@ -148,7 +133,6 @@ def export_nerfstudio(scene: Scene, output: Path, *, beside: Path | None = None)
 
 
 def export_tum(scene: Scene, output: Path) -> None:
-    """Write a TUM trajectory."""
     rows = []
     for image in sorted(scene.images, key=lambda one: one.timestamp):
         world_from_cam = image.cam_from_world.inverse()
@@ -167,20 +151,16 @@ def export_tum(scene: Scene, output: Path) -> None:
 
 
 def _exponent_of_seconds(timestamp: int) -> int:
-    """Return the power of ten that converts a timestamp to seconds.
+    """Return the power of ten that converts a timestamp to seconds, recognised by its magnitude.
 
-    Nanoseconds, microseconds and milliseconds since 1970 are recognised by their magnitude (each
-    limit is between 1973 and 5138); smaller numbers are seconds or frame numbers.
+    Nano-, micro- and milliseconds are since 1970; each limit is between 1973 and 5138.
     """
     limits = ((10**17, -9), (10**14, -6), (10**11, -3))
     return next((exponent for limit, exponent in limits if timestamp >= limit), 0)
 
 
 def export_ply(scene: Scene, output: Path) -> None:
-    """Write the points, and every camera as five vertices and eight edges.
-
-    A frustum is as deep as a twentieth of what the cameras see in the median.
-    """
+    """Write the points, and every camera as a frustum, a twentieth of the median depth deep."""
     depths = [
         float(np.median(image.cam_from_world.apply(scene.points[image.points, :3])[:, 2]))
         for image in scene.images
@@ -201,8 +181,7 @@ def export_ply(scene: Scene, output: Path) -> None:
 
 
 def frustum(camera: Camera, cam_from_world: RigidTransform, depth: float) -> NDArray[np.float64]:
-    """Centre and corners (5, 3) of what a camera sees up to a depth, in the world; see
-    :func:`~megloc_kapture.evaluation.report.scene.corner_rays`."""
+    """Return the centre and image corners (5, 3) of a camera at a depth, in the world."""
     rays = np.concatenate([np.zeros((1, 3)), depth * corner_rays(camera)])
     return cam_from_world.inverse().apply(rays)
 
@@ -246,21 +225,15 @@ def export(
     undistort: bool = False,
     force: bool = False,
 ) -> int:
-    """Write a map, localized queries, or both in the format of another tool.
+    """Write a map, localized queries, or both in another tool's format; return the image count.
 
     Parameters
     ----------
     name : colmap and nerfstudio write folders, tum and ply files.
-    map : kapture map, or a kapture folder of images with poses.
-    query : kapture folder of localized queries in the map's world. With queries a trajectory has
-        these alone.
-    sensor : images of this camera only.
-    undistort : for colmap: write undistorted images and their model, as programs for Gaussian
-        splatting read them: ``images/`` and ``sparse/0`` with PINHOLE cameras.
-
-    Returns
-    -------
-    Number of images written.
+    map : kapture map, or a kapture folder of posed images.
+    query : kapture folder of localized queries; a trajectory then holds only these.
+    sensor : export only images of this camera.
+    undistort : write undistorted images and PINHOLE cameras for Gaussian splatting; colmap only.
     """
     if name not in get_args(ExportFormat):
         raise OptionError(f"unknown format {name!r}; {suggestion(name, get_args(ExportFormat))}")
@@ -328,12 +301,6 @@ def _scene(
 def _posed_images(
     folder: KaptureFolder, opened: KaptureMap | None, sensor: str | None, *, is_query: bool
 ) -> list[PosedImage]:
-    """The images of a folder that have a pose; those of the map with their observations.
-
-    Parameters
-    ----------
-    opened : the map, which cameras are described as; None without one.
-    """
     data, (scaled, errors) = folder.read(), cameras_of_folder(folder)
     if errors:
         raise errors[0]
@@ -373,8 +340,7 @@ def _posed_images(
 def _observed(
     opened: KaptureMap, image: str
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Keypoints (K, 2) of all types of a map image, one behind the other; rows (M,) of these and
-    of the points that they observe."""
+    """Return keypoints (K, 2) of all types, and rows (M,) of keypoints and observed points."""
     keypoints, rows, points = [np.zeros((0, 2))], [_NO_ROWS], [_NO_ROWS]
     for typed in opened.keypoints.values():
         if image in typed:

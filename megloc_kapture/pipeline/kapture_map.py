@@ -1,4 +1,4 @@
-"""A kapture map, of any tool, as the localizer needs it; read-only."""
+"""Read-only kapture map of any tool, for the localizer."""
 
 from __future__ import annotations
 
@@ -32,21 +32,15 @@ AS_ASKED = "as asked for"
 
 _SAMPLED_IMAGES = 50
 _NETWORKS = ("aliked", "aslfeat", "disk", "r2d2", "superpoint", "xfeat")
-# extractor of SIFT by whether descriptors are bytes
+# SIFT extractor by whether descriptors are bytes
 _SIFT_OF = {True: "sift", False: "rootsift"}
 
 
 @dataclass(frozen=True, eq=False)
 class MapKeypoints:
-    """The keypoints of one type in a map, and the points they observe.
+    """Keypoints of one type in a map, in COLMAP's convention, and the points they observe.
 
-    Coordinates leave it in COLMAP's convention, whatever the map's.
-
-    Attributes
-    ----------
-    name : the kapture type name.
-    index : points and observations as arrays; without any where nothing of the type has a point.
-    pixel_origin : of the map's intrinsics and of these keypoints, and why we think so.
+    ``index`` holds points and observations as arrays, empty if the type has no points.
     """
 
     folder: KaptureFolder
@@ -58,46 +52,44 @@ class MapKeypoints:
         return image in self._keypoints
 
     def keypoints_px(self, image: str) -> NDArray[np.float32]:
-        """Keypoints float32 (N, 2 or more) of a map image; x, y in COLMAP's convention."""
+        """Return keypoints float32 (N, 2 or more) of a map image."""
         return self.to_colmap(self._keypoints.read(image))
 
     def to_colmap(self, keypoints: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Keypoints stored as the map stores its own, x and y in COLMAP's convention."""
+        """Convert x and y of keypoints from the map's convention to COLMAP's."""
         moved = np.array(keypoints, dtype=np.float32)
         moved[:, :2] += np.float32(self.pixel_origin.keypoints_shift_px)
         return moved
 
     def descriptors(self, image: str) -> NDArray[Any]:
-        """Descriptors (N, D) of a map image, as stored."""
+        """Return the stored descriptors (N, D) of a map image."""
         return np.asarray(self._descriptors.read(image))
 
     def has_descriptors(self, images: Collection[str]) -> bool:
-        """Return whether all of these images that have keypoints have descriptors too."""
         if self.name not in self.folder.types("descriptors"):
             return False
         return all(image in self._descriptors for image in images if image in self._keypoints)
 
     def extractor(self) -> PluginChoice | None:
-        """The extractor plugin of the type, by its name or that in its file; None without one."""
+        """Return the extractor plugin given by the type's name or file, or None."""
         names = [self.name, base_type(self.name)]
         if self.name in self.folder.types("keypoints"):
             names.append(self._keypoints.config.name)
         found = next((found for name in names if (found := _extractor_named(name))), None)
         has_descriptors = self.name in self.folder.types("descriptors")
         if found is not None and found.name in _SIFT_OF.values() and has_descriptors:
-            # other tools call both SIFT; COLMAP's and OpenMVG's descriptors are bytes
+            # other tools also say SIFT; COLMAP's and OpenMVG's descriptors are bytes
             found = PluginChoice(name=_SIFT_OF[self._descriptors.config.dtype.kind == "u"])
         return found
 
     def check(self, images: Collection[str]) -> None:
-        """Compare the sizes of the images' feature files; reads none of them."""
         if not self.has_descriptors(images):
             return
         for image in images:
             if image in self._keypoints:
                 check_lengths(self._keypoints, self._descriptors, image)
 
-    # readers are kept: opening one means listing folders, or the members of a tar
+    # opening a reader lists folders or tar members, so readers are kept
     @cached_property
     def _keypoints(self) -> FeatureReader:
         return self.folder.keypoints(self.name)
@@ -109,16 +101,10 @@ class MapKeypoints:
 
 @dataclass(frozen=True, eq=False)
 class KaptureMap:
-    """A map with keypoints, 3D points and observations, of one keypoints type or several.
+    """Read-only map with 3D points, observations and keypoints; see :meth:`open`.
 
-    Open one with :meth:`open`. Coordinates leave it in COLMAP's convention, whatever the map's.
-
-    Attributes
-    ----------
-    folder : the kapture folder; nothing is ever written to it.
-    keypoints : the types that are localized with, sorted by name; all of them have points.
-    restrictions : coordinate frames of its images, and priors of queries, where it lies in a
-        workspace whose dataset has them.
+    All coordinates are in COLMAP's convention. ``keypoints`` are the types used for localization,
+    ``restrictions`` the coordinate frames of images and priors of queries of a workspace's map.
     """
 
     folder: KaptureFolder
@@ -139,9 +125,9 @@ class KaptureMap:
 
         Parameters
         ----------
-        keypoints_types : those to localize with; all that have points unless given.
-        features_dirs : folders with features in the orphan layout, in addition to the map's.
-        pixel_origin : of the map's intrinsics; "auto" finds it out (see ``.pixel_origin``).
+        keypoints_types : types used for localization; by default all that have points.
+        features_dirs : additional feature folders in the orphan layout.
+        pixel_origin : origin of the map's intrinsics; "auto" estimates it (see ``.pixel_origin``).
         allow_links_below : folders that links in the map may lead to.
         """
         if pixel_origin not in ("auto", "corner", "centre"):
@@ -164,13 +150,12 @@ class KaptureMap:
                 for name, found in origins.items()
             }
         keypoints = {n: MapKeypoints(folder, n, indices[n], origins[n]) for n in indices}
-        # a workspace's map has its dataset's tables beside it, a foreign map has none
+        # only a workspace has the dataset's side tables
         tables = tables_of(folder.root)
         restrictions = UNRESTRICTED if tables is None else Restrictions.read(tables)
         return cls(folder, keypoints, restrictions)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled it is its folders' names; another process opens it again."""
         asked = self.pixel_origin.intrinsics if self.pixel_origin.reason == AS_ASKED else "auto"
         linked = tuple(path.absolute() for path in self.folder.allow_links_below)
         features = tuple(path.absolute() for path in self.folder.features_dirs)
@@ -179,11 +164,10 @@ class KaptureMap:
 
     @property
     def pixel_origin(self) -> PixelOrigin:
-        """Of the intrinsics, which all types share; ``keypoints`` is that of the first type."""
+        """Origin of the intrinsics, and of the first type's keypoints."""
         return next(iter(self.keypoints.values())).pixel_origin
 
     def keypoints_of(self, name: str) -> MapKeypoints:
-        """The keypoints of a type that the map stores, whether any of them has a point."""
         if name in self.keypoints:
             return self.keypoints[name]
         index = index_map(self.folder, name)
@@ -198,7 +182,7 @@ class KaptureMap:
         return unit_of(self.folder.root)
 
     def stored_types(self) -> list[str]:
-        """Keypoints types that the map stores, whether any of them has a point."""
+        """Keypoints types with or without points."""
         return self.folder.types("keypoints")
 
     @cached_property
@@ -212,34 +196,30 @@ class KaptureMap:
 
     @cached_property
     def images(self) -> list[str]:
-        """Names of the images a query can be matched with, sorted."""
+        """Sorted names of map images that can be matched."""
         return sorted(self.poses)
 
     def camera(self, image: str) -> Camera:
-        """Camera of a map image, principal point in COLMAP's convention."""
+        """Return the camera of a map image in COLMAP's convention."""
         return self.to_colmap(self.folder.read().camera_of(image))
 
     def to_colmap(self, camera: Camera) -> Camera:
-        """A camera described as the map describes its own, in COLMAP's convention."""
+        """Convert a camera from the map's convention to COLMAP's."""
         shift = self.pixel_origin.intrinsics_shift_px
         return shift_principal_point(camera, shift) if shift else camera
 
     def has_images(self) -> bool:
-        """Return whether the map's image files are there."""
         try:
             return all(self.folder.image_path(image).is_file() for image in self.images)
         except DataError:
             return False
 
     def global_types(self) -> list[str]:
-        """Global-feature types that all images of the map have."""
+        """Return the global-feature types that all map images have."""
         return list(self._global_types)
 
     def check(self) -> None:
-        """Compare the sizes of all feature files that localizing reads; reads none of them.
-
-        Observations are compared with keypoints when they are read, which :meth:`open` does.
-        """
+        """Compare the sizes of all feature files used for localization without reading them."""
         for keypoints in self.keypoints.values():
             keypoints.check(self.images)
         for name in self._global_types:
@@ -248,18 +228,14 @@ class KaptureMap:
                 vectors.length(image)
 
     def fault(self) -> str | None:
-        """In words, why the map contradicts itself; None where it does not.
-
-        Of a sample of its images the points are compared with the keypoints that observe them; see
-        :mod:`megloc_kapture.mapping.map_check`.
-        """
+        """Return an inconsistency between points and a sample of images' keypoints, or None."""
         for name, keypoints in self.keypoints.items():
             images = [image for image in self.images if image in keypoints]
-            # runs of neighbours: a pose may have gone to the image after its own
+            # consecutive images, as poses may be shifted by one image
             run, number = 10, _SAMPLED_IMAGES // 10
             starts = np.linspace(0, max(len(images) - run, 0), number).astype(int).tolist()
             taken = sorted({at for start in starts for at in range(start, start + run)})
-            # half a pixel of another origin is far within what a map may err by
+            # half a pixel of pixel origin is well below the tolerated error
             sample = observed_keypoints(
                 self.folder, keypoints.index, (images[at] for at in taken if at < len(images))
             )
@@ -279,7 +255,7 @@ class KaptureMap:
 
 
 def check_lengths(keypoints: FeatureReader, descriptors: FeatureReader, image: str) -> None:
-    """Raise DataError when an image has not as many descriptors as keypoints; reads sizes only."""
+    """Raise DataError if an image has different numbers of descriptors and keypoints."""
     expected, found = keypoints.length(image), descriptors.length(image)
     if found != expected:
         raise DataError(
@@ -288,13 +264,12 @@ def check_lengths(keypoints: FeatureReader, descriptors: FeatureReader, image: s
 
 
 def plain_name(local_type: str) -> str:
-    """A type's name without case and separators, which tools write as they like."""
+    """Return a type's name in lower case without separators, which differ between tools."""
     return re.sub("[^a-z0-9]", "", local_type.lower())
 
 
 def _extractor_named(name: str) -> PluginChoice | None:
-    """The plugin that a type is called as, or its weights (aliked-n16, r2d2_WASF_N16); a number at
-    the end of a name that is neither is that of the keypoints: r2d2_500."""
+    """Return the plugin named by a type or its weights, ignoring a trailing number (r2d2_500)."""
     plugins = {plain_name(plugin): plugin for plugin in plugin_names(LOCAL_FEATURES)}
     weights = {plain_name(one): one for one in registry()}
     for plain in (plain_name(name), plain_name(re.sub(r"[-_ ]\d+k?$", "", name))):
@@ -337,9 +312,8 @@ def _read_indices(folder: KaptureFolder, keypoints_types: Sequence[str]) -> dict
 
 
 def _is_ours(folder: KaptureFolder, local_type: str) -> bool:
-    """Return whether the keypoints are surely in our convention.
-
-    Other toolkits write types named after the same networks, in the networks' own convention.
+    """Return whether the keypoints are certainly in megloc's convention; other toolkits use the
+    same names with the networks' conventions.
     """
     refined = (folder.root / "reconstruction" / REPORT_FILE).is_file()
     name = base_type(local_type)
@@ -350,10 +324,8 @@ def _is_ours(folder: KaptureFolder, local_type: str) -> bool:
 
 
 def _find_origins(folder: KaptureFolder, indices: Mapping[str, MapIndex]) -> dict[str, PixelOrigin]:
-    """The origin of the intrinsics, one for all types, and of each type's keypoints.
-
-    Where types disagree on the intrinsics, that with the most observations is believed, and the
-    others' keypoints are where they fit these intrinsics best.
+    """Estimate the pixel origin of the intrinsics, by the type with the most observations, and of
+    each type's keypoints.
     """
     found = {name: _find_origin(folder, name, index) for name, index in indices.items()}
     most = max(found, key=lambda name: (len(indices[name].point_ids), name))
@@ -361,7 +333,7 @@ def _find_origins(folder: KaptureFolder, indices: Mapping[str, MapIndex]) -> dic
     origins = {}
     for name, origin in found.items():
         if origin.intrinsics != intrinsics:
-            # what was measured is the offset of the two
+            # only their difference is measured
             agree = origin.keypoints == origin.intrinsics
             keypoints = intrinsics if agree else origin.keypoints
             reason = f"{origin.reason}; of the intrinsics {most} says {intrinsics}"

@@ -1,4 +1,4 @@
-"""The keypoints types that queries are localized with: how each is extracted and matched."""
+"""Keypoints types for localization, with their extraction and matching."""
 
 from __future__ import annotations
 
@@ -43,17 +43,10 @@ _NO_MATCHES = VerifiedMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32
 
 
 class LocalType:
-    """One keypoints type of a map, as queries are matched with it.
+    """A keypoints type of the map with its query extraction and matching; plugins load lazily.
 
-    Networks and matchers are made when they are first needed.
-
-    Parameters
-    ----------
-    points : keypoints of the map that observe its points.
-    first : those that queries are matched with at first: of a guided pyramid's type, where pairs
-        with few matches are tried again, the type that it is made of.
-    choice : the options' entry for this type of features; None if they do not name it.
-    cache : of the map's features, shared with other types.
+    ``points`` observe the map's points; ``first`` is matched first and differs from ``points`` in
+    guided pyramids. ``cache`` holds map features, shared with other types.
     """
 
     def __init__(
@@ -71,18 +64,16 @@ class LocalType:
         self._again: dict[str, NDArray[Any]] | None = None
 
     def prepare(self) -> None:
-        """Extract the map's descriptors again where it has none."""
+        """Extract missing map descriptors again; call this before matching."""
         if not self.first.has_descriptors(self._map.images):
             self._again = extract_again(self._map, self.first, self.extractor)
 
     @property
     def name(self) -> str:
-        """The kapture type name of the features that queries have."""
         return self.first.name
 
     @cached_property
     def matcher(self) -> Matcher:
-        """The matcher; raises PluginError, MissingWeightsError."""
         own = None if self.choice is None else self.choice.matching
         chosen = own or self._options.matching
         found: Matcher = load_plugin(MATCHERS, chosen.name, chosen.options)
@@ -90,7 +81,6 @@ class LocalType:
 
     @cached_property
     def extractor(self) -> LocalFeatureExtractor:
-        """The extractor of the type."""
         found = self.brought()
         if found is None:
             raise DataError(
@@ -104,7 +94,6 @@ class LocalType:
         return extractor
 
     def brought(self) -> PluginChoice | None:
-        """The extractor, where one is known by the options or by the map's name of the type."""
         found = self.first.extractor()
         if self.choice is None or (found is not None and found.name != self.choice.name):
             return with_device(found, self._options.device, self._options.precision)
@@ -112,7 +101,7 @@ class LocalType:
         return PluginChoice(name=self.choice.name, options={**self.choice.options, **known})
 
     def of_query(self, image: QueryImage) -> Features:
-        """The features of a query: those that it brings, else extracted ones."""
+        """Return the query's own features, or extract them."""
         brought = image.query.features
         local = next((brought[n] for n in equivalent_types(self.name) if n in brought), None)
         if local is None:
@@ -120,14 +109,13 @@ class LocalType:
         return Features.of(image.camera, local.keypoints_px, local.descriptors)
 
     def descriptors(self, image: str) -> NDArray[Any]:
-        """Descriptors (N, D) of a map image."""
+        """Return descriptors (N, D) of a map image."""
         return self.first.descriptors(image) if self._again is None else self._again[image]
 
     def match(self, query: Features, images: Sequence[str]) -> list[VerifiedMatches]:
-        """Verified matches of a query with each of several map images."""
         found = dict.fromkeys(images, _NO_MATCHES)
         verify = verification_of(self._options.verify_queries())
-        # features of some at a time are in memory
+        # limits the features in memory
         for names in batched((image for image in images if image in self.first), BATCH):
             others = [self._map_features(self.first, name) for name in names]
             pairs = match_all(self.matcher, query, others, [f"pair with {name}" for name in names])
@@ -138,16 +126,10 @@ class LocalType:
     def match_again(
         self, query: Features, pairs: Mapping[str, VerifiedMatches], image: QueryImage
     ) -> tuple[NDArray[np.float32], list[ImageMatches], str]:
-        """Try map images with few matches again by guided pyramid matching, where it is on.
+        """Match map images with few matches again by guided pyramid matching, if enabled.
 
-        Parameters
-        ----------
-        pairs : the matches with each map image, by its name.
-
-        Returns
-        -------
-        The query's keypoints, added ones last, the matches in their order, and why it was left
-        out although it is on; empty where it was not.
+        Returns query keypoints with added ones last, matches in the order of ``pairs``, and the
+        reason if the enabled step was skipped, else "".
         """
         options = self._options
         is_hard = options.guided_pyramid.is_hard
@@ -174,7 +156,7 @@ class LocalType:
 
     @cached_property
     def pyramid_obstacle(self) -> str:
-        """The reason why guided pyramid matching cannot extract this type; empty if it can."""
+        """Return the reason why guided pyramid matching cannot extract this type, or ""."""
         try:
             _ = self.extractor
         except MissingWeightsError:
@@ -196,20 +178,16 @@ class LocalType:
                 f"{keypoints.name!r}",
                 path=self._map.folder.root,
             )
-        # only keypoints that observe a point can help a pose, but all take part in the mutual
-        # check: without its rivals a wrong match would look unrivalled
+        # keypoints without a point help no pose, but reject wrong matches in the mutual check
         return Features.of(self._map.camera(image), stored, descriptors)
 
 
 def local_types_of(
     kapture_map: KaptureMap, options: PipelineOptions, cache: FeatureCache
 ) -> list[LocalType]:
-    """The types that queries are localized with, in the options' order, others behind by name.
+    """Return the types for localization, in the options' order, then others by name.
 
-    These are the types of the map that have points, and those without any that the options name:
-    their matches have a say in which images are candidates, as in ``megloc eval``.
-
-    Each is to be prepared before it is matched with.
+    Types in the options without map points only help to rank candidates.
     """
     choices = _choices(options)
     by_base = {base_type(name): keypoints for name, keypoints in kapture_map.keypoints.items()}
@@ -229,7 +207,6 @@ def local_types_of(
 
 
 def _choices(options: PipelineOptions) -> list[LocalFeaturesChoice]:
-    """The options' entries for types of features, ours first, then the given map's."""
     own = list(options.local_features) if options.makes_points() else []
     if options.uses_given_map():
         given = options.given_features
@@ -238,7 +215,6 @@ def _choices(options: PipelineOptions) -> list[LocalFeaturesChoice]:
 
 
 def _rank(local_type: str, choices: Sequence[LocalFeaturesChoice]) -> int:
-    """The position of the choice that makes a type, whose name begins with that of its plugin."""
     plain = plain_name(base_type(local_type))
     fitting = (rank for rank, one in enumerate(choices) if plain.startswith(plain_name(one.name)))
     return next(fitting, len(choices))
@@ -247,7 +223,7 @@ def _rank(local_type: str, choices: Sequence[LocalFeaturesChoice]) -> int:
 def extract_again(
     kapture_map: KaptureMap, keypoints: MapKeypoints, extractor: LocalFeatureExtractor
 ) -> dict[str, NDArray[Any]]:
-    """Descriptors of every map image, one row per stored keypoint; zero where it is not found."""
+    """Extract descriptors of all stored map keypoints; zero for keypoints not detected again."""
     if not kapture_map.has_images():
         raise DataError(
             f"the map has no descriptors of type {keypoints.name!r}, and no images to extract "

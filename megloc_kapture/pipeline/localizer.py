@@ -1,4 +1,4 @@
-"""Localize images in a kapture map, from Python: see :class:`Localizer`."""
+"""Localization of images in a kapture map from Python: see :class:`Localizer`."""
 
 from __future__ import annotations
 
@@ -46,18 +46,12 @@ _ALONE = RigidTransform.identity()
 
 
 class Localizer:
-    """Finds camera poses in a map of any tool, as ``megloc eval`` does with the same options.
+    """Estimates camera poses in a map of any tool, as ``megloc eval`` does with the same options.
 
-    All keypoints types of the map make one problem. Query features come with the query, or are
-    extracted where the map's type has an extractor plugin. Candidates come from global features
-    (see :class:`~megloc_kapture.pipeline.map_retrieval.MapRetrieval`), or are all images where
-    these are few. Networks are loaded when they are first used.
-
-    Parameters
-    ----------
-    kapture_map : the map.
-    preset, device, precision : options by name, and where and how its networks compute: auto (a GPU
-        where there is one), cpu, cuda, cuda:N; full or half. ``options`` gives all of it instead.
+    Matches of all keypoints types form one pose problem. Query features are given, or extracted if
+    the map's type has an extractor plugin. Candidates are ranked by global features; small maps
+    use all images. Networks load on first use. ``options`` replaces preset, device (auto, cpu,
+    cuda, cuda:N) and precision (full, half).
 
     Examples
     --------
@@ -76,7 +70,7 @@ class Localizer:
         precision: Precision = "full",
     ) -> None:
         self.map = kapture_map
-        self._key = uuid4().hex  # tells it from another of the same name, in processes that live on
+        self._key = uuid4().hex  # distinguishes maps of the same name in workers
         if options is not None and (device, precision) != ("auto", "full"):
             raise OptionError("give the device and the precision in the options")
         where = {"device": device, "precision": precision}
@@ -88,17 +82,14 @@ class Localizer:
         )
         self.types = local_types_of(kapture_map, self.options, FeatureCache())
         names = [one.name for one in self.types]
-        # a map of another tool may lack the type that a preset counts
+        # a foreign map may lack the types of the preset
         self._counted = self.options.reranking.types_named(names) or names
         for local in self.types:
             local.prepare()
         self._retrieval = MapRetrieval(kapture_map, self.options, self.types, self._preprocessor)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled it is its map's name and its options; another process makes it again, once."""
         return _made_again, (self._key, *self.map.__reduce__(), self.options.model_dump_json())
-
-    # ------------------------------------------------------------------ the public calls
 
     def localize(
         self,
@@ -107,17 +98,13 @@ class Localizer:
         *,
         prior: Sequence[str] | None = None,
     ) -> Pose | Failure:
-        """Localize one image.
+        """Localize one image; a Failure is falsy and has a reason.
 
         Parameters
         ----------
         image : path of an image file, or uint8 (H, W, 3) RGB.
-        camera : its intrinsics, COLMAP's models and pixel origin.
-        prior : names of the map images it may be matched with.
-
-        Returns
-        -------
-        Pose, or Failure, which is falsy and says why.
+        camera : intrinsics with COLMAP's models and pixel origin.
+        prior : names of map images that may be matched.
         """
         permitted = None if prior is None else tuple(prior)
         return self.localize_query(replace(_query_of(image, camera), prior=permitted))
@@ -129,13 +116,10 @@ class Localizer:
         *,
         candidates: Mapping[str, Sequence[str]] | None = None,
     ) -> Iterator[Pose | Failure]:
-        """Localize each query by itself, lazily, results in the order of the queries.
+        """Localize each query separately and lazily, in order.
 
-        Parameters
-        ----------
-        executor : a thread pool suits: it shares the map, and the work is done outside Python.
-            Processes, of this machine or of a dask cluster, open the map for themselves.
-        candidates : query name to the map images it is matched with, instead of retrieval.
+        ``executor`` may hold threads, which share the map, or processes, which open it again;
+        ``candidates`` are map images by query name, used instead of retrieval.
         """
         wrapped = (q if isinstance(q, Query) else _query_of(*q) for q in queries)
         units = (((query, _ALONE),) for query in wrapped)
@@ -145,10 +129,7 @@ class Localizer:
     def localize_kapture(
         self, folder: KaptureFolder | Path | str, executor: Executor | None = None
     ) -> Iterator[tuple[str, Pose | Failure]]:
-        """Localize the images of a kapture folder: (name, result).
-
-        Sorted by name; with ``localization.rigs`` the cameras of a rig stand together.
-        """
+        """Yield (name, result) of a kapture folder's images, sorted by name or grouped by rig."""
         opened = folder if isinstance(folder, KaptureFolder) else KaptureFolder(folder)
         queries = KaptureQueries(opened, self.map)
         units = queries.units(rigs=self.options.localization.rigs)
@@ -163,10 +144,9 @@ class Localizer:
         *,
         candidates: Mapping[str, Sequence[str]] | None = None,
     ) -> Iterator[list[Pose | Failure]]:
-        """Localize images, or the cameras of a rig together: one result per camera of each unit.
+        """Localize images or rigs and yield one result per camera for each unit.
 
-        A rig that has no pose is tried camera by camera, and an image file that cannot be decoded
-        is a Failure of its unit. Parameters as of :meth:`localize_many`.
+        A rig without a pose is tried camera by camera. An undecodable image file fails its unit.
         """
         if candidates is not None:
             known = candidates
@@ -177,19 +157,12 @@ class Localizer:
         return ordered_map(self._localize_readable, units, executor)
 
     def localize_query(self, query: Query) -> Pose | Failure:
-        """Localize a query that may bring its features."""
         return self._localize_unit(((query, _ALONE),))[0]
 
     def localize_rig(self, views: Sequence[tuple[Query, RigidTransform]]) -> Pose | Failure:
-        """Localize several cameras of a rig at once.
+        """Localize cameras, given as (query, ``cam_from_rig``), together.
 
-        Parameters
-        ----------
-        views : each camera's query and its ``cam_from_rig``.
-
-        Returns
-        -------
-        Pose whose ``cam_from_world`` is ``rig_from_world``, or Failure.
+        The pose's ``cam_from_world`` is ``rig_from_world``.
         """
         if self.refiners.refiners:
             raise OptionError(
@@ -199,8 +172,6 @@ class Localizer:
             images = self._images(views)
             (found,), _ = self._solve(views, images, self._scene(images), as_rig=True)
             return found
-
-    # ------------------------------------------------------------------ the steps
 
     def _localize_readable(self, unit: Unit) -> list[Pose | Failure]:
         try:
@@ -240,10 +211,9 @@ class Localizer:
         *,
         as_rig: bool = False,
     ) -> tuple[list[Pose | Failure], list[_Matching]]:
-        """Match and localize all cameras; returns a result per camera, and the matches.
+        """Match and localize all cameras; return a result per camera, and the matches.
 
-        Reranking and guided pyramids need the matches with all candidates first; otherwise no more
-        candidates are matched than are used.
+        Only reranking and guided pyramids need matches with unused candidates.
         """
         cameras = [self._begin(image, at) for image, (_, at) in zip(images, unit, strict=True)]
         whole = self.options.reranking.reranks() or self.options.matches_again()
@@ -274,7 +244,7 @@ class Localizer:
         return in_turn(localize, longest, self.options.localization), cameras
 
     def _images(self, unit: Sequence[tuple[Query, RigidTransform]]) -> list[QueryImage]:
-        """The images of a unit by unique names: their pixels are looked up by name."""
+        """Return the images of a unit under unique names, by which their pixels are looked up."""
         named = Counter(query.name for query, _ in unit)
         return [
             self._preprocessor.of(
@@ -299,7 +269,6 @@ class Localizer:
         return _Matching(image, cam_from_rig, features, ranked, [[] for _ in self.types], clock)
 
     def _match(self, camera: _Matching, count: int) -> None:
-        """Match with the best ``count`` candidates; what is matched already stays."""
         camera.clock.start()
         features, ranked = camera.features, camera.ranked[:count]
         for local, own, found in zip(self.types, features, camera.of_types, strict=True):
@@ -318,14 +287,12 @@ class Localizer:
         camera.clock.lap("matching")
 
     def _kept(self, of_types: Sequence[Sequence[VerifiedMatches]]) -> list[int]:
-        """Positions of the candidates that reranking leaves, best first."""
         how = self.options.reranking
         of_named = zip(self.types, of_types, strict=True)
         counted_types = [own for local, own in of_named if local.name in self._counted]
         return rerank([[counted(one, how.by) for one in own] for own in counted_types], how)[0]
 
     def _candidates(self, image: QueryImage, features: Sequence[Features]) -> list[str]:
-        """The map images to match a query with, best first where they can be ranked."""
         query = image.query
         if query.candidates is not None:
             return self._usable(query, query.candidates)
@@ -340,7 +307,7 @@ class Localizer:
         return self._retrieval.rank(image, features, permitted)
 
     def ranked(self, query: Query) -> list[str]:
-        """The most similar map images of a query, best first, however few, reranked if at all."""
+        """Return the most similar map images of a query, best first, with reranking if enabled."""
         image = self._preprocessor.of(query)
         features = [local.of_query(image) for local in self.types]
         found = self._retrieval.rank(image, features, self._permitted(query))
@@ -355,7 +322,6 @@ class Localizer:
         return sorted(self._usable(query, query.prior))
 
     def _usable(self, query: Query, images: Sequence[str]) -> list[str]:
-        """Those of the images that have a pose and keypoints; the others cannot help."""
         unknown = set(images) - self._known_images
         if unknown:
             raise DataError(
@@ -370,7 +336,6 @@ class Localizer:
         return frozenset(self.map.folder.read().image_names())
 
     def describe_retrieval(self, global_types: Collection[str]) -> str:
-        """How the candidates of queries that bring these global features are found, for people."""
         options = self.options.query_pairs
         if options.by == "exhaustive" or len(self.map.images) <= options.top_k:
             return f"all {len(self.map.images)} map images"
@@ -379,14 +344,7 @@ class Localizer:
 
 @dataclass(eq=False)
 class _Matching:
-    """One camera: its features, its candidates, best first, and the first of these matched.
-
-    Attributes
-    ----------
-    of_types : of each keypoints type, the matches with as many of ``ranked`` as were asked for.
-    view, candidates : the matches for the solver, and the candidates that reranking keeps.
-    left_out : remarks on steps that were left out.
-    """
+    """State of one camera; ``of_types`` holds matches by type with the first of ``ranked``."""
 
     image: QueryImage
     cam_from_rig: RigidTransform

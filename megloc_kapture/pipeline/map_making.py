@@ -1,13 +1,8 @@
-"""The plans that make a map, without queries: of images with poses, photographs, COLMAP models.
+"""Plans that make a map without queries, from posed images, photographs or COLMAP models.
 
-Photographs have no poses yet (``megloc map``): they are matched with each other, verified by a
-two-view model, and COLMAP's mapper finds their poses and cameras. From there they are map images as
-any others: matched again with the known poses, triangulated and refined by the stages that make
-every map.
-
-COLMAP models are taken where a kapture map is expected: imported once, kept in the user's cache,
-and imported again when one of their files, or their database, has another size or time. Weights
-lie in the same cache, see :mod:`megloc_kapture.io.weights`.
+Photographs are matched, verified by a two-view model and reconstructed by COLMAP's mapper, then
+mapped again with known poses. COLMAP models are imported into the user's cache, and again if a
+file changes.
 """
 
 from __future__ import annotations
@@ -94,7 +89,7 @@ from megloc_kapture.values import Options
 
 _log = logging.getLogger(__name__)
 
-# each is there where the options ask for it
+# each runs only if the options request it
 MAP_STAGES: tuple[type[PipelineStage], ...] = (
     Preprocess,
     ExtractLocalFeatures,
@@ -124,7 +119,6 @@ _WITH_POSES: tuple[type[PipelineStage], ...] = (
 
 
 def plan_map(mapping: KaptureFolder, options: PipelineOptions) -> list[Stage]:
-    """The stages that make a map of images with poses, without queries."""
     check_weights(options)
     options.retrieval()
     if options.uses_given_map() or options.pairs_by_points():
@@ -133,11 +127,11 @@ def plan_map(mapping: KaptureFolder, options: PipelineOptions) -> list[Stage]:
 
 
 class ImportMapping(Stage):
-    """Import images with poses alone, with the coordinate frames that tables beside them name."""
+    """Import posed images, with coordinate frames from adjacent tables."""
 
     name = "import"
     version = 3
-    writes = (MAPPING, QUERY, SIDE_TABLES)  # no queries: what stages read of them is nothing
+    writes = (MAPPING, QUERY, SIDE_TABLES)  # read by later stages, although the queries are empty
 
     def __init__(self, mapping: KaptureFolder) -> None:
         super().__init__(Options())
@@ -156,10 +150,10 @@ _BY_POSES = frozenset({"poses", "covisibility"})
 
 
 class ImportPhotographs(Stage):
-    """Bring photographs into a workspace: cameras by EXIF, images upright, no poses."""
+    """Import photographs into a workspace: cameras by EXIF, upright images, no poses."""
 
     name = "import"
-    writes = (MAPPING, QUERY, SIDE_TABLES)  # no queries: what stages read of them is nothing
+    writes = (MAPPING, QUERY, SIDE_TABLES)  # read by later stages, although the queries are empty
 
     def __init__(self, photographs: Photographs) -> None:
         super().__init__(Options())
@@ -200,7 +194,7 @@ class ImportPhotographs(Stage):
 def options_of_photographs(
     preset: str, assignments: Sequence[str] | Mapping[str, Any] = ()
 ) -> PipelineOptions:
-    """Return a preset's options, without those that need poses or a known lens."""
+    """Return a preset's options without those that need poses or calibrated cameras."""
     by = PRESETS[preset].mapping_pairs.by if preset in PRESETS else ()
     changes: list[dict[str, Any]] = [
         {"preprocessing": {"undistort": False}},
@@ -222,12 +216,7 @@ def options_of_photographs(
 def structure_options(
     photographs: Photographs, mapper: Mapper, scale: Sequence[str], *, known_cameras: bool
 ) -> StructureOptions:
-    """How poses are found.
-
-    Parameters
-    ----------
-    scale : nothing; ``gps``; or two photographs and the metres between them.
-    """
+    """Return reconstruction options; ``scale`` is empty, ``gps``, or two photographs and metres."""
     gps, distance = None, None
     if tuple(scale) == (GPS,):
         gps = photographs.gps()
@@ -256,7 +245,6 @@ def structure_options(
 def plan_photographs(
     photographs: Photographs, options: PipelineOptions, structure: StructureOptions
 ) -> list[Stage]:
-    """The stages from photographs to a map."""
     check_weights(options)
     options.retrieval()
     if len(photographs.names) < MIN_IMAGES:
@@ -271,7 +259,6 @@ def plan_photographs(
 
 
 def describe_map(workspace: Path, photographs: Photographs) -> list[str]:
-    """Lines about the map, and about photographs that are not in it."""
     tables = workspace / SIDE_TABLES
     missing = read_unreadable(tables, UNREGISTERED_FILE)
     everything = len(photographs.names) + len(photographs.unreadable)
@@ -302,28 +289,21 @@ def _too_few(number: int, unreadable: Mapping[str, str]) -> DataError:
 
 
 _STAMP = "colmap.txt"
-_VERSION = 3  # of the import: another one makes all maps anew
+_VERSION = 3  # of the import; another version rebuilds all maps
 
 
 def colmap_maps_folder() -> Path:
-    """The folder of the imported maps; it need not be there, and may be deleted."""
+    """Return the folder of imported maps, which may be missing and may be deleted."""
     return user_cache() / "maps"
 
 
 def import_colmap(
     source: ColmapFolders, output: Path, *, unit: str = NO_METRES, work: Work = HERE
 ) -> dict[str, float]:
-    """Write a COLMAP reconstruction as a kapture map; ``output`` is empty.
+    """Write a COLMAP reconstruction as a kapture map into an empty folder and return counts.
 
-    A model does not say its scale, so its unit is unknown unless given.
-
-    A model of poses alone, without points, images and database, becomes a kapture folder of poses.
-    Where the model's features cannot be had (no points; no database, and no SIFT), its images are
-    mapped anew with its poses, by the default preset, and a warning is logged.
-
-    Returns
-    -------
-    Counts for the log.
+    The unit is unknown unless given. A model of poses alone becomes a kapture folder of poses; a
+    model with unavailable features is mapped again with its poses and the default preset.
     """
     read = ColmapReconstruction.read(source)
     if unit != METRES:
@@ -348,7 +328,7 @@ def import_colmap(
         try:
             with workspace.lock(), single_threaded():
                 run_plan(stages, workspace, work)
-        except DataError as error:  # the workspace will be gone
+        except DataError as error:  # the workspace is deleted
             raise DataError(error.message, path=source.model) from error
         for made in workspace.path(MAP).iterdir():
             made.rename(output / made.name)
@@ -359,15 +339,7 @@ def import_colmap(
 
 
 def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
-    """The kapture folder of a map: the path itself, the map of a workspace of ours, or where a
-    COLMAP model is imported to.
-
-    Parameters
-    ----------
-    path : kapture folder, workspace, or a COLMAP model or workspace, see
-        :func:`~megloc_kapture.datasets.colmap_map.find_colmap`.
-    work : where features are extracted, if they have to be.
-    """
+    """Return the kapture folder of a map or workspace, or import a COLMAP model."""
     path = map_of_workspace(Path(path))
     if not is_colmap(path):
         return path
@@ -396,7 +368,6 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
 
 
 def _stamp(source: ColmapFolders) -> str:
-    """The sources of an imported map: image folder, and size and time of each file."""
     lines = [f"import {_VERSION}", f"images {source.images and os.path.realpath(source.images)}"]
     for file in source.files():
         try:

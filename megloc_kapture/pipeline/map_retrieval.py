@@ -1,4 +1,4 @@
-"""Rank a map's images by their similarity to a query."""
+"""Ranking of map images by similarity to a query."""
 
 from __future__ import annotations
 
@@ -32,13 +32,9 @@ from megloc_kapture.stages.options import PipelineOptions
 
 @dataclass(frozen=True)
 class _GlobalType:
-    """A type of global features by which queries and map images are compared.
+    """Global features for comparison; ``choice`` is None if queries provide them.
 
-    Attributes
-    ----------
-    choice : how a query's vector is made; None means that the query brings it.
-    extractor : of an image network; None for VLAD, and where the network's weights are missing.
-    stored : whether the map has the vectors of its images.
+    ``extractor`` is None for VLAD and without weights, ``stored`` true if the map has vectors.
     """
 
     name: str
@@ -53,16 +49,14 @@ class _GlobalType:
 
     @property
     def is_at_hand(self) -> bool:
-        """Return whether neither the map has to be described first, nor weights are missing."""
         return self.stored and (self.choice is None or self.is_vlad or self.extractor is not None)
 
 
 class MapRetrieval:
-    """Ranks a map's images for queries; threads may share it.
+    """Ranks map images for queries; thread-safe.
 
-    Global features that both map and query bring are compared; where there are none, those of the
-    options that the map has vectors of, and VLAD over its descriptors. Where the options name
-    neither, the map's images are described once, in memory.
+    Uses global features shared by map and query, else those of the options that the map has, else
+    describes map images in memory.
     """
 
     def __init__(
@@ -82,12 +76,7 @@ class MapRetrieval:
     def rank(
         self, image: QueryImage, features: Sequence[Features], permitted: Sequence[str]
     ) -> list[str]:
-        """Names of the permitted map images most similar to a query, best first.
-
-        Parameters
-        ----------
-        features : local features of the query, of each type.
-        """
+        """Return the permitted map images most similar to a query, best first."""
         compared = self._compared(image.query.global_features)
         vectors = [self._of_query(one, image, features) for one in compared]
         rows = [_unit(np.asarray(v, np.float32).reshape(1, -1)) for v in vectors]
@@ -97,18 +86,16 @@ class MapRetrieval:
         return [self._map.images[i] for i in index[0] if i >= 0]
 
     def is_at_hand(self, brought: Collection[str]) -> bool:
-        """Return whether queries that bring these global features can be ranked at once."""
+        """Return whether queries with these global features can be ranked immediately."""
         return all(one.is_at_hand for one in self._compared(brought))
 
     def describe(self, brought: Collection[str]) -> str:
-        """How queries that bring these global features are compared, for people."""
         return ", ".join(
             "VLAD over the map's descriptors" if one.is_vlad else f"global features {one.name}"
             for one in self._compared(brought)
         )
 
     def describe_candidates(self, brought: Collection[str]) -> str:
-        """The map images that such queries are matched with, for people."""
         how, count = self.describe(brought), len(self._map.images)
         top_k = self._options.query_pairs.top_k
         if count <= top_k:
@@ -128,7 +115,6 @@ class MapRetrieval:
 
     @cached_property
     def _wanted(self) -> Sequence[_GlobalType]:
-        """The options' global features, by the names that the map knows them by."""
         return [self._wanted_type(choice) for choice in self._options.global_features]
 
     def _wanted_type(self, choice: GlobalFeaturesChoice) -> _GlobalType:
@@ -137,14 +123,14 @@ class MapRetrieval:
             return _GlobalType(name, choice.weight, name in self._stored_vocabularies, choice)
         try:
             extractor = choice.make()
-        except MissingWeightsError:  # raised again when they are needed
+        except MissingWeightsError:  # raised again on use
             stored = any(name.startswith(choice.name) for name in self._map.global_types())
             return _GlobalType(choice.name, choice.weight, stored, choice)
         stored = extractor.name in self._map.global_types()
         return _GlobalType(extractor.name, choice.weight, stored, choice, extractor)
 
     def _vlad_name(self, choice: GlobalFeaturesChoice) -> str:
-        """The map's own VLAD where it was made with these options, else a name that it lacks."""
+        """Return the map's VLAD type made with these options, or a new name."""
         local_type = choice.vlad_options().local_type
         asked = {key: value for key, value in choice.options.items() if key != "local_type"}
         for name, (_, settings) in sorted(self._stored_vocabularies.items()):
@@ -156,7 +142,6 @@ class MapRetrieval:
 
     @cached_property
     def _stored_vocabularies(self) -> dict[str, tuple[Vocabulary, VladSettings]]:
-        """Vocabularies stored with the map's vectors, of local features that queries have."""
         folder = self._map.folder
         known = {base_type(one.name) for one in self._types}
         found: dict[str, tuple[Vocabulary, VladSettings]] = {}
@@ -176,7 +161,7 @@ class MapRetrieval:
         if names not in self._candidates:
             self._candidates[names] = Candidates(
                 lambda positions: [
-                    # the whole map is by far the most frequent pool: no copy of it
+                    # do not copy the whole map, the usual pool
                     database if len(positions) == len(database) else database[positions]
                     for database in databases
                 ],
@@ -224,13 +209,11 @@ class MapRetrieval:
         return np.stack([self._map_image(name).describe(extractor) for name in images])
 
     def _map_image(self, name: str) -> QueryImage:
-        """A map image, pre-processed as queries are."""
         folder = self._map.folder
         pixels = read_image_of(folder.image_path(name), folder.read().camera_of(name))
         return self._preprocessor.of(Query(self._map.camera(name), pixels, name))
 
     def _vlad(self, one: _GlobalType) -> tuple[Vocabulary, VladSettings]:
-        """The vocabulary and its settings: the map's own where it has one, else trained on it."""
         with self._lock:
             if one.name not in self._vocabularies:
                 stored = self._stored_vocabularies.get(one.name)

@@ -1,4 +1,4 @@
-"""A plan: stages in order, each run only when necessary."""
+"""Plan of stages in order, each run only if necessary."""
 
 from __future__ import annotations
 
@@ -30,14 +30,12 @@ _NOT_DONE = "not done yet"
 
 @dataclass(frozen=True)
 class StageReport:
-    """What happened to a stage."""
-
     name: str
     state: State
     seconds: float
     counts: Mapping[str, float]
     why: str
-    num_kept: int = 0  # items that a stopped run had finished
+    num_kept: int = 0  # items finished by an interrupted run
 
 
 def run_plan(
@@ -50,14 +48,10 @@ def run_plan(
     dry_run: bool = False,
     say: Callable[[str], None] = lambda text: None,
 ) -> list[StageReport]:
-    """Run the stages that have to be run.
+    """Run the stages that are out of date, or report them in a ``dry_run``.
 
-    Parameters
-    ----------
-    first : earlier stages are taken as they are; this one and all that depend on it run again.
-    last : later stages are left out.
-    dry_run : say what would run, run nothing.
-    say : gets a line when a stage starts, with the reason, and one when it ends.
+    ``first`` and its dependents run again, earlier stages are kept; stages after ``last`` are
+    skipped. ``say`` receives a line when a stage starts, with the reason, and when it ends.
     """
     names = [stage.name for stage in stages]
     for name in (first, last):
@@ -76,11 +70,11 @@ def run_plan(
     for stage in stages:
         _check_root(stage, workspace)
     if not dry_run:
-        # whatever stops this run, the next one has to do what was asked for
+        # an interrupted run leaves the request to the next run
         for name in asked:
             workspace.manifest_path(name).unlink(missing_ok=True)
             remove(workspace.partial_path(name))
-    marks: dict[str, str] = {}  # fingerprints of the stages' outputs
+    marks: dict[str, str] = {}  # output -> fingerprint
     reports = []
     for number, stage in enumerate(stages[:stop]):
         inputs = {name: marks[name] for name in _before(stages, stage)}
@@ -108,8 +102,6 @@ def run_plan(
 
 @dataclass(frozen=True)
 class _Due:
-    """A stage, what its output depends on now, and the manifest of its last run."""
-
     stage: Stage
     settings: Mapping[str, Any]
     inputs: Mapping[str, str]
@@ -124,12 +116,10 @@ class _Due:
         return output_fingerprint(self.stage.name, self.stage.version, self.settings, self.inputs)
 
     def former_outputs(self) -> list[str]:
-        """Return outputs it wrote and does not write now: options may rename an output."""
         before = () if self.made is None else self.made.outputs
         return sorted(set(before) - set(self.stage.writes))
 
     def why(self, workspace: Workspace) -> str:
-        """Return why it has to run; empty when it need not."""
         made = self.made
         if made is None:
             return _NOT_DONE
@@ -143,9 +133,9 @@ class _Due:
         if made.version != self.stage.version:
             return "a newer version of the stage"
         changed = _differences(made.inputs, self.inputs)
-        # another plugin has other code; the option that chose it tells more
+        # prefer the changed option to the changed plugin code
         read = [name for name in changed if not name.startswith(CODE_OF)]
-        settings = json.loads(json.dumps(self.settings))  # knows no tuples
+        settings = json.loads(json.dumps(self.settings))  # converts tuples to lists
         options = _differences(made.options, settings)
         if options and not read:
             return f"options changed: {', '.join(options[:3])}"
@@ -162,7 +152,7 @@ def _before(stages: Sequence[Stage], stage: Stage) -> list[str]:
 
 
 def _there(stages: Sequence[Stage], stage: Stage, workspace: Workspace) -> dict[str, str]:
-    """Return fingerprints of inputs that earlier runs left, and none of these stages writes."""
+    """Return fingerprints of inputs from earlier runs that none of these stages writes."""
     written = [path for other in stages for path in other.writes]
     missing = [path for path in stage.reads if not any(is_below(path, other) for other in written)]
     if not missing:
@@ -180,7 +170,7 @@ def _there(stages: Sequence[Stage], stage: Stage, workspace: Workspace) -> dict[
 
 
 def _check_root(stage: Stage, workspace: Workspace) -> None:
-    """Refuse to replace results of another root, unless it is gone, e.g. was renamed."""
+    """Refuse to replace results of another root, unless that root no longer exists."""
     made = workspace.manifest(stage.name)
     held = "" if made is None else made.inputs.get(ROOT, "")
     if workspace.force or not held or not Path(held).is_dir():
@@ -193,7 +183,6 @@ def _check_root(stage: Stage, workspace: Workspace) -> None:
 
 
 def _with_followers(stages: Sequence[Stage], first: str) -> dict[str, str]:
-    """Return a stage and those that depend on it, each with why it is run again."""
     found = {first: "asked for"}
     for stage in stages:
         if not found.keys().isdisjoint(_before(stages, stage)):
@@ -202,7 +191,6 @@ def _with_followers(stages: Sequence[Stage], first: str) -> dict[str, str]:
 
 
 def _take_over(stage: Stage, workspace: Workspace) -> None:
-    """Forget other stages that wrote, under other options, an output of this one."""
     for path in workspace.manifest_paths():
         other = read_manifest(path)
         if other is None or other.stage == stage.name:
@@ -221,7 +209,6 @@ def _differences(old: Any, new: Any, prefix: str = "") -> list[str]:
 
 
 def _run(due: _Due, workspace: Workspace, work: Work) -> tuple[Manifest, int]:
-    """Run a stage; return its manifest, and how many of its items were kept."""
     stage = due.stage
     started = datetime.now(UTC).isoformat(timespec="seconds")
     clock = time.perf_counter()
@@ -229,9 +216,8 @@ def _run(due: _Due, workspace: Workspace, work: Work) -> tuple[Manifest, int]:
         finished = FinishedItems(folder / FINISHED, due.mark)
         resumed = replace(work, finished=finished)
         counts = dict(stage.run(StageWork(**vars(resumed), root=workspace.root, out=folder)))
-        clear_temporary(folder)  # of killed workers
-        # without a manifest a stage counts as not done: killed between here and the end, it
-        # runs again
+        clear_temporary(folder)
+        # without a manifest a stage killed below this line runs again
         workspace.manifest_path(stage.name).unlink(missing_ok=True)
         _take_over(stage, workspace)
         written = tuple(o for o in stage.writes if (folder / o).exists())
@@ -255,12 +241,10 @@ def _run(due: _Due, workspace: Workspace, work: Work) -> tuple[Manifest, int]:
 
 
 def all_kept(reports: Iterable[StageReport]) -> bool:
-    """Return whether nothing had to be done."""
     return all(report.state in ("kept", "skipped") for report in reports)
 
 
 def describe(report: StageReport) -> str:
-    """Return one line about a stage."""
     if report.state == "kept":
         return f"{report.name}: up to date"
     if report.state == "skipped":

@@ -1,4 +1,4 @@
-"""Presets: options by name, and changes to them from files and the command line."""
+"""Presets: named options, and changes to them from files and the command line."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ from megloc_kapture.values import Options
 
 OptionsT = TypeVar("OptionsT", bound=Options)
 
-# the paper as printed; benchmarks/*.toml have the steps that depend on the dataset (masks,
-# co-visibility, sequences, indoor weights), docs/paper.md has a row for each
+# the paper as printed; benchmarks/*.toml have the dataset-dependent steps (masks,
+# co-visibility, sequences, indoor weights), see docs/paper.md
 _MEGLOC = PipelineOptions(
-    # cameras without distortion stay as they are; enlarging: docs/experiments/preprocessing.md
+    # undistorted cameras are unchanged; enlarging: docs/experiments/preprocessing.md
     preprocessing=PreprocessingOptions(max_size_px=1600, upscale=True, undistort=True),
     local_features=(
         LocalFeaturesChoice(name="superpoint", matching=PluginChoice(name="superglue")),
         LocalFeaturesChoice(
             name="aslfeat",
-            # the paper does not name ASLFeat's matcher; this is its authors'
+            # ASLFeat's authors' matcher; the paper names none
             matching=PluginChoice(name="nn", options={"max_ratio": 0.8}),
         ),
     ),
@@ -63,14 +63,14 @@ _MEGLOC = PipelineOptions(
     localization=LocalizationOptions(rank=PluginChoice(name="inliers")),
     pose_refinement=PoseRefinementOptions(references="cluster"),
 )
-# chosen among weights free for any use: docs/experiments/presets.md
+# weights with a free licence: docs/experiments/presets.md
 _MODERN = PipelineOptions(
     preprocessing=PreprocessingOptions(max_size_px=1600),
     local_features=(
         LocalFeaturesChoice(name="aliked", options={"max_keypoints": 2048, "threshold": 0.05}),
     ),
 )
-# what only a download gives, all of it free for any use
+# weights available for download only, all with a free licence
 _MODERN_LARGE = PipelineOptions(
     preprocessing=PreprocessingOptions(max_size_px=1600),
     local_features=(
@@ -117,7 +117,6 @@ def options_with(
     assignments: Sequence[str] | Mapping[str, Any],
     changes: Mapping[str, Any] | None = None,
 ) -> OptionsT:
-    """Return a model's defaults with changes by ``key.key``, then with the user's."""
     tree = model().model_dump()
     _merge(tree, assigned(changes or {}))
     _merge(tree, assigned(assignments))
@@ -151,12 +150,11 @@ def assigned(
 
 
 def _typed(assignment: str, flag: str) -> tuple[str, Any]:
-    """Key and value of ``key=value``: a TOML value, or the text itself where it is none."""
     key, equals, text = assignment.partition("=")
     if not equals or not key:
         raise OptionError(f"{flag} takes key=value, got {assignment!r}")
     key, text = key.strip(), text.strip()
-    if text in ("None", "null"):  # Options reads "none", which is a choice of some options
+    if text in ("None", "null"):  # Options parses "none", which is also a choice of some options
         return key, None
     try:
         return key, tomllib.loads(f"value = {text}")["value"]
@@ -165,11 +163,10 @@ def _typed(assignment: str, flag: str) -> tuple[str, Any]:
 
 
 def _known(path: str, root: type[Options]) -> str:
-    """Suggest an option similar to an unknown one."""
     model: Any = root
     *parents, name = path.split(".")
     for part in parents:
-        if part.isdigit():  # a place in a list
+        if part.isdigit():
             continue
         annotation = model.model_fields[part].annotation if part in model.model_fields else None
         annotation = next(iter(get_args(annotation)), annotation)
@@ -185,8 +182,6 @@ def _known(path: str, root: type[Options]) -> str:
 
 @dataclass(frozen=True)
 class Option:
-    """One option of a model: ``key.key``, its value there, its type and meaning in words."""
-
     key: str
     value: Any
     kind: str
@@ -194,7 +189,6 @@ class Option:
 
 
 def options_of(options: Options, prefix: str = "") -> Iterator[Option]:
-    """Every option of a model and of the models in it, in their order."""
     for name, field in type(options).model_fields.items():
         value = getattr(options, name)
         if isinstance(value, Options) and not isinstance(value, PluginChoice):
@@ -205,7 +199,6 @@ def options_of(options: Options, prefix: str = "") -> Iterator[Option]:
 
 
 def _type_name(annotation: Any) -> str:
-    """A type as a person reads it: choices one by one, classes without their modules."""
     text = annotation.__name__ if isinstance(annotation, type) else str(annotation)
     text = re.sub(r"[A-Za-z_]\w*\.(?=[A-Za-z_])", "", text)
     return re.sub(r"Literal\[(.*?)\]", lambda m: m[1].replace("', '", "' | '"), text)
@@ -226,10 +219,8 @@ def _merge(tree: dict[str, Any], changes: dict[str, Any]) -> None:
 def _merged_choices(
     key: str, choices: Sequence[Any], changes: dict[str, Any]
 ) -> list[dict[str, Any]]:
-    """Plugins of a list with changes: of the only one, or of those that are named.
-
-    ``local_features.options.max_keypoints`` is the option of the only type,
-    ``local_features.aliked.options.max_keypoints`` that of one of several.
+    """Apply changes to the only plugin of a list, or to named ones, as in
+    ``local_features.aliked.options.max_keypoints``.
     """
     merged = [
         {"name": one} if isinstance(one, str) else dict(one)
@@ -253,11 +244,7 @@ def _merged_choices(
 
 
 def check_weights(options: PipelineOptions) -> None:
-    """Make every plugin that a run uses once.
-
-    Raises MissingWeightsError: names each missing checkpoint, how to get it, and the command that
-    fetches those of a preset at once.
-    """
+    """Raise MissingWeightsError, with the download command, if a plugin lacks its weights."""
     if (error := _missing(options)) is None:
         return
     of_presets = {name: _missing(preset) for name, preset in PRESETS.items()}
@@ -289,7 +276,7 @@ def _makers(options: PipelineOptions) -> Iterator[Callable[[], object]]:
     chosen: list[tuple[str, PluginChoice]] = []
     if (segmenter := options.preprocessing.masks.segmenter) is not None:
         chosen.append((SEGMENTERS, segmenter))
-    features: list[tuple[PluginChoice, PluginChoice]] = []  # extractor and matcher
+    features: list[tuple[PluginChoice, PluginChoice]] = []
     if options.makes_points():
         features += [
             (local, local.matching or options.matching) for local in options.local_features

@@ -1,4 +1,4 @@
-"""Queries of the localizer: images or given features, pre-processed; those of kapture folders."""
+"""Preprocessed queries of the localizer: images, or given features."""
 
 from __future__ import annotations
 
@@ -32,23 +32,17 @@ from megloc_kapture.values import Camera, LocalFeatures, Pose, RigidTransform
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """One image to localize.
+    """One image to localize; camera, keypoints and pose are in COLMAP's convention.
 
     Parameters
     ----------
-    camera : in COLMAP's convention.
-    image : uint8 (H, W, 3) RGB or the path of an image file; may be absent where the features
-        are given.
-    name : what to call it.
-    features : keypoints type of the map to local features, keypoints in COLMAP's convention.
-        Types that it does not bring are extracted.
-    global_features : type name to vector, of the map's types.
-    prior : names of the map images it may be matched with; None: all.
-    candidates : names of the map images it is matched with, best first, instead of retrieval.
-    mask : bool (H, W), True = use, or the path of a mask image (0 = ignore), which may be absent.
-    depth : a depth map that was taken with the image, or what reads one; for ``icp``.
-    orientation : EXIF's, by which the pixels of an image file are turned upright; the camera is of
-        the turned image. 1: they stay as they are stored.
+    image : uint8 (H, W, 3) RGB or the path of an image file; optional if features are given.
+    features, global_features : by the map's type names; missing local features are extracted.
+    prior : map images that may be matched; None means all.
+    candidates : map images to match, best first, instead of retrieval.
+    mask : bool (H, W), True = use, or the path of a mask image (0 = ignore), which may not exist.
+    depth : depth map taken with the image, or a function that reads one; for ``icp``.
+    orientation : EXIF orientation to turn an image file upright, as the camera describes it.
     """
 
     camera: Camera
@@ -63,7 +57,7 @@ class Query:
     orientation: int = 1
 
     def read_mask(self) -> NDArray[np.bool_] | None:
-        """The mask, bool (H, W), True = use; None where there is none."""
+        """Return the mask, bool (H, W), True = use, or None."""
         shape = (self.camera.height, self.camera.width)
         if isinstance(self.mask, Path):
             return read_mask(self.mask, shape)
@@ -77,19 +71,17 @@ class Query:
         return mask
 
     def read_depth(self) -> DepthView | None:
-        """The depth map that was taken with the image; None without."""
         if self.depth is None or isinstance(self.depth, DepthView):
             return self.depth
         return self.depth()
 
     def has_image(self) -> bool:
-        """Whether there is an image to look at, or a file that should be one."""
         if isinstance(self.image, str | Path):
             return Path(self.image).is_file()
         return self.image is not None
 
     def read_image(self) -> NDArray[np.uint8]:
-        """The image as uint8 (H, W, 3) RGB."""
+        """Return the image as uint8 (H, W, 3) RGB."""
         if self.image is None:
             raise DataError(
                 f"query {self.name} has no image, and lacks features of the map's types or is to "
@@ -113,7 +105,7 @@ class Query:
 
 
 class Preprocessor:
-    """Pre-processes query images like :mod:`megloc_kapture.stages.preprocessing`."""
+    """Preprocesses query images like :mod:`megloc_kapture.stages.preprocessing`."""
 
     def __init__(self, options: PipelineOptions) -> None:
         self._options = options
@@ -126,16 +118,12 @@ class Preprocessor:
             )
 
     def of(self, query: Query) -> QueryImage:
-        """What becomes of a query's image; nothing is read yet.
-
-        The image of a query that brings local features stays as it is, for they are in its pixels.
-        """
+        """Prepare a query lazily; images with local features stay as they are."""
         frame = FrameOptions() if query.features else self._options.preprocessing
         return QueryImage(query, plan_frame(query.camera, frame), self)
 
     @cached_property
     def classes(self) -> ClassMasks | None:
-        """What tells classes of pixels apart; raises PluginError, MissingWeightsError."""
         masks = self._options.preprocessing.masks
         if masks.segmenter is None:
             return None
@@ -144,12 +132,7 @@ class Preprocessor:
 
 
 class QueryImage:
-    """Camera, pixels, mask and depth of a query after pre-processing, made when first asked for.
-
-    Attributes
-    ----------
-    camera : the one that would have taken the new image.
-    """
+    """Preprocessed pixels, mask and depth of a query, computed lazily, with the matching camera."""
 
     def __init__(self, query: Query, plan: FramePlan, preprocessor: Preprocessor) -> None:
         self.query, self._preprocessor = query, preprocessor
@@ -160,7 +143,7 @@ class QueryImage:
         )
 
     def in_original(self, pose: Pose) -> Pose:
-        """The pose with its camera and its inliers' pixels in the original image."""
+        """Convert a pose's camera and inlier pixels to the original image."""
         if pose.camera is not None:
             camera = self._plan.original_of(pose.camera)
             remark = estimate_remark(camera, self.query.camera)
@@ -177,48 +160,40 @@ class QueryImage:
 
     @property
     def pixels(self) -> NDArray[np.uint8]:
-        """The image, uint8 (H, W, 3) RGB."""
+        """Image, uint8 (H, W, 3) RGB."""
         return self._frame.stored
 
     @cached_property
     def mask(self) -> NDArray[np.bool_] | None:
-        """Its mask bool (H, W), True = use: its own, dynamic classes, what the original shows.
-
-        None where all of it is used.
-        """
+        """Combined mask bool (H, W), True = use; None means all."""
         return self._frame.mask
 
     @property
     def feature_mask(self) -> NDArray[np.bool_] | None:
-        """The mask as the extraction of features gets it: with its margin."""
         mask = self.mask
         return None if mask is None else with_margin(mask, self._preprocessor.mask_margin_px)
 
     def extract(self, extractor: LocalFeatureExtractor) -> LocalFeatures:
-        """Its local features."""
         return extract_all(extractor, [(self.pixels, self.feature_mask)], [self.query.name])[0]
 
     def describe(self, extractor: GlobalFeatureExtractor) -> NDArray[np.float32]:
-        """Its global feature, float32 (D,)."""
+        """Return the global feature, float32 (D,)."""
         return describe_images(extractor, [self.pixels], [self.query.name])[0]
 
 
 class QueryImages:
-    """Images by their names, as a :class:`~megloc_kapture.stages.scene.QueryScene`."""
+    """Images by name, as a :class:`~megloc_kapture.stages.scene.QueryScene`."""
 
     def __init__(self, images: Iterable[QueryImage]) -> None:
         self._images = {image.query.name: image for image in images}
 
     def image(self, name: str) -> NDArray[np.uint8]:
-        """RGB pixels (H, W, 3)."""
         return self._images[name].pixels
 
     def mask(self, name: str) -> NDArray[np.bool_] | None:
-        """Mask (H, W), True = use; None without one."""
         return self._images[name].mask
 
     def depth(self, name: str) -> DepthView | None:
-        """Depth that was taken with the image; None without."""
         return self._images[name].query.read_depth()
 
 

@@ -1,4 +1,4 @@
-"""Folders of queries: kapture's, with the features they bring, and plain photographs and videos."""
+"""Query folders: kapture folders with optional features, and plain photographs and videos."""
 
 from __future__ import annotations
 
@@ -59,14 +59,10 @@ _LIST_SUFFIXES = (".txt", ".csv")
 
 
 class Queries(ABC):
-    """Images to localize, read one by one.
+    """Query images, read one at a time.
 
-    Attributes
-    ----------
-    names : of the images that can be used, sorted.
-    unreadable : names of the others to the reason, so far as headers say it.
-    faults : why the features that a query brings cannot be used, known when they have been read;
-        such a query has neither features nor candidates.
+    ``unreadable`` and ``faults`` are reasons, by image name, why images or their features are
+    unusable; faults are filled during reading.
     """
 
     def __init__(self) -> None:
@@ -76,46 +72,44 @@ class Queries(ABC):
 
     @abstractmethod
     def check(self) -> None:
-        """Check all that can be checked without reading features or pixels."""
+        """Check everything that needs neither features nor pixels."""
 
     def lacking(self, local_type: str) -> str | None:
-        """The first image without features that serve a type; None where all bring them."""
+        """Return the first image without features for a type, or None."""
         return next(iter(self.names), None)
 
     def types_of_all(self) -> list[str]:
-        """Global-feature types that all queries bring and the map has."""
+        """Return the global-feature types shared by all queries and the map."""
         return []
 
     def units(self, *, rigs: bool) -> list[scene.Unit]:
-        """Names of the images that are localized together, with the ``cam_from_rig`` of each: with
-        ``rigs`` those of one rig and moment, else every image by itself."""
+        """Return jointly localized (name, ``cam_from_rig``), by rig and timestamp or by image."""
         units = scene.query_units(self.data(), rigs=rigs)
         usable = (tuple(one for one in unit if one[0] not in self.unreadable) for unit in units)
         return [unit for unit in usable if unit]
 
     def read(self, unit: scene.Unit) -> Unit:
-        """The queries of a unit; pixels are read when they are needed."""
+        """Return the queries of a unit; pixels are read lazily."""
         return tuple((self.query(name), cam_from_rig) for name, cam_from_rig in unit)
 
     @abstractmethod
     def query(self, name: str) -> Query:
-        """The query of a name."""
+        """Return a query by name."""
 
     @abstractmethod
     def data(self) -> KaptureData:
-        """Sensors, rigs and records; the cameras as they were before the run."""
+        """Return sensors, rigs and records with the original cameras."""
 
     @abstractmethod
     def write_images(self, output: Path) -> None:
-        """Put the images into a kapture folder, as links where they stay as they are."""
+        """Write the images into a kapture folder, as links if unchanged."""
 
 
 class KaptureQueries(Queries):
-    """The images of a kapture folder as queries, with the features it brings; read one by one.
+    """Queries of a kapture folder, with its features if it has any.
 
-    Its cameras and keypoints are taken to be described as the map describes its own. Where it
-    brings no features, its cameras are scaled to its images. A camera that is not calibrated is
-    that of a photograph: its focal length is EXIF's or a guess, and estimated with the pose.
+    Cameras and keypoints are assumed to follow the map's conventions. The focal length of an
+    uncalibrated camera comes from EXIF or a guess, and is estimated with the pose.
     """
 
     def __init__(self, folder: KaptureFolder, kapture_map: KaptureMap) -> None:
@@ -135,7 +129,6 @@ class KaptureQueries(Queries):
             if source is not None
         }
         self._data = folder.read() if self._local else with_cameras_of_images(folder)
-        # what the map says of keypoints of each type; looked up here, not for every query
         self._like = {
             name: kapture_map.keypoints_of(
                 next(other for other in equivalent_types(name) if other in stored)
@@ -155,7 +148,6 @@ class KaptureQueries(Queries):
         )
 
     def check(self) -> None:
-        """See :meth:`Queries.check`."""
         self._map.folder.check_features_apart(self._folder)
         if not self.names:
             raise DataError("there are no query images", path=self._folder.root)
@@ -179,7 +171,7 @@ class KaptureQueries(Queries):
     def units(self, *, rigs: bool) -> list[scene.Unit]:
         units: list[scene.Unit] = []
         for unit in super().units(rigs=rigs):
-            if any(self._is_unknown(name) for name, _ in unit):  # one is estimated by itself
+            if any(self._is_unknown(name) for name, _ in unit):  # no calibrated rig
                 units += [((name, RigidTransform.identity()),) for name, _ in unit]
             else:
                 units.append(unit)
@@ -200,9 +192,9 @@ class KaptureQueries(Queries):
         width, height = map(int, self._sensor(name).params[1:])
         try:
             found = read_photo(self._folder.image_path(name)).camera
-        except DataError:  # features are enough
+        except DataError:  # the features are enough
             return guessed_camera(width, height)
-        # keypoints are in pixels of the size that the sensor says
+        # keypoints are in pixels of the sensor's image size
         is_other = min(width, height) > 0 and (width, height) != (found.width, found.height)
         brings = any(name in keypoints for keypoints, _ in self._local.values())
         return scaled_camera(found, width, height) if is_other and brings else found
@@ -260,7 +252,6 @@ class KaptureQueries(Queries):
 
     @cached_property
     def _priors(self) -> dict[str, tuple[str, ...]]:
-        """Map images permitted by the dataset; queries of one pool share their tuple."""
         images = self._map.images
         found = {}
         for positions, permitted in self._map.restrictions.pools(self.names, images):
@@ -307,29 +298,21 @@ class _Image:
 
 
 class Photographs(Queries):
-    """Image files, folders of them, and videos, as the queries of a run, or to make a map of.
+    """Photographs and videos, as queries or as input of a map.
 
-    Without a camera an image is turned upright by its EXIF orientation, its camera is of the turned
-    image, and its focal length is EXIF's or a guess, estimated with the pose in any case. A given
-    camera is of the pixels as they are stored, and is scaled to an image of another size with both
-    sides scaled by one factor. Images of one size, make and focal length share a camera.
+    Without a given camera, images are turned upright by their EXIF orientation and the camera
+    describes the turned image; the focal length comes from EXIF or a guess and is always
+    estimated with the pose. A given camera describes the stored pixels and is scaled uniformly to
+    images of another size. Images of the same size, make and focal length share a camera.
 
     Parameters
     ----------
-    paths : files and folders. An image is named by its path below the folder that was given, a
-        file that was given by its own name, a frame by its video and number:
-        ``walk.mp4/000120.jpg``. Of a folder images, by their content, and videos are taken, also
-        behind links; hidden files are not, nor kapture folders and what else we have written below
-        it. Of a kapture folder that is given its images are taken, with its calibrated cameras.
-    camera : of all images, EXIF is not looked at then; or a list of cameras, those of images
-        without a row are estimated.
-    every : of a video, every n-th frame; 30 unless given.
-
-    Attributes
-    ----------
-    root : the first folder, or that of the first file.
-    passed_over : files of the folders that are no images.
-    without_row : images that the list of cameras does not have.
+    paths : files and folders, searched through links for images and videos; hidden files, nested
+        kapture folders and megloc outputs are skipped. Names are paths below the given folder, or
+        file names; frames are ``walk.mp4/000120.jpg``. A given kapture folder contributes its
+        images and calibrated cameras.
+    camera : camera of all images, or a list of cameras by image; replaces EXIF.
+    every : take every n-th frame of a video; 30 by default.
     """
 
     def __init__(
@@ -368,11 +351,10 @@ class Photographs(Queries):
             )
 
     def known_cameras(self) -> bool:
-        """Return whether the cameras of all images are given."""
         return all(image.camera.focal_deviation == 0 for image in self._images.values())
 
     def describe(self) -> list[str]:
-        """Lines about files that are left out or have no camera in the list."""
+        """Describe skipped files and images missing from the camera list."""
         lines = []
         if self.passed_over:
             said = f"{len(self.passed_over)} files that are no images are left out"
@@ -383,18 +365,16 @@ class Photographs(Queries):
         return lines
 
     def check(self) -> None:
-        """Nothing more is known without reading pixels."""
+        """Do nothing: everything else needs pixels."""
 
     def query(self, name: str) -> Query:
         image = self._images[name]
         return Query(image.camera, image.path, name, orientation=image.orientation)
 
     def gps(self) -> dict[str, tuple[float, float, float]]:
-        """Latitude, longitude and height of the images whose EXIF has them."""
         return {name: one.gps for name, one in self._images.items() if one.gps is not None}
 
     def files(self) -> dict[str, Path]:
-        """The files of the images that can be read; of frames those that were taken out."""
         return {name: self._images[name].path for name in self.names}
 
     def data(self) -> KaptureData:
@@ -402,7 +382,7 @@ class Photographs(Queries):
         sensor_ids: dict[tuple[str, Camera], str] = {}
         for timestamp, name in enumerate(self.names):
             image = self._images[name]
-            # the frames of a video have one camera, and photographs without EXIF may have
+            # frames of a video share a camera, and photographs without EXIF may
             made_by = name.rpartition("/")[0] if image.is_frame else image.make
             sensor_id = sensor_ids.setdefault((made_by, image.camera), f"camera{len(sensor_ids)}")
             title = made_by.replace(",", " ")
@@ -421,7 +401,7 @@ class Photographs(Queries):
             else:
                 try:
                     pixels = read_image_rgb(image.path)
-                except DataError:  # its row in status.csv says so
+                except DataError:  # reported in status.csv
                     continue
                 write_image(place, turned_upright(pixels, image.orientation))
 
@@ -457,13 +437,11 @@ class Photographs(Queries):
 
 
 def _first(names: Sequence[str]) -> str:
-    """The first few of some names, and how many more there are."""
     more = f" and {len(names) - 5} more" if len(names) > 5 else ""
     return ", ".join(names[:5]) + more
 
 
 def _calibrated(root: Path) -> dict[str, Camera]:
-    """The calibrated cameras of a kapture folder's images by their names; none of a plain one."""
     if not is_kapture(root):
         return {}
     data, found = KaptureFolder(root).read(), {}
@@ -474,7 +452,6 @@ def _calibrated(root: Path) -> dict[str, Camera]:
 
 
 def _named_files(paths: Sequence[Path]) -> tuple[dict[str, Path], list[str]]:
-    """Name to path of all images that were given, sorted by name; and names of the other files."""
     found: dict[str, Path] = {}
     others: list[str] = []
     for path in paths:
@@ -516,16 +493,15 @@ def _images_of_kapture(folder: KaptureFolder) -> dict[str, Path]:
 
 
 def _images_below(folder: Path) -> tuple[list[Path], list[Path]]:
-    """The images and videos below a folder, and the other files."""
     found, seen = list[Path](), set[str]()
     for place, folders, files in os.walk(folder, followlinks=True):
         here, real = Path(place), os.path.realpath(place)
         written = (here / MARKER).is_file() or (here / "sensors" / "sensors.txt").is_file()
-        if real in seen or (written and here != folder):  # a loop of links, or a map of these
+        if real in seen or (written and here != folder):  # link loop or megloc output
             folders.clear()
             continue
         seen.add(real)
-        # what is linked to counts where it is, if it is below
+        # visit real folders first, so that links to them are the duplicates
         shown = (name for name in folders if not name.startswith("."))
         folders[:] = sorted(shown, key=lambda name: ((here / name).is_symlink(), name))
         found += [here / name for name in files if not name.startswith(".")]
@@ -535,7 +511,6 @@ def _images_below(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def _check_name(name: str, path: Path) -> None:
-    """Refuse names that kapture's tables cannot hold."""
     try:
         check_relative(name)
     except DataError as error:

@@ -1,4 +1,4 @@
-"""Results of a kapture folder or of photographs: localized when asked for, saved as kapture."""
+"""Lazily computed results of a kapture folder or of photographs."""
 
 from __future__ import annotations
 
@@ -30,18 +30,11 @@ Candidates = Mapping[str, Sequence[str]]
 
 
 class Results(Mapping[str, Pose | Failure]):
-    """Image name to result, in the order of the names (rigs: of their moments).
+    """Mapping from image name to result, in the order of names (rigs: of timestamps).
 
-    An image is localized when its result is asked for, together with those before it, and of
-    photographs all of them, for those of one camera tell of it together; what is found is kept.
-
-    Parameters
-    ----------
-    folder : kapture folder of the queries, and their features where they bring some; or
-        photographs. Images that cannot be used are failures.
-    workers : threads that localize.
-    candidates : query name to the map images it is matched with, instead of retrieval.
-    track : shows progress.
+    Access localizes an image and those before it; photographs share cameras and are localized all
+    at once. Results are kept, with failures for unusable images. ``candidates`` are map images by
+    query name, used instead of retrieval.
     """
 
     def __init__(
@@ -62,7 +55,6 @@ class Results(Mapping[str, Pose | Failure]):
         else:
             opened = folder if isinstance(folder, KaptureFolder) else KaptureFolder(folder)
             self.queries = KaptureQueries(opened, localizer.map)
-        # what is wrong is found before the first query
         localizer.map.check()
         self.queries.check()
         self._check_extractors()
@@ -91,23 +83,15 @@ class Results(Mapping[str, Pose | Failure]):
         return len(self._found)
 
     def __reduce__(self) -> tuple[type[dict[str, Pose | Failure]], tuple[Any, ...]]:
-        """Pickled, and copied to other processes, they are a plain dict."""
+        """Pickle as a plain dict."""
         return dict, (list(self.items()),)
 
     def save(self, output: Path | str, *, force: bool = False) -> dict[str, int]:
-        """Write a kapture folder of the localized images, with ``status.csv`` and its like.
-
-        Failed queries get what ``localization.fallback`` says.
-
-        Returns
-        -------
-        Counts: queries, localized, failed, fallbacks.
-        """
+        """Write a kapture folder with ``status.csv`` and fallbacks for failures; return counts."""
         with staged_output(Path(output), kind=LOCALIZED, force=force) as out:
             return self.write_to(out)
 
     def write_to(self, output: Path) -> dict[str, int]:
-        """As :meth:`save`, into a folder that is ours already."""
         fallback = self.localizer.options.localization.fallback
         best = self._best_candidates() if fallback == "retrieval" else {}
         counts = write_localized(
@@ -121,10 +105,7 @@ class Results(Mapping[str, Pose | Failure]):
         return counts
 
     def to_pandas(self) -> pd.DataFrame:
-        """One row per image: the columns of ``status.csv``, and the pose, NaN where there is none.
-
-        The pose is ``cam_from_world``: qw qx qy qz, tx ty tz in the map's unit.
-        """
+        """Return one row per image: ``status.csv`` and ``cam_from_world``, NaN without a pose."""
         import pandas as pd
 
         rows = []
@@ -139,23 +120,17 @@ class Results(Mapping[str, Pose | Failure]):
         return pd.DataFrame(rows).set_index("image")
 
     def view(self, path: Path | str, truth: Path | str | None = None) -> None:
-        """Write a page that shows the images in the map in 3D; see
-        :func:`megloc_kapture.evaluation.view.write_view`."""
+        """Write a 3D page; see :func:`megloc_kapture.evaluation.view.write_view`."""
         from megloc_kapture.evaluation.view import write_view
 
         data, cameras = self.queries.data(), {}
         for name in self:
-            with contextlib.suppress(DataError):  # of a photograph perhaps nobody knows it
+            with contextlib.suppress(DataError):  # photographs may lack a known camera
                 cameras[name] = data.camera_of(name)
         folder = self.localizer.map.folder
         write_view(path, folder, self, truth, cameras=cameras)
 
     def _check_extractors(self) -> None:
-        """Make the extractors that queries without features need.
-
-        Raises DataError where there is none for a type, with the first image that needs it;
-        PluginError, MissingWeightsError where it cannot be made.
-        """
         for local in self.localizer.types:
             lacking = self.queries.lacking(local.name)
             if lacking is None:
@@ -180,15 +155,14 @@ class Results(Mapping[str, Pose | Failure]):
                         result = replace(result, reason=self.queries.faults[name])
                     yield name, result
         except GeneratorExit:
-            # nobody reads on; the garbage collector may say so in any thread, one that is being
-            # started and holds what ending the workers needs included, so nothing is waited for
+            # the garbage collector may close this generator in any thread, even in one that holds
+            # locks needed to stop the workers, so do not wait
             read_on = False
             raise
         finally:
             executor.shutdown(wait=read_on)
 
     def _with_shared_cameras(self, results: list[Pose | Failure]) -> list[Pose | Failure]:
-        """Results of photographs, each by itself; those of one camera are solved with one."""
         data, of_sensor = self.queries.data(), defaultdict(list)
         for at, (((name, _),), result) in enumerate(zip(self._units, results, strict=True)):
             if isinstance(result, Pose):
@@ -201,7 +175,6 @@ class Results(Mapping[str, Pose | Failure]):
         return results
 
     def _best_candidates(self) -> dict[str, tuple[str, RigidTransform]]:
-        """Failed query to its best candidate and that image's pose."""
         poses = self.localizer.map.poses
         best = {}
         for name, result in self.items():
@@ -211,7 +184,7 @@ class Results(Mapping[str, Pose | Failure]):
             if self._candidates is not None:
                 ranked = self._candidates.get(name, ())
             else:
-                # one that cannot be decoded could not be either when it was localized
+                # undecodable images fail here as in localization
                 with contextlib.suppress(DataError):
                     ranked = self.localizer.ranked(self.queries.query(name))
             first = next((image for image in ranked if image in poses), None)

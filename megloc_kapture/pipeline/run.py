@@ -30,14 +30,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Run:
-    """A dataset and the options to run it with.
-
-    Attributes
-    ----------
-    options : those of the run, with the changes of the dataset's file and of the user.
-    benchmark : the dataset's file, which changes the protocol too.
-    usual : the options without the user's changes; None: the preset's.
-    """
+    """A dataset and its final options; ``usual`` are the options without the user's changes."""
 
     source: DatasetChoice
     preset: str
@@ -47,12 +40,10 @@ class Run:
 
     @property
     def dataset(self) -> str:
-        """The dataset's name."""
         return self.source.name
 
     @property
     def default_workspace(self) -> Path:
-        """``runs/DATASET-PRESET``; of kapture folders, ``runs/kapture-ROOT-PRESET``."""
         source, folder = self.source, ""
         if source.root is not None and source.adapter is None:
             folder = Path(os.path.abspath(source.root)).name
@@ -60,12 +51,11 @@ class Run:
 
     @property
     def label(self) -> str:
-        """What its result is called: ``kapture, classic with local_features=aliked``."""
+        """Title of the result: ``kapture, classic with local_features=aliked``."""
         changed = " and ".join(f"{key}={names}" for key, names in self._changed_features().items())
         return f"{self.dataset}, {self.preset}{' with ' if changed else ''}{changed}"
 
     def _changed_features(self) -> dict[str, str]:
-        """Types of features, by option, that the user has chosen instead of the usual ones."""
         usual, changed = self.usual or options_of_preset(self.preset), {}
         for key in ("local_features", "global_features"):
             names = [one.name for one in getattr(self.options, key)]
@@ -74,11 +64,9 @@ class Run:
         return changed
 
     def submission_below(self, folder: Path, tables: Path) -> Path:
-        """Where, below ``folder``, the pose file stands; a folder where it is several files.
+        """Return the path of the pose file, or of the folder of several, below ``folder``.
 
-        Its name is the server's, ``Aachen_v1_1_eval_METHOD.txt``; METHOD names the preset, and the
-        features that were chosen instead of its own. That of a rendered twin begins with
-        ``synthetic-``: there is no server for it. ``tables`` : the dataset's side tables.
+        The name is the server's, ``Aachen_v1_1_eval_METHOD.txt``, or begins with ``synthetic-``.
         """
         protocol = read_protocol(tables)
         stem = self.dataset
@@ -89,7 +77,6 @@ class Run:
         return folder / SUBMISSIONS / f"{stem}_eval_{method}{end}"
 
     def provenance(self) -> dict[str, Any]:
-        """What a result is of, as plain JSON values."""
         options = self.options.model_dump(mode="json")
         return {"dataset": self.dataset, "preset": self.preset, "options": options}
 
@@ -106,16 +93,15 @@ def choose_run(
     allow_missing: bool = False,
     find_root: bool = True,
 ) -> Run:
-    """Choose what ``megloc eval`` runs.
+    """Return the run of ``megloc eval`` for a dataset.
 
     Parameters
     ----------
-    root : folder of the dataset as published; looked for below MEGLOC_DATA by default.
-    preset : that of the benchmark file by default.
+    root : published dataset folder; searched below MEGLOC_DATA by default.
     assignments : the user's changes: ``key.key=value`` texts, or ``key.key`` to values.
-    import_options : options of the dataset, after those of the benchmark file.
-    config : a benchmark file instead of the one that comes with the package.
-    find_root : false: an official dataset may be without a root; it cannot be imported then.
+    import_options : dataset options, applied after those of the benchmark file.
+    config : benchmark file that replaces the packaged one.
+    find_root : if false, an official dataset may lack a root and then cannot be imported.
     """
     benchmark = find_benchmark(dataset)
     if config:
@@ -146,7 +132,7 @@ def choose_run(
 
 
 def _without_covisibility(options: PipelineOptions) -> PipelineOptions:
-    """Drop pairs by co-visibility, which need a reference model, where others are left."""
+    """Drop pairs by co-visibility, which need a reference model, if other pairs remain."""
     others = tuple(method for method in options.mapping_pairs.by if method != "covisibility")
     if not others or not options.pairs_by_points():
         return options

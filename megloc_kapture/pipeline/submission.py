@@ -1,4 +1,4 @@
-"""Pose files of a localized kapture, by its challenge's rules, and the folder that keeps them."""
+"""Challenge pose files of a localized kapture folder, and the folder that collects them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ from megloc_kapture.values import Pose, RigidTransform
 
 _log = logging.getLogger(__name__)
 
-# a row of MLAD for a query without a pose; kapture's own exporter writes the same
+# row of MLAD for a query without a pose, as kapture's exporter writes it
 _DUMMY = RigidTransform.identity()
 
 
@@ -64,11 +64,6 @@ _Content = tuple[Mapping[str, str], Sequence[str], Sequence[tuple[str, str]]]
 
 @dataclass(frozen=True)
 class _Result:
-    """The queries, and their poses in the workspace's frame; which are guesses or of the rig.
-
-    ``doubtful`` are queries whose own pose was not trusted.
-    """
-
     data: KaptureData
     poses: Mapping[str, RigidTransform]
     guesses: Collection[str]
@@ -78,15 +73,7 @@ class _Result:
 
 
 def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> None:
-    """Refuse a dataset whose rules are not those of the side tables.
-
-    Kapture folders may be anything; what an official dataset's import wrote goes by its own name
-    only. A rendered twin's rules are those of its dataset.
-
-    Parameters
-    ----------
-    tables : where the protocol was read; None: nowhere, it is the default.
-    """
+    """Raise an error if an official dataset's rules differ from those of the side tables."""
     check_known(dataset)
     plain = (KAPTURE, SYNTHETIC)
     wanted, given = (name.removeprefix(TWIN_PREFIX) for name in (dataset, protocol.dataset))
@@ -111,26 +98,23 @@ def write_submission(
     provenance: Mapping[str, Any],
     from_rig: bool = False,
 ) -> dict[str, int]:
-    """Write the pose file or files of a localized kapture, and the provenance beside them.
+    """Write the pose file or files of a localized kapture folder, and their provenance.
 
-    Poses leave in the official frame. A query without a pose has no row; where every row is asked
-    for (MLAD) its row is the identity, a dummy that counts as missing.
+    Poses are written in the official frame. A query without a pose has no row, except for MLAD,
+    where its row is an identity pose that counts as missing.
 
     Parameters
     ----------
-    place : the file; for MLAD the folder, which gets one file per relocalization file.
-    tables : the workspace's ``megloc/`` folder; None: no list, no rules, one frame. Beside it lie
-        ``mapping/`` (poses of MLAD's reference keyframes), ``query/`` (all queries, the rig) and
-        ``stages/`` (the dataset's fingerprint), where there are any.
+    place : the file; for MLAD a folder with one file per relocalization file.
+    tables : the workspace's ``megloc/`` folder; None means no query list, no rules, one frame.
     provenance : entries for the provenance (dataset, preset, options).
-    from_rig : queries without a pose of their own get one through the rig.
+    from_rig : derive missing poses from the rig.
 
     Returns
     -------
-    Counts: ``queries``, ``scored`` (images, or rows of MLAD, that the challenge counts),
-    ``poses`` written for them, ``missing``, queries of these that are ``doubtful`` (a pose of too
-    little confidence), and of the poses ``fallbacks`` (guesses) and ``from_rig``; ``dummies`` are
-    rows that hold no pose.
+    Counts: ``queries``; ``scored`` images, or rows of MLAD; their ``poses`` and ``missing``;
+    ``doubtful`` among the missing (low confidence); ``fallbacks`` (guesses) and ``from_rig`` among
+    the poses; ``dummies``, rows without a pose.
     """
     beside = None if tables is None else tables.parent
     rules = Protocol() if tables is None else read_protocol(tables)
@@ -171,10 +155,9 @@ def poses_through_rig(
     poses: Mapping[str, RigidTransform],
     statuses: Mapping[str, QueryStatus] = MappingProxyType({}),
 ) -> dict[str, RigidTransform]:
-    """Poses of images that have none of their own, through the rig, from another of the moment.
+    """Derive missing poses from the image of the same rig and timestamp with the most inliers.
 
-    A fallback pose is only a guess: it is replaced, and not passed on to other images. Of
-    several siblings the one with the most inliers counts; without status a pose is localized.
+    Fallback poses are replaced and never propagated.
     """
     localized = {}
     for image, pose in poses.items():
@@ -191,7 +174,7 @@ def _read_result(localized: Path, beside: Path | None, *, from_rig: bool) -> _Re
     data = own
     query = None if beside is None else beside / QUERY
     if query is not None and (query / "sensors" / "sensors.txt").is_file():
-        # it has the queries that a foreign result leaves out, and the rig
+        # includes the rig, and queries missing from a foreign result
         data = KaptureFolder(query).read()
         strange = set(own.image_names()) - set(data.image_names())
         if strange:
@@ -229,7 +212,6 @@ def _read_result(localized: Path, beside: Path | None, *, from_rig: bool) -> _Re
 def _ltvl(
     result: _Result, tables: Path | None, rules: Protocol, unreadable: Collection[str]
 ) -> _Content:
-    """The same as :func:`_mlad`, for one file without a name."""
     names = {} if tables is None else read_names(tables)
     world = World() if tables is None else read_world(tables)
     images = list(names)
@@ -252,7 +234,7 @@ def _ltvl(
 
 
 def _mlad(result: _Result, tables: Path) -> _Content:
-    """Texts by file name, images of the rows that have a pose, and the other rows with theirs."""
+    """Return texts by file name, (row, image) with a pose, and those without."""
     pairs = read_relocalization(tables)
     if not pairs:
         raise DataError(
@@ -278,16 +260,12 @@ def _mlad(result: _Result, tables: Path) -> _Content:
 
 
 def _dataset_fingerprint(workspace: Path | None) -> str | None:
-    """Fingerprint of the imported dataset; None where it was not imported by a run."""
     manifest = None if workspace is None else read_manifest(workspace / "stages" / "import.json")
     return None if manifest is None else manifest.fingerprint
 
 
 def workspace_provenance(localized: Path) -> dict[str, Any]:
-    """Preset and options of a result, from the manifests of its workspace.
-
-    Empty unless they belong to this very result, and not to an older one.
-    """
+    """Return preset and options of a result from its workspace's manifests; empty if stale."""
     manifests = _manifests(localized)
     made = _maker(localized, manifests)
     if made is None:
@@ -301,11 +279,7 @@ def workspace_provenance(localized: Path) -> dict[str, Any]:
 
 
 def _weights(localized: Path) -> dict[str, str]:
-    """File name to SHA-256 of the weights of all networks that took part in a workspace's result.
-
-    They stand in the manifests of the stages that it was made of, which are followed back by what
-    each has read. Nothing where it is in no workspace.
-    """
+    """Return the SHA-256 by file name of all network weights used for a workspace's result."""
     manifests = _manifests(localized)
     made = _maker(localized, manifests)
     reached: dict[str, Manifest] = {}
@@ -323,14 +297,12 @@ def _weights(localized: Path) -> dict[str, str]:
 
 
 def _manifests(localized: Path) -> dict[str, Manifest]:
-    """The manifests, by stage, of the workspace that a result is in."""
     paths = sorted((localized.resolve().parent / "stages").glob("*.json"))
     found = map(read_manifest, paths)
     return {manifest.stage: manifest for manifest in found if manifest is not None}
 
 
 def _maker(localized: Path, manifests: Mapping[str, Manifest]) -> Manifest | None:
-    """The manifest of the stage that wrote a result."""
     name = localized.resolve().name
     return next((one for one in manifests.values() if name in one.outputs), None)
 
@@ -339,25 +311,15 @@ FOLDER = "submissions"
 
 
 def keep_submission(place: Path, folder: Path) -> Path:
-    """Copy a submission and its provenance into a folder, beside those of other runs.
+    """Copy a submission and its provenance into a folder of submissions; return the copy's path.
 
-    A submission with the same content is not copied again. If another one has the name, the copy
-    gets a number: ``Aachen_eval_METHOD-2.txt``.
-
-    Parameters
-    ----------
-    place : the pose file, or the folder of a challenge that takes several; its provenance lies
-        beside it.
-
-    Returns
-    -------
-    Path of the copy.
+    Identical content is not copied again; a name conflict gets a number, ``..._METHOD-2.txt``.
     """
     for path in (place, provenance_path(place)):
         if not path.exists():
             raise DataError("no such file; --from submission writes it again", path=path)
     provenance = json.loads(read_text(provenance_path(place)))
-    # only a file's name has a suffix: that of a folder may hold a dot
+    # a dot in a folder's name starts no suffix
     suffix = place.suffix if place.is_file() else ""
     for number in count(1):
         numbered = "" if number == 1 else f"-{number}"
@@ -366,7 +328,7 @@ def keep_submission(place: Path, folder: Path) -> Path:
             return kept
         if not os.path.lexists(kept) and not os.path.lexists(provenance_path(kept)):
             break
-    if place.is_file():  # the provenance has the file's name
+    if place.is_file():  # the provenance contains the file's name
         provenance["files"] = {kept.name: provenance["files"][place.name]}
     copied = folder / temporary_name()
     folder.mkdir(parents=True, exist_ok=True)
@@ -377,6 +339,5 @@ def keep_submission(place: Path, folder: Path) -> Path:
 
 
 def _hashes(place: Path) -> list[str]:
-    """Hashes of a submission's pose files, by its provenance; empty where it has none."""
     path = provenance_path(place)
     return sorted(json.loads(read_text(path))["files"].values()) if path.is_file() else []

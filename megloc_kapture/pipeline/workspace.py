@@ -1,9 +1,7 @@
-"""The workspace: where a run keeps its results, and recognizes them.
+"""Workspace: stage outputs of a run, with manifests.
 
-Each stage leaves a manifest there. Its fingerprint is a hash of the stage's name, version and
-options, the code of its plugins, and the fingerprints of its inputs: of the stages that wrote
-them, or of names, sizes and times of files outside the workspace. A stage runs again when its
-fingerprint has changed or an output is gone.
+A stage runs again if an output is missing or its fingerprint changes: a hash of its name, version,
+options, plugin code, and inputs (fingerprints of stages, or sizes and times of external files).
 """
 
 from __future__ import annotations
@@ -30,18 +28,18 @@ from megloc_kapture.values import Options
 
 PARTIAL = ".partial"
 LOCK = ".lock"
-FINISHED = ".items"  # in a stage's unfinished folder: its finished items
+FINISHED = ".items"  # finished items in a stage's unfinished folder
 _MAP = "map"
 
 
 def map_of_workspace(path: Path) -> Path:
-    """Return the kapture folder of a workspace's map; any other path as it is."""
+    """Return the kapture map in a workspace; any other path unchanged."""
     is_workspace = (path / LOCK).is_file() and (path / _MAP).is_dir()
     return path / _MAP if is_workspace else path
 
 
 class Workspace:
-    """Paths of a workspace (docs/architecture.md); a folder that is none is refused."""
+    """Paths of a workspace (docs/architecture.md)."""
 
     def __init__(self, root: Path, *, force: bool = False) -> None:
         self.root, self.force = Path(root).absolute(), force
@@ -49,37 +47,31 @@ class Workspace:
         self._published = False
 
     def path(self, relative: str) -> Path:
-        """Return a path below the workspace."""
         return self.root / relative
 
     def manifest_path(self, stage: str) -> Path:
-        """Return where the manifest of a stage lies."""
         return self.root / "stages" / f"{stage}.json"
 
     def manifest(self, stage: str) -> Manifest | None:
-        """Return the manifest of a stage; see :func:`read_manifest`."""
         return read_manifest(self.manifest_path(stage))
 
     def manifest_paths(self) -> list[Path]:
-        """Return the paths of all manifests."""
         found = (self.root / "stages").glob("*.json")
         return sorted(path for path in found if path.name[0] != ".")
 
     def partial_path(self, stage: str) -> Path:
-        """Return the folder that a stage writes into until it is finished."""
+        """Return the folder of a stage's unfinished output."""
         return self.root / PARTIAL / stage
 
     def folder(self, name: str, *features: str) -> KaptureFolder:
-        """Return a kapture folder of the workspace, with features folders of the workspace."""
         return KaptureFolder(self.path(name), features_dirs=[self.path(f) for f in features])
 
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """Hold the workspace against a second run; a dead process holds nothing.
+        """Lock the workspace for this process.
 
-        Leftovers of killed runs are removed, except finished items. A workspace that no stage
-        has been run in by the end of the block is removed: a refused run, or a dry run,
-        leaves nothing behind.
+        Removes leftovers of killed runs, except finished items; at the end, removes a workspace
+        that has no stage.
         """
         path = self.root / LOCK
         try:
@@ -122,10 +114,9 @@ class Workspace:
 
     @contextmanager
     def staging(self, stage: str, mark: str) -> Iterator[Path]:
-        """Yield the folder to write a stage's output into; removed when the block ends well.
+        """Yield the folder to write a stage's output into; removed on success.
 
-        A folder that a stopped run of the same fingerprint (``mark``) left is used again. When
-        the block raises, a folder with finished items stays for the next run.
+        Reuses the finished items of an interrupted run with the same fingerprint (``mark``).
         """
         place = self.partial_path(stage)
         try:
@@ -144,7 +135,7 @@ class Workspace:
                     remove(place)
 
     def publish(self, staging: Path, outputs: tuple[str, ...]) -> None:
-        """Move a stage's outputs to their places; outputs it did not write are removed."""
+        """Move a stage's outputs into place and remove old ones that were not written."""
         if not staging.is_dir():
             raise OutputError(f"{self.root}: was deleted or moved while a run was working in it")
         self._published = True
@@ -162,7 +153,6 @@ class Workspace:
                 raise output_error(place, error) from error
 
     def remove(self, outputs: Iterable[str]) -> None:
-        """Remove outputs."""
         for output in outputs:
             place = self.root / output
             try:
@@ -172,8 +162,6 @@ class Workspace:
 
 
 class Manifest(Options):
-    """``stages/NAME.json``."""
-
     stage: str
     version: int
     options: dict[str, Any]
@@ -190,7 +178,6 @@ class Manifest(Options):
 def fingerprint(
     stage: str, version: int, options: Mapping[str, Any], inputs: Mapping[str, str]
 ) -> str:
-    """Return a hash of everything that determines a stage's output."""
     content = {"stage": stage, "version": version, "options": dict(options), "inputs": dict(inputs)}
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(text.encode()).hexdigest()
@@ -199,18 +186,14 @@ def fingerprint(
 def output_fingerprint(
     stage: str, version: int, options: Mapping[str, Any], inputs: Mapping[str, str]
 ) -> str:
-    """As :func:`fingerprint`, for stages that read the outputs.
-
-    It is the same wherever the dataset lies, for it may be moved, and for any protocol: the
-    submission and the evaluation, which depend on that, have it among their own options.
-    """
+    """Return a fingerprint that ignores the dataset's location and the protocol, for dependents."""
     others = {name: value for name, value in options.items() if name != PROTOCOL}
     content = {name: mark for name, mark in inputs.items() if name != ROOT}
     return fingerprint(stage, version, others, content)
 
 
 def read_manifest(path: Path) -> Manifest | None:
-    """Read a manifest; None where it is missing or broken: then the stage has to run."""
+    """Read a manifest; None if missing or broken, so that the stage runs again."""
     try:
         return read_json_model(path, Manifest)
     except DataError:

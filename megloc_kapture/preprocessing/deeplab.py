@@ -1,7 +1,7 @@
-"""DeepLabV3+ trained on Cityscapes as a segmenter: people and vehicles are what moves.
+"""DeepLabV3+ trained on Cityscapes as a segmenter of people and vehicles.
 
-Chen et al., ECCV 2018, at output stride 16, under the keys of VainF's checkpoints: ResNet-101 or
-MobileNetV2 below; the head's convolutions are plain ones, as those of all public checkpoints are.
+Chen et al., ECCV 2018, output stride 16, with the keys of VainF's checkpoints: ResNet-101 or
+MobileNetV2 backbone, plain convolutions in the head as in all public checkpoints.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from megloc_kapture.nets.trunks import ResNet, imagenet_normalised
 
 Backbone = Literal["resnet101", "mobilenet"]
 
-# by train id, as cityscapesScripts numbers them; the categories human and vehicle are the last
+# by train id of cityscapesScripts; the categories human and vehicle come last
 CITYSCAPES_CLASSES = (
     *("road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign"),
     *("vegetation", "terrain", "sky"),
@@ -39,13 +39,13 @@ CITYSCAPES_DYNAMIC = frozenset(CITYSCAPES_CLASSES[11:])
 _WIDTH = 256
 _LOW_LEVEL_WIDTH = 48
 _DILATIONS = (6, 12, 18)
-# of MobileNetV2: expansion, channels, blocks (table 2 of the paper); stride and dilation of the
-# first, dilation of the others: the sixth stage's stride is a dilation of all that follows it
+# MobileNetV2 (table 2 of the paper): expansion, channels, blocks, stride and dilation of the first
+# block, dilation of the others; the sixth stage is dilated instead of strided
 _MOBILENET_STAGES = (
     *((1, 16, 1, 1, 1, 1), (6, 24, 2, 2, 1, 1), (6, 32, 3, 2, 1, 1), (6, 64, 4, 2, 1, 1)),
     *((6, 96, 3, 1, 1, 1), (6, 160, 3, 1, 1, 2), (6, 320, 1, 1, 2, 2)),
 )
-_NUM_LOW_LEVEL = 4  # the stem and the blocks down to a quarter of the size
+_NUM_LOW_LEVEL = 4  # the stem and the blocks down to 1/4 resolution
 
 
 class DeepLabOptions(NetworkOptions):
@@ -64,7 +64,7 @@ class DeepLabOptions(NetworkOptions):
 
 
 class DeepLab(Checkpointed[DeepLabOptions]):
-    """Cityscapes' 19 classes of an image, at the image's own size."""
+    """Segmenter of the 19 Cityscapes classes at the image's resolution."""
 
     name = "deeplabv3plus"
     classes = CITYSCAPES_CLASSES
@@ -72,11 +72,7 @@ class DeepLab(Checkpointed[DeepLabOptions]):
     Options = DeepLabOptions
 
     def segment(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Labels uint8 (H, W), indices into ``classes``, of an RGB image, uint8 (H, W, 3).
-
-        Raises DataError where the checkpoint does not fit, OptionError where the device is not
-        there.
-        """
+        """Return labels uint8 (H, W), indices into ``classes``, of an RGB image uint8 (H, W, 3)."""
         height, width = image.shape[:2]
         scale = self.options.max_size_px / max(height, width)
         if scale < 1:
@@ -95,7 +91,7 @@ def _deeplab(tensors: Mapping[str, torch.Tensor], where: str) -> DeepLabV3Plus:
 
 
 def backbone_of(keys: Collection[str], where: str) -> Backbone:
-    """Trunk that the keys of a checkpoint are of; raises DataError that names the file."""
+    """Return the backbone of a checkpoint by its keys."""
     for key in keys:
         if key.startswith("backbone.layer1."):
             return "resnet101"
@@ -124,7 +120,7 @@ def _activated(
 
 
 class Pooling(nn.Sequential):
-    """The mean of the whole map, projected and spread over the map again."""
+    """Global average pooling and projection, expanded to the size of the map."""
 
     def __init__(self, channels: int) -> None:
         super().__init__(nn.AdaptiveAvgPool2d(1), *_activated(channels, _WIDTH, 1))
@@ -137,7 +133,7 @@ class Pooling(nn.Sequential):
 
 
 class AtrousPyramid(nn.Module):
-    """Atrous spatial pyramid pooling: five branches of different dilation, projected together."""
+    """Atrous spatial pyramid pooling: five branches, concatenated and projected."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -153,7 +149,7 @@ class AtrousPyramid(nn.Module):
 
 
 class Head(nn.Module):
-    """The pyramid, brought to a quarter of the image's size and sharpened by low-level features."""
+    """Classifier of the pyramid at 1/4 resolution, refined by low-level features."""
 
     def __init__(self, channels: int, low_level_channels: int, num_classes: int) -> None:
         super().__init__()
@@ -196,12 +192,10 @@ class InvertedResidual(nn.Module):
 
 
 class MobileNetV2(nn.Module):
-    """MobileNetV2 (Sandler et al., CVPR 2018) before the classifier, at output stride 16.
+    """MobileNetV2 (Sandler et al., CVPR 2018) without the classifier, at output stride 16.
 
-    Two things differ from the usual one, and the weights were trained with them: the first
-    convolution has no padding, and a block pads its input before the expansion rather than its
-    depthwise convolution, so that the frame around an expanded map is not zero but what the
-    expansion makes of zeros.
+    As in training of the weights, the first convolution has no padding, and blocks pad their input
+    before the expansion: the expanded border is not zero.
     """
 
     def __init__(self) -> None:
@@ -214,22 +208,19 @@ class MobileNetV2(nn.Module):
                 sizes = {"expansion": expansion, "stride": steps, "dilation": reach}
                 layers.append(InvertedResidual(channels, out, **sizes))
                 channels = out
-        # a slice of a Sequential keeps the numbers of its layers, as the checkpoint has them
+        # slices of a Sequential keep the layer numbers, as in the checkpoint
         everything = nn.Sequential(*layers)
         self.low_level_features = everything[:_NUM_LOW_LEVEL]
         self.high_level_features = everything[_NUM_LOW_LEVEL:]
 
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Features at a quarter and a sixteenth of the size, 24 and 320 channels.
-
-        ``image`` is (B, 3, H, W), see :func:`~megloc_kapture.nets.trunks.imagenet_normalised`.
-        """
+        """Return 24 and 320 channels of a normalised image (B, 3, H, W) at 1/4 and 1/16 size."""
         low_level = self.low_level_features(image)
         return low_level, self.high_level_features(low_level)
 
 
 class DeepLabV3Plus(nn.Module):
-    """Image to a logit per class, at about a quarter of its size."""
+    """Logits per class at about 1/4 resolution."""
 
     def __init__(self, backbone: Backbone, *, num_classes: int) -> None:
         super().__init__()
@@ -242,17 +233,13 @@ class DeepLabV3Plus(nn.Module):
             self.classifier = Head(320, 24, num_classes)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Logits (B, classes, h, w) of an RGB image (B, 3, H, W) in [0, 1]."""
+        """Return logits (B, classes, h, w) of an RGB image (B, 3, H, W) in [0, 1]."""
         features = self.backbone(imagenet_normalised(image))
         return self.classifier(features[0], features[-1])
 
 
 def most_likely(logits: torch.Tensor, height: int, width: int) -> torch.Tensor:
-    """Class of each pixel: the largest of logits (C, h, w), scaled bilinearly; of equals the first.
-
-    Class by class: of a full-size map for every class, which is the largest thing there is in
-    memory where the image is large, only two are held. Returns uint8 (height, width).
-    """
+    """Return the argmax uint8 (height, width) of upscaled logits (C, h, w), one class at a time."""
     best = logits.new_full((height, width), -torch.inf)
     label = torch.zeros((height, width), dtype=torch.uint8, device=logits.device)
     for number, one in enumerate(logits):

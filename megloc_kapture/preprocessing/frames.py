@@ -1,8 +1,7 @@
 """Resizing and undistortion of images and masks, their cameras and their keypoints.
 
-An image is resampled once. Where it is undistorted, each pixel of the result is the mean of a
-square of samples taken from the original, as many as it spans pixels there: undistorting first and
-resizing then would blur it twice.
+Images are resampled once: undistortion averages a square of samples of the original per pixel,
+because undistorting first and resizing afterwards would blur twice.
 """
 
 from __future__ import annotations
@@ -35,24 +34,23 @@ from megloc_kapture.geometry.cameras import (
 from megloc_kapture.io.colmap import undistorted_pinhole
 from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, Options
 
-# what lies between two points that belong to each other does so too: the models fold slowly
+# coarse checks suffice: between two valid points all points are valid, as the models fold slowly
 _CHECKED_EVERY = 16
-# original pixels between which a map is interpolated, which costs it less than 0.005 px; the
-# library's own interpolation rounds positions to 1/32 px
+# grid spacing of interpolated maps, in original pixels: errors are below 0.005 px, while OpenCV's
+# interpolation rounds to 1/32 px
 _INTERPOLATED_PX = 4
-# a point may leave the image by rounding
+# tolerance for points on the image border
 _ROUNDING_PX = 1e-6
-# two that are one up to what COLMAP's iterations leave
+# residual of COLMAP's iterative undistortion
 _SAME_PX = 1e-3
 Floats = NDArray[np.float64]
-# models whose distortion is a polynomial of the tangent: without coefficients there is none (the
-# fisheye models' is one of the angle)
+# distortion is a polynomial of the tangent: zero coefficients mean none (not so for fisheye models)
 _POLYNOMIAL_MODELS = frozenset({"OPENCV", "FULL_OPENCV"})
 Float32 = NDArray[np.float32]
 
 
 def processed_image(image: NDArray[np.uint8], plan: FramePlan) -> NDArray[np.uint8]:
-    """The image (H, W, 3) of the processed camera; black where the original does not reach."""
+    """Return the image (H, W, 3) of the processed camera; black outside the original."""
     if not plan.warps:
         width, height = plan.resized
         whole = resized(image, width, height)
@@ -73,15 +71,12 @@ def processed_image(image: NDArray[np.uint8], plan: FramePlan) -> NDArray[np.uin
 
 
 def processed_mask(mask: NDArray[np.bool_], plan: FramePlan) -> NDArray[np.bool_]:
-    """The mask (H, W) of the processed image: that of the pixel under each pixel's centre.
-
-    Where the original does not reach, that of its nearest pixel; see :func:`reached_region`.
-    """
+    """Return the nearest-neighbour mask (H, W) of the processed image."""
     size = (plan.processed.height, plan.processed.width)
     if not plan.changes_pixels:
         return mask
     if not plan.warps:
-        # not the library's nearest neighbour, which looks up the pixel's corner
+        # OpenCV's nearest neighbour looks up the pixel's corner
         rows, columns = (
             (2 * np.arange(number) + 1) * old_side // (2 * side)
             for number, old_side, side in zip(size, mask.shape, plan.resized[::-1], strict=True)
@@ -95,11 +90,10 @@ def processed_mask(mask: NDArray[np.bool_], plan: FramePlan) -> NDArray[np.bool_
 
 @lru_cache(maxsize=2)
 def reached_region(plan: FramePlan) -> NDArray[np.bool_] | None:
-    """Mask (H, W) of the processed image's pixels that the original shows; None: all of them."""
+    """Return the mask (H, W) of processed pixels inside the original; None if all are."""
     if not plan.warps:
         return None
     width, height = plan.processed.width, plan.processed.height
-    # not all pixels along a side, but the first and the last
     some = [
         np.append(np.arange(0, side - 1, _CHECKED_EVERY), side - 1) + 0.5
         for side in (width, height)
@@ -121,21 +115,16 @@ def _reaches(
 
 
 def _grid(x: NDArray[np.floating[Any]], y: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Points (len(y) * len(x), 2), row by row."""
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(np.float64)
 
 
 @lru_cache(maxsize=4)
 def _sampled_at(plan: FramePlan, samples: int) -> tuple[Float32, Float32]:
-    """Positions at which the original is sampled, float32 (samples * H, samples * W) x and y.
-
-    The first pixel's centre is at (0, 0), as OpenCV has it.
-    """
+    """Return float32 x and y of samples; the first pixel's centre is (0, 0), as in OpenCV."""
     import cv2
 
     width, height = plan.processed.width, plan.processed.height
-    # computed at the middles of squares of pixels, one square more on each side, and interpolated
-    # between: the map is that smooth
+    # maps are smooth: computed at the centres of blocks, and interpolated
     square = max(1, round(_INTERPOLATED_PX / max(plan.shrink, 1.0)))
     columns, rows = -(-width // square) + 2, -(-height // square) + 2
     x, y = ((np.arange(number) - 0.5) * square for number in (columns, rows))
@@ -180,11 +169,10 @@ class FrameOptions(Options):
 
 @dataclass(frozen=True, slots=True)
 class FramePlan:
-    """One camera before and after pre-processing; the pose stays.
+    """A camera before and after pre-processing; the pose does not change.
 
-    ``resized`` is width and height before the crop, ``shrink`` how many original pixels of the
-    undistorted image a processed one spans, the larger of the two axes; 1 or less where nothing is
-    made smaller.
+    ``resized`` is (width, height) before the crop, ``shrink`` the original pixels per processed
+    pixel.
     """
 
     original: Camera
@@ -194,20 +182,17 @@ class FramePlan:
 
     @property
     def warps(self) -> bool:
-        """True if the images are undistorted."""
         return not same_lens(self.original, self.processed)
 
     @property
     def changes_pixels(self) -> bool:
-        """True if the images become other ones."""
         size = (self.processed.width, self.processed.height)
         return self.warps or size != (self.original.width, self.original.height)
 
     def original_of(self, estimated: Camera) -> Camera:
-        """The original camera, where ``estimated`` is what became known of the processed one."""
+        """Return the original camera for an estimate of the processed camera."""
         if not self.changes_pixels:
             return estimated
-        # original pixels in a processed one
         px = focal_px(self.original) / focal_px(self.processed)
         shift = np.subtract(principal_point_px(estimated), principal_point_px(self.processed)) * px
         found = shift_principal_point(self.original, *shift.tolist())
@@ -218,10 +203,7 @@ class FramePlan:
 
 
 def plan_frame(camera: Camera, options: FrameOptions) -> FramePlan:
-    """Plan the frame of a camera.
-
-    Raises OptionError where its images are too small to be cropped.
-    """
+    """Plan size and projection of a camera's images."""
     lens = camera
     if options.undistort:
         lens = undistorted_camera(camera, blank_pixels=options.blank_pixels)
@@ -240,12 +222,9 @@ def plan_frame(camera: Camera, options: FrameOptions) -> FramePlan:
 
 
 def carry_points(source: Camera, target: Camera, points_px: NDArray[np.floating[Any]]) -> Floats:
-    """Carry points (N, 2) of one camera's image into another's, in double precision; (N, 2).
+    """Carry points (N, 2) through their rays between cameras with the same centre and axes.
 
-    Both look along the same axes from the same centre, as before and after pre-processing, so a
-    pixel is carried through its ray. Where they share their distortion that is a scale per axis,
-    else COLMAP's camera models. NaN where the target's image does not reach: cropped away, or
-    beyond what a pinhole sees.
+    Returns float64 (N, 2), NaN outside the target image.
     """
     points = np.asarray(points_px, np.float64).reshape(-1, 2)
     if same_lens(source, target):
@@ -261,10 +240,9 @@ def carry_points(source: Camera, target: Camera, points_px: NDArray[np.floating[
 
 
 def sees(camera: Camera, rays: Floats, points_px: Floats) -> NDArray[np.bool_]:
-    """Mask (N,): ray (N, 3) and pixel (N, 2) of a camera belong to each other.
+    """Return the mask (N,) of rays (N, 3) that match their pixels (N, 2).
 
-    The polynomials of the models fold over beyond some angle: a ray out there has a pixel too,
-    but it is that of a ray nearer to the axis.
+    Distortion polynomials fold over: far rays may project to the pixels of rays nearer to the axis.
     """
     if camera.model in PINHOLE_MODELS:
         return np.asarray(np.isfinite(points_px).all(axis=1))
@@ -277,23 +255,17 @@ def sees(camera: Camera, rays: Floats, points_px: Floats) -> NDArray[np.bool_]:
 def fitted_size(
     width: int, height: int, max_size_px: int, *, upscale: bool = False
 ) -> tuple[int, int]:
-    """Size whose larger side is ``max_size_px``, the ratio kept as whole pixels allow.
-
-    Smaller images stay unless ``upscale``, which adds pixels but nothing that can be seen.
-    """
+    """Return the size with a larger side of ``max_size_px``; enlarge only with ``upscale``."""
     larger = max(width, height)
     if larger <= max_size_px and not upscale:
         return width, height
-    # in whole numbers, half up: no rounding of a float can make two machines differ
+    # integer arithmetic, half up: float rounding could differ between machines
     smaller = max(1, (2 * min(width, height) * max_size_px + larger) // (2 * larger))
     return (max_size_px, smaller) if width >= height else (smaller, max_size_px)
 
 
 def cropped_size(width: int, height: int, multiple_of: int) -> tuple[int, int]:
-    """The largest size within an image both of whose sides are multiples of a number.
-
-    Raises OptionError where a side is smaller than that number.
-    """
+    """Return the largest size within an image with sides that are multiples of ``multiple_of``."""
     if min(width, height) < multiple_of:
         raise OptionError(
             f"an image of {width}x{height} cannot be cropped to multiples of {multiple_of}"
@@ -302,13 +274,9 @@ def cropped_size(width: int, height: int, multiple_of: int) -> tuple[int, int]:
 
 
 def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
-    """The camera of an image that was resized as a whole to ``width`` x ``height``.
-
-    Rounded to whole pixels the two sides may be scaled differently; a model with one focal
-    length then becomes the one with two that has the same distortion.
-    """
+    """Return the camera of a resized image, with two focal lengths if the scales differ."""
     scale_x, scale_y = width / camera.width, height / camera.height
-    # compared as whole numbers: equal ratios may round to different floats
+    # compare integers: equal ratios may round to different floats
     if width * camera.height != height * camera.width:
         camera = with_two_focals(camera)
     else:
@@ -323,11 +291,7 @@ def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
 
 
 def resized(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """The image (H, W, ...) scaled as a whole to ``height`` x ``width``.
-
-    Smaller pixels are the means of what they cover, so that nothing is aliased; larger ones are
-    interpolated by cubics.
-    """
+    """Resize an image (H, W, ...): area averaging to shrink, cubic interpolation to enlarge."""
     import cv2
 
     old_height, old_width = image.shape[:2]
@@ -339,11 +303,10 @@ def resized(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uin
 
 
 def undistorted_camera(camera: Camera, *, blank_pixels: float = 0.0) -> Camera:
-    """The pinhole camera of an undistorted image, as COLMAP chooses it, with the focal lengths.
+    """Return the pinhole camera of an undistorted image, as COLMAP chooses it.
 
-    The argument itself where it is a pinhole already. With 0 ``blank_pixels`` the image is as large
-    as it can be without a pixel that the distorted one does not show, with 1 as it must be to show
-    all of that; in between, in between.
+    With ``blank_pixels`` 0 all of its pixels are in the original; with 1 it shows the whole
+    original.
     """
     if camera.model in PINHOLE_MODELS:
         return camera

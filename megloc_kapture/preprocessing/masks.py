@@ -1,4 +1,4 @@
-"""Masks: fixed ones, regions that never change (a car's bonnet), and margins around them."""
+"""Fixed masks, static regions of moving cameras (a car's bonnet), and margins around masks."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from pydantic import Field, model_validator
 
 from megloc_kapture.values import Options
 
-# more pixels than this times the edges of a polygon are not tested at once
+# bounds the memory of a polygon test
 _ROWS_AT_ONCE = 256
-# images a camera needs: of fewer, chance makes edges agree
+# fewer images agree by chance
 MIN_IMAGES = 10
-# more tell nothing new
+# more images add no information
 MAX_IMAGES = 60
 _WORKING_SIZE_PX = 256
 _NOISE_PER_PX = 3.0  # grey levels per working px; weaker edges count less
-# mean agreement of two images' edges, -1 to 1: what stays has 0.5 and more, what passes 0.1 at most
+# mean agreement of two images' edges, -1 to 1: static edges reach 0.5, moving edges at most 0.1
 _MIN_AGREEMENT = 0.3
-_WIDE_PX, _NARROW_PX = 9, 3  # windows in which it is averaged
-# a pixel changes where there are edges that do not agree
+_WIDE_PX, _NARROW_PX = 9, 3  # averaging windows
+# a pixel changes if it has edges that disagree
 _CHANGING_AGREEMENT, _CHANGING_STRENGTH = 0.1, 0.5
 _MAX_CHANGING = 0.4  # share of a column below the frontier
-_MIN_RUN = 0.1  # of the width; narrower is no bonnet
-_MAX_GAP = 0.05  # of the width, closed between two parts
-# where light comes and goes the frontier is found this much too low
+_MIN_RUN = 0.1  # of the width; bonnets are wider
+_MAX_GAP = 0.05  # of the width; smaller gaps are closed
+# varying light lowers the detected frontier by up to this
 _MARGIN_PX = 4
-_MAX_AREA = 0.6  # of the image; more, and it is the camera that does not move
+_MAX_AREA = 0.6  # of the image; larger regions mean a static camera
 Float32 = NDArray[np.float32]
 
 
@@ -71,11 +71,10 @@ class FixedMask(Options):
         return self
 
     def is_for(self, sensor_id: str, image: str) -> bool:
-        """True if it applies to an image of a sensor."""
         return self.camera == sensor_id or fnmatchcase(image, self.camera)
 
     def drawn(self, width: int, height: int) -> NDArray[np.bool_]:
-        """The mask bool (H, W), True = use, of polygon or share; ValueError of a file."""
+        """Return the mask bool (H, W), True = use, of the polygon or the bottom share."""
         if self.polygon is not None:
             return outside_polygon(np.array(self.polygon), width, height)
         if self.bottom_share is None:
@@ -85,10 +84,7 @@ class FixedMask(Options):
 
 
 def outside_polygon(corners: NDArray[np.floating], width: int, height: int) -> NDArray[np.bool_]:
-    """Mask (H, W) of the pixels whose centres are not in a polygon.
-
-    Its corners (N, 2) are x and y in shares of width and height; even-odd where edges cross.
-    """
+    """Return the mask (H, W) outside a polygon (N, 2) in shares of the sides; even-odd rule."""
     x0, y0 = (np.asarray(corners, np.float64) * [width, height]).T
     x1, y1 = np.roll(x0, -1), np.roll(y0, -1)
     x = np.arange(width) + 0.5
@@ -97,7 +93,7 @@ def outside_polygon(corners: NDArray[np.floating], width: int, height: int) -> N
         rows = outside[start : start + _ROWS_AT_ONCE]
         y = np.arange(start, start + len(rows)) + 0.5
         for ax, ay, bx, by in zip(x0, y0, x1, y1, strict=True):
-            # edges that a ray to the left crosses; half open, so that a corner counts once
+            # edges crossed by a ray to the left; half open, so that a corner counts once
             crossed = (ay <= y) != (by <= y)
             if crossed.any():
                 at = ax + (y[crossed] - ay) * ((bx - ax) / (by - ay))
@@ -106,15 +102,10 @@ def outside_polygon(corners: NDArray[np.floating], width: int, height: int) -> N
 
 
 def with_margin(mask: NDArray[np.bool_], margin_px: float) -> NDArray[np.bool_]:
-    """The mask bool (H, W), True = use, without the pixels that are near what it ignores.
-
-    A pixel is used where the nearest ignored one is farther away than the margin, between the
-    centres of the two (Euclidean). The border of the image is no edge of the mask: nothing is taken
-    away along it. The argument itself where there is nothing to do.
-    """
+    """Erode a mask bool (H, W), True = use, by a Euclidean margin, but not at the image border."""
     if margin_px <= 0 or mask.all():
         return mask
-    import cv2  # 0.1 s, and most commands never get here
+    import cv2  # takes 0.1 s, and most commands do not need it
 
     distances = cv2.distanceTransform(
         mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE, dstType=cv2.CV_32F
@@ -124,10 +115,10 @@ def with_margin(mask: NDArray[np.bool_], margin_px: float) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class UnchangingRegion:
-    """Region below a frontier across the image; falsy where it is empty, for a reason.
+    """Static region below a frontier across the image; falsy with a reason if empty.
 
-    The frontier is where the region starts, from the top in shares of the height, at the middles of
-    equally wide columns; 1: nowhere.
+    The frontier is in shares of the height from the top, for equally wide columns; 1 means no
+    region.
     """
 
     frontier: tuple[float, ...]
@@ -137,7 +128,7 @@ class UnchangingRegion:
         return not self.reason
 
     def mask(self, width: int, height: int) -> NDArray[np.bool_]:
-        """The mask bool (H, W), True = use."""
+        """Return the mask bool (H, W), True = use."""
         if not self:
             return np.ones((height, width), dtype=bool)
         columns = np.arange(width) * len(self.frontier) // width
@@ -146,10 +137,7 @@ class UnchangingRegion:
 
 
 def edge_directions(image: NDArray[np.uint8]) -> Float32:
-    """Directions of an image's edges, small: float32 (h, w, 2), x and y, of length 0 to 1.
-
-    Of an RGB image uint8 (H, W, 3).
-    """
+    """Return float32 (h, w, 2) edge directions, length 0 to 1, of a downscaled RGB image."""
     import cv2
 
     height, width = image.shape[:2]
@@ -157,7 +145,7 @@ def edge_directions(image: NDArray[np.uint8]) -> Float32:
     size = max(1, round(width * scale)), max(1, round(height * scale))
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    # Sobel's kernel sums to 8 times the slope
+    # the kernel returns 8 times the slope
     slopes = [
         cv2.Sobel(small, cv2.CV_32F, *axis, ksize=3, scale=1 / 8) for axis in ((1, 0), (0, 1))
     ]
@@ -167,10 +155,9 @@ def edge_directions(image: NDArray[np.uint8]) -> Float32:
 
 
 def find_unchanging_region(sequence: Iterable[Float32]) -> UnchangingRegion:
-    """The region at the bottom that never changes.
+    """Find the static region at the bottom of a moving camera's images.
 
-    Of :func:`edge_directions` of at least MIN_IMAGES images, else it is a ValueError, of one camera
-    that moved between them.
+    ``sequence`` has the :func:`edge_directions` of at least MIN_IMAGES images.
     """
     total: Any
     total = lengths = squares = np.float32(0)
@@ -181,7 +168,7 @@ def find_unchanging_region(sequence: Iterable[Float32]) -> UnchangingRegion:
         count += 1
     if count < MIN_IMAGES:
         raise ValueError(f"{count} images; at least {MIN_IMAGES} are needed")
-    # of all pairs of different images: products of their directions, and of the lengths alone
+    # sums over all pairs of different images: dot products, and products of lengths
     agreeing = np.square(total).sum(axis=-1) - squares
     present = np.square(lengths) - squares
     wide, narrow = (
@@ -210,10 +197,6 @@ def _mean(values: Float32, window: int) -> Float32:
 
 
 def _column_tops(persistent: NDArray[np.bool_], changing: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Per column the highest persistent row below which hardly anything changes; int64 (w,).
-
-    The height where there is none.
-    """
     height = len(persistent)
     below = np.arange(height, 0, -1)[:, None]
     share = np.cumsum(changing[::-1], axis=0)[::-1] / below
@@ -222,7 +205,6 @@ def _column_tops(persistent: NDArray[np.bool_], changing: NDArray[np.bool_]) -> 
 
 
 def _without_slivers(tops: NDArray[np.int64], height: int) -> NDArray[np.int64]:
-    """Gaps closed, single columns smoothed, and what is too narrow taken out."""
     width = len(tops)
     inside = np.flatnonzero(tops < height)
     if len(inside) == 0:

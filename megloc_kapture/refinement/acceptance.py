@@ -1,9 +1,4 @@
-"""Acceptance of a pose found by rendering: its fit, its covariance, and the decision.
-
-It must look more like the query than the old one, in most parts of the query, and it must differ
-from the old one by more than its own uncertainty: images say where a camera is to some millimetres,
-and a pose that is as good as that gains nothing.
-"""
+"""Acceptance of a refined pose: fit, covariance and decision."""
 
 from __future__ import annotations
 
@@ -26,27 +21,23 @@ from megloc_kapture.refinement.photometric import (
 from megloc_kapture.refinement.pyramid import Appearance, ChosenPoints
 from megloc_kapture.values import Options, RigidTransform
 
-# squared distance between two poses over the covariance of one that chance exceeds once in a
-# thousand times: the chi-squared distribution of six degrees of freedom
+# chi-squared quantile (six degrees of freedom, p = 0.999) for a squared Mahalanobis distance
 CHI2_OF_CHANCE = 22.46
-# displacement in pixels of the level that says nothing, however small the covariance is: without
-# any noise that is of the size of rounding
+# displacements below this are rounding, however small the covariance; pixels of the level
 _LEAST_PX = 1e-3
 Float64 = NDArray[np.float64]
-_CHANGE = 0.5  # of the residuals by a difference at most, in their deviations
-# of the normal equations, that the objective's own curvature must have
+_CHANGE = 0.5  # largest change of the residuals by a finite difference, in standard deviations
+# least share of the normal equations that the objective's curvature must have
 _LEAST_SHARE = 0.02
-# by about how many pixels of the level points move to either side of a difference
+# displacement of points on either side of a finite difference, pixels of the level
 _CURVATURE_PX = 0.5
-# how far alignments are tried again, in steps that change the image by that much
+# largest displacement of perturbed starts, pixels of the level
 _BESIDE = (-4.0, -2.0, 0.0, 2.0, 4.0)
-# eigenvalue over the largest, in units that move points as far, from which a pose is determined
+# least ratio of the smallest to the largest eigenvalue of a determined pose
 _LEAST_CURVATURE = 1e-7
 
 
 class RenderingOptions(Options):
-    """Options of the refinement by rendering."""
-
     appearance: Appearance = Field(
         default="normalised",
         description="what is compared: brightness of locally normalised contrast (day and night), "
@@ -101,12 +92,10 @@ class RenderingOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A pose that may replace the old one."""
-
-    # problem, free: at the finest level, with all points, and without what something else hides
+    # problem: at the finest level, with all points and without occluded cells
     problem: LevelProblem
     free: LevelProblem
-    alignment: Alignment  # of ``free``
+    alignment: Alignment
 
 
 def accept_or_keep(
@@ -115,12 +104,7 @@ def accept_or_keep(
     overlaps: tuple[float, float],
     options: RenderingOptions,
 ) -> PoseRefinement:
-    """The new pose with its covariance, or the old one and why.
-
-    Both are compared on all points, also those that something may hide. ``start`` is the old
-    ``cam_from_world``; ``overlaps`` are shares of the query that references cover, at the old pose
-    and at the new one.
-    """
+    """Return the new pose with its covariance, or the old one and the reason."""
     pose = found.alignment.cam_from_world
     comparison = compare_poses(found.problem, start, pose)
     moved_m, turned_deg = movement(start, pose)
@@ -158,10 +142,7 @@ def accept_or_keep(
 def squared_distance(
     old: RigidTransform, new: RigidTransform, covariance: NDArray[np.float64]
 ) -> float:
-    """Squared Mahalanobis distance of two poses by the covariance (6, 6) of the new one.
-
-    The covariance is as of ``Pose``; exact where the distance is small.
-    """
+    """Return the squared Mahalanobis distance of two poses by the new one's covariance (6, 6)."""
     old_from_new = old @ new.inverse()
     w, x, y, z = old_from_new.quat_wxyz
     turn = 2.0 * np.copysign(1.0, w) * np.array([x, y, z])
@@ -170,7 +151,6 @@ def squared_distance(
 
 
 def _moved_px(problem: LevelProblem, old: RigidTransform, new: RigidTransform) -> float:
-    """Median displacement of the points in the image, in pixels of the level."""
     points = problem.chosen.points
     ahead = (old.apply(points)[:, 2] > 0) & (new.apply(points)[:, 2] > 0)
     if not ahead.any():
@@ -211,21 +191,14 @@ def _no_better(
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Fit of the query to the warped references under one pose."""
-
-    cost: float  # mean of the robust loss, over the square of its scale: 0 to 0.5
-    correlation: float  # of the query's values with the references', over all points and channels
-    count: int  # of points that are seen
+    cost: float
+    correlation: float  # of query and reference values, over all points and channels
+    count: int
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """An old pose and a new one on the points that both see, and how well they fit.
-
-    ``significance`` is by how many of its standard errors the cost falls. Cells of the query count
-    as one observation each: a pose that is better shows it in most of them, one that was tuned to
-    noise, or to what looks alike by chance, in some.
-    """
+    """Two poses compared; ``significance`` is the cost's decrease in standard errors."""
 
     before: Fit
     after: Fit
@@ -233,10 +206,7 @@ class Comparison:
 
 
 def compare_poses(problem: LevelProblem, old: RigidTransform, new: RigidTransform) -> Comparison:
-    """Compare two poses on the points that both see, each with its own gains and biases.
-
-    Both with the loss' scale of the new one.
-    """
+    """Compare two poses on the points visible under both."""
     aligned = [problem.nuisance_at(pose) for pose in (old, new)]
     rows = [problem.rows(at) for at in aligned]
     hidden = np.isnan(rows[0][:, 0, 0]) | np.isnan(rows[1][:, 0, 0])
@@ -245,20 +215,18 @@ def compare_poses(problem: LevelProblem, old: RigidTransform, new: RigidTransfor
     deviation = aligned[1].deviation
     gained = _losses(rows[0][~hidden], deviation) - _losses(rows[1][~hidden], deviation)
     before, after = (_fit(problem, each, deviation) for each in rows)
-    # sum of the gains over its standard error, if the cells' were independent, of mean 0
+    # sum of the gains over its standard error, for independent cells of mean 0
     sums = np.bincount(problem.cells(new, ~hidden), gained)
     error = float(np.sqrt(np.square(sums).sum()))
     return Comparison(before, after, float(sums.sum()) / error if error > 0 else 0.0)
 
 
 def _losses(rows: Float64, deviation: float) -> Float64:
-    """Robust loss of each point, over the square of its scale: 0 to 0.5."""
     squared = np.square(rows[..., 0]).mean(1) / (LOSS_SCALE * max(deviation, 1e-12)) ** 2
     return np.asarray(0.5 * squared / (1.0 + squared))
 
 
 def correlation(problem: LevelProblem, at: Alignment) -> float:
-    """Of the query's values with the references'; see :class:`Fit`."""
     return _correlation(problem.rows(at), problem.chosen, problem.num_groups)
 
 
@@ -270,7 +238,6 @@ def _fit(problem: LevelProblem, rows: Float64, deviation: float) -> Fit:
 
 
 def _correlation(rows: Float64, chosen: ChosenPoints, num_groups: int) -> float:
-    """Correlation of two sets of values whose means are those of each reference and channel."""
     seen = ~np.isnan(rows[:, 0, 0])
     query, reference, groups = rows[seen][..., 7], chosen.values[seen], chosen.groups[seen]
     together = apart_query = apart_reference = 0.0
@@ -288,14 +255,12 @@ def _correlation(rows: Float64, chosen: ChosenPoints, num_groups: int) -> float:
 
 
 def covariance(problem: LevelProblem, at: Alignment) -> Float64 | None:
-    """Covariance (6, 6) of the pose, as of ``Pose``; None where it is not determined.
+    """Estimate the covariance (6, 6) of the pose, as in ``Pose``; None where it is undetermined.
 
-    The sandwich of the objective's curvature with the scores of cells of the query, each taken as
-    one observation (Liang and Zeger, Biometrika 1986): what neighbouring residuals have in common
-    (blur, light, the query's noise seen by several references) makes it larger as it must. The
-    curvature is that of the objective about the pose and not of its normal equations, in which the
-    query's noise passes for gradients. Errors that the whole image shares, of the map's poses and
-    depths or of the calibration, are not in the residuals and thus not in the covariance.
+    A sandwich estimate clustered by cells of the query (Liang and Zeger, Biometrika 1986), so that
+    correlated residuals enlarge it. It uses the objective's curvature rather than the normal
+    equations, in which the query's noise counts as gradient. Errors shared by the whole image (map
+    poses, depth, calibration) are not included.
     """
     rows = problem.rows(at)
     scale2 = max(at.squared_scale, 1e-24)
@@ -313,11 +278,11 @@ def covariance(problem: LevelProblem, at: Alignment) -> Float64 | None:
 def _scatter(
     problem: LevelProblem, at: Alignment, rows: Float64, squared_scale: float, projection: Float64
 ) -> Float64 | None:
-    """Squared scores (6, 6) of the cells; None where there are too few."""
+    """Return the squared scores (6, 6) of the cells; None for too few cells."""
     seen = ~np.isnan(rows[:, 0, 0])
     rows, groups = rows[seen], problem.chosen.groups[seen]
     weight = (1.0 + np.square(rows[..., 0]).mean(1) / squared_scale) ** -2 / rows.shape[1]
-    # the derivative by the pose where gain and bias follow it
+    # total derivative by the pose: gain and bias follow it
     own = np.stack([rows[..., 7], np.ones(rows.shape[:2])], axis=-1)
     derivative = rows[..., 1:7] - np.einsum("ncpi,nci->ncp", projection[groups], own)
     score = np.einsum("n,nc,ncp->np", weight, rows[..., 0], derivative)
@@ -331,15 +296,10 @@ def _scatter(
 def _inverse_curvature(
     problem: LevelProblem, at: Alignment, squared_scale: float, system: NormalEquations
 ) -> Float64 | None:
-    """Inverse (6, 6) of the second derivatives by the pose; None where it is no minimum.
-
-    Differences are taken along the whitened directions.
-    """
     found = whitened_directions(problem, system)
     if found is None:
         return None
     steps, change = found
-    # not so far that the loss takes the change for outliers
     weights = float(system.own[..., 2].sum())
     nearer = min(1.0, (_CHANGE * at.deviation) ** 2 * weights / change)
     steps, change = steps * np.sqrt(nearer), change * nearer
@@ -355,7 +315,6 @@ def _inverse_curvature(
         columns.append(steps.T @ (ends[0] - ends[1]) / 2.0)
     curvature = 0.5 * (np.array(columns) + np.array(columns).T)
     values, vectors = np.linalg.eigh(curvature)
-    # normal equations would have six values of ``change``
     if not values[0] > _LEAST_SHARE * change:
         return None
     half = steps @ (vectors / np.sqrt(values))
@@ -365,14 +324,13 @@ def _inverse_curvature(
 def whitened_directions(
     problem: LevelProblem, system: NormalEquations
 ) -> tuple[Float64, float] | None:
-    """Steps of the pose that are uncorrelated by the normal equations and change the image alike.
+    """Return steps of the pose that whiten the normal equations.
 
     Returns
     -------
-    steps : float64 (6, 6), in columns, each as large as half a pixel of the level; the first is
-        along the direction that the image determines least.
-    change : of the weighted sum of squared residuals, by each step. None where the image leaves a
-        direction free.
+    steps : float64 (6, 6), in columns, each half a pixel of the level; the least determined
+        direction first.
+    change : of the weighted sum of squared residuals, by each step.
     """
     reduced = system.reduced()
     if reduced is None:
@@ -387,10 +345,7 @@ def whitened_directions(
 
 
 def perturbed_starts(problem: LevelProblem, at: Alignment) -> list[Alignment]:
-    """Alignments that look much the same, those of the least cost first.
-
-    They are off by pixels along the two directions that the image determines least.
-    """
+    """Return alignments perturbed along the two least determined directions, best first."""
     scale2 = at.squared_scale
     found = whitened_directions(problem, problem.system_at(at, scale2)) if scale2 > 0 else None
     if found is None:

@@ -1,7 +1,7 @@
 """Training of a neural field on the posed images of a map.
 
-With the loss of NeRF-W (:func:`~megloc_kapture.nets.radiance.nerf_w_loss`) on random pixels of all
-images but those held out; where an image has depth, the field's own is drawn to it.
+The loss is NeRF-W's (:func:`~megloc_kapture.nets.radiance.nerf_w_loss`) on random pixels, with a
+depth term for images with depth.
 """
 
 from __future__ import annotations
@@ -37,15 +37,13 @@ from megloc_kapture.refinement.neural_field import (
     reduced_view,
 )
 
-# Adam's rates at the beginning; at the end a thirtieth
+# Adam's initial rates; they decay to a thirtieth
 _PLANE_RATE, _RATE, _NERF_RATE = 2e-2, 5e-3, 5e-4
 _DECAY = 1 / 30
-_KEEP_EVERY = 200  # steps
+_KEEP_EVERY = 200
 
 
 class FieldTrainingOptions(NetworkOptions):
-    """Options of a field's training."""
-
     kind: Kind = Field(
         default="triplane",
         description="triplane: minutes on a processor; nerfw: needs a GPU",
@@ -77,12 +75,7 @@ class FieldTrainingOptions(NetworkOptions):
 
 
 class FieldTrainer:
-    """A field, what it learns from, and its optimizer.
-
-    Raises DataError for too few images, for an image that does not fit its camera, and for masks
-    that leave nothing. Of eight or more ``views`` some are held out, as the options say;
-    ``module`` is built as the options say unless given.
-    """
+    """A field, its training pixels and its optimizer; holds out some of eight or more ``views``."""
 
     def __init__(
         self,
@@ -114,11 +107,7 @@ class FieldTrainer:
         self._step, self._seconds = 0, 0.0
 
     def resume(self, state: bytes, path: Path) -> None:
-        """Go on from what :meth:`train` gave to ``keep``.
-
-        Raises DataError that names the path, for a state that is damaged, or of other options or
-        images.
-        """
+        """Restore a state passed to ``keep``; DataError if damaged or of another training."""
         found = load_state(state, path, self._field.module, self._optimizer)
         if found.get("training") != self._fingerprint:
             raise DataError("is of other options or images; -f begins again", path=path)
@@ -135,10 +124,10 @@ class FieldTrainer:
         progress: Callable[[int, float, list[float]], None] | None = None,
         keep: Callable[[bytes], None] | None = None,
     ) -> tuple[NeuralField, dict[str, float]]:
-        """Train to the last step: the field, and PSNR in dB of each held-out image by name.
+        """Train to the last step; return the field and the PSNR in dB of each held-out image.
 
-        ``progress`` is given the step, the seconds, and the held-out PSNR in dB of two, now and
-        then; ``keep`` is given the state, more often.
+        ``progress`` receives the step, the seconds and the held-out PSNR in dB of two images;
+        ``keep`` receives the state.
         """
         options, field = self.options, self._field
         started = time.monotonic() - self._seconds
@@ -169,7 +158,6 @@ class FieldTrainer:
         return field, {view.name: field.held_out_psnr(view) for view in self._held_out}
 
     def _learn(self, generator: torch.Generator) -> None:
-        """One step."""
         options, device = self.options, self._field.device
         rays, rgb = self._data.batch(self._field, options.rays_per_step, generator)
         with torch.autocast(device.type, torch.bfloat16, enabled=options.half_precision):
@@ -186,11 +174,9 @@ class FieldTrainer:
 
 @contextmanager
 def _compiling() -> Iterator[None]:
-    """torch.compile compiles within; OptionError where it cannot, for want of a compiler.
+    """Enable torch.compile, with its cache keyed by processor.
 
-    torch keeps graphs on disk by their content alone, tiled for the vectors of the processor at
-    hand: one kept where AVX2 was used, by an older machine on the same disk or by
-    ATEN_CPU_CAPABILITY, writes past its arrays where AVX-512 is. So processors are told apart.
+    torch caches graphs by content only: one compiled for AVX2 writes past its arrays under AVX-512.
     """
     from torch._dynamo.exc import TorchDynamoException
 
@@ -213,8 +199,6 @@ def _groups(module: FieldModule) -> list[dict[str, object]]:
 
 
 class _Pixels:
-    """All pixels that are trained on, as one table."""
-
     def __init__(self, views: Sequence[FieldView], max_side_px: int) -> None:
         found = [pixels_of(view, max_side_px) for view in views]
         self._cameras = list(dict.fromkeys(camera for camera, *_ in found))
@@ -233,7 +217,6 @@ class _Pixels:
         self._centres = np.stack([pose.center() for pose in self._poses])
 
     def frame(self) -> FieldFrame:
-        """The frame about the cameras and what their depth shows; without, about the cameras."""
         low, high = self._centres.min(0), self._centres.max(0)
         spread = float(max((high - low).max(), 1e-6))
         near, far = 0.02 * spread, 20 * spread
@@ -252,12 +235,10 @@ class _Pixels:
         return FieldFrame(centre=(x, y, z), scale=scale, near=near, far=far)
 
     def _points(self, rows: NDArray[np.int64], depth: Floats) -> NDArray[np.float64]:
-        """Points (N, 3) of the world that the depth of pixels shows."""
         image, rays = self._lines(rows)
         return np.asarray(self._centres[image] + rays * depth[rows, None])
 
     def _lines(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Images (N,) of pixels, and their rays (N, 3) in the world."""
         image = np.searchsorted(self._starts, rows, side="right") - 1
         rays = np.empty((len(rows), 3))
         camera_of = self._camera_of[image]
@@ -265,14 +246,13 @@ class _Pixels:
             which = camera_of == number
             camera = self._cameras[number]
             y, x = np.divmod(rows[which] - self._starts[image[which]], camera.width)
-            # of these pixels alone: a map may have a camera for each image
+            # only for these pixels: a map may have a camera for each image
             rays[which] = bearing_rays(camera, np.stack([x + 0.5, y + 0.5], axis=1))
         return image, np.einsum("nj,njk->nk", rays, self._rotations[image])
 
     def batch(
         self, field: NeuralField, count: int, generator: torch.Generator
     ) -> tuple[Rays, torch.Tensor]:
-        """Random rays with their embeddings, and the colours (N, 3) that are seen there."""
         drawn = torch.randint(len(self._usable), (count,), generator=generator).numpy()
         rows = self._usable[drawn]
         image, directions = self._lines(rows)

@@ -1,10 +1,8 @@
-"""Poses of queries that have depth, refined by geometry alone: the plugin ``icp``.
+"""Refinement of query poses by depth alone: the plugin ``icp``.
 
-The query's cloud is fitted to the map's around the estimated pose, point to plane, from coarse to
-fine, in the end with every pixel weighted by its noise. Geometry can be wrong as features can: it
-may fit the wrong wall, or slide along the right one. So the new pose counts only where it explains
-no less of the query, better, from nearby, and the surfaces say where it is in every direction;
-otherwise the old one stays, with the reason.
+The query's cloud is fitted to the map's, point to plane and coarse to fine. Since it may slide
+along a wall or fit the wrong one, the new pose is accepted only if it explains the query better,
+lies nearby and is determined in every direction.
 """
 
 from __future__ import annotations
@@ -40,22 +38,21 @@ Floats = NDArray[np.float64]
 
 # coefficients of z^0, z^1, z^2 of 0.0012 + 0.0019 (z - 0.4)^2
 _STRUCTURED_LIGHT = (0.001504, -0.00152, 0.0019)
-# pixels of the query that count in the last step: more cost time and change nothing
+# query pixels in the last step: more cost time without effect
 _MAX_PIXELS = 10000
-# pixels of a reference's depth map between those by which its overlap is measured
+# pixel step of a reference's depth map for its overlap
 _OVERLAP_STEP_PX = 8
-# views this near to each other are one view: a depth sensor's errors depend on where a surface
-# lies in its image, and only those of different views average out
+# views this close count as one: a depth sensor's errors depend on the position in its image, and
+# only those of different views average out
 _SAME_VIEW_M, _SAME_VIEW_DEG = 0.2, 10.0
 
 
 class IcpOptions(Options):
     """Options of the refinement by ICP.
 
-    The finest distance is three standard deviations of a structured-light sensor's depth at the
-    end of its range; each level's is three of its voxels. The noise is that of such a sensor:
-    0.0012 + 0.0019 (z - 0.4)^2, Nguyen, Izadi and Lovell, Modeling Kinect Sensor Noise for Improved
-    3D Reconstruction and Tracking, 3DIMPVT 2012, eq. 4.
+    The finest distance is three standard deviations of a structured-light sensor's depth at the end
+    of its range: 0.0012 + 0.0019 (z - 0.4)^2, Nguyen, Izadi and Lovell, Modeling Kinect Sensor
+    Noise for Improved 3D Reconstruction and Tracking, 3DIMPVT 2012, eq. 4.
     """
 
     voxels_m: tuple[float, ...] = Field(
@@ -126,14 +123,11 @@ class IcpOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class _Level:
-    """The map's surface and the query's points, both thinned to one size of voxels."""
-
     surface: Surface
     points: Floats
     max_distance_m: float
 
     def fit(self, local_from_cam: RigidTransform, options: IcpOptions) -> SurfaceFit:
-        """Compare the points with the surface under a transform."""
         near_m, far_m = self.max_distance_m, options.max_distances_m[0]
         return surface_fit(self.surface, self.points, local_from_cam, near_m=near_m, far_m=far_m)
 
@@ -146,15 +140,13 @@ def refine_by_icp(
 ) -> PoseRefinement:
     """Fit a query's cloud, float64 (N, 3) in the camera's frame, to the map's (M, 3), in metres.
 
-    Returns PoseRefinement with ``residual_before_m`` and ``residual_after_m`` (median distance from
-    the map's planes, of points that have map within the coarsest distance), ``overlap_before`` and
-    ``overlap_after`` (share of points that have map within the finest), ``moved_m``, ``moved_deg``
-    and ``condition``, as far as it came; accepted only if residual and overlap improve and every
-    limit of the options holds, or if ``accept_always`` is set. Its covariance is that of
-    :func:`~megloc_kapture.refinement.icp_surface.fit_covariance`.
+    The measures are ``residual_before_m`` and ``residual_after_m`` (median distance from the map's
+    planes within the coarsest distance), ``overlap_before`` and ``overlap_after`` (share of points
+    within the finest distance), ``moved_m``, ``moved_deg`` and ``condition``. The covariance is
+    that of :func:`~megloc_kapture.refinement.icp_surface.fit_covariance`.
     """
     options = options or IcpOptions()
-    # near the camera coordinates are small, whatever the world's origin
+    # coordinates are small near the camera, whatever the world's origin
     center = cam_from_world.center()
     local_from_cam = RigidTransform(cam_from_world.inverse().quat_wxyz, (0.0, 0.0, 0.0))
     fine_points = downsample(query_points, options.voxels_m[-1])
@@ -179,7 +171,7 @@ def refine_by_icp(
     if reason:
         return PoseRefinement(cam_from_world, reason, measures)
     after = levels[-1].fit(moved, options)
-    # the finest normals are noisy, which looks like structure on a bare wall
+    # noisy normals of the finest level look like structure on a bare wall
     condition = condition_number(levels[0].fit(moved, options))
     moved_m, moved_deg = _movement(local_from_cam, moved)
     measures |= {
@@ -201,7 +193,6 @@ def refine_by_icp(
 def _reason_to_skip(
     levels: Sequence[_Level], local_from_cam: RigidTransform, options: IcpOptions
 ) -> str:
-    """Reason why fitting need not be tried; empty where it should be."""
     if options.accept_always:
         return ""
     spacing, limit = levels[-1].surface.spacing(), options.max_distances_m[-1]
@@ -210,7 +201,6 @@ def _reason_to_skip(
             f"the map is too sparse here: {NORMAL_NEIGHBOURS} points take {spacing:.3f} m, "
             f"at most {limit:g} m is allowed"
         )
-    # what has no map within the coarsest distance is not drawn anywhere
     reach = levels[0].fit(local_from_cam, options).reach
     if reach < options.min_overlap:
         return (
@@ -223,7 +213,6 @@ def _reason_to_skip(
 def _fit_levels(
     levels: Sequence[_Level], pixels: Floats, start: RigidTransform, options: IcpOptions
 ) -> tuple[RigidTransform, str]:
-    """Coarse to fine by voxels, then by pixels: ``local_from_cam``, or why it is none."""
     moved = start
     for level in levels:
         found = fit_to_surface(level.surface, level.points, moved, level.max_distance_m)
@@ -245,7 +234,6 @@ def _noise(depth_m: Floats, noise: tuple[float, float, float]) -> Floats:
 
 
 def _movement(start: RigidTransform, end: RigidTransform) -> tuple[float, float]:
-    """Metres and degrees between two ``local_from_cam``."""
     moved_m = np.linalg.norm(np.subtract(end.translation, start.translation))
     angle = rotation_angles_deg(np.array(end.quat_wxyz), np.array(start.quat_wxyz))
     return float(moved_m), float(angle)
@@ -268,7 +256,6 @@ def _reason_too_far(start: RigidTransform, end: RigidTransform, options: IcpOpti
 def _reason_to_refuse(
     before: SurfaceFit, after: SurfaceFit, num_points: int, condition: float, options: IcpOptions
 ) -> str:
-    """Reason why a refined pose is not taken; empty where it is."""
     if options.accept_always and math.isfinite(condition):
         return ""
     if after.overlap < options.min_overlap:
@@ -281,7 +268,7 @@ def _reason_to_refuse(
             f"the surfaces do not determine the pose: condition number {condition:.0f}, "
             f"at most {options.max_condition:g} is allowed"
         )
-    # shares of points are of points that happen to be taken: voxels follow the world's axes
+    # voxels follow the world's axes, so shares of points depend on the voxel grid
     noise = 2 * math.sqrt(before.overlap * (1 - before.overlap) / num_points)
     if after.overlap < before.overlap - noise:
         return f"the overlap fell from {before.overlap:.4f} to {after.overlap:.4f}"
@@ -301,13 +288,11 @@ def map_cloud(
     scene: RankingScene,
     options: IcpOptions,
 ) -> Floats:
-    """The map around a query's points under its estimated pose, float64 (M, 3) in the world.
+    """Return the map's points around a query under its estimated pose, float64 (M, 3), world.
 
-    The depth maps of the references that overlap most with the query's, of those within 0.2 m and
-    10 deg of each other only one; where no reference has depth, the points of the map that the
-    references observe. Depths that differ by less than the coarsest distance agree, and points that
-    far from the query's are kept. ``query_points``: float64 (N, 3) in the query camera's frame;
-    ``references``: map images, best first.
+    They come from the depth maps of the references with most overlap, one per view within 0.2 m and
+    10 deg, or from the references' sparse points without depth. ``query_points``: float64 (N, 3) in
+    the query camera's frame; ``references``: map images, best first.
     """
     margin_m = options.max_distances_m[0]
     low, high = query_points.min(axis=0) - margin_m, query_points.max(axis=0) + margin_m
@@ -323,14 +308,13 @@ def map_cloud(
     clouds, voxel_m = [np.zeros((0, 3))], options.voxels_m[-1]
     for name in _different_views(overlaps, scene, options.max_references):
         view = scene.map_depth(name)
-        assert view is not None  # it overlaps
-        # as many pixels as half a voxel covers at the greatest depth
+        assert view is not None
         step_px = max(1, round(0.5 * voxel_m * focal_px(view.camera) / options.depth.max_depth_m))
         camera, mask = scene.map_camera(name), scene.map_mask(name)
         points = depth_cloud(
             view, options.depth, image_camera=camera, image_mask=mask, step_px=step_px
         )
-        # a vote per image and voxel: a near image has more pixels there, not more right
+        # one vote per image and voxel: a near image has more pixels but is no more reliable
         clouds.append(downsample(cropped(scene.map_pose(name).inverse().apply(points)), voxel_m))
     return np.concatenate(clouds)
 
@@ -342,7 +326,7 @@ def _overlaps(
     scene: RankingScene,
     options: IcpOptions,
 ) -> list[tuple[str, float]]:
-    """References that have depth, and the share of it that agrees with the query's; most first."""
+    """Return references with depth and the share that agrees with the query's; most first."""
     found = []
     depth_from_world = query_depth.image_from_depth.inverse() @ cam_from_world
     for name in references:
@@ -353,14 +337,12 @@ def _overlaps(
         seen = (depth_from_world @ scene.map_pose(name).inverse()).apply(points)
         agrees = _agrees(query_depth, seen, options.max_distances_m[0])
         found.append((name, float(agrees.mean()) if len(agrees) else 0.0))
-    # stable: of equals the better reference stays first
     return sorted(found, key=lambda each: -each[1])
 
 
 def _different_views(
     overlaps: Sequence[tuple[str, float]], scene: RankingScene, count: int
 ) -> list[str]:
-    """The first references that overlap at all and do not repeat the view of an earlier one."""
     names: list[str] = []
     quats, centers = np.zeros((0, 4)), np.zeros((0, 3))
     for name, overlap in overlaps:
@@ -377,7 +359,6 @@ def _different_views(
 
 
 def _agrees(view: DepthView, points_in_depth: Floats, tolerance_m: float) -> NDArray[np.bool_]:
-    """Mask (N,) of points (N, 3) in the depth camera's frame that lie near a measured depth."""
     pixels = px_from_cam(view.camera, points_in_depth)
     inside = in_image(view.camera, pixels)
     column, row = pixels[inside].astype(np.int64).T
@@ -390,11 +371,7 @@ def _agrees(view: DepthView, points_in_depth: Floats, tolerance_m: float) -> NDA
 
 
 class Icp:
-    """Plugin ``icp``: the query's depth against the map's depth, or its points where dense.
-
-    A map's points are dense enough where those that a normal is estimated from lie, for half of the
-    points, within the finest distance of correspondence.
-    """
+    """Plugin ``icp``: the query's depth against the map's depth, or against its points if dense."""
 
     name = "icp"
     Options = IcpOptions
@@ -410,10 +387,6 @@ class Icp:
         references: Sequence[str],
         scene: RankingScene,
     ) -> PoseRefinement:
-        """Refine the pose of one query image; see :func:`refine_by_icp`.
-
-        Raises DataError for a depth map or mask that there should be and that cannot be read.
-        """
         options, view = self.options, scene.query_depth(query)
         if view is None:
             return PoseRefinement(cam_from_world, "the query has no depth")

@@ -1,7 +1,6 @@
-"""Clouds and surfaces of ICP: points of depth maps, surfaces through them, and how they fit.
+"""Clouds and surfaces for ICP: points of depth maps, normals and fits.
 
-The adapter of small_gicp, with one thread throughout: with more, its voxel grid does not give the
-same points twice.
+The adapter of small_gicp runs with one thread: its voxel grid is not deterministic with more.
 """
 
 from __future__ import annotations
@@ -22,19 +21,16 @@ from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
-NORMAL_NEIGHBOURS = 20  # that a normal is estimated from; small_gicp's own number
+NORMAL_NEIGHBOURS = 20  # for a normal; small_gicp's default
 _MAX_ITERATIONS = 20
-# a tenth of what a refined pose has to be good to
 _ROTATION_EPSILON_RAD = 1e-4
 _TRANSLATION_EPSILON_M = 1e-4
-_CONVERGED = 5e-5  # radians and metres, a hundredth of what a refined pose has to be good to
-# the scale at which the Cauchy loss has 95 % of least squares' efficiency under Gaussian noise
+_CONVERGED = 5e-5  # radians and metres, a hundredth of the required accuracy
+# Cauchy scale with 95 % efficiency under Gaussian noise
 _CAUCHY_EFFICIENT = 2.385
 
 
 class DepthCloudOptions(Options):
-    """Options: depths that are trusted."""
-
     max_depth_m: float = Field(
         default=4.0,
         gt=0,
@@ -59,13 +55,12 @@ def depth_cloud(
     image_mask: NDArray[np.bool_] | None = None,
     step_px: int = 1,
 ) -> Floats:
-    """Points of a depth map, float64 (N, 3), in the frame of the image that it was taken with.
+    """Return the points of a depth map, float64 (N, 3), in the frame of its image, in metres.
 
-    By rows of the depth map, metres. Left out are pixels without depth (0, less, or not finite),
-    beyond the greatest depth, beside a jump in depth (a sensor smears edges: Khoshelham and
-    Elberink, Sensors 12(2), 2012), and points that the image's mask hides. ``image_camera`` and
-    ``image_mask``: camera of the image, and its mask, bool (H, W), True = use; points that lie
-    outside of the image stay; ``step_px``: take every such pixel, along both axes.
+    Pixels without depth, beyond the greatest depth, at depth edges (sensors smear them: Khoshelham
+    and Elberink, Sensors 12(2), 2012) and hidden by the mask are dropped. ``image_camera`` and
+    ``image_mask``: camera and mask of the image, bool (H, W), True = use; ``step_px``: sampling
+    step along both axes.
     """
     options = options or DepthCloudOptions()
     depth = np.asarray(view.depth_m, np.float32)
@@ -85,7 +80,6 @@ def depth_cloud(
 def _on_edge(
     depth: NDArray[np.float32], sampled: tuple[slice, slice], max_jump: float
 ) -> NDArray[np.bool_]:
-    """Mask of the sampled pixels with one of eight neighbours far before or behind them."""
     height, width = depth.shape
     padded = np.pad(depth, 1)
     z, limit = depth[sampled], np.float32(1.0 + max_jump)
@@ -93,13 +87,12 @@ def _on_edge(
     with np.errstate(invalid="ignore"):
         for down, right in product((0, 1, 2), (0, 1, 2)):
             other = padded[down : down + height, right : right + width][sampled]
-            # one without depth, 0 or NaN, says nothing
+            # pixels without depth (0, NaN) are no edges
             edge |= (other > limit * z) | ((other > 0) & (limit * other < z))
     return edge
 
 
 def _hidden(points: Floats, camera: Camera, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Points (N,) in the camera's frame that lie on False pixels of the mask."""
     pixels = px_from_cam(camera, points)
     inside = in_image(camera, pixels)
     column, row = pixels[inside].astype(np.int64).T
@@ -110,39 +103,34 @@ def _hidden(points: Floats, camera: Camera, mask: NDArray[np.bool_]) -> NDArray[
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Points on a surface, with its normals."""
-
     points: Floats  # float64 (N, 3)
     normals: Floats  # float64 (N, 3), unit length, of either sign
     _cloud: Any
     _tree: Any
 
     def nearest(self, points: Floats) -> tuple[NDArray[np.int64], Floats]:
-        """Rows of the nearest points of the surface, and their distances, of points (M, 3)."""
+        """Return rows and distances of the nearest surface points, for points (M, 3)."""
         rows, squared = self._tree.batch_knn_search(np.ascontiguousarray(points), 1)
         return rows[:, 0].astype(np.int64), np.sqrt(squared[:, 0])
 
     def spacing(self) -> float:
-        """Median distance from a point to the last of those that its normal comes from."""
+        """Return the median distance from a point to the farthest neighbour of its normal."""
         _, squared = self._tree.batch_knn_search(self.points, NORMAL_NEIGHBOURS)
         return float(np.sqrt(np.median(squared[:, -1])))
 
 
 def downsample(points: Floats, voxel_m: float) -> Floats:
-    """One point per voxel, the mean of those in it: float64 (M, 3) of (N, 3)."""
+    """Average the points (N, 3) of each voxel: float64 (M, 3)."""
     if not len(points):
         return np.zeros((0, 3))
-    # voxel indices have 21 bits: far from the origin there are none
+    # voxel indices have 21 bits, too few far from the origin
     origin = points.mean(axis=0)
     cloud = small_gicp.voxelgrid_sampling(np.ascontiguousarray(points - origin), voxel_m)
     return np.array(cloud.points())[:, :3] + origin
 
 
 def surface_of(points: Floats) -> Surface:
-    """The surface through points (N, 3) near the origin; see :func:`downsample`.
-
-    Its normals are the directions in which the nearest points vary least.
-    """
+    """Estimate the surface through points (N, 3) near the origin; see :func:`downsample`."""
     cloud = small_gicp.PointCloud(np.ascontiguousarray(points))
     tree = small_gicp.KdTree(cloud)
     small_gicp.estimate_normals(cloud, tree, min(NORMAL_NEIGHBOURS, len(points)))
@@ -152,11 +140,11 @@ def surface_of(points: Floats) -> Surface:
 def fit_to_surface(
     surface: Surface, points: Floats, surface_from_points: RigidTransform, max_distance_m: float
 ) -> RigidTransform | None:
-    """Move points (N, 3) onto a surface: point-to-plane ICP by Levenberg-Marquardt.
+    """Fit points (N, 3) to a surface: point-to-plane ICP by Levenberg-Marquardt.
 
     Chen and Medioni, "Object modelling by registration of multiple range images", Image and Vision
-    Computing 10(3), 1992; small_gicp's ``PLANE_ICP``. None where no point of the surface is within
-    ``max_distance_m``, or the result is not finite.
+    Computing 10(3), 1992; small_gicp's ``PLANE_ICP``. None without correspondences within
+    ``max_distance_m``.
     """
     start = np.eye(4)
     start[:3, :3] = surface_from_points.rotation_matrix()
@@ -178,19 +166,14 @@ def fit_to_surface(
 
 @dataclass(frozen=True, eq=False)
 class SurfaceFit:
-    """A cloud on a surface."""
-
-    # overlap, reach: shares of the points with the surface within the near and the far distance
     overlap: float
     reach: float
-    # median distance from the planes, over the points with the surface within the far distance;
-    # infinite where there are none
+    # median distance from the planes within the far distance; infinite without points
     residual_m: float
-    # points, normals: float64 (K, 3) in the cloud's frame: points that are near, and the normals of
-    # their planes
+    # points, normals: float64 (K, 3) in the cloud's frame, of points within the near distance
     points: Floats
     normals: Floats
-    residuals_m: Floats  # float64 (K,), their signed distances from the planes
+    residuals_m: Floats  # float64 (K,), signed distances from the planes
 
 
 def surface_fit(
@@ -201,7 +184,6 @@ def surface_fit(
     near_m: float,
     far_m: float,
 ) -> SurfaceFit:
-    """Compare points (N, 3) with the surface under a transform."""
     rotation = surface_from_points.rotation_matrix()
     moved = surface_from_points.apply(points)
     rows, distances = surface.nearest(moved)
@@ -219,12 +201,11 @@ def surface_fit(
 
 
 def condition_number(fit: SurfaceFit) -> float:
-    """Greatest over least eigenvalue of the fit's normal matrix; infinite for fewer than 6 points.
+    """Return the condition number of the fit's normal matrix; infinite for fewer than 6 points.
 
-    A plane, a sphere or a corridor slides along itself without a residual. Points are centred
-    and scaled to a mean distance of 1, so that turning counts as much as moving (Gelfand, Ikemoto,
-    Rusinkiewicz and Levoy, "Geometrically stable sampling for the ICP algorithm", 3DIM 2003,
-    section 2).
+    Points are centred and scaled to a mean distance of 1, so that rotation and translation weigh
+    alike (Gelfand, Ikemoto, Rusinkiewicz and Levoy, "Geometrically stable sampling for the ICP
+    algorithm", 3DIM 2003, section 2).
     """
     if len(fit.points) < 6:
         return np.inf
@@ -236,11 +217,10 @@ def condition_number(fit: SurfaceFit) -> float:
 
 
 def fit_covariance(fit: SurfaceFit) -> Floats:
-    """Covariance (6, 6) of ``cam_from_world`` for a cloud in the camera's frame.
+    """Estimate the covariance (6, 6) of ``cam_from_world`` for a cloud in the camera's frame.
 
     Rotation in radians, then translation in metres, of a left perturbation. Residuals count as
-    independent, with the deviation that their median tells; what a sensor does to all of its
-    pixels alike is not in it.
+    independent; systematic sensor errors are not included.
     """
     jacobian = np.column_stack([np.cross(fit.points, fit.normals), fit.normals])
     deviation = deviation_by_median(fit.residuals_m)
@@ -254,13 +234,11 @@ def fit_weighted(
     surface_from_points: RigidTransform,
     max_distance_m: float,
 ) -> RigidTransform | None:
-    """Move points (N, 3) onto a surface that they are near already, point to plane.
+    """Refine a fit of points (N, 3) to a nearby surface, point to plane, weighted by noise.
 
-    Gauss-Newton on Cauchy's loss of the distances over their noise, whose scale follows their
-    median: small_gicp's least squares give the far and noisy, and what only one of the two clouds
-    has, the same weight as the rest. Corresponding points are sought anew in every step. ``noise``
-    (N,) is what the deviations of the points are proportional to. None where fewer than six points
-    are within ``max_distance_m`` or they do not determine the transform.
+    Gauss-Newton on Cauchy's loss of the distances over ``noise`` (N,), which is proportional to the
+    standard deviations. Correspondences are searched anew in every step. None for fewer than six
+    points within ``max_distance_m`` or an undetermined transform.
     """
     transform = surface_from_points
     for _ in range(_MAX_ITERATIONS):
@@ -276,7 +254,7 @@ def fit_weighted(
         if scale == 0:
             return transform
         weights = 1.0 / (1.0 + (relative / (_CAUCHY_EFFICIENT * scale)) ** 2) / noise[near] ** 2
-        # turned about the points' own origin: rotation and translation are nearly independent
+        # about the points' centre, rotation and translation are nearly independent
         origin = np.array(transform.translation)
         jacobian = np.column_stack([np.cross(moved - origin, normals), normals])
         weighted = jacobian * weights[:, None]

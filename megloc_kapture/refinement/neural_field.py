@@ -1,7 +1,7 @@
-"""A map as a radiance field: trained on posed images, it renders colour and depth anywhere.
+"""Radiance field of a map, which renders colour and depth from any pose.
 
-:mod:`~megloc_kapture.refinement.field_training` trains it. As NeRF-W judges, the appearance of an
-image that was held out is fitted on its left half, and the error taken on its right.
+Trained by :mod:`~megloc_kapture.refinement.field_training`. As in NeRF-W's evaluation, the
+appearance of a held-out image is fitted on its left half, and the error measured on its right.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ Kind = Literal["triplane", "nerfw"]
 FieldModule = NerfW | TriPlane
 Lights = Literal["image", "folder"]
 Floats = NDArray[np.float32]
-# rays that are rendered at once: a processor is fastest where their samples stay in its cache
+# rays rendered at once: fastest on a CPU while their samples fit its cache
 _CHUNK, _CPU_CHUNK = 8192, 512
-# of an appearance: Adam's rate, its steps, the rays of each, and those that are drawn of
+# fit of an appearance: Adam's rate, steps, rays per step, and rays to draw from
 _FIT_RATE, _FIT_STEPS, _FIT_RAYS, _FIT_OF = 0.1, 20, 512, 2048
 
 
 @dataclass(frozen=True, eq=False)
 class FieldView:
-    """An image to train on, as of :class:`~.references.RenderingReference`, maybe without depth."""
+    """A training image, like :class:`~.references.RenderingReference`, with optional depth."""
 
     name: str
     image: NDArray[np.uint8]
@@ -46,7 +46,6 @@ class FieldView:
     depth: DepthView | None = None
 
     def as_source(self) -> WarpSource:
-        """The view to be warped; one that has depth. Raises DataError where sizes do not fit."""
         assert self.depth is not None
         depth, pose = self.depth, self.cam_from_world
         own = depth.depth_m, depth.camera, depth.image_from_depth
@@ -54,11 +53,7 @@ class FieldView:
 
 
 class FieldFrame(Options):
-    """Where a field's own coordinates lie in the world.
-
-    ``x_field = (x_world - centre) / scale``; rays begin and end at ``near`` and ``far``, depths
-    along the optical axis. All in the unit of the map.
-    """
+    """Frame of a field: ``x_field = (x_world - centre) / scale``; ``near``, ``far`` are depths."""
 
     centre: tuple[float, float, float]
     scale: float = Field(gt=0)
@@ -68,38 +63,31 @@ class FieldFrame(Options):
 
 @dataclass(frozen=True, eq=False)
 class FieldRendering:
-    """A view of a field."""
-
-    # image, camera: uint8 (H, W, 3), RGB; the view's camera, reduced
-    image: NDArray[np.uint8]
-    # float32 (H, W) along the optical axis, unit of the map; 0 where the field is mostly empty
+    image: NDArray[np.uint8]  # uint8 (H, W, 3), RGB
+    # float32 (H, W) along the optical axis, unit of the map; 0 where mostly empty
     depth_m: Floats
-    camera: Camera
+    camera: Camera  # reduced camera of the view
 
 
 def build_field(kind: Kind, num_images: int, num_lights: int) -> FieldModule:
-    """Build an untrained field; torch's global generator draws its parameters.
-
-    ``num_images`` and ``num_lights`` are rows of the transient and of the appearance embedding.
-    """
+    """Build an untrained field; torch's global generator draws its parameters."""
     return (NerfW if kind == "nerfw" else TriPlane)(num_images, num_lights)
 
 
 def light_rows(images: Sequence[str], lights: Lights) -> list[int]:
-    """Row of the appearance embedding of each image: its own, or that of its folder."""
+    """Return each image's row of the appearance embedding: per image or per folder."""
     names = [image if lights == "image" else str(PurePosixPath(image).parent) for image in images]
     row_of = {name: row for row, name in enumerate(dict.fromkeys(names))}
     return [row_of[name] for name in names]
 
 
 class NeuralField:
-    """A field, its frame, and the images whose appearance it knows.
+    """A field, its frame and its training images.
 
     Parameters
     ----------
-    module : in the mode and on the device that it is used in.
     images : names, in the order of the transient embedding's rows.
-    light_rows : of the appearance embedding, of each image.
+    light_rows : row of the appearance embedding of each image.
     """
 
     def __init__(
@@ -114,17 +102,14 @@ class NeuralField:
         self.light_rows = torch.tensor(light_rows, device=self.device)
 
     def rays(self, camera: Camera, cam_from_world: RigidTransform) -> Rays:
-        """Rays (H * W,) through the centres of a view's pixels, by rows."""
+        """Return rays (H * W,) through the pixel centres of a view, by rows."""
         directions = pixel_rays(camera) @ cam_from_world.rotation_matrix()
         origin = (cam_from_world.center() - self.frame.centre) / self.frame.scale
         there = self._tensor(directions / self.frame.scale)
         return Rays(self._tensor(origin).expand_as(there), there, self.frame.near, self.frame.far)
 
     def appearance_of(self, image: str) -> torch.Tensor | None:
-        """Embedding (A,) of an image's light; None where the field has none of them.
-
-        Raises DataError for an image that it was not trained on.
-        """
+        """Return the appearance embedding (A,) of a training image; None without embeddings."""
         if image not in self.images:
             raise DataError(f"the field was not trained on an image {image!r}")
         embedding = self.module.appearance
@@ -141,11 +126,7 @@ class NeuralField:
         appearance: torch.Tensor | None = None,
         max_side_px: int | None = None,
     ) -> FieldRendering:
-        """Render a view, without what is transient.
-
-        ``appearance`` is an embedding (A,), the mean of all images' unless given; ``max_side_px``
-        of the rendering, the camera's own unless given.
-        """
+        """Render a view without transient objects; ``appearance`` (A,) is the mean by default."""
         camera = reduced_camera(camera, max_side_px or max(camera.width, camera.height))
         shape = camera.height, camera.width
         rendered = self.render_rays(self.rays(camera, cam_from_world), appearance)
@@ -154,7 +135,7 @@ class NeuralField:
         return FieldRendering(rgb, depth_m.reshape(shape).astype(np.float32), camera)
 
     def render_rays(self, rays: Rays, appearance: torch.Tensor | None = None) -> Rendered:
-        """Render rays in parts, all with one appearance (A,) or the mean; no transients."""
+        """Render rays in chunks with one appearance (A,) or the mean, without transients."""
         parts, size = [], _CPU_CHUNK if self.device.type == "cpu" else _CHUNK
         for start in range(0, len(rays.origins), size):
             part = select(rays, slice(start, start + size))
@@ -168,14 +149,14 @@ class NeuralField:
     def fit_appearance(
         self, rays: Rays, rgb: torch.Tensor, *, seed: int = 0
     ) -> torch.Tensor | None:
-        """Embedding (A,) under which rays look most like colours (N, 3); None without any."""
+        """Fit the embedding (A,) of rays to colours (N, 3); None without embeddings."""
         embedding = self.module.appearance
         if embedding is None:
             return None
         generator = torch.Generator().manual_seed(seed)
         drawn = torch.randperm(len(rgb), generator=generator)[:_FIT_OF].to(self.device)
         rays, rgb = select(rays, drawn), rgb[drawn]
-        with torch.no_grad():  # where samples lie does not depend on the light
+        with torch.no_grad():
             seen = self.render_rays(rays)
             rays = replace(rays, depth=torch.where(seen.opacity > 0.5, seen.depth, 0.0))
         fitted = embedding.weight.detach().mean(0).clone().requires_grad_()
@@ -184,16 +165,16 @@ class NeuralField:
             rows = torch.randint(len(rgb), (min(_FIT_RAYS, len(rgb)),), generator=generator)
             rows = rows.to(self.device)
             part = replace(select(rays, rows), appearance=fitted.expand(len(rows), -1))
-            # what is transient in the image must not pull on its light
+            # transient pixels must not affect the appearance
             off = self.module.render(part).rgb - rgb[rows]
-            # linear from a tenth of full scale
+            # loss is linear from a tenth of full scale
             loss = torch.nn.functional.huber_loss(off, torch.zeros_like(off), delta=0.1)
             (fitted.grad,) = torch.autograd.grad(loss, [fitted])
             optimizer.step()
         return fitted.detach()
 
     def fitted_appearance(self, view: FieldView, max_side_px: int) -> torch.Tensor | None:
-        """Embedding (A,) of a view's light, of an image reduced to that longer side."""
+        """Fit the appearance embedding (A,) of a view, reduced to a longer side."""
         camera, rgb, usable, _ = pixels_of(view, max_side_px)
         rows = torch.from_numpy(np.flatnonzero(usable)).to(self.device)
         if not len(rows):
@@ -202,7 +183,7 @@ class NeuralField:
         return self.fit_appearance(rays, self._tensor(rgb.astype(np.float32) / 255)[rows])
 
     def held_out_psnr(self, view: FieldView) -> float:
-        """PSNR in dB on the right half of an image, its appearance fitted on the left one."""
+        """Return the PSNR in dB on the right half of an image, with appearance from the left."""
         camera, rgb, usable, _ = pixels_of(view, max(view.camera.width, view.camera.height))
         rays = self.rays(camera, view.cam_from_world)
         left = np.arange(camera.width * camera.height) % camera.width < camera.width // 2
@@ -224,7 +205,6 @@ class NeuralField:
 
 
 def select(rays: Rays, rows: slice | torch.Tensor) -> Rays:
-    """Some of the rays."""
     chosen = {
         name: value[rows]
         for name in ("origins", "directions", "appearance", "transient", "depth")
@@ -236,7 +216,7 @@ def select(rays: Rays, rows: slice | torch.Tensor) -> Rays:
 def pixels_of(
     view: FieldView, max_side_px: int
 ) -> tuple[Camera, NDArray[np.uint8], NDArray[np.bool_], Floats | None]:
-    """Reduced camera, colours (N, 3), usable pixels (N,) and depths (N,) of a view."""
+    """Return reduced camera, colours (N, 3), usable pixels (N,) and depths (N,) of a view."""
     if view.image.shape != (view.camera.height, view.camera.width, 3):
         size = f"{view.camera.width}x{view.camera.height}"
         raise DataError(f"image {view.name}: {view.image.shape} does not fit a camera of {size}")
@@ -260,7 +240,6 @@ def pixels_of(
 
 
 def reduced_view(view: FieldView, max_side_px: int) -> FieldView:
-    """A view without depth, reduced to a longer side; raises DataError as :func:`pixels_of`."""
     camera, rgb, usable, _ = pixels_of(view, max_side_px)
     shape = camera.height, camera.width
     image, mask = rgb.reshape(*shape, 3), usable.reshape(shape)

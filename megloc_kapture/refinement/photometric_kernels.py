@@ -1,9 +1,7 @@
-"""Compiled loops of photometric alignment: residuals, normal equations, visibility, selection.
+"""Compiled loops of photometric alignment; import only when needed, since numba is slow to load.
 
-Imported only when a pose is refined: numba costs half a second to import. A residual is
-``gain I(px) + bias - r`` of a point with value r in a reference image; I is a level of the query,
-read bilinearly where the point falls, and its derivatives are those of the bilinear interpolation:
-exactly those of the objective.
+A residual is ``gain I(px) + bias - r`` of a point with reference value r; the query level I is
+interpolated bilinearly, and the derivatives are exact for that interpolation.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
@@ -20,14 +18,11 @@ from megloc_kapture.geometry.cameras import normalized_from_px
 from megloc_kapture.geometry.projection import PINHOLES, distorted, model_id, packed_params
 from megloc_kapture.values import Camera
 
-_ROWS = 256  # evaluated at a time
+_ROWS = 256
 
 
 def camera_of(camera: Camera) -> tuple[int, NDArray[np.float64], float]:
-    """A camera as the loops here take it: model, parameters, and how far off the axis it sees.
-
-    The last is the squared tangent of the angle.
-    """
+    """Return model, parameters and squared tangent of the largest viewing angle of a camera."""
     across, down = np.linspace(0, camera.width, 17), np.linspace(0, camera.height, 17)
     border = np.concatenate(
         [
@@ -41,12 +36,9 @@ def camera_of(camera: Camera) -> tuple[int, NDArray[np.float64], float]:
 
 @compiled_loop
 def _project(camera, r, t, points, shown_at):
-    """Points in the camera of pose ``r``, ``t``, and where its image shows them.
+    """Project points by the pose; fill camera coordinates, px, py and the derivatives of both.
 
-    A lens' polynomial holds inside the image; past its turning point it may lead back into it. So a
-    point is shown only as far off the axis as the image reaches. ``shown_at``: (11, N or more),
-    filled with the points' coordinates there; px and py, NaN where not shown; and the derivatives
-    of px by these coordinates, and of py.
+    The viewing angle is limited: a distortion polynomial may lead back into the image.
     """
     model, p, reach2 = camera
     for k in range(len(points)):
@@ -58,7 +50,6 @@ def _project(camera, r, t, points, shown_at):
         inverse = 1.0 / z
         fx, fy = p[0] * inverse, p[1] * inverse
         shown_at[0, k], shown_at[1, k], shown_at[2, k] = x, y, z
-        # those of a pinhole, by the dozen
         shown_at[3, k] = fx * x + p[2] if shown else math.nan
         shown_at[4, k] = fy * y + p[3] if shown else math.nan
         shown_at[5, k], shown_at[6, k], shown_at[7, k] = fx, 0.0, -fx * x * inverse
@@ -79,13 +70,9 @@ def _project(camera, r, t, points, shown_at):
 
 @compiled_loop
 def _corner(valid, x, y):
-    """Row and column of the upper left of the four pixels about a position, and the offset.
-
-    ``x``, ``y`` count from the centre of the first pixel. Row and column are -1 where not all four
-    are valid.
-    """
+    """Return row and column of the upper left of four pixels, -1 if invalid, and the offset."""
     h, w = valid.shape
-    # not so for NaN either
+    # false for NaN too
     if x >= 0.0 and y >= 0.0 and x < w - 1 and y < h - 1:
         i, j = int(y), int(x)
         if valid[i, j] and valid[i, j + 1] and valid[i + 1, j] and valid[i + 1, j + 1]:
@@ -95,7 +82,6 @@ def _corner(valid, x, y):
 
 @compiled_loop
 def _read(values, row, column, a, b, c):
-    """Channel ``c`` at a position that :func:`_corner` gave, and its derivatives by x and y."""
     v00, v01 = values[row, column, c], values[row, column + 1, c]
     v10, v11 = values[row + 1, column, c], values[row + 1, column + 1, c]
     top, low = (1.0 - a) * v00 + a * v01, (1.0 - a) * v10 + a * v11
@@ -105,7 +91,7 @@ def _read(values, row, column, a, b, c):
 
 @compiled_loop
 def read_values(values, valid, x, y, out, found):
-    """Values (N, C) at N pixels by bilinear interpolation, and where there are any, bool (N,)."""
+    """Interpolate values (N, C) at N pixels bilinearly, and set a mask of valid ones, bool (N,)."""
     for k in range(len(x)):
         row, column, a, b = _corner(valid, x[k], y[k])
         found[k] = row >= 0
@@ -117,17 +103,15 @@ def read_values(values, valid, x, y, out, found):
 
 @compiled_loop
 def evaluate(chosen, query, alignment, out):
-    """Residuals and what they are made of, for each point: float64 (N, C, 8), NaN where not seen.
+    """Evaluate residuals and derivatives per point: float64 (N, C, 8), NaN where invisible.
 
     Parameters
     ----------
-    chosen : points (N, 3), in the world, their values (N, C) in their reference, and the group
-        (N,), the reference each is of.
-    query : a level (h, w, C), where it is valid (h, w), its pixels per pixel of the camera (2,),
-        and the camera, of :func:`camera_of`.
+    chosen : points (N, 3) in the world, values (N, C) and reference index (N,).
+    query : a level (h, w, C), its valid pixels (h, w), its scale (2,), and its :func:`camera_of`.
     alignment : rotation and translation of ``cam_from_world``, gains and biases (G, C).
-    out : filled per point and channel with the residual, its six derivatives by a left perturbation
-        of the pose, rotation first, and the query's value.
+    out : filled with the residual, its six derivatives by a left perturbation of the pose, rotation
+        first, and the query's value.
     """
     points, values, groups = chosen
     level, valid, scale_xy, camera = query
@@ -155,7 +139,6 @@ def evaluate(chosen, query, alignment, out):
                 d1 = gx * shown_at[6, n] + gy * shown_at[9, n]
                 d2 = gx * shown_at[7, n] + gy * shown_at[10, n]
                 out[k, c, 0] = gain * value + biases[group, c] - values[k, c]
-                # d^T (omega x p) = omega^T (p x d)
                 out[k, c, 1] = y * d2 - z * d1
                 out[k, c, 2] = z * d0 - x * d2
                 out[k, c, 3] = x * d1 - y * d0
@@ -167,19 +150,17 @@ def evaluate(chosen, query, alignment, out):
 
 @compiled_loop
 def normal_equations(rows, groups, squared_scale, sums):
-    """Robust cost and normal equations of the residuals that :func:`evaluate` gives.
+    """Add up the robust normal equations of :func:`evaluate`; return cost sum and point count.
 
-    A point's squared length ``e^2`` is the mean of its squared residuals over channels; its cost is
-    Geman and McClure's ``s^2 / 2  e^2 / (s^2 + e^2)`` and its weight ``(1 + e^2 / s^2)^-2``; with
-    an infinite scale s^2 both are those of least squares. Returns the sum of the costs, and of how
-    many points.
+    A point's ``e^2`` is the mean of its squared residuals over channels; its cost is Geman and
+    McClure's ``s^2 / 2  e^2 / (s^2 + e^2)`` and its weight ``(1 + e^2 / s^2)^-2``; an infinite s^2
+    gives least squares.
 
     Parameters
     ----------
     rows, groups : (N, C, 8), and (N,).
-    sums : added to. Of the pose (6, 6), its upper half; of the pose with gain and bias (G, C, 6,
-        2); of these, gain gain, gain bias, bias bias (G, C, 3); the gradients of the pose (6,) and
-        of gain and bias (G, C, 2).
+    sums : added to. Pose (6, 6), upper half; pose with gain and bias (G, C, 6, 2); gain gain, gain
+        bias, bias bias (G, C, 3); gradients of the pose (6,) and of gain and bias (G, C, 2).
     """
     pose, mixed, own, pose_gradient, own_gradient = sums
     channels = rows.shape[1]
@@ -218,7 +199,7 @@ def normal_equations(rows, groups, squared_scale, sums):
 
 @compiled_loop
 def evaluated_equations(chosen, query, alignment, squared_scale, sums):
-    """:func:`normal_equations` of :func:`evaluate`, by a few rows, which stay in the cache."""
+    """Add :func:`normal_equations` of :func:`evaluate`, in blocks that fit the cache."""
     points, values, groups = chosen
     rows = np.empty((min(len(points), _ROWS), values.shape[1], 8))
     cost = 0.0
@@ -240,11 +221,10 @@ def splat_depths(points, camera, size_xy, cell_px, r, t, nearest, cells, depths)
 
     Parameters
     ----------
-    points : (N, 3), in the world. camera : of :func:`camera_of`.
+    points : (N, 3), in the world.
     size_xy : (2,), of the image in pixels.
-    nearest : (rows, columns), holding infinity or what other points left; updated.
-    cells, depths : (N,), filled with the flat index of a point's cell, -1 outside the image, and
-        with its depth.
+    nearest : (rows, columns), initially infinity or other points' depths; updated.
+    cells, depths : (N,), filled with the flat cell index (-1 outside the image) and the depth.
     """
     columns = nearest.shape[1]
     shown_at = np.empty((11, min(len(points), _ROWS)))
@@ -255,7 +235,6 @@ def splat_depths(points, camera, size_xy, cell_px, r, t, nearest, cells, depths)
             z, px, py = shown_at[2, k - start], shown_at[3, k - start], shown_at[4, k - start]
             cells[k] = -1
             depths[k] = z
-            # not so for NaN either
             if not (px >= 0.0 and py >= 0.0 and px < size_xy[0] and py < size_xy[1]):
                 continue
             # a quotient may round up to the next cell
@@ -267,10 +246,10 @@ def splat_depths(points, camera, size_xy, cell_px, r, t, nearest, cells, depths)
 
 @compiled_loop
 def strongest_per_cell(x, y, energy, wanted, cell_px, best):
-    """Of the wanted points in each cell of a level the one where ``energy`` (h, w) is largest.
+    """Find the wanted point with the largest ``energy`` (h, w) in each cell of a level.
 
     ``x`` and ``y`` (N,) are pixels of the level, ``wanted`` is bool (N,). ``best``, int64 (rows,
-    columns), is filled with the point's index, -1 where none has any energy; of equals the first.
+    columns), is filled with point indices, -1 for zero energy.
     """
     best[:] = -1
     h, w = energy.shape

@@ -1,10 +1,8 @@
-"""Images as photometric alignment compares them: points of depth, pyramids of values, choice.
+"""Image pyramids and depth points for photometric alignment.
 
-A reference image is compared at pixels of its depth map, so that the depth camera may be another
-one than the image's; and not at all of them, but at those with the strongest gradient in the cells
-of a grid, as direct odometry chooses them (Engel et al., "Direct Sparse Odometry", PAMI 2018,
-section 3.2). What a mask leaves out never enters a value: every mean is taken over the pixels that
-are used (normalised convolution, Knutsson and Westin, CVPR 1993).
+A reference is compared at pixels of its depth map, those with the strongest gradient per grid cell
+(Engel et al., "Direct Sparse Odometry", PAMI 2018, section 3.2). Masked pixels never enter a mean
+(normalised convolution, Knutsson and Westin, CVPR 1993).
 """
 
 from __future__ import annotations
@@ -23,28 +21,28 @@ from megloc_kapture.geometry.cameras import bearing_rays, in_image, project
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, RigidTransform
 
-# depth pixels looked at along the longer side of a depth map; about four per point
+# depth samples along the longer side of a depth map; about four per point
 _GRID = 320
-# second difference of inverse depth, over it, from which a pixel is on an edge: planes have none
+# relative second difference of inverse depth at an edge; zero on planes
 _JUMP = 0.05
-# cells of an image in which the nearest surface hides others, along its longer side
+# cells of the visibility buffer along an image's longer side
 _CELLS = 80
-# a point hides those that are further by more than this share: a cell of slanted ground has as much
+# relative depth margin of occlusion; slanted ground varies as much within a cell
 _HIDES = 0.15
 Float64 = NDArray[np.float64]
 Appearance = Literal["normalised", "colours"]
-_BLUR_PX = 0.8  # before each halving, and of the values: bilinear reading needs smooth ones
-_WINDOW_PX = 17  # in which contrast is normalised
-# of the mean local variance, which local variances are raised by: flat areas stay flat
+_BLUR_PX = 0.8  # before each halving; bilinear interpolation needs smooth values
+_WINDOW_PX = 17
+# share of the mean local variance added to local variances: flat areas stay flat
 _FLAT = 0.1
 _SMALLEST_SIDE_PX = 16
-_HALF = 0.5  # share of a pixel that must be used
+_HALF = 0.5  # least used share of a pixel
 Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class DepthPoints:
-    """Points (N, 3) in the world, float64, and where a reference image shows them (N, 2)."""
+    """World points (N, 3), float64, and their pixels in a reference image (N, 2)."""
 
     points: Float64
     px: Float64
@@ -52,20 +50,13 @@ class DepthPoints:
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """Points of several references that a camera sees."""
-
-    # per reference bool (N,), the points inside the image that no other hides
+    # per reference bool (N,), visible points
     seen: tuple[NDArray[np.bool_], ...]
-    # bool (rows, columns), the cells of the image in which there is a point
-    covered: NDArray[np.bool_]
+    covered: NDArray[np.bool_]  # bool (rows, columns), cells of the image with a point
 
 
 def lift_points(camera: Camera, cam_from_world: RigidTransform, depth: DepthView) -> DepthPoints:
-    """Points of a depth map that its image sees; none on edges of depth.
-
-    ``camera`` and ``cam_from_world`` are of the image. Raises DataError for a depth map that has
-    not the size of its camera.
-    """
+    """Lift the depth map's points that its image sees, without those on depth edges."""
     if depth.depth_m.shape != (depth.camera.height, depth.camera.width):
         raise DataError(
             f"a depth map of {depth.depth_m.shape} does not fit a camera of "
@@ -77,7 +68,7 @@ def lift_points(camera: Camera, cam_from_world: RigidTransform, depth: DepthView
     bend = np.zeros_like(middle)
     h, w = inverse.shape
     for down, across in ((1, 0), (0, 1)):
-        # NaN, thus no point, beside a pixel without depth
+        # NaN next to pixels without depth
         after = inverse[np.minimum(rows + down, h - 1), np.minimum(columns + across, w - 1)]
         before = inverse[np.maximum(rows - down, 0), np.maximum(columns - across, 0)]
         bend = np.maximum(bend, np.abs(after + before - 2 * middle))
@@ -91,7 +82,7 @@ def lift_points(camera: Camera, cam_from_world: RigidTransform, depth: DepthView
         px = project(camera, RigidTransform.identity(), points)
         inside = in_image(camera, px)
         points, px = points[inside], px[inside]
-        # what the depth camera sees past an edge may be hidden from the image
+        # points behind an edge of the depth camera may be hidden from the image
         alone = DepthPoints(points, px)
         seen = visibility([alone], camera, RigidTransform.identity()).seen[0]
         points, px = points[seen], px[seen]
@@ -101,7 +92,7 @@ def lift_points(camera: Camera, cam_from_world: RigidTransform, depth: DepthView
 def visibility(
     references: Sequence[DepthPoints], camera: Camera, cam_from_world: RigidTransform
 ) -> Visibility:
-    """Points of several references that a camera sees, by a coarse z-buffer."""
+    """Find visible points of several references by a coarse z-buffer."""
     from megloc_kapture.refinement.photometric_kernels import camera_of, splat_depths
 
     sides = np.array([camera.width, camera.height], np.float64)
@@ -121,7 +112,6 @@ def visibility(
 
 
 def usable_cells(valid: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Mask (rows, columns) of the cells of an image that are valid in their middle."""
     h, w = valid.shape
     rows = ((np.arange(shape[0]) + 0.5) * h / shape[0]).astype(np.int64)
     columns = ((np.arange(shape[1]) + 0.5) * w / shape[1]).astype(np.int64)
@@ -129,7 +119,6 @@ def usable_cells(valid: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np
 
 
 def _inverse_depth(depth_m: NDArray[np.float32]) -> Float64:
-    """1/m, NaN where nothing is known."""
     depth = depth_m.astype(np.float64)
     known = np.isfinite(depth) & (depth > 0)
     return np.where(known, 1.0 / np.where(known, depth, 1.0), np.nan)
@@ -137,7 +126,7 @@ def _inverse_depth(depth_m: NDArray[np.float32]) -> Float64:
 
 @lru_cache(maxsize=4)
 def _grid(camera: Camera) -> tuple[NDArray[np.int64], NDArray[np.int64], Float64]:
-    """Rows (N,) and columns (N,) of the pixels looked at, and their rays (N, 3) of unit depth."""
+    """Return sampled rows (N,) and columns (N,), and rays (N, 3) of unit depth."""
     stride = max(1, -(-max(camera.width, camera.height) // _GRID))
     sides = (np.arange(stride // 2, n, stride) for n in (camera.height, camera.width))
     grid = np.meshgrid(*sides, indexing="ij")
@@ -150,21 +139,16 @@ def _grid(camera: Camera) -> tuple[NDArray[np.int64], NDArray[np.int64], Float64
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """One level of an image's pyramid."""
-
     values: Float32  # float32 (h, w, C)
-    valid: NDArray[np.bool_]  # bool (h, w), where the values may be used
-    # scale_x, scale_y: pixels of the level per pixel of the image: a pixel (u, v) of the image, the
-    # first pixel's centre at (0.5, 0.5), is (u scale_x, v scale_y) of the level
+    valid: NDArray[np.bool_]  # bool (h, w)
+    # pixels of the level per pixel of the image: pixel (u, v), the first centre at (0.5, 0.5), is
+    # at (u scale_x, v scale_y)
     scale_x: float
     scale_y: float
 
     @cached_property
     def gradient_energy(self) -> Float32:
-        """Squared gradient by central differences, summed over channels: float32 (h, w).
-
-        Zero on the border and where a pixel or one beside it is not valid.
-        """
+        """Return the squared gradient over all channels, float32 (h, w); 0 if invalid."""
         values, valid = self.values, self.valid
         energy = np.zeros(valid.shape, np.float32)
         across = values[1:-1, 2:] - values[1:-1, :-2]
@@ -183,15 +167,15 @@ def build_pyramid(
     max_side_px: int = 640,
     appearance: Appearance = "normalised",
 ) -> list[Level]:
-    """The levels of an image, finest first; raises DataError for what does not fit it.
+    """Build the levels of an image, finest first.
 
     Parameters
     ----------
     image, mask : RGB, uint8 (H, W, 3), and bool (H, W), True = use.
     levels : at most; none is smaller than 16 px.
-    max_side_px : longer side of the finest level; larger images are reduced.
-    appearance : ``normalised`` is brightness of zero mean and unit deviation in a window about each
-        pixel, ``colours`` the same of red, green and blue.
+    max_side_px : longer side of the finest level.
+    appearance : ``normalised`` is brightness of zero mean and unit deviation in a window around
+        each pixel, ``colours`` the same of red, green and blue.
     """
     height, width = image.shape[:2]
     if mask is not None and mask.shape != (height, width):
@@ -236,11 +220,10 @@ def _box_mean(values: Float32) -> Float32:
 
 
 def _normalised(plane: Float32, used: Float32) -> Float32:
-    """Values (h, w, 1) of a plane (h, w): zero mean, unit deviation in the window of a pixel."""
     share = np.maximum(_box_mean(used), np.float32(1e-3))
     mean = _box_mean(plane * used) / share
     centred = np.asarray(plane - mean, np.float32)
-    # about the pixel's own mean, which differs little from that of its neighbours
+    # about the pixel's own mean, close to that of its neighbours
     variance = _box_mean(centred * centred * used) / share
     floor = _FLAT * float(np.average(variance, weights=used)) if used.any() else 0.0
     result = centred / np.sqrt(variance + np.float32(max(floor, 1e-8)))
@@ -249,20 +232,15 @@ def _normalised(plane: Float32, used: Float32) -> Float32:
 
 @dataclass(frozen=True, eq=False)
 class ChosenPoints:
-    """Points of several references at one level of their pyramids."""
-
-    # points, values: float64 (N, 3) in the world, and (N, C) in their reference
-    points: Float64
-    values: Float64
-    groups: NDArray[np.int64]  # int64 (N,), of which reference each is
+    points: Float64  # float64 (N, 3), in the world
+    values: Float64  # float64 (N, C)
+    groups: NDArray[np.int64]  # int64 (N,), reference of each point
 
     def thinned(self, most: int) -> ChosenPoints:
-        """At most so many of them, still evenly spread."""
         step = max(1, -(-len(self.points) // most))
         return self.subset(np.arange(0, len(self.points), step))
 
     def subset(self, which: NDArray[Any]) -> ChosenPoints:
-        """Those of a mask (N,) or of rows."""
         return ChosenPoints(self.points[which], self.values[which], self.groups[which])
 
 
@@ -272,9 +250,9 @@ def choose_points(
     wanted: Sequence[NDArray[np.bool_]],
     max_points: int,
 ) -> ChosenPoints:
-    """At most ``max_points`` of each reference, evenly spread, with their values at a level.
+    """Choose at most ``max_points`` of each reference, evenly spread, with their values at a level.
 
-    ``wanted`` are masks (N,), one for each reference, of those to choose from.
+    ``wanted`` are masks (N,) per reference.
     """
     from megloc_kapture.refinement.photometric_kernels import read_values, strongest_per_cell
 

@@ -1,20 +1,9 @@
-"""Reference images of refinement by rendering: choice, preparation, and consistency of a map.
+"""Reference images of refinement by rendering: choice, preparation and map consistency.
 
-A reference serves many queries: what was made of it is kept, by the content of its pixels and
-depths, so that a map that changes is never taken for what it was.
-
-Refinement by rendering finds the pose under which map images, warped by their depth, look like the
-query. It is as good as they fit each other: poses that are off, or depth that is not registered to
-colour, move every query by what no residual shows. So some of the map's own images are held out and
-refined, from their given poses, against others that see the same from elsewhere (leave-one-out
-cross-validation, Stone, JRSS B 1974). An image contradicts its map where it moves by more than the
-covariance that refinement claims for it, by the limit beyond which a query's new pose is accepted
-at all, and by more than alignment resolves. A map that most of its images contradict does not allow
-what is claimed in it.
-
-Images of one position share the errors of their pose, and show neither those nor wrong depth to
-each other: references are taken that see the image's surfaces under another angle. An error that
-all images share as one, and one finer than images see of each other, are not found.
+Consistency is tested by leave-one-out refinement of map images (Stone, JRSS B 1974) against images
+with another viewing angle. An image contradicts the map if its displacement exceeds the claimed
+covariance, the acceptance limit and the resolution of alignment; errors shared by all images are
+not detected.
 """
 
 from __future__ import annotations
@@ -46,26 +35,22 @@ from megloc_kapture.values import Camera, RigidTransform
 _FORWARD = np.array([0.0, 0.0, 1.0])
 # prepared references per process; one of 640x480 takes about 8 MB
 _KEPT_REFERENCES = 32
-# of a map: images whose displacement is known, after which there is no need of more; that many at
-# least (all of five on the wrong side of a median is chance once in 32 times); that are tried
+# images with known displacement that suffice, that are required (all of five on the wrong side of a
+# median has a chance of 1 in 32), and that are tried
 MAX_TESTED, MIN_TESTED, MAX_TRIED = 24, 5, 96
-# distance of a reference's centre over that of the surfaces: an angle of about 6 deg between views
+# baseline over distance of the surfaces: an angle of about 6 deg between views
 _MIN_PARALLAX = 0.1
-# references that look the image's way, the nearest: all are asked what they may see of it, the best
-# also what they do see
+# candidate references: nearest ones whose overlap is bounded, and best ones whose overlap is
+# measured
 _NEAREST, _BEST = 200, 6
 _ASKED_POINTS = 300
-_MIN_SHARED = 0.1  # of the image, that a reference must see
-# of the finest level: alignments are solved to steps of 0.01 px and read pixels bilinearly, and
-# exact images move by up to 0.02 px, where the claims of large images are smaller still
+_MIN_SHARED = 0.1
+# pixels of the finest level: alignments converge to 0.01 px, and exact images move by up to 0.02 px
 _RESOLVED_PX = 0.05
 
 
 class ReferenceImages:
-    """Finds map images, by their ``cam_from_world``, that may show what a camera sees.
-
-    ``names`` are those of the images, sorted.
-    """
+    """Finder of map images, by their ``cam_from_world``, that may overlap with a camera."""
 
     def __init__(self, poses: Mapping[str, RigidTransform]) -> None:
         self.names = tuple(sorted(poses))
@@ -83,14 +68,14 @@ class ReferenceImages:
         max_angle_deg: float = 60.0,
         min_distance_m: float = 0.0,
     ) -> list[str]:
-        """Images that look a camera's way, nearest first; half of them, at least, of ``first``.
+        """Return images with a similar viewing direction, nearest first, half from ``first``.
 
         Parameters
         ----------
-        first : images that the pose comes from: they are known to match.
-        only_first : take no other images.
-        max_angle_deg : between the viewing directions; images beyond it stay out.
-        min_distance_m : of the centres; images within it stay out, unit of the map.
+        first : images that the pose comes from, which are known to match.
+        only_first : use no other images.
+        max_angle_deg : largest angle between viewing directions.
+        min_distance_m : least distance of the centres, unit of the map.
         """
         forward = cam_from_world.rotation_matrix()[2]
         facing = self._directions @ forward >= np.cos(np.deg2rad(max_angle_deg))
@@ -108,7 +93,7 @@ class ReferenceImages:
 
 @dataclass(frozen=True, eq=False)
 class RenderingQuery:
-    """The image whose pose is refined: RGB uint8 (H, W, 3); of the mask True means use."""
+    """An image to refine: RGB uint8 (H, W, 3), mask True = use."""
 
     image: NDArray[np.uint8]
     camera: Camera
@@ -117,10 +102,7 @@ class RenderingQuery:
 
 @dataclass(frozen=True, eq=False)
 class RenderingReference:
-    """An image of the map, as of :class:`RenderingQuery`, that is warped into the query.
-
-    ``depth`` was taken with it, maybe by another camera.
-    """
+    """A map image with depth, maybe of another camera, to warp into the query."""
 
     image: NDArray[np.uint8]
     camera: Camera
@@ -130,7 +112,7 @@ class RenderingReference:
 
 
 def reference_of(name: str, scene: RankingScene) -> RenderingReference | None:
-    """A map image as a reference; None where it has no depth; raises DataError."""
+    """Return a map image as a reference; None without depth."""
     depth = scene.map_depth(name)
     if depth is None:
         return None
@@ -140,8 +122,6 @@ def reference_of(name: str, scene: RankingScene) -> RenderingReference | None:
 
 @dataclass(frozen=True)
 class PyramidKind:
-    """Options of :func:`~.pyramid.build_pyramid`."""
-
     levels: int
     max_side_px: int
     appearance: Appearance
@@ -149,21 +129,16 @@ class PyramidKind:
 
 @dataclass(frozen=True, eq=False)
 class PreparedReference:
-    """A reference's pyramid, finest first, and its points in the world."""
-
     pyramid: list[Level]
     points: DepthPoints
 
 
 def prepared(reference: RenderingReference, kind: PyramidKind) -> PreparedReference:
-    """The result of :func:`prepare`, kept for the references used last."""
     return _prepared(_ByContent(_content(reference), reference), kind)
 
 
 @dataclass(frozen=True)
 class _ByContent:
-    """A reference that equals any other of the same content."""
-
     content: tuple[Any, ...]
     reference: RenderingReference = field(compare=False)
 
@@ -174,13 +149,12 @@ def _prepared(key: _ByContent, kind: PyramidKind) -> PreparedReference:
 
 
 def prepare(reference: RenderingReference, kind: PyramidKind) -> PreparedReference:
-    """Pyramid and points of a reference; raises DataError for what does not fit its camera."""
     points = lift_points(reference.camera, reference.cam_from_world, reference.depth)
     return PreparedReference(pyramid_of(reference, kind), points)
 
 
 def pyramid_of(view: RenderingQuery | RenderingReference, kind: PyramidKind) -> list[Level]:
-    """Levels of an image, finest first; raises DataError for what does not fit the camera."""
+    """Build the pyramid of an image, finest first."""
     image, camera = view.image, view.camera
     if image.shape != (camera.height, camera.width, 3):
         raise DataError(
@@ -190,7 +164,6 @@ def pyramid_of(view: RenderingQuery | RenderingReference, kind: PyramidKind) -> 
 
 
 def _content(reference: RenderingReference) -> tuple[Any, ...]:
-    """Key of a prepared reference: all that it depends on, arrays by their digest."""
     depth = reference.depth
     digest = hashlib.blake2b(digest_size=16)
     for array in (reference.image, depth.depth_m, reference.mask):
@@ -203,20 +176,19 @@ def _content(reference: RenderingReference) -> tuple[Any, ...]:
 
 @dataclass(frozen=True)
 class Displacement:
-    """Displacement by refinement of an image from a pose that should be right."""
+    """Displacement of an image by refinement from a presumably right pose."""
 
-    # moved_m, turned_deg: of the camera; unit of the map
     moved_m: float
     turned_deg: float
-    moved_px: float  # of what it shows (median), in pixels of the finest level that is compared
-    # claimed_m, claimed_deg: standard deviations by the covariance that refinement claims
+    moved_px: float
+    # claimed_m, claimed_deg: standard deviations by the claimed covariance
     claimed_m: float
     claimed_deg: float
-    squared_distance: float  # of the poses over that covariance; of six degrees of freedom
+    squared_distance: float  # of the poses by that covariance; six degrees of freedom
 
     @property
     def contradicts(self) -> bool:
-        """True if it is more than the claim explains, and than alignment resolves."""
+        """True if it exceeds the claimed uncertainty and the resolution of alignment."""
         return self.squared_distance > CHI2_OF_CHANCE and self.moved_px > _RESOLVED_PX
 
 
@@ -228,25 +200,20 @@ Displace = Callable[
 
 @dataclass(frozen=True)
 class Consistency:
-    """Consistency of a map by its held-out images."""
-
-    # images, contradicting: how many were tested, and of them contradict the map
     images: int
     contradicting: int
-    # medians of their displacements, each of its own; None where none was tested
+    # separate medians of their displacements; None without tests
     median: Displacement | None
-    reason: str  # why refinement cannot be trusted in this map; empty where it can
+    reason: str  # of inconsistency; empty if consistent
 
     @property
     def consistent(self) -> bool:
-        """True if refinement in this map is as accurate as it claims, as far as is known."""
+        """True unless the tests contradict the claimed accuracy."""
         return not self.reason
 
 
 @runtime_checkable
 class HoldsOut(Protocol):
-    """A pose refiner whose results are as good as the map is consistent."""
-
     name: str
     require_consistent_map: bool
     """If true, poses may be refined only in a map that was found consistent."""
@@ -254,16 +221,12 @@ class HoldsOut(Protocol):
     def hold_out(
         self, image: str, images: ReferenceImages, scene: RankingScene
     ) -> Displacement | None:
-        """Displacement of a map image; None where the others do not determine it."""
+        """Return the displacement of a map image; None where the others do not determine it."""
         ...
 
 
 def spread_names(names: Sequence[str]) -> list[str]:
-    """At most ``MAX_TRIED`` names, the first of which are spread evenly over all, as all are.
-
-    Names are taken in van der Corput's order of their ranks: neighbours in time or space, whose
-    names follow each other, come far apart.
-    """
+    """Return at most ``MAX_TRIED`` names in van der Corput's order: prefixes are spread evenly."""
     names = sorted(names)
     bits = max(len(names) - 1, 1).bit_length()
     order = (int(f"{k:0{bits}b}"[::-1], 2) for k in range(1 << bits))
@@ -271,10 +234,7 @@ def spread_names(names: Sequence[str]) -> list[str]:
 
 
 def judge_consistency(displacements: Iterable[Displacement | None]) -> Consistency:
-    """Judge a map by the displacements of :func:`refine_held_out` of :func:`spread_names`.
-
-    No more are asked for once ``MAX_TESTED`` are known.
-    """
+    """Judge a map by at most ``MAX_TESTED`` displacements of :func:`refine_held_out`."""
     known: list[Displacement] = []
     for each in displacements:
         if each is not None:
@@ -311,16 +271,15 @@ def refine_held_out(
     *,
     max_references: int,
 ) -> Displacement | None:
-    """Displacement of a map image from its given pose when it is refined against others.
+    """Refine a map image against others from its given pose and return the displacement.
 
-    None where the image has no depth, or the others do not determine its pose. Raises DataError for
-    an image or a depth map that cannot be read, or does not fit its camera.
+    None without depth, or where the others do not determine the pose.
 
     Parameters
     ----------
-    images : the map's, of one coordinate frame.
-    scene : has their pixels, cameras, poses and depth; nothing of queries is asked for.
-    max_references : those that see most of the image, from elsewhere.
+    images : of the map, in one coordinate frame.
+    scene : source of pixels, cameras, poses and depth; no query data is read.
+    max_references : the references with most overlap and another viewing angle.
     """
     view = reference_of(image, scene)
     if view is None:
@@ -336,7 +295,6 @@ def refine_held_out(
 def _references_elsewhere(
     view: RenderingReference, own: DepthPoints, images: ReferenceImages, scene: RankingScene
 ) -> list[RenderingReference]:
-    """Images that see the surfaces of another under another angle, those that see most first."""
     points = own.points[:: max(1, len(own.points) // _ASKED_POINTS)]
     if len(points) == 0:
         return []
@@ -344,7 +302,6 @@ def _references_elsewhere(
     near = images.near(
         view.cam_from_world, (), max_references=_NEAREST, min_distance_m=_MIN_PARALLAX * distance_m
     )
-    # a stable sort: of equals the nearest comes first
     best = sorted(near, key=lambda name: -_share_inside(points, name, scene))[:_BEST]
     found = [each for name in best if (each := reference_of(name, scene)) is not None]
     shared = [_share_seen(view, own, each) for each in found]
@@ -353,14 +310,12 @@ def _references_elsewhere(
 
 
 def _share_inside(points: NDArray[np.float64], name: str, scene: RankingScene) -> float:
-    """Share of points (N, 3) that a map image would show, were nothing in front of them."""
     camera, pose = scene.map_camera(name), scene.map_pose(name)
     ahead = points[pose.apply(points)[:, 2] > 0]
     return float(in_image(camera, project(camera, pose, ahead)).sum() / len(points))
 
 
 def _share_seen(view: RenderingReference, own: DepthPoints, other: RenderingReference) -> float:
-    """Share of an image in which another has points that the image's own surface does not hide."""
     points = lift_points(other.camera, other.cam_from_world, other.depth)
     seen = visibility([own, points], view.camera, view.cam_from_world).seen[1]
     free = DepthPoints(points.points[seen], points.px[seen])

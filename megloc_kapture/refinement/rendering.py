@@ -1,13 +1,8 @@
-"""Refinement of a pose by rendering: reference images are warped into the query by their depth.
+"""Pose refinement by rendering: reference images are warped into the query by their depth.
 
-The pose is the one under which they look like the query, up to a gain and a bias per reference
-(:mod:`megloc_kapture.refinement.photometric`). A result counts only where it is better than what
-there was (:mod:`megloc_kapture.refinement.acceptance`); otherwise the old pose stays, with the
-reason.
-
-Gradients lead to the right pose from a few pixels only, of a level on which the light of day and
-night has not changed what is seen; so the alignment begins at a coarse level, from several poses
-around the start that look much the same.
+:mod:`megloc_kapture.refinement.photometric` aligns them, and
+:mod:`megloc_kapture.refinement.acceptance` accepts or rejects the result. Alignment converges only
+from a few pixels, so it begins at a coarse level, from several perturbed poses.
 """
 
 from __future__ import annotations
@@ -53,13 +48,12 @@ from megloc_kapture.refinement.references import (
 )
 from megloc_kapture.values import Camera, RigidTransform
 
-# poses beside the start from which the alignment begins, and points of each
 _MAX_STARTS, _START_POINTS = 5, 2500
-# of a level: an alignment is done when it moves points by less, the last of all, the others
+# convergence in pixels of a level: at the finest level, and at the others
 _LAST_STEP_PX, _COARSE_STEP_PX = 0.01, 0.2
-# of a level, for each point that is chosen there; of a reference on coarse levels
+# pixels of a level per chosen point, and points of a reference on coarse levels
 _PX_PER_POINT, _COARSE_POINTS = 24, 3200
-# standard errors by which the cost falls where nobody need ask whether the start was as good
+# decrease of the cost, in standard errors, that needs no check of the start
 _CLEAR = 4.0
 
 
@@ -69,20 +63,18 @@ def refine_by_rendering(
     cam_from_world: RigidTransform,
     options: RenderingOptions | None = None,
 ) -> PoseRefinement:
-    """Refine the pose of an image by what reference images show, lifted by their depth.
+    """Refine the pose of an image by references lifted by their depth.
 
-    Returns the new pose with its covariance, or the old one and the reason. ``measures``: cost (of
-    the robust loss, 0 to 0.5), correlation and overlap before and after, by how many of its
-    standard errors the cost falls, how far the pose moved in m and deg, the points and references
-    used. Raises DataError for images, masks or depth maps that do not fit their cameras.
+    ``measures`` of the result: cost (robust loss, 0 to 0.5), correlation and overlap before and
+    after, decrease of the cost in standard errors, motion in m and deg, points and references.
 
     Parameters
     ----------
-    references : all of them are used; those that do not see the same cost time only.
+    references : all are used.
     cam_from_world : of the query, in the frame of the references' poses, metres.
     """
     options = options or RenderingOptions()
-    # what is independent goes to two threads; the order of results is that of the work
+    # independent work on two threads; results keep the order of the work
     with ThreadPoolExecutor(2) as threads:
         return _Refining(query, references, options, threads).refine(cam_from_world)
 
@@ -96,10 +88,10 @@ def judge_by_rendering(
     *,
     judged: NDArray[np.bool_] | None = None,
 ) -> PoseRefinement:
-    """Judge a pose that was found by other means, aligned at the finest level; raises as above.
+    """Judge a pose found by other means, after alignment at the finest level.
 
-    ``start`` and ``found``: the old ``cam_from_world`` and the one that may replace it; ``judged``:
-    bool (H, W), pixels of the query by which it is accepted or not; all unless given.
+    ``start`` and ``found``: old and new ``cam_from_world``; ``judged``: bool (H, W), pixels of the
+    query for acceptance, all by default.
     """
     with ThreadPoolExecutor(2) as threads:
         return _Refining(query, references, options, threads).judge(start, found, judged)
@@ -111,17 +103,16 @@ def displacement_by_rendering(
     cam_from_world: RigidTransform,
     options: RenderingOptions | None = None,
 ) -> Displacement | None:
-    """Displacement by :func:`refine_by_rendering` of a pose that should be right; raises as there.
+    """Return the displacement by :func:`refine_by_rendering` from a presumably right pose.
 
-    Where it keeps the pose, how far the least cost nearby is from it. None where the references do
-    not determine the pose: they cover too little, correlate too little, or lead out of its bounds.
+    For a rejected pose, the distance to the nearest minimum. None where overlap or correlation is
+    too small, or the minimum is out of bounds.
     """
     options = options or RenderingOptions()
     with ThreadPoolExecutor(2) as threads:
         refining = _Refining(query, references, options, threads)
         refined = refining.refine(cam_from_world)
         if not refined.accepted:
-            # the same at the finest level alone, without looking around
             refined = refining.judge(cam_from_world, cam_from_world, None)
     found = refined.measures
     if "squared_distance" not in found or (
@@ -134,8 +125,6 @@ def displacement_by_rendering(
 
 
 class _Refining:
-    """The pyramids and points of one query and its references."""
-
     def __init__(
         self,
         query: RenderingQuery,
@@ -154,7 +143,6 @@ class _Refining:
         self.points = [each.points for each in theirs]
 
     def refine(self, start: RigidTransform) -> PoseRefinement:
-        """See :func:`refine_by_rendering`."""
         sight, overlap = self._visibility(start)
         if overlap < self.least_overlap:
             return _uncovered(start, overlap)
@@ -163,7 +151,7 @@ class _Refining:
         clear = searched.accepted and searched.measures["significance"] >= _CLEAR
         if clear or coarsest == 0:
             return searched
-        # looking around may lead away from a pose that was nearly right
+        # perturbed starts may lead away from a pose that was nearly right
         direct = self._decide(start, overlap, self._align(0, start, sight))
         if not searched.accepted:
             return direct if direct.accepted else searched
@@ -172,7 +160,6 @@ class _Refining:
     def judge(
         self, start: RigidTransform, pose: RigidTransform, judged: NDArray[np.bool_] | None
     ) -> PoseRefinement:
-        """See :func:`judge_by_rendering`."""
         sight, overlap = self._visibility(pose)
         if overlap < self.least_overlap:
             return _uncovered(start, overlap)
@@ -182,7 +169,6 @@ class _Refining:
         return self._decide(start, overlap, found)
 
     def _visibility(self, pose: RigidTransform) -> tuple[Visibility, float]:
-        """Visibility of the references, and the share of the query's usable cells they cover."""
         sight = visibility(self.points, self.camera, pose)
         usable = usable_cells(self.query_levels[0].valid, sight.covered.shape)
         return sight, float((sight.covered & usable).sum() / max(usable.sum(), 1))
@@ -190,7 +176,6 @@ class _Refining:
     def _align_from_search(
         self, coarsest: int, start: RigidTransform, sight: Visibility
     ) -> Candidate | None:
-        """Coarse to fine, from the best of what is found around the start."""
         problem = self._problem(coarsest, start, sight)
         if len(problem.chosen.points) < MIN_POINTS:
             return None
@@ -200,19 +185,18 @@ class _Refining:
             if found is None:
                 break
             pose = found.alignment.cam_from_world
-            if number == coarsest - 1:  # later steps are too small to uncover anything
+            if number == coarsest - 1:  # later steps are too small to change visibility
                 sight = visibility(self.points, self.camera, pose)
             found = self._align(number, pose, sight)
         return found
 
     def _align(self, number: int, pose: RigidTransform, sight: Visibility) -> Candidate | None:
-        """The alignment of one level; None where there are too few points."""
         problem = self._problem(number, pose, sight)
         if len(problem.chosen.points) < MIN_POINTS:
             return None
         found = problem.nuisance_at(pose)
         for step_px in (_COARSE_STEP_PX, _COARSE_STEP_PX if number else _LAST_STEP_PX):
-            # what is in front of the scene shows the better the better the pose
+            # occlusion estimates improve with the pose
             unhidden = unoccluded_points(problem, found)
             free = problem.subset(unhidden) if unhidden.sum() >= MIN_POINTS else problem
             found = minimise(free, found, last_step_px=step_px, rounds=1 if number else 2)
@@ -226,10 +210,6 @@ class _Refining:
         return LevelProblem(chosen, level, self.camera, pose)
 
     def _best_perturbation(self, problem: LevelProblem, pose: RigidTransform) -> RigidTransform:
-        """The alignment that correlates best, from a pose and from others that look much the same.
-
-        The alignment may stop at any of these.
-        """
         fewer = problem.thinned(_START_POINTS)
         here = minimise(fewer, fewer.nuisance_at(pose), last_step_px=_COARSE_STEP_PX)
         starts = [here, *perturbed_starts(fewer, here)[:_MAX_STARTS]]
@@ -265,7 +245,6 @@ class Rendering:
     def hold_out(
         self, image: str, images: ReferenceImages, scene: RankingScene
     ) -> Displacement | None:
-        """Displacement of a map image; see :func:`~.references.refine_held_out`."""
         options = self.options.model_copy(update={"accept_always": False})
         displace = partial(displacement_by_rendering, options=options)
         return refine_held_out(
@@ -280,7 +259,7 @@ class Rendering:
         references: Sequence[str],
         scene: RankingScene,
     ) -> PoseRefinement:
-        """Refine the pose of a query by the best references that have depth."""
+        """Refine the pose of a query by its best references with depth."""
         used: list[RenderingReference] = []
         for name in references:
             if len(used) == self.options.max_references:

@@ -1,4 +1,4 @@
-"""Localization over HTTP: ``megloc serve``; needs the extra ``serve``."""
+"""Localization over HTTP, ``megloc serve``; needs the extra ``serve``."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from megloc_kapture.values import Options
 
 
 class Limits(Options):
-    """What a service accepts."""
-
     threads: int | None = Field(
         default=None, ge=1, description="Images that are localized at once; all cores unless given."
     )

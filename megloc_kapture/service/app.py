@@ -1,7 +1,7 @@
-"""The HTTP service: an image comes in, its pose goes out; see docs/serve.md.
+"""HTTP service that estimates the poses of uploaded images; see docs/serve.md.
 
-Errors are JSON, ``{"error": "..."}``. A client's mistake has a status of 400 to 499 and says what
-is wrong; an internal error is a 500 without details, which are in the log.
+Errors are JSON, ``{"error": "..."}``. Client errors have a status of 400 to 499 and a message; an
+internal error is a 500 whose details are only logged.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _PAGE_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src blob: data:; connect-src 'self'"
 )
-# a client that is still sending would not see the refusal, so this many times the limit is read
+# reading up to this multiple of the limit lets a sending client see the refusal
 _READ_BEYOND_LIMIT = 3
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _FORM = {
@@ -59,7 +59,7 @@ Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
 class CameraModel(BaseModel):
-    """A camera as COLMAP describes it; the centre of the first pixel is (0.5, 0.5)."""
+    """Camera in COLMAP's convention; the centre of the first pixel is (0.5, 0.5)."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
@@ -72,14 +72,14 @@ class CameraModel(BaseModel):
 
 
 class Transform(BaseModel):
-    """A rigid transform: x_cam = R x_world + t; axes as in COLMAP: x right, y down, z forward."""
+    """Rigid transform x_cam = R x_world + t; COLMAP's axes: x right, y down, z forward."""
 
     quat_wxyz: Annotated[list[float], Field(min_length=4, max_length=4)]
     translation: Vector = Field(description="in the unit of the map")
 
 
 class Answer(BaseModel):
-    """The result for an image: a pose, or the reason why there is none."""
+    """Result for an image: a pose, or the reason for its absence."""
 
     localized: bool
     reason: str | None = Field(description="why there is no pose")
@@ -102,11 +102,9 @@ class Answer(BaseModel):
 
     @classmethod
     def of(cls, result: Pose | Failure, camera: Camera, frame: str = "") -> Answer:
-        """The answer for a query with this camera; JSON writes numbers that are not finite as null.
+        """Return the answer for a query; non-finite numbers become null in JSON.
 
-        Parameters
-        ----------
-        frame : coordinate frame of the pose; "" where the map has only one.
+        ``frame`` is the pose's coordinate frame, "" if the map has only one.
         """
         pose = result if isinstance(result, Pose) else None
         used = camera if pose is None else pose.camera or camera
@@ -134,7 +132,6 @@ class Answer(BaseModel):
 
 
 def read_camera(text: str) -> Camera:
-    """Read a camera from JSON; raises DataError, which says what is wrong."""
     try:
         read = CameraModel.model_validate_json(text)
     except ValidationError as error:
@@ -145,10 +142,10 @@ def read_camera(text: str) -> Camera:
 
 
 def read_query(content: bytes, camera: str | None, *, max_megapixels: float) -> ImageQuery:
-    """Read the query in a request: the bytes of an image, and its camera as JSON.
+    """Read a query from an image file's bytes and a camera as JSON.
 
-    The header is read first, so that nothing larger than allowed is decoded. Raises HTTPException:
-    another format (415) or too many pixels (413); DataError: a broken image, or a wrong camera.
+    The header is checked before decoding. Raises HTTPException for another format (415) or too
+    many pixels (413), and DataError for a broken image or camera.
     """
     try:
         image = Image.open(BytesIO(content), formats=["JPEG", "PNG"])
@@ -182,12 +179,7 @@ def read_query(content: bytes, camera: str | None, *, max_megapixels: float) -> 
 
 
 class Service:
-    """A localizer behind limits; images are localized in threads, which share it.
-
-    Parameters
-    ----------
-    token : what clients have to send; None means no token.
-    """
+    """A localizer with limits, shared by worker threads; clients send ``token`` if given."""
 
     def __init__(self, localizer: Localizer, limits: Limits, token: str | None = None) -> None:
         self.localizer, self.limits, self._token = localizer, limits, token
@@ -196,7 +188,7 @@ class Service:
         self._pending = 0
 
     def check_token(self, request: Request) -> None:
-        """Refuse requests without the token, in a time that does not depend on what was sent."""
+        """Refuse requests without the token, in constant time."""
         if self._token is None:
             return
         kind, _, sent = request.headers.get("authorization", "").partition(" ")
@@ -207,7 +199,7 @@ class Service:
             )
 
     async def answer(self, request: Request, camera: str | None) -> Answer:
-        """Localize the image in a request as soon as a thread is free."""
+        """Localize the image in a request when a thread is free."""
         content, camera_in_form = await self._image_in(request)
         if self._pending >= self._num_threads + self.limits.max_waiting:
             raise HTTPException(503, "too many images are waiting", {"retry-after": "2"})
@@ -225,13 +217,12 @@ class Service:
             result = self.localizer.localize_query(query)
         except (DataError, OptionError) as error:
             if isinstance(error, DataError) and error.path is not None:
-                raise  # a file of the map is broken
+                raise  # a map file is broken
             raise HTTPException(422, str(error)) from error
         frame = self.localizer.map.restrictions.frame(result.candidates[0]) if result else ""
         return Answer.of(result, query.camera, frame)
 
     async def _image_in(self, request: Request) -> tuple[bytes, str | None]:
-        """The bytes of the image, and the camera if the request is a form."""
         body = await self._read_body(request)
         kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         if kind in ("image/jpeg", "image/png", "application/octet-stream", ""):
@@ -272,12 +263,7 @@ class Service:
 
 
 def make_app(service: Service, overview: bytes) -> FastAPI:
-    """The application.
-
-    Parameters
-    ----------
-    overview : the map from above as JSON; see :mod:`megloc_kapture.service.server`.
-    """
+    """Return the application; ``overview`` is the map as JSON, see :func:`.server.map_overview`."""
     app = FastAPI(title="megloc", description="Where was this photograph taken? Poses in one map.")
     protected = [Depends(service.check_token)]
 
@@ -319,7 +305,7 @@ def make_app(service: Service, overview: bytes) -> FastAPI:
 
     @app.exception_handler(ClientDisconnect)
     async def leave(_: Request, __: ClientDisconnect) -> Response:
-        return Response(status_code=400)  # nobody reads it, and it is no internal error
+        return Response(status_code=400)  # the client has disconnected
 
     @app.exception_handler(Exception)
     async def fail(_: Request, __: Exception) -> Response:

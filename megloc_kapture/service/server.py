@@ -1,4 +1,4 @@
-"""Run the service: load what it needs, listen, and show the map from above."""
+"""Start of the service: load the networks, listen, and draw the map from above."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import Camera
 
 _MAX_POINTS, _MAX_CAMERAS = 15_000, 3_000
-_SHUTDOWN_S = 60  # for running requests to finish; slow uploads are cut off then
+_SHUTDOWN_S = 60  # lets running requests finish; slow uploads are cut off then
 
 
 def prepared_localizer(kapture_map: KaptureMap, options: PipelineOptions) -> Localizer:
-    """A localizer that has loaded its networks, so that what is missing is found at the start."""
+    """Return a localizer with loaded networks, so that missing files fail at the start."""
     localizer = Localizer(kapture_map, options=options)
     kapture_map.check()
     for local in localizer.types:
         _ = local.extractor
-    # noise matches nothing, but passes through every step
+    # noise matches nothing, but exercises every step
     noise = np.random.default_rng(0).integers(0, 255, (240, 320, 3), np.uint8)
     with single_threaded():
         localizer.localize(noise, Camera.pinhole(320, 240, 300.0))
@@ -39,7 +39,7 @@ def prepared_localizer(kapture_map: KaptureMap, options: PipelineOptions) -> Loc
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """A listening socket; port 0 means a free one. Raises OptionError."""
+    """Return a listening socket; port 0 picks a free port."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family)
@@ -55,12 +55,7 @@ def serve(
     token: str | None = None,
     log_requests: bool = False,
 ) -> None:
-    """Serve until SIGTERM or SIGINT; running requests are finished, then the signal takes effect.
-
-    Parameters
-    ----------
-    bound : the socket of :func:`bind`.
-    """
+    """Serve until SIGTERM or SIGINT, which takes effect after running requests have finished."""
     logging.getLogger("uvicorn").setLevel(logging.ERROR)
     cv2.setNumThreads(1)  # the threads are for images
     app = make_app(Service(localizer, limits, token), map_overview(localizer.map))
@@ -77,12 +72,11 @@ def serve(
 
 
 def map_overview(kapture_map: KaptureMap) -> bytes:
-    """The map from above as JSON.
+    """Return the map from above as JSON.
 
     ``right`` and ``up`` are unit vectors of the world, ``origin`` a point in it; ``points``
-    [x, y, ...] and ``cameras`` [x, y, direction x, direction y, ...] are relative to these.
-    ``images`` counts the map's images, ``unit`` is ``m`` or ``units``. Many points and cameras are
-    sampled.
+    [x, y, ...] and ``cameras`` [x, y, direction x, direction y, ...] are relative to these and
+    subsampled if many. ``images`` counts the map's images, ``unit`` is ``m`` or ``units``.
     """
     from megloc_kapture.evaluation.report.map_view import top_view  # imports matplotlib
 

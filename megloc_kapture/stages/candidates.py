@@ -1,4 +1,4 @@
-"""Stage: which map images resemble a query most, by one or several global features."""
+"""Stage: retrieval of map images by one or several global features."""
 
 from __future__ import annotations
 
@@ -31,13 +31,10 @@ from megloc_kapture.values import Options
 
 @dataclass(frozen=True, eq=False)
 class Restrictions:
-    """Priors of the queries, and the coordinate frames of the map's images.
+    """Priors of the queries, and the coordinate frames of the map images.
 
-    Parameters
-    ----------
-    groups : image -> its group; of the map's images, frame and location count.
-    priors : query -> names of map images, locations or frames it may be matched with. A query
-        that is not in it may be matched with everything.
+    ``groups`` has each image's group. ``priors`` has the permitted map images, locations or frames
+    of each query; others are unrestricted.
     """
 
     groups: Mapping[str, ImageGroup] = field(default_factory=dict)
@@ -45,16 +42,16 @@ class Restrictions:
 
     @classmethod
     def read(cls, side_tables: Path) -> Restrictions:
-        """From a workspace's ``megloc/`` folder; absent tables restrict nothing."""
+        """Read from a workspace's ``megloc/`` folder; missing tables restrict nothing."""
         return cls(read_groups(side_tables), read_priors(side_tables))
 
     def frame(self, image: str) -> str:
-        """The coordinate frame of a map image; ``""`` where there is only one."""
+        """Return the coordinate frame of a map image; ``""`` if there is only one."""
         group = self.groups.get(image)
         return "" if group is None else group.frame
 
     def frames(self, images: Sequence[str]) -> list[NDArray[np.int64]]:
-        """Positions in ``images`` by frame, frames in order of their names."""
+        """Return indices into ``images`` by frame, frames sorted by name."""
         members: dict[str, list[int]] = {}
         for position, image in enumerate(images):
             members.setdefault(self.frame(image), []).append(position)
@@ -63,10 +60,9 @@ class Restrictions:
     def pools(
         self, queries: Sequence[str], images: Sequence[str]
     ) -> Iterator[tuple[list[int], NDArray[np.int64]]]:
-        """Queries that may be matched with the same images, and these images.
+        """Group queries by permitted images.
 
-        Yields positions in ``queries``, and sorted positions in ``images``, int64 (M,); every query
-        once. M is 0 where nothing of what a prior permits is in the map.
+        Yield indices into ``queries`` and sorted indices into ``images``, int64 (M,); M may be 0.
         """
         together: dict[tuple[str, ...] | None, list[int]] = {}
         for position, query in enumerate(queries):
@@ -93,13 +89,11 @@ UNRESTRICTED = Restrictions()
 
 
 Vectors = KaptureVectors | NDArray[np.float32]  # unit rows
-_QUERY_ELEMENTS = 1 << 27  # of query vectors held at once: 512 MiB of float32
-_ROWS = 1 << 14  # of a database at most that a worker searches at once
+_QUERY_ELEMENTS = 1 << 27  # query vector elements in memory: 512 MiB of float32
+_ROWS = 1 << 14  # maximum number of database rows per worker task
 
 
 class QueryPairsOptions(Options):
-    """How a query's candidates among the map's images are chosen."""
-
     by: Literal["retrieval", "exhaustive"] = Field(
         default="retrieval", description="the most similar map images, or all"
     )
@@ -108,20 +102,13 @@ class QueryPairsOptions(Options):
 
 @dataclass(frozen=True)
 class Retrieval:
-    """Global features that are compared, and how they are fused.
-
-    Attributes
-    ----------
-    types : kapture type names.
-    weights : of the types in fusion; all equal where empty.
-    """
+    """Global features, by kapture type name, and their fusion weights; equal if empty."""
 
     types: tuple[str, ...]
     weights: tuple[float, ...] = ()
     fusion: FusionOptions = field(default_factory=FusionOptions)
 
     def readers(self, folder: KaptureFolder) -> list[FeatureReader]:
-        """Readers of a folder's vectors, by type."""
         return [folder.global_features(name) for name in self.types]
 
     def rank(
@@ -132,13 +119,9 @@ class Retrieval:
         *,
         work: Work = HERE,
     ) -> Found:
-        """The most similar rows of the database: indices and scores (Q, at most ``top_k``).
+        """Find the most similar database rows: indices and scores (Q, at most ``top_k``).
 
-        The database is searched in parts, which the workers share.
-
-        Parameters
-        ----------
-        queries, database : of each type, unit rows; neither is held in memory as a whole.
+        ``queries`` and ``database`` hold unit rows by type, read in parts.
         """
         search = FusedSearch(top_k, self.fusion, self.weights or None)
         asked = [as_blocks(source) for source in queries]
@@ -155,7 +138,7 @@ def _part(source: Vectors, start: int, stop: int) -> VectorBlocks:
     return as_blocks(rows)
 
 
-_Part = tuple[int, Sequence[VectorBlocks]]  # of a database: the row it begins at, and it by type
+_Part = tuple[int, Sequence[VectorBlocks]]  # database part: first row, and vectors by type
 
 
 def _search_part(search: FusedSearch, queries: Sequence[VectorBlocks], part: _Part) -> list[Found]:
@@ -174,7 +157,7 @@ def _search_part(search: FusedSearch, queries: Sequence[VectorBlocks], part: _Pa
 
 
 def vectors_of(readers: Sequence[FeatureReader], images: Sequence[str]) -> list[KaptureVectors]:
-    """Vectors of the images by type, unit rows, read when they are asked for."""
+    """Return lazily read unit vectors of the images by type."""
     for reader in readers:
         missing = [image for image in images if image not in reader]
         if missing:
@@ -186,10 +169,7 @@ def vectors_of(readers: Sequence[FeatureReader], images: Sequence[str]) -> list[
 
 
 class Candidates:
-    """Ranks the images of a map.
-
-    ``database`` gives vectors of the images at some positions, by type.
-    """
+    """Retrieval of map images; ``database`` returns vectors by image index, for each type."""
 
     def __init__(
         self,
@@ -205,12 +185,12 @@ class Candidates:
         options: QueryPairsOptions,
         work: Work = HERE,
     ) -> Found:
-        """Positions of the most similar images, best first, and scores: (Q, K), -1 for none.
+        """Return indices of the most similar images, best first, and scores: (Q, K), -1 for none.
 
         Parameters
         ----------
         queries : vectors (Q, D) by type, unit rows.
-        permitted : sorted positions of the images that these queries may have.
+        permitted : sorted indices of the permitted images.
         """
         database = self._database(permitted)
         index, scores = self._retrieval.rank(queries, database, options.top_k, work=work)

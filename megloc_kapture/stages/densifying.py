@@ -1,7 +1,6 @@
-"""Stage: depth of map images without a depth sensor, by multi-view stereo.
+"""Stage: multi-view stereo depth of map images without a depth sensor.
 
-The map that is written is the one that is read, with depth beside its images; how it lies there:
-:mod:`.stereo_depth`. Images that have depth keep theirs.
+The output is the input map with added depth, in the layout of :mod:`.stereo_depth`.
 """
 
 from __future__ import annotations
@@ -61,19 +60,19 @@ from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Camera, Options
 
 _NO_POINTS = np.zeros(0, np.int64)
-_ANCHOR_VIEWS = 2  # that agree with a keypoint's depth, for it to be lifted
-# of keypoints where poses are exact, in pixels of the image; more is laid to the poses
+_ANCHOR_VIEWS = 2  # that must agree with a keypoint's depth before it is lifted
+# keypoint noise in image pixels under exact poses; excess is attributed to the poses
 _KEYPOINT_ERROR_PX = 0.3
-# median error by the poses, in pixels of the depth maps, that images are reduced to; multiples of
-# it that views may differ by; and the deviation between two views, both of which err, when points
-# of three views have taken up half of the variance, for a median of distances in a plane
+# target median pose error in depth-map pixels; tolerated difference of views, in multiples of
+# it; deviation between two noisy views per median planar distance, after the points of three
+# views have absorbed half of the variance
 _ERROR_PX, _DIFFERENCE, _DEVIATION = 0.5, 5.0, 2 / 1.1774
 
 Floats = NDArray[np.float64]
 
 
 class DensifyOptions(Options):
-    """Depth by multi-view stereo; defaults: docs/experiments/mvs.md."""
+    """Multi-view stereo options; defaults: docs/experiments/mvs.md."""
 
     mode: Literal["off", "depth", "points"] = Field(
         default="off",
@@ -90,7 +89,6 @@ class DensifyOptions(Options):
     agreement: AgreementOptions = AgreementOptions()
 
     def make_estimator(self) -> DepthEstimator:
-        """The estimator; raises PluginError, MissingWeightsError."""
         found: DepthEstimator = load_plugin(
             DEPTH_ESTIMATORS, self.estimator.name, self.estimator.options
         )
@@ -99,8 +97,6 @@ class DensifyOptions(Options):
 
 @dataclass(frozen=True)
 class _Job:
-    """One image, those it is compared with, and where their depth lies meanwhile."""
-
     folder: FolderSpec
     scratch: Path
     out: Path
@@ -110,7 +106,6 @@ class _Job:
     options: DensifyOptions
     error_px: float
     estimator: DepthEstimator
-    # keypoints that have a point, by type; empty where none is lifted
     seen: Mapping[str, NDArray[np.int32]]
 
 
@@ -124,18 +119,11 @@ def densify_map(
     link_features: bool = False,
     work: Work = HERE,
 ) -> dict[str, float]:
-    """Write a map with depth of its images; returns counts for the log.
+    """Write a map with stereo depth of its images; return counts for the log.
 
-    Parameters
-    ----------
-    estimator : that of the options unless given.
-    restrictions : images are compared within a frame, location and condition only.
-    link_features : as of :func:`~megloc_kapture.stages.map_refinement.refine_map`.
-
-    Raises
-    ------
-    DataError : no map, or one that cannot be densified; names the file.
-    PluginError, MissingWeightsError : the estimator cannot be made.
+    Images are only compared within a frame, location and condition. ``estimator`` overrides the one
+    in the options. ``link_features`` is as in
+    :func:`~megloc_kapture.stages.map_refinement.refine_map`.
     """
     estimator = estimator or options.make_estimator()
     data = source.read()
@@ -189,13 +177,11 @@ def _check(source: KaptureFolder, data: KaptureData) -> None:
 
 
 def fitted_to_poses(source: KaptureFolder, options: DensifyOptions) -> tuple[DensifyOptions, float]:
-    """Options for poses as accurate as a map's, and the error that remains.
+    """Adapt options to the pose error: the median reprojection error beyond keypoint noise.
 
-    The median distance between observations and their points tells how far poses can be trusted.
-    Where it is more than half a pixel of the depth maps, beyond what keypoints err by, images are
-    reduced until it is that, as no view could confirm finer detail, and compared with more sources
-    in proportion; views may differ by five times that median. Returns options, and the median error
-    in pixels of the depth maps, 0 where the map does not tell it.
+    Images are reduced until it is at most half a pixel, as no view could confirm finer detail, and
+    compared with proportionally more sources. Views may differ by five times the error. Return the
+    options and the error in depth-map pixels, 0 if unknown.
     """
     indices = [index_map(source, local_type) for local_type in source.observations()]
     angles = [with_noise(source, index).noise_rad for index in indices]
@@ -229,7 +215,6 @@ def _plan(
     estimator: DepthEstimator,
     restrictions: Restrictions,
 ) -> tuple[list[_Job], list[DepthRow]]:
-    """What is worked on, and a row for every image with a pose; reasons of those left out."""
     data, xyz = source.read(), source.points3d()[:, :3]
     poses = data.poses()
     images = list(poses)
@@ -290,16 +275,15 @@ def _session(restrictions: Restrictions, image: str) -> tuple[str, str, str]:
 
 @lru_cache(maxsize=12)
 def _view(folder: KaptureFolder, image: str, max_size_px: int) -> StereoView:
-    """An image and its neighbours are looked at one after another: each is read once or twice."""
     data = folder.read()
     pixels, mask = read_frame(folder, image)
     pose = data.cam_from_world(image)
-    assert pose is not None  # who has none is not looked at
+    assert pose is not None
     return stereo_view(pixels, data.camera_of(image), pose, mask, max_size_px)
 
 
 def _estimate(job: _Job) -> str:
-    """Estimate one image's depth into the scratch folder; why there is none, else empty."""
+    """Estimate one image's depth into the scratch folder; return why it failed, or ""."""
     folder, size = job.folder.open(), job.options.max_size_px
     try:
         views = [_view(folder, image, size) for image in (job.image, *job.sources)]
@@ -313,7 +297,7 @@ def _estimate(job: _Job) -> str:
 
 
 def _confirm(job: _Job) -> tuple[float, dict[str, LiftedPoints]]:
-    """Write what the sources confirm of an image's depth; the share of it, and lifted points."""
+    """Write the depth that the sources confirm; return its share and the lifted points."""
     folder, size = job.folder.open(), job.options.max_size_px
     view = _view(folder, job.image, size)
     names = ("depth", "sigma", "normals")

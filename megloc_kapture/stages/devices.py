@@ -1,8 +1,6 @@
-"""Where networks compute, and how many items they get at once.
+"""Devices and batch sizes of networks.
 
-The option ``device`` of a plugin says where. On a processor it gets one item at a time: a batch
-gains nothing there, and would change last bits. On a GPU it gets several; the batch is halved when
-memory runs out.
+On the CPU batches gain nothing and would change last bits.
 """
 
 from __future__ import annotations
@@ -21,21 +19,20 @@ Result = TypeVar("Result")
 Value = TypeVar("Value")
 Precision = Literal["full", "half"]
 
-BATCH = 8  # items of a plugin that takes several and does not say where it computes
+BATCH = 8  # for batch plugins without a device option
 MOST_AT_ONCE = {"cpu": 1, "cuda": 16}
 
 
 class DeviceMemoryError(MeglocError):
-    """There is no memory for a single image or pair."""
+    """Out of memory for a single image or pair."""
 
 
 def on_gpu(plugin: object) -> bool:
-    """Return whether a plugin computes on a GPU."""
     return _device_of(plugin) not in (None, "cpu")
 
 
 def most_at_once(plugin: object, many: str) -> int:
-    """Return how many items a plugin gets at once; one without the method ``many`` gets one."""
+    """Return the batch size of a plugin; 1 without the batch method ``many``."""
     if not hasattr(plugin, many):
         return 1
     device = _device_of(plugin)
@@ -43,7 +40,7 @@ def most_at_once(plugin: object, many: str) -> int:
 
 
 def _device_of(plugin: object) -> str | None:
-    """Return cpu, cuda or cuda:N; None where the plugin names none."""
+    """Return cpu, cuda or cuda:N; None if unspecified."""
     wanted = getattr(getattr(plugin, "options", None), "device", None)
     if wanted is None or wanted == "cpu":
         return wanted
@@ -52,7 +49,7 @@ def _device_of(plugin: object) -> str | None:
     return str(pick_device(wanted))
 
 
-_limits: dict[tuple[str, str, str], int] = {}  # batch sizes of plugins that ran out of memory
+_limits: dict[tuple[str, str, str], int] = {}  # batch sizes after running out of memory
 
 
 def in_batches(
@@ -63,10 +60,9 @@ def in_batches(
     *,
     name: Callable[[int], str],
 ) -> list[Result]:
-    """Return the results of items, of several at once; the batch is halved when memory runs out.
+    """Run a plugin on items in batches, halved when memory runs out.
 
-    ``many`` is the plugin's method that takes several; ``run`` takes one item or several. Raises
-    DeviceMemoryError: there is no memory for one item.
+    Raise DeviceMemoryError if one item does not fit.
     """
     key = type(plugin).__qualname__, many, repr(getattr(plugin, "options", None))
     found: list[Result] = []
@@ -94,17 +90,14 @@ def in_batches(
 
 def _is_out_of_memory(error: RuntimeError) -> bool:
     torch: Any = sys.modules.get("torch")
-    # of a processor torch raises a plain error
+    # on the CPU torch raises a plain RuntimeError
     return torch is not None and (
         isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
     )
 
 
 def with_device(value: Value, device: Device, precision: Precision) -> Value:
-    """Return options, or a tuple of them, whose networks compute on a device.
-
-    Networks whose options name a device or precision keep it.
-    """
+    """Return options with device and precision set for the networks that name none."""
     wanted: dict[str, Any] = {"device": device} if device != "auto" else {}
     wanted |= {"half_precision": True} if precision != "full" else {}
     given: Any = value
@@ -116,7 +109,6 @@ def with_device(value: Value, device: Device, precision: Precision) -> Value:
 
 
 def _filled(tree: Any, wanted: dict[str, Any]) -> Any:
-    """Fill in options of all plugins in nested tables that have them and do not set them."""
     if isinstance(tree, list | tuple):
         return [_filled(one, wanted) for one in tree]
     if not isinstance(tree, dict):

@@ -1,8 +1,7 @@
-"""Features of map images: of the map a dataset comes with, and as maps take them over.
+"""Features of map images: reuse of a prebuilt map's features, and copies into new maps.
 
-A published model names the keypoints that see its points; to match queries with them they need
-descriptors. Where these are published (a COLMAP database) they are taken as they are. Where not,
-the images' features are extracted again, and the observations move to those at the same places.
+Without published descriptors, features are extracted again and the observations are transferred to
+the keypoints at the same positions.
 """
 
 from __future__ import annotations
@@ -29,15 +28,14 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.io.kapture.features import SUFFIX, ArrayKind
 from megloc_kapture.stages.stage import FEATURES, MAP, REFERENCE, PipelineStage, StageWork
 
-# other implementations of a detector differ by some tenths of a pixel; by chance few are so near
+# detector implementations differ by some tenths of a pixel
 _MAX_SHIFT_PX = 1.0
 _MIN_FOUND_AGAIN = 0.5
-# a keypoint that is found again is found at the same place but for rounding
+# identical keypoints only differ by rounding
 _SAME_PLACE_PX = 0.1
 
 
 def given_type(reference: KaptureFolder) -> str:
-    """The keypoints type of a given map."""
     if not reference.has_points():
         raise DataError(
             "no given map: reconstruction/points3d.txt or observations.txt is missing "
@@ -54,7 +52,6 @@ def given_type(reference: KaptureFolder) -> str:
 
 
 def check_given_type(reference: KaptureFolder, expected: str) -> None:
-    """Check that a given map is of the keypoints type that is extracted for it."""
     found = given_type(reference)
     if found != expected:
         raise DataError(
@@ -64,9 +61,7 @@ def check_given_type(reference: KaptureFolder, expected: str) -> None:
 
 
 def has_descriptors(reference: KaptureFolder) -> bool:
-    """Whether every image that sees a point of a given map has descriptors; else the images'
-    features have to be extracted anew for :func:`given_map`.
-    """
+    """Return whether every image that observes points has descriptors."""
     local_type = given_type(reference)
     if local_type not in reference.types("descriptors"):
         return False
@@ -75,25 +70,15 @@ def has_descriptors(reference: KaptureFolder) -> bool:
 
 
 def given_map(reference: KaptureFolder, mapping: KaptureFolder, output: Path) -> dict[str, float]:
-    """Write a given map as the map to localize in: features, points and observations.
+    """Write a prebuilt map as the map to localize in; return counts for the log.
 
-    Features that are extracted again are those that see points, as the published model names them.
-    Points that nothing observes any more are left out.
-
-    Parameters
-    ----------
-    reference : the given map.
-    mapping : its images with what was extracted from them: global features, and local features of
-        the map's type where :func:`has_descriptors` says no.
-
-    Returns
-    -------
-    Counts for the log; ``share_found_again`` is the share of the observations whose keypoints were.
+    ``mapping`` has extracted global features, and local features unless :func:`has_descriptors`.
+    Of these only keypoints that see points are kept; points without observations are dropped.
     """
     local_type = given_type(reference)
     seen = reference.observations()[local_type]
     found_again = 1.0
-    # what is the reference's own comes first
+    # the reference's features take precedence
     source = reference.with_features(mapping.features_dirs)
     if not has_descriptors(reference):
         moved, rows, num_found = _moved(reference, mapping, seen)
@@ -113,7 +98,7 @@ def given_map(reference: KaptureFolder, mapping: KaptureFolder, output: Path) ->
     number = np.cumsum(kept) - 1
     write_sensors(output, reference.read())
     link_images(reference.root, output)
-    copy_features(source, output, [local_type])  # leaves what is there as it is
+    copy_features(source, output, [local_type])
     write_points3d(output, xyz_rgb[kept])
     write_observations(output, {local_type: replace(seen, point_ids=number[seen.point_ids])})
     return {
@@ -125,19 +110,15 @@ def given_map(reference: KaptureFolder, mapping: KaptureFolder, output: Path) ->
 
 
 def _observing(seen: Observations) -> list[str]:
-    """Names of the images that observe something, sorted."""
     return [seen.image_names[row] for row in np.unique(seen.image_ids).tolist()]
 
 
 def _moved(
     reference: KaptureFolder, mapping: KaptureFolder, seen: Observations
 ) -> tuple[Observations, dict[str, NDArray[np.int64]], int]:
-    """Move the observations to the keypoints extracted again.
+    """Transfer observations to all extracted keypoints at the same position (one per orientation).
 
-    An observation whose place has several keypoints (one per orientation) becomes one of each: any
-    may be the one that was matched, and all see the point. Returns the observations, whose
-    ``keypoint_ids`` count in an image's rows; image -> these rows of its extracted features that
-    see points, ascending; and how many of the stored ones were found.
+    Return observations that index the kept rows, these rows by image, and the transferred number.
     """
     local_type = seen.keypoints_type
     if local_type not in mapping.types("descriptors"):
@@ -157,7 +138,7 @@ def _moved(
             continue
         places = stored.read(image)[seen.keypoint_ids[rows], :2]
         of, keypoints = rows_at_their_places(places, extracted.read(image)[:, :2], _MAX_SHIFT_PX)
-        # two stored keypoints of one place that see one point are the same twice
+        # stored keypoints at one position that see one point are duplicates
         pairs = np.unique(np.stack([seen.point_ids[rows[of]], keypoints], axis=1), axis=0)
         num_found += len(np.unique(of))
         rows_of[image], numbers = np.unique(pairs[:, 1], return_inverse=True)
@@ -178,7 +159,6 @@ def _moved(
 def _write_rows(
     mapping: KaptureFolder, local_type: str, rows: dict[str, NDArray[np.int64]], output: Path
 ) -> None:
-    """Write some of the features of the images with a pose, none where ``rows`` has no entry."""
     none = np.zeros(0, np.int64)
     for reader in (mapping.keypoints(local_type), mapping.descriptors(local_type)):
         with FeatureWriter(output, reader.kind, local_type, reader.config) as writer:
@@ -189,10 +169,10 @@ def _write_rows(
 def rows_found_again(
     stored: NDArray[np.float32], extracted: NDArray[np.float32]
 ) -> NDArray[np.int64]:
-    """Row of ``extracted`` (M, 2) for each row of ``stored`` (N, 2), -1 where there is none.
+    """Return the row of ``extracted`` (M, 2) for each row of ``stored`` (N, 2), or -1.
 
-    Each row of ``extracted`` is taken once. Several keypoints may stand at one place with different
-    orientations; they are joined in the order both have them.
+    Each extracted row is used once. Keypoints at one position with different orientations are
+    assigned in order.
     """
     if len(stored) == len(extracted) and np.allclose(stored, extracted, atol=1e-3):
         return np.arange(len(stored), dtype=np.int64)
@@ -210,18 +190,10 @@ def rows_found_again(
 def rows_at_their_places(
     stored: NDArray[np.float32], extracted: NDArray[np.float32], max_shift_px: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """All keypoints that stand where the stored ones do: one of ``stored`` may be any of them.
+    """Return all pairs of stored (N, 2) and extracted (M, 2) keypoints at the same position.
 
-    The place of a stored keypoint is that of the nearest extracted one.
-
-    Parameters
-    ----------
-    stored, extracted : float32 (N, 2) and (M, 2), pixels.
-    max_shift_px : how far the nearest may be.
-
-    Returns
-    -------
-    Rows of ``stored`` and of ``extracted``, int64 (K,) each, sorted by the first, then the second.
+    The position of a stored keypoint is that of the nearest extracted one within ``max_shift_px``.
+    Return rows of both, int64 (K,) each, sorted by the first, then the second.
     """
     none = np.zeros(0, dtype=np.int64)
     if len(stored) == 0 or len(extracted) == 0:
@@ -235,24 +207,20 @@ def rows_at_their_places(
 
 
 def is_given(stage: PipelineStage, local_type: str) -> bool:
-    """Whether points of a keypoints type are those of the given map."""
     options = stage.options
     return options.uses_given_map() and local_type == options.make_given_extractor().name
 
 
 def described_images(work: StageWork, stage: PipelineStage, local_type: str) -> KaptureFolder:
-    """The map's images with their features of a type, before there is a map."""
-    # descriptors of its own: those that were extracted for it lie in the workspace
+    """Open the map images with features of a type, before the map is made."""
+    # otherwise the extracted descriptors are in the workspace
     if is_given(stage, local_type) and has_descriptors(work.folder(REFERENCE)):
         return work.folder(REFERENCE, FEATURES)
     return work.folder(stage.layout.mapping(), FEATURES)
 
 
 def matched_images(work: StageWork, stage: PipelineStage, local_type: str) -> KaptureFolder:
-    """The map's images with the features of a type that queries are matched with.
-
-    A given map has keypoints of its own, which are not all that its images' extraction gives.
-    """
+    """Open the map images with the features that queries are matched with."""
     if is_given(stage, local_type):
         return work.folder(MAP)
     return work.folder(stage.layout.mapping(), FEATURES, *stage.layout.mapping_matches())
@@ -276,14 +244,10 @@ def copy_features(
     *,
     link_own: bool = False,
 ) -> None:
-    """Put the map images' features of ``source`` into the kapture at ``output``; what is there
-    stays.
+    """Add features of the map images to the kapture at ``output`` without overwriting.
 
-    Files of features folders are hard links where the file system has them: a map then stands alone
-    and takes no space twice. The kapture's own features, which come first as everywhere, are
-    somebody's data and copied, unless ``link_own`` says that they are ours; what comes out of a tar
-    is copied. ``local_types``: all types of local features unless given; of global features all are
-    copied.
+    Files are hard links where possible. The source's internal features are user data and copied,
+    unless ``link_own``. ``local_types`` does not restrict global features.
     """
     wanted = None if local_types is None else set(local_types)
     for kind in _KINDS:
@@ -308,7 +272,7 @@ def _copy_type(
         beside.append(found.parent)
         for image in images:
             file, copy = found / f"{image}{suffix}", copies / f"{image}{suffix}"
-            if image not in kept and file.is_file() and not copy.exists():  # the first has it
+            if image not in kept and file.is_file() and not copy.exists():
                 hard_link(file, copy)
     if kind == "global_features":
         for folder, name in product(beside, _VLAD_FILES):

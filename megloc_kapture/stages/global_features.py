@@ -1,4 +1,4 @@
-"""Stage: a vector of every image, of VLAD trained on the map or of an image network."""
+"""Stage: global features of every image, by VLAD trained on the map or by an image network."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ from megloc_kapture.values import Camera, Options
 
 
 class VladSettings(Options):
-    """What ``vlad.json`` says: how the vectors beside it were made."""
+    """``vlad.json``: settings of the stored VLAD vectors."""
 
     local_type: str
     options: VladOptions
@@ -59,14 +59,12 @@ def _descriptors(folder: FolderSpec, local_type: str, image: str) -> NDArray[Any
 
 
 def vlad_type(local_type: str) -> str:
-    """The kapture type name of VLAD over a local type."""
     return f"vlad_{local_type}"
 
 
 def train_on_map(
     mapping: KaptureFolder, local_type: str, options: VladOptions, *, work: Work = HERE
 ) -> Vocabulary:
-    """Train on the descriptors of the map's images."""
     images = mapping.read().image_names()
     descriptors = mapping.descriptors(local_type)
     if not any(descriptors.length(image) for image in images):
@@ -85,11 +83,7 @@ def extract_vlad(
     *,
     work: Work = HERE,
 ) -> dict[str, int]:
-    """Train on ``mapping``, aggregate for all images of the folders, write to ``output``.
-
-    The descriptors are read from the folders and their features folders. Returns counts for the
-    log: images, clusters, dimensions.
-    """
+    """Train VLAD on ``mapping`` and write vectors of all images; return counts for the log."""
     type_name = vlad_type(local_type)
     place = output / "global_features" / type_name
     trained = work.items(f"vocabulary of {type_name}")
@@ -123,7 +117,7 @@ def _aggregate(
 
 @lru_cache(maxsize=1)
 def _read_once(folder: Path, run: tuple[object, ...]) -> tuple[Vocabulary, VladSettings]:
-    """A vocabulary may be large: not sent with every image, but read once by every process."""
+    """Read a vocabulary once per process, as it may be too large to send with every image."""
     found = read_vocabulary(folder)
     if found is None:
         raise DataError("the vocabulary is gone", path=folder / VOCABULARY_FILE)
@@ -133,10 +127,7 @@ def _read_once(folder: Path, run: tuple[object, ...]) -> tuple[Vocabulary, VladS
 def write_vocabulary(
     folder: Path, vocabulary: Vocabulary, local_type: str, options: VladOptions
 ) -> None:
-    """Write a vocabulary into the folder of a global-features type.
-
-    ``vocabulary.npy`` and ``vlad.json``, and with whitening its mean and projection.
-    """
+    """Write ``vocabulary.npy``, ``vlad.json`` and the whitening."""
     write_array(folder / VOCABULARY_FILE, vocabulary.centres)
     if vocabulary.whitening is not None:
         write_array(folder / MEAN_FILE, vocabulary.whitening.mean)
@@ -145,13 +136,13 @@ def write_vocabulary(
 
 
 def read_vocabulary(folder: Path) -> tuple[Vocabulary, VladSettings] | None:
-    """The vocabulary stored in a type's folder, None where there is none."""
+    """Read the vocabulary of a global feature type, or None."""
     path = folder / VOCABULARY_FILE
     if not path.is_file():
         return None
     settings = read_json_model(folder / SETTINGS_FILE, VladSettings)
     centres = _read_array(path, "vocabulary")
-    if centres.ndim == 2:  # as it was written when there was one vocabulary only
+    if centres.ndim == 2:  # older format with a single vocabulary
         centres = centres[None]
     if centres.ndim != 3:
         raise DataError(f"not a vocabulary: {centres.shape}", path=path)
@@ -182,30 +173,25 @@ VLAD = "vlad"
 
 
 class VladChoiceOptions(VladOptions):
-    """Options of the global features ``vlad``."""
-
     local_type: str | None = Field(
         default=None, description="local features to aggregate; none: the first of the run"
     )
 
     def of_vlad(self) -> VladOptions:
-        """How the vocabulary is trained and used."""
         return VladOptions(**self.model_dump(exclude={"local_type"}))
 
 
 class GlobalFeaturesChoice(PluginChoice):
-    """Global features by name: ``vlad``, or a plugin; its options, and its weight in fusion."""
+    """Global features by name (``vlad`` or a plugin), with options and fusion weight."""
 
     name: str = VLAD
     weight: float = Field(default=1.0, gt=0, description="among the features that are fused")
 
     @property
     def is_vlad(self) -> bool:
-        """Whether they are trained on the map's local features."""
         return self.name == VLAD
 
     def vlad_options(self) -> VladChoiceOptions:
-        """The options of VLAD."""
         try:
             return VladChoiceOptions(**self.options)
         except ValidationError as error:
@@ -213,11 +199,6 @@ class GlobalFeaturesChoice(PluginChoice):
             raise OptionError(f"global features {VLAD!r} refuse their options: {fault}") from error
 
     def make(self) -> GlobalFeatureExtractor:
-        """The extractor of an image network.
-
-        Raises OptionError: there are no such global features; PluginError, MissingWeightsError: it
-        cannot be loaded, or refuses its options.
-        """
         known = plugin_names(PLUGINS)
         if self.name not in known:
             raise OptionError(
@@ -227,16 +208,13 @@ class GlobalFeaturesChoice(PluginChoice):
         return extractor
 
     def type_name(self, main_local_type: str) -> str:
-        """The kapture type name of the vectors.
-
-        ``main_local_type``: local features that VLAD takes where its options name none.
-        """
+        """Return the kapture type name; VLAD uses ``main_local_type`` by default."""
         if self.is_vlad:
             return vlad_type(self.vlad_options().local_type or main_local_type)
         return self.make().name
 
 
-_Job = tuple[str, Path, Camera]  # an image
+_Job = tuple[str, Path, Camera]
 
 
 def extract_global_features(
@@ -246,10 +224,7 @@ def extract_global_features(
     *,
     work: Work = HERE,
 ) -> dict[str, int]:
-    """Describe all images of the folders, into ``output`` (orphan layout).
-
-    Returns counts for the log: images.
-    """
+    """Write global features of all images (orphan layout); return counts for the log."""
     folder_of = images_of(folders, "describe")
     items = work.items(extractor.name)
     jobs = [
@@ -257,7 +232,7 @@ def extract_global_features(
         for image, folder in folder_of.items()
         if image not in items.done
     ]
-    jobs.sort(key=_size)  # images of one size can be a batch
+    jobs.sort(key=_size)  # images of equal size can share a batch
     describe = partial(_describe, extractor)
     steps: Batched[_Job, NDArray[np.float32]] = Batched(
         _read, describe, extractor, "describe_many", _size
@@ -283,10 +258,7 @@ def extract_global_features(
 def describe_images(
     extractor: GlobalFeatureExtractor, images: Sequence[NDArray[np.uint8]], names: Sequence[str]
 ) -> NDArray[np.float32]:
-    """Vectors of RGB images of one size: float32 (B, D), unit length.
-
-    Images of more than 8 megapixels are reduced to that, whatever the extractor.
-    """
+    """Compute unit vectors, float32 (B, D), of RGB images of one size, at most 8 megapixels."""
     many: Any = extractor
 
     def describe(batch: Sequence[NDArray[np.uint8]]) -> list[Any]:
@@ -354,7 +326,7 @@ class ExtractGlobalFeatures(PipelineStage):
         found = super().settings()
         if self._trains():
             return found
-        # image networks know nothing of local features
+        # image networks do not depend on local features
         return {key: found[key] for key in ("global_features", "weights") if key in found}
 
     def plugins(self) -> Sequence[object]:

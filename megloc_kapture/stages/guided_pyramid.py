@@ -1,12 +1,7 @@
-"""Guided pyramid matching of one image with others, and the files that hold what it adds.
+"""Guided pyramid matching of one image with others (MegLoc), and its output files.
 
-MegLoc, section "Guided pyramid matching": when mapping, both images of a pair are extracted again
-at other scales and turns, when localizing the query alone. An image is extracted again once,
-however many pairs it is in.
-
-What comes of it is a keypoints type of its own: ``T-pyramid`` has of every image the keypoints of T
-first, unchanged, then those that were added, and the matches of all pairs. So every index into T is
-one into T-pyramid, and what reads kapture reads it.
+The result is a keypoints type ``T-pyramid``: the keypoints of T, unchanged, followed by the added
+ones, with the matches of all pairs. Indices into T are therefore valid in T-pyramid.
 """
 
 from __future__ import annotations
@@ -63,9 +58,9 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class PyramidMethod:
-    """How pairs with few matches are tried again.
+    """Plugins and options of guided pyramid matching.
 
-    ``mask_margin_px``: keypoints nearer than this to a masked pixel are none.
+    Keypoints closer than ``mask_margin_px`` to a masked pixel are dropped.
     """
 
     extractor: LocalFeatureExtractor
@@ -81,13 +76,9 @@ UNVERIFIED = PairVerifier(lambda _, matches: np.ones(len(matches), dtype=bool))
 
 @dataclass(frozen=True, eq=False)
 class MatchedVariants:
-    """Matches of an image's variants.
+    """Matches of an image's variants with each other image.
 
-    Attributes
-    ----------
-    found : for each of the other images the variants that match it.
-    num_variants : number of variants tried with each of these, skipped ones included.
-    skipped : the variants without features, grouped by reason.
+    ``num_variants`` includes skipped ones; ``skipped`` lists the reasons.
     """
 
     found: list[list[VariantMatches]]
@@ -108,17 +99,12 @@ def match_image_again(
     only_scaled: Sequence[str] = (),
     name: str,
 ) -> MatchedVariants:
-    """Extract the variants of an image, and match them with other images as they are.
+    """Extract the variants of an image and match them with other images.
 
     Parameters
     ----------
-    itself : features of the image as it is.
     pixels, mask : RGB (H, W, 3), and True = use (H, W) or None.
-    others : matched with all variants.
-    load : features of another image; a few at a time are in memory.
-    judge : the verifier of the matches with another image, by its name and features.
-    only_scaled : matched with the variants of another scale only. Their results follow those of
-        ``others``.
+    only_scaled : images to match with scaled, unrotated variants; their results come last.
     """
     started = time.perf_counter()
     every = method.options.variants(itself.camera.width, itself.camera.height)
@@ -152,7 +138,7 @@ def _described(skipped: Mapping[ImageVariant, str]) -> str:
 def tried_row(
     pair: tuple[str, str], before: int, combined: Combined, tried: int, best: str, skipped: str
 ) -> list[str]:
-    """A pair as ``guided_pyramid.csv`` has it, see :data:`COLUMNS`."""
+    """Format a row of ``guided_pyramid.csv``; see :data:`COLUMNS`."""
     added = [len(new) for new in combined.added]
     return [*pair, *map(str, (before, len(combined.matches), *added, tried)), best, skipped]
 
@@ -160,10 +146,7 @@ def tried_row(
 def write_tried(
     output: Path, local_type: str, rows: Sequence[Sequence[str]], seconds: float
 ) -> dict[str, float]:
-    """Write the table of pairs that were tried; returns its sums for the log.
-
-    ``seconds`` are those that all workers took together. Warns of variants that were skipped.
-    """
+    """Write the table of retried pairs, warn of skipped variants, and return sums for the log."""
     path = table_path(output, local_type)
     write_csv_table(path, COLUMNS, rows)
     skipped = Counter(row[-1] for row in rows if row[-1])
@@ -184,18 +167,12 @@ def write_tried(
 
 
 def table_path(output: Path, local_type: str) -> Path:
-    """The table of the pairs of ``local_type`` that were tried, beside their matches."""
     matches = feature_folder(output, "matches", pyramid_type(local_type), orphan=True)
     return matches.with_name("guided_pyramid.csv")
 
 
 class PyramidFeatures:
-    """Writes the type ``T-pyramid``: of each image the features of T, then those added.
-
-    Files of images that nothing was added to are hard links to those of T where the file system
-    has them, so that they take no space twice. Raises DataError where an image of ``folder`` has
-    more or fewer descriptors of ``local_type`` than keypoints.
-    """
+    """Writer of the type ``T-pyramid``, with hard links to unchanged files of T where possible."""
 
     def __init__(self, output: Path, folder: KaptureFolder, local_type: str) -> None:
         name = pyramid_type(local_type)
@@ -206,7 +183,7 @@ class PyramidFeatures:
             if lengths[0] != lengths[1]:
                 message = f"{lengths[0]} descriptors for {lengths[1]} keypoints"
                 raise DataError(message, path=descriptors.where(image))
-        # the name in the files stays that of the method: by it the extractor is found again
+        # the files keep the method's name, which identifies the extractor
         configs = keypoints.config, replace(descriptors.config, keypoints_type=name)
         self._kinds = [
             (
@@ -220,18 +197,16 @@ class PyramidFeatures:
     def write(
         self, image: str, added_px: NDArray[np.float32], added_descriptors: NDArray[Any]
     ) -> None:
-        """Write an image's features, with those added to it."""
         self._left.remove(image)
         added = (added_px, added_descriptors)
         for (source, writer, folder), more in zip(self._kinds, added, strict=True):
             stored = Path(source.where(image))
-            if len(more) == 0 and stored.is_file():  # else it is a member of a tar
+            if len(more) == 0 and stored.is_file():  # members of a tar cannot be linked
                 hard_link(stored, folder / f"{image}{SUFFIX[source.kind]}")
             else:
                 writer.write(image, np.concatenate([source.read(image), more]))
 
     def write_rest(self) -> None:
-        """Write the features of the images that nothing is added to."""
         px, descriptors = (
             np.zeros((0, source.config.dsize), source.config.dtype) for source, *_ in self._kinds
         )
@@ -243,11 +218,8 @@ class PyramidFeatures:
 class RetriedQuery:
     """A query after guided pyramid matching.
 
-    Attributes
-    ----------
-    added_px, added_descriptors : (A, C) and (A, D), keypoints behind the query's own.
-    matches : of all candidates, in their order.
-    rows : of the candidates that were tried, see :data:`COLUMNS`; and the seconds it took.
+    Added keypoints (A, C) and descriptors (A, D) follow the query's; matches are in order of the
+    candidates.
     """
 
     added_px: NDArray[np.float32]
@@ -267,15 +239,13 @@ def retry_query(
     num_found: Mapping[str, int] | None = None,
     name: str = "query",
 ) -> RetriedQuery:
-    """Try a query's candidates with few matches again: its variants with the map's keypoints.
+    """Match candidates with few matches again, using variants of the query.
 
     Parameters
     ----------
-    matches : of each candidate, best first: its name, verified matches (K, 2), scores (K,).
-    load : features of a candidate.
-    frame : pixels and mask of the query; called only where a candidate has few matches.
-    num_found : matches of each candidate before verification; as many as in ``matches`` unless
-        given.
+    matches : name, verified matches (K, 2) and scores (K,) of each candidate, best first.
+    frame : reads pixels and mask of the query; called only if a candidate has few matches.
+    num_found : matches of each candidate before verification; by default as in ``matches``.
     """
     base = {other: pairs for other, pairs, _ in matches}
     found = num_found or {}

@@ -1,7 +1,4 @@
-"""An image after pre-processing, and masks, from wherever they come, and how they are combined.
-
-Everything that is ignored by one source is ignored: masks are combined by AND.
-"""
+"""Pre-processed images, and the sources of masks, which are combined by AND."""
 
 from __future__ import annotations
 
@@ -38,8 +35,8 @@ from megloc_kapture.stages.local_features import mask_path, read_image_of, read_
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, Options
 
-# a JPEG stays one: at this quality half of the keypoints move by less than 0.03 px, at a third of
-# the size that it would have as PNG
+# at this quality half of the keypoints move by less than 0.03 px, at a third of the size
+# as PNG
 JPEG_QUALITY = 98
 
 Mask = NDArray[np.bool_]
@@ -47,7 +44,7 @@ _SIZE = attrgetter("width", "height")
 
 
 class MaskOptions(Options):
-    """Where masks come from beside those that the kapture has; by default from nowhere."""
+    """Mask sources in addition to the kapture's masks; by default none."""
 
     segmenter: PluginChoice | None = Field(
         default=None, description="network that names the class of each pixel"
@@ -70,7 +67,7 @@ class MaskOptions(Options):
 def mask_files(
     folder: KaptureFolder, images: Iterable[str], user_masks: Path | None
 ) -> dict[str, dict[str, Path]]:
-    """The mask files that there are, by image and source (``own`` or ``user``)."""
+    """Find mask files by image and source (``own`` or ``user``)."""
     if user_masks is not None and not user_masks.is_dir():
         raise DataError("no such folder of masks", path=user_masks)
     found = {}
@@ -89,13 +86,13 @@ def mask_files(
 
 
 def read_masks(files: Mapping[str, Path], shape: tuple[int, ...]) -> dict[str, Mask]:
-    """The masks of an image by source, bool (H, W), True = use."""
+    """Read the masks of an image by source, bool (H, W), True = use."""
     masks = {source: read_mask(path, shape) for source, path in files.items()}
     return {source: mask for source, mask in masks.items() if mask is not None}
 
 
 class StandingMasks:
-    """Masks of whole cameras, drawn once each: fixed ones, and unchanging regions by sensor id."""
+    """Cached per-camera masks: fixed masks, and unchanging regions by sensor id."""
 
     def __init__(self, fixed: Sequence[FixedMask], regions: Mapping[str, UnchangingRegion]) -> None:
         self._fixed, self._regions = tuple(fixed), dict(regions)
@@ -104,7 +101,7 @@ class StandingMasks:
         self._combined: dict[tuple[object, ...], dict[str, Mask]] = {}
 
     def of(self, sensor_id: str, image: str, camera: Camera) -> dict[str, Mask]:
-        """Return the masks bool (H, W) of an image by source, in original pixels; shared."""
+        """Return the shared masks bool (H, W) of an image by source, in original pixels."""
         width, height = camera.width, camera.height
         region = self._regions.get(sensor_id)
         fitting = [one for one in self._fixed if one.is_for(sensor_id, image)]
@@ -123,7 +120,6 @@ class StandingMasks:
         return self._combined[key]
 
     def unused(self) -> list[FixedMask]:
-        """The fixed masks that no image asked for matched."""
         return [one for one in self._fixed if one not in self._used]
 
     def _draw(self, one: FixedMask, width: int, height: int) -> Mask:
@@ -142,14 +138,14 @@ class StandingMasks:
 
 @dataclass(frozen=True)
 class ClassMasks:
-    """A segmenter and the classes whose pixels are ignored, in the order of their labels."""
+    """A segmenter with its ignored classes, in the order of their labels."""
 
     segmenter: Segmenter
     dynamic: tuple[str, ...]
 
     @classmethod
     def of(cls, segmenter: Segmenter, dynamic: Sequence[str] | None = None) -> ClassMasks:
-        """Of the classes asked for; without, of those the segmenter names itself."""
+        """Create from the dynamic classes, by default the segmenter's."""
         wanted = segmenter.dynamic if dynamic is None else dynamic
         unknown = sorted(set(wanted) - set(segmenter.classes))
         if unknown:
@@ -160,7 +156,7 @@ class ClassMasks:
         return cls(segmenter, tuple(name for name in segmenter.classes if name in wanted))
 
     def labels(self, image: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
-        """Return the label of each pixel, uint8 (H, W), of an image (H, W, 3) called ``name``."""
+        """Return the label of each pixel, uint8 (H, W), of an image (H, W, 3)."""
         who = f"plugin {self.segmenter.name!r} on image {name}"
         found = checked_array(who, self.segmenter.segment(image), image.shape[:2], "uint8")
         if found.max() >= len(self.segmenter.classes):
@@ -170,7 +166,7 @@ class ClassMasks:
         return found
 
     def mask(self, labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """True where a pixel is used, bool (H, W)."""
+        """Return the mask bool (H, W), True = use."""
         used = np.array([name not in self.dynamic for name in self.segmenter.classes])
         return np.asarray(used[labels])
 
@@ -178,10 +174,9 @@ class ClassMasks:
 def find_unchanging_regions(
     folder: KaptureFolder, sequences: Sequence[KaptureFolder] = (), *, work: Work = HERE
 ) -> dict[str, UnchangingRegion]:
-    """The region of every camera of a folder, by sensor id; falsy with a reason where none is.
+    """Find the unchanging region of each camera, by sensor id; falsy with a reason if not found.
 
-    ``sequences``: folders whose images tell of its cameras as well, where they have a sensor of the
-    same id and image size: the map's, for queries.
+    ``sequences`` are folders with more images of these cameras: the map's, for queries.
     """
     chosen: dict[str, list[tuple[Path, Camera]]] = {}
     regions: dict[str, UnchangingRegion] = {}
@@ -200,13 +195,12 @@ def find_unchanging_regions(
     results = iter(work.map(_edges, everything, "unchanging regions"))
     for sensor, images in chosen.items():
         regions[sensor] = find_unchanging_region(next(results) for _ in images)
-    for _ in results:  # lets a progress bar see its end
+    for _ in results:  # exhaust the iterator so that the progress bar completes
         pass
     return regions
 
 
 def _images_of(sensor: str, folders: Sequence[KaptureFolder]) -> list[tuple[Path, Camera]]:
-    """Images of a sensor in the order they were taken, folder by folder."""
     images: list[tuple[Path, Camera]] = []
     for folder in folders:
         data = folder.read()
@@ -225,14 +219,9 @@ def _edges(image: tuple[Path, Camera]) -> NDArray[np.float32]:
 
 
 class ProcessedFrame:
-    """An image after pre-processing: its pixels and masks, made when first asked for.
+    """An image after pre-processing, with lazily computed pixels and masks.
 
-    Parameters
-    ----------
-    name : of the image; its suffix says how it is stored.
-    read : gives the original pixels, uint8 (H, W, 3) RGB.
-    masks : gives the masks of the original by their sources, bool (H, W), True = use.
-    classes : gives what tells classes of pixels apart, None without.
+    ``read`` returns uint8 (H, W, 3) RGB, ``masks`` bool (H, W), True = use, by source.
     """
 
     def __init__(
@@ -248,20 +237,20 @@ class ProcessedFrame:
 
     @cached_property
     def pixels(self) -> NDArray[np.uint8]:
-        """The new image, uint8 (H, W, 3) RGB."""
+        """Return the new image, uint8 (H, W, 3) RGB."""
         image = self._read()
         return processed_image(image, self.plan) if self.plan.changes_pixels else image
 
     @property
     def written(self) -> NDArray[np.uint8]:
-        """The new image as it is written: a grey one has one channel, a third of the size."""
+        """Return the pixels to write: one channel for grey images, a third of the size."""
         red = self.pixels[..., 0]
         grey = all(np.array_equal(red, self.pixels[..., channel]) for channel in (1, 2))
         return np.ascontiguousarray(red) if grey else self.pixels
 
     @cached_property
     def stored(self) -> NDArray[np.uint8]:
-        """The new image as it is read from the new kapture: a JPEG has lost a little."""
+        """Return the new image as read back, after JPEG loss."""
         if not self.plan.changes_pixels:
             return self.pixels
         read = image_as_read_back(self.written, self.name, jpeg_quality=JPEG_QUALITY)
@@ -269,13 +258,13 @@ class ProcessedFrame:
 
     @cached_property
     def labels(self) -> NDArray[np.uint8] | None:
-        """The class of each pixel, uint8 (H, W); None where nothing tells them apart."""
+        """Return the class of each pixel, uint8 (H, W), if there is a segmenter."""
         classes = self._classes()
         return None if classes is None else classes.labels(self.pixels, self.name)
 
     @cached_property
     def masks(self) -> dict[str, Mask]:
-        """The masks of the new image by source, bool (H, W), True = use."""
+        """Return the masks of the new image by source, bool (H, W), True = use."""
         original = self._original_masks()
         masks = {source: processed_mask(mask, self.plan) for source, mask in original.items()}
         classes = self._classes()
@@ -288,5 +277,5 @@ class ProcessedFrame:
 
     @property
     def mask(self) -> Mask | None:
-        """All masks together; None where all of the image is used."""
+        """Return the combined mask; None means no mask."""
         return np.logical_and.reduce(list(self.masks.values())) if self.masks else None

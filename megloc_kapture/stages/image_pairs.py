@@ -1,4 +1,4 @@
-"""Stage: which images are matched: within the map, and queries with the map."""
+"""Stages: image pairs to match, within the map and between queries and map."""
 
 from __future__ import annotations
 
@@ -59,8 +59,6 @@ PairingMethod = Literal["poses", "covisibility", "retrieval", "sequence", "exhau
 
 
 class MappingPairsOptions(Options):
-    """How the map's images are paired: the union of the methods named."""
-
     by: tuple[PairingMethod, ...] = Field(
         default=("retrieval",), min_length=1, description="methods, of whose pairs all are matched"
     )
@@ -70,7 +68,6 @@ class MappingPairsOptions(Options):
     sequence: PairsBySequenceOptions = PairsBySequenceOptions()
 
     def needs_points(self) -> bool:
-        """Whether a method looks at points that are there already."""
         overlap = "poses" in self.by and self.poses.min_overlap is not None
         return overlap or "covisibility" in self.by
 
@@ -78,7 +75,7 @@ class MappingPairsOptions(Options):
 def _seen_points(
     folder: KaptureFolder, images: Sequence[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Points (N, 3), and the points and images (O,) of what the images observe."""
+    """Return points (N, 3), and the point ids and image rows (O,) of the observations."""
     if not folder.has_points():
         raise DataError("co-visibility and overlap need a map's points", path=folder.root)
     row_of = {image: row for row, image in enumerate(images)}
@@ -106,12 +103,11 @@ def pair_map_images(
     covisible: KaptureFolder | None = None,
     work: Work = HERE,
 ) -> list[ImagePair]:
-    """Pairs of map images with a pose, each once, first name before second, sorted.
+    """Choose sorted pairs of posed map images within coordinate frames, first name before second.
 
-    Where no image has a pose, of all of them, by methods that look at none. Images of different
-    coordinate frames are never paired. The score is the cosine similarity where retrieval named the
-    pair, else 1. ``covisible``: a map of the same images in the same frames, whose points
-    co-visibility and overlap look at; by default those of ``mapping`` itself.
+    If no image has a pose, pair all images by methods that need no poses. The score is the cosine
+    similarity for pairs found by retrieval, else 1. ``covisible`` is a map of the same images whose
+    points are used for co-visibility and overlap, by default ``mapping``.
     """
     data = mapping.read()
     poses = data.poses()
@@ -125,7 +121,7 @@ def pair_map_images(
         row_of = np.full(len(images), -1, dtype=np.int64)
         row_of[members] = np.arange(len(members))
         rows = row_of[image_ids]
-        seen = point_ids[rows >= 0], rows[rows >= 0]  # of these images, by their rows among them
+        seen = point_ids[rows >= 0], rows[rows >= 0]  # rows index ``images``
         for method in options.by:
             similarity = None
             if method == "retrieval":
@@ -162,14 +158,14 @@ def _by_poses(
         return pairs
     cameras = [data.camera_of(name) for name in names]
     overlap = frustum_overlap(pairs, cameras, of_images, xyz, *seen)
-    # where neither image observes anything nobody knows
+    # overlap is NaN where neither image observes a point; such pairs are kept
     return pairs[~(overlap < options.min_overlap)]
 
 
 def _united(
     images: Sequence[str], pairs: NDArray[np.int64], similarities: NDArray[np.float64]
 ) -> list[ImagePair]:
-    """Each pair of ``pairs`` (P, 2), i < j, once, with its best similarity, 1 for -infinity."""
+    """Return each pair once with its best similarity; 1 for -inf."""
     keys, rows = np.unique(pairs[:, 0] * len(images) + pairs[:, 1], return_inverse=True)
     scores = np.full(len(keys), -np.inf)
     np.maximum.at(scores, rows, similarities)
@@ -184,11 +180,11 @@ def _united(
 def _most_similar(
     vectors: Sequence[KaptureVectors], retrieval: Retrieval, top_k: int, work: Work
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Pairs (P, 2), i < j, of each row and its ``top_k`` most similar others, and similarities."""
+    """Return pairs (P, 2), i < j, of each row and its ``top_k`` neighbours, and similarities."""
     index, similarity = retrieval.rank(vectors, vectors, top_k + 1, work=work)
     rows = np.repeat(np.arange(len(index)), index.shape[1])
     both = np.stack([rows, index.ravel()], axis=1)
-    # an image is its own nearest, or ties with its copies: it must not use up a place
+    # the image ranks among its own results, not always first if it has duplicates
     others = both[:, 0] != both[:, 1]
     rank = np.cumsum(others.reshape(index.shape), axis=1).ravel()
     keep = others & (rank <= top_k) & (both[:, 1] >= 0)
@@ -204,10 +200,7 @@ def pair_queries(
     restrictions: Restrictions = UNRESTRICTED,
     work: Work = HERE,
 ) -> list[ImagePair]:
-    """Candidates of every query among the posed map images its prior permits, best first.
-
-    Sorted by query. A query that nothing is permitted to has no candidate.
-    """
+    """Choose candidates of every query among the posed map images that its prior permits."""
     poses = mapping.read().poses()
     images = sorted(poses)
     queries = query.read().image_names()
@@ -237,7 +230,7 @@ def pair_queries(
     return list(chain(*of_query))
 
 
-# what decides which global features there are, and how they are fused
+# options that determine the global feature types and their fusion
 RETRIEVAL_OPTIONS = ("global_features", "fusion", *LOCAL_TYPES)
 
 
@@ -297,8 +290,6 @@ Matched = int | NDArray[np.int64]
 
 
 class RerankingOptions(Options):
-    """How the retrieved images of a query are put in a new order."""
-
     by: Literal["none", "matches", "verified", "coverage"] = Field(
         default="none",
         description="matches: their number; verified: of those that two-view geometry leaves; "
@@ -312,20 +303,18 @@ class RerankingOptions(Options):
     keep: int = Field(default=20, gt=0, description="images that stay, N")
 
     def reranks(self) -> bool:
-        """Whether anything is done."""
         return self.by != "none"
 
     def types_named(self, local_types: Sequence[str]) -> list[str]:
-        """Those of the types that ``local_type`` names; all where it names no type."""
+        """Return the types selected by ``local_type``; all if it names none."""
         name = self.local_type
         if name is None or not self.reranks():
             return list(local_types)
-        # a type may be named after its weights, which begin with the plugin's name
+        # a type may carry the name of its weights after the plugin's name
         found = [one for one in local_types if base_type(one) == name]
         return found or [one for one in local_types if one.startswith(name)]
 
     def counted_types(self, local_types: Sequence[str]) -> list[str]:
-        """The types whose matches count."""
         found = self.types_named(local_types)
         if not found:
             raise OptionError(
@@ -338,16 +327,15 @@ class RerankingOptions(Options):
 def rerank(
     of_types: Sequence[Sequence[Matched]], options: RerankingOptions
 ) -> tuple[list[int], list[int]]:
-    """Positions of the candidates of one query that stay, best first, and what each has.
+    """Rank the candidates of one query by matches; return kept positions and their counts.
 
-    Of equal counts, and so where nothing matches, retrieval's order stays. ``of_types``: of each
-    type of local features and each candidate, in retrieval's order, the number of its matches; for
-    coverage the rows (K,) of the query's keypoints that they are of.
+    Ties keep the retrieval order. ``of_types`` has the number of matches, or matched keypoint rows
+    (K,), by type and candidate.
     """
     num = len(of_types[0]) if of_types else 0
     if options.by == "coverage":
         rows = [[np.unique(np.asarray(matched)) for matched in own] for own in of_types]
-        # keypoints are numbered through the types
+        # keypoints are numbered consecutively across types
         sizes = [max((int(ids[-1]) + 1 for ids in own if len(ids)), default=0) for own in rows]
         starts = np.cumsum([0, *sizes[:-1]])
         keypoints = [
@@ -363,7 +351,7 @@ def rerank(
 
 
 def counted(pair: VerifiedMatches, by: str) -> Matched:
-    """What reranking looks at in the matches of a candidate, see :func:`rerank`."""
+    """Return the quantity that :func:`rerank` compares."""
     if by == "coverage":
         return pair.matches[:, 0]
     return pair.num_found if by == "matches" else len(pair.matches)
@@ -376,15 +364,7 @@ def reranked(
     local_types: Sequence[str],
     options: RerankingOptions,
 ) -> list[ImagePair]:
-    """Candidates as the options want them, from matches that are stored; sorted by query.
-
-    The score is what a candidate has, and below one a part that keeps their order in the file.
-
-    Parameters
-    ----------
-    query : with matches of the types.
-    matches : the features folder that the matches are in.
-    """
+    """Rerank candidates by stored matches; the score is the count plus a tie-breaking fraction."""
     if not options.reranks():
         return list(pairs)
     counted_types = options.counted_types(local_types)
@@ -400,7 +380,6 @@ def reranked(
 def _stored(
     query: KaptureFolder, matches_dir: Path, local_type: str, by: str
 ) -> Callable[[str, str], Matched]:
-    """Reads what :func:`counted` says of a query and a candidate; of unmatched pairs nothing."""
     if by != "coverage":
         rows = read_match_counts(matches_dir, local_type)
         counts = {

@@ -57,19 +57,14 @@ def extract_local_features(
     mask_margin_px: float = 0.0,
     work: Work = HERE,
 ) -> dict[str, int]:
-    """Extract from all images of the folders into ``output`` (orphan layout).
-
-    Masks are read from ``sensors/masks/<image>.png`` where there are any (0 = ignore); keypoints
-    nearer than ``mask_margin_px`` to a masked pixel are dropped as well. Returns counts for the
-    log.
-    """
+    """Extract features of all images (orphan layout), without masked keypoints."""
     spec_of, jobs = cache(FolderSpec), []
     for image, folder in images_of(folders, "extract features from").items():
         camera, has_mask = folder.read().camera_of(image), mask_path(folder, image).is_file()
         jobs.append(_Job(image, spec_of(folder), (camera.width, camera.height), has_mask))
     items = work.items(extractor.name)
     todo = [job for job in jobs if job.image not in items.done]
-    todo.sort(key=_SIZE)  # images of one size can be a batch
+    todo.sort(key=_SIZE)  # images of equal size can share a batch
     steps: Batched[_Job, LocalFeatures] = Batched(
         partial(_read, mask_margin_px),
         partial(_extract, extractor),
@@ -96,7 +91,6 @@ def extract_local_features(
 
 
 def images_of(folders: Sequence[KaptureFolder], purpose: str) -> dict[str, KaptureFolder]:
-    """All images in order of their names, with their folders."""
     named = [(image, folder) for folder in folders for image in folder.read().image_names()]
     named.sort(key=itemgetter(0))
     for (image, _), (other, _) in pairwise(named):
@@ -133,25 +127,24 @@ def _extract(
 
 
 def mask_path(folder: KaptureFolder, image: str) -> Path:
-    """Where the mask of an image lies, if it has one."""
     return folder.root / "sensors" / "masks" / f"{image}.png"
 
 
 def read_frame(folder: KaptureFolder, image: str, *, margin_px: float = 0.0) -> Frame:
-    """An image of a folder, uint8 (H, W, 3) RGB, and its mask, see :func:`read_mask`."""
+    """Read an image, uint8 (H, W, 3) RGB, and its mask; see :func:`read_mask`."""
     pixels = read_image_of(folder.image_path(image), folder.read().camera_of(image))
     return pixels, read_mask(mask_path(folder, image), pixels.shape[:2], margin_px=margin_px)
 
 
 def read_image_of(path: Path, camera: Camera) -> NDArray[np.uint8]:
-    """Read an image and check that it has the size its camera says; uint8 (H, W, 3) RGB."""
+    """Read an image of the camera's size, uint8 (H, W, 3) RGB."""
     image = read_image_rgb(path)
     check_size(image.shape[1::-1], camera, path)
     return image
 
 
 def check_size(size: tuple[int, ...], camera: Camera, name: Path | str) -> None:
-    """Raise DataError when an image is not of the size (width, height) its camera says."""
+    """Raise DataError if an image size (width, height) differs from its camera's."""
     if size != (camera.width, camera.height):
         raise DataError(
             f"the image is {size[0]}x{size[1]}, its camera says {camera.width}x{camera.height}",
@@ -162,9 +155,9 @@ def check_size(size: tuple[int, ...], camera: Camera, name: Path | str) -> None:
 def read_mask(
     path: Path, shape: tuple[int, ...], *, margin_px: float = 0.0
 ) -> NDArray[np.bool_] | None:
-    """Read the mask of an image of ``shape`` (H, W), True = use; None where there is no file.
+    """Read a mask of ``shape`` (H, W), True = use; None if there is no file.
 
-    Pixels nearer than ``margin_px`` to an ignored one are ignored as well.
+    Pixels closer than ``margin_px`` to an ignored one are ignored as well.
     """
     if not path.is_file():
         return None
@@ -180,7 +173,7 @@ def read_mask(
 def extract_all(
     extractor: LocalFeatureExtractor, frames: Sequence[Frame], names: Sequence[str]
 ) -> list[LocalFeatures]:
-    """Extract from images of one size, very large ones reduced meanwhile."""
+    """Extract features from images of one size; very large ones are reduced for extraction."""
     found = in_batches(
         extractor,
         "extract_many",

@@ -1,7 +1,6 @@
-"""The localized queries as a kapture folder, with what became of each beside it.
+"""The localized queries as a kapture folder with status tables.
 
-A query whose image cannot be used is set aside at import, and failed with the reason in the end:
-one broken photograph must not end the run of all others, and counts as a miss.
+Unreadable query images are set aside at import and reported as failures.
 """
 
 from __future__ import annotations
@@ -46,20 +45,16 @@ def write_localized(
     first_candidates: dict[str, tuple[str, RigidTransform]] | None = None,
     timing: Path | None = None,
 ) -> dict[str, int]:
-    """Write the localized queries as kapture, with ``status.csv``, ``poses.csv`` and
-    ``clusters.csv`` next to them.
+    """Write localized queries as kapture with tables of status, poses, clusters and covariances.
 
-    ``covariance.csv`` has the covariances of the localized poses. Where pose refiners were at work,
-    ``refinement.csv`` says what each made of a pose. A query whose focal length was estimated gets
-    a camera of its own.
+    A query with an estimated focal length gets a separate camera.
 
     Parameters
     ----------
-    query : sensors and records; of a folder the images are linked.
-    fallback : what a query that failed gets: nothing; the pose of its best retrieved image; or its
-        pose through the rig, from another camera of its moment, where that was localized.
-    first_candidates : query -> (best retrieved map image, its pose), needed for "retrieval".
-    timing : where to write seconds per query and step.
+    fallback : pose of a failed query: none, that of its best retrieved image, or the one derived
+        from a localized camera of the same rig and timestamp.
+    first_candidates : best retrieved map image and its pose by query, for "retrieval".
+    timing : optional file for seconds per query and step.
     """
     data = query.read() if isinstance(query, KaptureFolder) else query
     named = sorted(results, key=lambda result: result[0])
@@ -114,7 +109,7 @@ def write_localized(
 
 
 def write_poses(path: Path, poses: Mapping[str, RigidTransform]) -> None:
-    """Write ``poses.csv``: ``cam_from_world`` and the camera's centre in the world by image."""
+    """Write ``poses.csv``: ``cam_from_world`` and camera centre in the world by image."""
     columns = ("image", "qw", "qx", "qy", "qz", "tx", "ty", "tz")
     rows = (
         (image, *map(repr, (*pose.quat_wxyz, *pose.translation, *pose.center().tolist())))
@@ -124,7 +119,6 @@ def write_poses(path: Path, poses: Mapping[str, RigidTransform]) -> None:
 
 
 def write_timing(path: Path, results: Iterable[tuple[str, Pose | Failure]]) -> None:
-    """Write the seconds of each query and step."""
     rows = (
         (image, step, f"{seconds:.5f}")
         for image, result in results
@@ -134,7 +128,6 @@ def write_timing(path: Path, results: Iterable[tuple[str, Pose | Failure]]) -> N
 
 
 def query_status(image: str, result: Pose | Failure, fallback: Fallback = "none") -> QueryStatus:
-    """The row of ``status.csv`` of a query."""
     return QueryStatus(
         image=image,
         status="localized" if result else "failed",
@@ -151,11 +144,7 @@ def query_status(image: str, result: Pose | Failure, fallback: Fallback = "none"
 
 
 def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, str]:
-    """Take images that cannot be read out of a workspace's queries; returns why, by name.
-
-    Their names and reasons go to ``tables``; the image files stay as they are. ``query``: kapture
-    folder in the workspace, which is written anew where an image is taken out.
-    """
+    """Remove unreadable images from a workspace's queries; write the reasons to ``tables``."""
     folder = KaptureFolder(query)
     data = folder.read()
     names = data.image_names()
@@ -164,7 +153,7 @@ def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, 
     if not reasons:
         return {}
     if len(reasons) == len(names):
-        # the image where it lies, not a link to it that may be gone in a moment
+        # report the target, as the link may be temporary
         raise DataError(reasons[names[0]], path=Path(os.path.realpath(folder.image_path(names[0]))))
     records = {key: name for key, name in data.records_camera.items() if name not in reasons}
     write_sensors(query, replace(data, records_camera=records))
@@ -173,13 +162,11 @@ def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, 
 
 
 def unreadable_queries(tables: Path) -> Iterator[tuple[str, Failure]]:
-    """The queries that were set aside, as results."""
     for name, reason in read_unreadable(tables).items():
         yield name, unreadable_image(name, reason)
 
 
 def unreadable_image(name: str, reason: str) -> Failure:
-    """The result of a query whose image cannot be used."""
     return Failure(f"the image cannot be used: {reason}", name=name)
 
 

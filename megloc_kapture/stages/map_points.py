@@ -1,8 +1,4 @@
-"""Stage: the points of the map: triangulated, lifted through depth, or of a given model.
-
-A map is a kapture with points3d and observations; triangulated ones come from verified matches and
-known poses.
-"""
+"""Stages: map points, triangulated, lifted through depth, or from a prebuilt model."""
 
 from __future__ import annotations
 
@@ -44,7 +40,7 @@ from megloc_kapture.stages.stage import (
 )
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 
-_IMAGES_AT_ONCE = 1000  # that parts are put together to
+_IMAGES_AT_ONCE = 1000  # small parts are merged up to this size
 
 
 def triangulate_map(
@@ -58,24 +54,18 @@ def triangulate_map(
     num_threads: int = 1,
     work: Work = HERE,
 ) -> dict[str, float]:
-    """Triangulate and write the map: sensors, features of its types, points3d, observations.
+    """Triangulate with fixed poses and intrinsics, write the map, and return counts for the log.
 
-    Each type has points and observations of its own, those of the first type come first. Poses,
-    given per camera or per rig, and intrinsics stay exactly what they are. Parts of a large map
-    that no match connects are triangulated one by one, which loses nothing: a point is seen from
-    one part alone, and poses are known.
+    Each feature type has separate points, those of the first type first. Parts of a large map
+    without matches between them are triangulated separately; with known poses the result is the
+    same.
 
     Parameters
     ----------
-    mapping : images with poses, and their keypoints.
-    matches : where the verified matches of the types are.
-    local_types : keypoints types; a repeated one counts once.
-    pairs : use the matches of these pairs only.
-    num_threads : of COLMAP, where no workers share the parts.
-
-    Returns
-    -------
-    Counts for the log; of several types also ``points_T`` and ``observations_T`` for each.
+    matches : folder of the verified matches.
+    local_types : keypoints types; duplicates are ignored.
+    pairs : restrict the matches to these pairs.
+    num_threads : of COLMAP, if no workers share the parts.
     """
     types = tuple(dict.fromkeys([local_types] if isinstance(local_types, str) else local_types))
     data = mapping.read()
@@ -85,7 +75,7 @@ def triangulate_map(
     asked = None if pairs is None else {tuple(sorted((pair.query, pair.map))) for pair in pairs}
     of_type = {name: matched_pairs(matches.matches(name), images, asked) for name in types}
     for name in types:
-        mapping.keypoints(name)  # refused before any work
+        mapping.keypoints(name)
     specs = FolderSpec(mapping), FolderSpec(matches)
     xyz, errors_px = np.zeros((0, 3)), np.zeros(0)
     observations = {}
@@ -115,10 +105,10 @@ def triangulate_map(
         )
     write_sensors(output, data)
     link_images(mapping.root, output)
-    # with a pyramid's type the one it begins with: queries are matched with that at first
+    # keep a pyramid's base type, as queries are first matched with that
     there = mapping.types("keypoints")
     copy_features(mapping, output, {*types, *map(base_type, types)}.intersection(there))
-    # kapture keeps a colour per point; black says that nobody looked it up
+    # kapture stores a colour per point; black means unknown
     write_points3d(output, np.concatenate([xyz, np.zeros_like(xyz)], axis=1))
     write_observations(output, observations)
     num_observations = sum(map(len, observations.values()))
@@ -136,14 +126,13 @@ def triangulate_map(
 def matches_of(
     reader: MatchesReader, images: Sequence[str], pairs: NDArray[np.int64]
 ) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """Matches by pairs (P, 2) of rows of ``images``."""
     return {(a, b): reader.read(images[a], images[b])[0] for a, b in pairs.tolist()}
 
 
 def matched_pairs(
     reader: MatchesReader, images: Sequence[str], asked: Collection[tuple[str, ...]] | None
 ) -> NDArray[np.int64]:
-    """Pairs (P, 2) of rows of ``images`` with a match, of those asked for (first name first)."""
+    """Return matched pairs (P, 2) of rows of ``images``, among ``asked`` (first name first)."""
     row_of = {image: row for row, image in enumerate(images)}
     pairs = [
         (row_of[a], row_of[b])
@@ -154,7 +143,7 @@ def matched_pairs(
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
-_Part = tuple[list[str], NDArray[np.int64]]  # images, and pairs (P, 2) of them that match
+_Part = tuple[list[str], NDArray[np.int64]]  # images, and matching pairs (P, 2) of them
 
 
 def _triangulate(
@@ -165,7 +154,6 @@ def _triangulate(
     work: Work,
     label: str,
 ) -> TriangulatedPoints:
-    """Points of the images, part by part where no match connects them."""
     if len(members) == 1:
         return triangulate_part((images, pairs))
     parts = [
@@ -204,14 +192,14 @@ def _triangulate_part(
     images = [
         MapImage(image, data.camera_of(image), pose, keypoints.read(image)[:, :2])
         for image in names
-        if (pose := data.cam_from_world(image)) is not None  # all have one
+        if (pose := data.cam_from_world(image)) is not None
     ]
     verified = matches_of(reader, names, pairs)
     return triangulate(images, verified, options, num_threads=num_threads, scratch=scratch)
 
 
 def _unconnected(num_images: int, pairs: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Rows of the images of parts that no pair connects; small ones are put together."""
+    """Return image rows of the connected components; small ones are merged."""
     links = csr_array((np.ones(len(pairs)), pairs.T), shape=(num_images, num_images))
     _, part_of = connected_components(links, directed=False)
     rows = np.argsort(part_of, kind="stable")
@@ -234,10 +222,7 @@ def lift_map(
     *,
     work: Work = HERE,
 ) -> dict[str, float]:
-    """Lift the keypoints of the map's images through their depth maps, and write the map.
-
-    Returns counts for the log. ``local_types``: keypoints types that get points, each its own.
-    """
+    """Lift keypoints through the depth maps and write the map; return counts for the log."""
     data = mapping.read()
     poses = data.poses()
     records = depth_records(data)
@@ -284,7 +269,7 @@ def lift_map(
 def _lift(
     spec: FolderSpec, local_type: str, options: LiftingOptions, job: tuple[str, DepthRecord]
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Points in the image's camera frame (N, 3), and the keypoints they belong to (N,)."""
+    """Return points in the camera frame (N, 3) and their keypoint ids (N,)."""
     image, depth = job
     folder = spec.open()
     points, valid = lift_keypoints(

@@ -1,8 +1,6 @@
-"""Stage: a kapture map without the points that do it no good, and with their uncertainties.
+"""Stage: map refinement, which removes wrong and uncertain points and writes covariances.
 
-What is wrong is dropped, nothing is moved: points keep their coordinates and colours. What each
-filter removed stands in ``reconstruction/refinement.json`` of the new map, the points' covariances
-in ``reconstruction/point_covariances.npy``.
+``reconstruction/refinement.json`` lists the removals of each filter.
 """
 
 from __future__ import annotations
@@ -55,9 +53,9 @@ from megloc_kapture.stages.stage import UNREFINED, Layout, PipelineStage, StageW
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Options, RigidTransform
 
-# a point that lost observations goes when fewer are left
+# a point that loses observations is dropped when fewer remain
 _MIN_OBSERVATIONS = 2
-# images with one centre are one scan; a lifted point is compared with the scans nearest to its own
+# images with the same centre form a scan; lifted points are compared with the nearest scans
 _SAME_CENTRE_M = 1e-3
 _NEIGHBOURING_SCANS = 10
 
@@ -66,7 +64,7 @@ Mask = NDArray[np.bool_]
 
 
 class FilterReport(BaseModel):
-    """What one filter removed; ``checked`` is what it could judge, of observations or points."""
+    """Removals of one filter; ``checked`` counts the items it could judge."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -77,7 +75,7 @@ class FilterReport(BaseModel):
 
 
 class MapSelection:
-    """A map's points and observations, and which of them are still in."""
+    """Points and observations of a map, with masks of those that are kept."""
 
     def __init__(self, source: KaptureFolder) -> None:
         self.source = source
@@ -88,7 +86,7 @@ class MapSelection:
         self.images = sorted({image for seen in types for image in seen.image_names})
         poses = self.data.poses()
         posed = np.array([image in poses for image in self.images], dtype=bool)
-        # images without a pose have one in the list, that no observation refers to
+        # entries without a pose keep the rows aligned; no judged observation refers to them
         self._poses = [poses.get(image) for image in self.images]
         row_of = {image: row for row, image in enumerate(self.images)}
         rows = [
@@ -98,7 +96,7 @@ class MapSelection:
         self._sizes = [len(seen) for seen in types]
         point_ids = _joined([seen.point_ids for seen in types], np.int64)
         image_ids = _joined(rows, np.int32)
-        # of several types, sorted by point as those of one are
+        # sort by point across types, as within one type
         self._order: Any = slice(None) if len(types) == 1 else np.argsort(point_ids, kind="stable")
         self.point_ids, self.image_ids = point_ids[self._order], image_ids[self._order]
         self.kept_points = np.ones(len(self.xyz), dtype=bool)
@@ -121,7 +119,7 @@ class MapSelection:
         return list(cameras), list(poses)
 
     def observed(self) -> tuple[ObservedPoints, NDArray[np.int64]]:
-        """What is in and can be judged, and the rows of these observations."""
+        """Return the kept observations by posed images, and their rows."""
         rows = np.flatnonzero(self.kept & self._placed)
         point_ids, image_ids = self.point_ids, self.image_ids
         if len(rows) < len(point_ids):
@@ -130,7 +128,7 @@ class MapSelection:
         return ObservedPoints(self.xyz, point_ids, image_ids, cameras, poses), rows
 
     def covariances(self) -> Floats:
-        """Covariances (N, 6) from the observations that are in; NaN where not determined."""
+        """Covariances (N, 6) from the kept observations; NaN where undetermined."""
         if self._covariances is None:
             observed, _ = self.observed()
             self._covariances = point_covariances(
@@ -143,14 +141,14 @@ class MapSelection:
         return self._covariances
 
     def drop_observations(self, name: str, dropped: Mask, checked: int) -> None:
-        """Take observations (O,) out, and the points that are left with too few."""
+        """Drop observations (O,), and points left with too few."""
         dropped = dropped & self.kept
         ids = self.point_ids[self.kept]
         gone = left_with_too_few(ids, dropped[self.kept], len(self.xyz), _MIN_OBSERVATIONS)
         self._take_out(name, dropped, gone, checked)
 
     def drop_points(self, name: str, dropped: Mask, checked: int) -> None:
-        """Take points (N,) out, with their observations."""
+        """Drop points (N,) with their observations."""
         self._take_out(name, np.zeros(len(self.kept), dtype=bool), dropped, checked)
 
     def _take_out(self, name: str, observations: Mask, points: Mask, checked: int) -> None:
@@ -164,12 +162,12 @@ class MapSelection:
             )
         )
         if self._covariances is not None and (gone & ~points[self.point_ids]).any():
-            self._covariances = None  # a point that loses some but not all is less sure
+            self._covariances = None  # points that lose only some observations get less certain
         self.kept &= ~gone
         self.kept_points &= ~points
 
     def observations(self) -> dict[str, Observations]:
-        """What is in, by type, points renumbered."""
+        """Return the kept observations by type, with renumbered points."""
         kept = np.empty_like(self.kept)
         kept[self._order] = self.kept
         number = np.cumsum(self.kept_points) - 1
@@ -194,14 +192,14 @@ REPORT_FILE = "refinement.json"
 
 
 class MapRefinementOptions(Options):
-    """What is taken out of a map; defaults: docs/experiments/map-refinement.md."""
+    """Map refinement options; defaults: docs/experiments/map-refinement.md."""
 
     depth: DepthVerificationOptions = DepthVerificationOptions()
     uncertainty: UncertaintyOptions = UncertaintyOptions()
 
 
 class RefinementReport(BaseModel):
-    """``reconstruction/refinement.json``: a map's points and observations before and after."""
+    """``reconstruction/refinement.json``."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -224,12 +222,9 @@ def refine_map(
 ) -> dict[str, float]:
     """Write a map without the points and observations that the options reject.
 
-    Points of any keypoints type, renumbered without gaps, and of several at once. Observations by
-    images without a pose cannot be judged; they stay as long as their point does.
-    ``restrictions``: the coordinate frames of the images, which are never compared.
-    ``link_features``: the features in the source's own folder may become hard links (they are a map
-    of ours, not somebody's data); those beside it always do. Returns counts for the log: points and
-    observations after, and what each filter removed.
+    Points are renumbered. Observations by images without a pose cannot be judged and stay as long
+    as their point does. ``link_features`` allows hard links to the features inside the source
+    folder, which must not be user data. Return counts for the log.
     """
     if not source.has_points():
         raise DataError(
@@ -273,11 +268,10 @@ def _verify_depth(
     restrictions: Restrictions,
     work: Work,
 ) -> None:
-    """Compare points with the depth of the images that see them.
+    """Drop observations and points that depth maps contradict.
 
-    A point that was lifted agrees with the depth it comes from, so it is compared with that of
-    other scans: more of them must see through it than have a surface there. Points that one image
-    alone sees, which has depth, count as lifted.
+    A lifted point, seen by one image that has depth, agrees with that depth, so it is compared with
+    other scans and dropped when more of them see through it than have a surface there.
     """
     records = depth_records(selection.data) if options.max_sigmas is not None else {}
     folder = selection.source
@@ -324,14 +318,11 @@ def _verify_depth(
     selection.drop_observations("depth", dropped, num_checked)
 
 
-# an image's depth, and its pose
 _DepthView = tuple[DepthRecord, RigidTransform]
 
 
 @dataclass(frozen=True)
 class _Scan:
-    """Depth maps of one centre by their images, and the numbers of the nearest other scans."""
-
     views: Mapping[int, _DepthView]
     neighbours: frozenset[int]
 
@@ -339,7 +330,6 @@ class _Scan:
 def _scans(
     selection: MapSelection, with_depth: Mapping[int, DepthRecord], restrictions: Restrictions
 ) -> list[_Scan]:
-    """The scans of the images with depth, by their rows in the selection."""
     poses = selection.data.poses()
     images = [row for row in with_depth if selection.images[row] in poses]
     scans: list[_Scan] = []
@@ -354,7 +344,7 @@ def _scans(
         for scan, row, cam in zip(scan_of.tolist(), rows, cams, strict=True):
             views[scan][row] = with_depth[row], cam
         centres = centres[np.unique(scan_of, return_index=True)[1]]
-        # the nearest scan is the scan itself
+        # index 0 is the scan itself
         nearest = range(1, min(_NEIGHBOURING_SCANS + 1, count) + 1)
         found = cKDTree(centres).query(centres, k=nearest)[1] + len(scans)
         scans += [
@@ -372,8 +362,10 @@ def _votes_of_other_scans(
     options: DepthVerificationOptions,
     work: Work,
 ) -> tuple[NDArray[np.int64], Mask]:
-    """Of lifted points, by rows (L,) of their observations: how many more of the scans near theirs
-    have a surface there than see through them, and which points a scan could judge."""
+    """Return votes (L,) of nearby scans, and the lifted points they could judge.
+
+    A scan votes +1 if it has a surface at the point, -1 if it sees through it.
+    """
     scan_of = np.full(len(observed.cameras), -1)
     for number, scan in enumerate(scans):
         scan_of[list(scan.views)] = number
@@ -405,7 +397,6 @@ def _judge(
     options: DepthVerificationOptions,
     job: tuple[list[_DepthView], Floats, Floats],
 ) -> tuple[Mask, Mask]:
-    """Masks (N,) of the points that a scan sees through, and of those on its surface."""
     views, xyz, sigmas = job
     through, there = np.zeros((2, len(xyz)), dtype=bool)
     for record, cam_from_world in views:
@@ -422,12 +413,12 @@ def _judge(
     return through & ~there, there
 
 
-# of an image: its depth, points (N, 3) in its frame, their deviations (N,) along the depth's axis
+# depth, points (N, 3) in the image's frame, deviations (N,) along the depth axis
 _DepthJob = tuple[DepthRecord, Floats, Floats]
 
 
 def _quadratic_form(covariances: Floats, axis: Floats) -> Floats:
-    """Variances (N,) along an axis (3,) of covariances (N, 6); never negative, NaN stays."""
+    """Return variances (N,) along an axis (3,), clipped at 0; NaN is kept."""
     x, y, z = axis
     weights = np.array([x * x, 2 * x * y, 2 * x * z, y * y, 2 * y * z, z * z])
     return np.maximum(covariances @ weights, 0.0)
@@ -450,7 +441,7 @@ def _compare(
 
 def _reject_uncertain(selection: MapSelection, max_robust_sigmas: float) -> None:
     deviations = point_deviations(selection.covariances())[:, 2]
-    # points that are out already do not count in the map's median
+    # dropped points do not count in the map's median
     deviations = np.where(selection.kept_points, deviations, np.nan)
     depths = mean_depths(selection.observed()[0])
     rejected = too_uncertain(deviations, depths, max_robust_sigmas)

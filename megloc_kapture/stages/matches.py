@@ -1,7 +1,4 @@
-"""Stage: match local features of image pairs, verified; stored as kapture matches.
-
-Mapping pairs are verified with their known poses, query pairs by a two-view model.
-"""
+"""Stage: local feature matching and verification of image pairs, stored as kapture matches."""
 
 from __future__ import annotations
 
@@ -53,11 +50,11 @@ from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
 
 _log = logging.getLogger(__name__)
 
-_CACHE_BYTES = 256 << 20  # descriptors kept per process: about a hundred images
-_PAIRS_PER_ITEM = 32  # of one image, whose features are read once for them
-# groups of images whose pairs say whether the given poses contradict the matches
+_CACHE_BYTES = 256 << 20  # per process: the descriptors of about a hundred images
+_PAIRS_PER_ITEM = 32  # share an image, whose features are read once
+# image groups in which the given poses are checked against the matches
 _CHECKED_GROUPS = 6
-_RANKS = (0, 1, 3, 7, 15)  # of the others in a group among the images paired with its first one
+_RANKS = (0, 1, 3, 7, 15)  # ranks of the other group members among the images paired with the first
 
 
 class NoVerification(Options):
@@ -71,10 +68,7 @@ Verification = KnownPoseOptions | TwoViewOptions | NoVerification
 
 @dataclass(frozen=True, eq=False)
 class Features(ImageFeatures):
-    """Local features of one image, as a matcher gets them, and what verifying matches needs.
-
-    Make one with :meth:`of`. Rays and slopes are worked out when first asked for.
-    """
+    """Local features of one image, with lazily computed rays and slopes."""
 
     camera: Camera
 
@@ -82,7 +76,7 @@ class Features(ImageFeatures):
     def of(
         cls, camera: Camera, keypoints_px: NDArray[np.float32], descriptors: NDArray[Any]
     ) -> Features:
-        """Keypoints (N, 2 or more) and descriptors (N, D) of an image of this camera."""
+        """Create from keypoints (N, 2 or more) and descriptors (N, D)."""
         return cls(keypoints_px, descriptors, camera.width, camera.height, camera)
 
     @cached_property
@@ -104,7 +98,7 @@ _PairMatches = tuple[NDArray[np.int64], NDArray[np.float32]]
 
 
 class VerifiedMatches(NamedTuple):
-    """Matches of a pair that are verified, their scores, and how many there were before."""
+    """Verified matches of a pair, their scores, and the number of matches before verification."""
 
     matches: NDArray[np.int64]
     scores: NDArray[np.float32]
@@ -122,14 +116,12 @@ def match_pairs(
     *,
     work: Work = HERE,
 ) -> dict[str, int]:
-    """Match each pair (image of ``first``, image of ``second``) and write what is verified.
+    """Match image pairs of two folders and write the verified matches; return counts for the log.
 
-    A pair without verified matches is written with none, so that it is known to be done. How many
-    matches each pair had before and has after verification stands in ``match_counts.csv``. Returns
-    counts for the log: pairs, pairs with matches, matches.
+    A pair without verified matches is written too, which marks it as done.
     """
     within_one = first.root == second.root
-    # within a map (a, b) and (b, a) are one pair, kept in one file
+    # within a map (a, b) and (b, a) are one pair, stored in one file
     ordered = sorted({_one_way(pair) if within_one else (pair.query, pair.map) for pair in pairs})
     named = {f"{image}\0{other}": (image, other) for image, other in ordered}
     items = work.items(local_type)
@@ -168,7 +160,7 @@ def check_given_poses(
 ) -> None:
     """Compare the given poses of map images with two-view models of a sample of their pairs.
 
-    Logs a warning where some poses contradict the matches; where most do, raises DataError unless
+    Log a warning where some poses contradict the matches. Where most do, raise DataError unless
     ``work.force``.
     """
     specs = FolderSpec(mapping), FolderSpec(mapping)
@@ -188,8 +180,7 @@ def check_given_poses(
 
 
 def _sampled(pairs: Sequence[ImagePair]) -> list[_Job]:
-    """Pairs within groups of images spread over the map: an image and some of those paired with
-    it, mostly the most similar ones, which overlap."""
+    """Sample pairs within groups of similar images spread over the map."""
     paired: dict[str, list[str]] = {}
     for pair in sorted(pairs, key=lambda pair: (-pair.score, pair.query, pair.map)):
         paired.setdefault(pair.query, []).append(pair.map)
@@ -209,7 +200,7 @@ def _evidence(
     local_type: str,
     found: tuple[_Job, Sequence[_PairMatches]],
 ) -> list[PairEvidence]:
-    """The pairs of an image that a two-view model explains better than chance would."""
+    """Return the pairs of an image that a two-view model explains better than chance."""
     (image, others), matched = found
     data, options = specs[0].open().read(), TwoViewOptions()
     a, *read = _read(specs, local_type, (image, others))
@@ -238,7 +229,6 @@ def _one_way(pair: ImagePair) -> tuple[str, str]:
 
 
 def _read(specs: tuple[FolderSpec, FolderSpec], local_type: str, job: _Job) -> list[Features]:
-    """Features of the image, and of the others."""
     image, others = job
     others_read = [cached_features(specs[1], local_type, other) for other in others]
     return [cached_features(specs[0], local_type, image), *others_read]
@@ -278,7 +268,7 @@ def _verify(
 def match_all(
     matcher: Matcher, a: ImageFeatures, others: Sequence[ImageFeatures], names: Sequence[str]
 ) -> list[_PairMatches]:
-    """Match one image with each of several, as many at once as there is memory for."""
+    """Match one image with several others, in batches that fit into memory."""
     many: Any = matcher
 
     def match(batch: Sequence[ImageFeatures]) -> Sequence[_PairMatches]:
@@ -304,7 +294,6 @@ def match_all(
 
 
 def verified(a: Features, b: Features, pair: _PairMatches, verify: Verify) -> VerifiedMatches:
-    """The matches of a pair that are verified."""
     matches, scores = pair
     good = verify_best_first(partial(verify, a, b), matches, scores)
     return VerifiedMatches(matches[good], scores[good], len(matches))
@@ -313,10 +302,7 @@ def verified(a: Features, b: Features, pair: _PairMatches, verify: Verify) -> Ve
 def verification_of(
     options: Verification, b_from_a: Callable[[], RigidTransform | None] = lambda: None
 ) -> Verify:
-    """How the matches of two images are verified.
-
-    ``b_from_a``: for known poses, the second camera's; without, no match is right.
-    """
+    """Return a verifier; without a known relative pose it rejects every match."""
 
     def verify(a: Features, b: Features, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
         rows_a, rows_b = matches.T
@@ -336,7 +322,7 @@ def verification_of(
 
 
 class FeatureCache:
-    """Features of the images used last, bounded in bytes; shared by threads."""
+    """Thread-safe LRU cache of image features, bounded in bytes."""
 
     def __init__(self, max_bytes: int = _CACHE_BYTES) -> None:
         self._items: OrderedDict[Hashable, Features] = OrderedDict()
@@ -345,7 +331,6 @@ class FeatureCache:
         self._lock = threading.Lock()
 
     def get(self, key: Hashable, load: Callable[[], Features]) -> Features:
-        """The features of a key, loaded when they are not there."""
         with self._lock:
             if key in self._items:
                 self._items.move_to_end(key)
@@ -362,7 +347,7 @@ class FeatureCache:
 
 
 def _size(features: Features) -> int:
-    rays_and_slopes = (3 + 4) * 8 * len(features.keypoints_px)  # there or not
+    rays_and_slopes = (3 + 4) * 8 * len(features.keypoints_px)  # counted even if not computed yet
     return features.descriptors.nbytes + features.keypoints_px.nbytes + rays_and_slopes
 
 
@@ -370,8 +355,6 @@ _cache = FeatureCache()
 
 
 def cached_features(spec: FolderSpec, local_type: str, image: str) -> Features:
-    """The features of an image of a folder; kept in this process."""
-
     def read() -> Features:
         folder = spec.open()
         keypoints, descriptors = folder.keypoints(local_type), folder.descriptors(local_type)
@@ -387,7 +370,7 @@ def cached_features(spec: FolderSpec, local_type: str, image: str) -> Features:
 
 
 def iterate_candidates(pairs: Sequence[ImagePair]) -> Iterator[tuple[str, list[str]]]:
-    """Queries with their candidates, best first; queries sorted."""
+    """Yield each query, sorted by name, with its candidates, best first."""
     candidates: dict[str, list[ImagePair]] = {}
     for pair in pairs:
         candidates.setdefault(pair.query, []).append(pair)
@@ -396,12 +379,12 @@ def iterate_candidates(pairs: Sequence[ImagePair]) -> Iterator[tuple[str, list[s
         yield query, [pair.map for pair in best_first]
 
 
-# what decides which types of local features there are, and how each is matched
+# options that determine the local feature types and their matching
 MATCHING_OPTIONS = ("map", "local_features", "given_features", "matching", "verification")
 
 
 def mapping_pairs(work: StageWork, mapping: KaptureFolder) -> list[ImagePair]:
-    """The pairs of map images; photographs that got no pose are none of these any more."""
+    """Read the pairs of map images, without photographs that got no pose."""
     names = set(mapping.read().image_names())
     return [p for p in read_pairs(work.path(MAPPING_PAIRS)) if {p.query, p.map} <= names]
 
@@ -431,13 +414,12 @@ class MatchMapping(_MatchStage):
         return [self.options.make_matcher(name) for name in self.options.own_types()]
 
     def verification(self) -> Verification:
-        """How the matches are verified."""
         return self.options.verify_mapping()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         mapping = work.folder(self.layout.mapping(), FEATURES)
         pairs, out = mapping_pairs(work, mapping), work.out / self.writes[0]
-        # the poses of photographs are made of matches
+        # poses of photographs are estimated from matches, so they cannot contradict them
         if isinstance(self.verification(), KnownPoseOptions) and not self.layout.posed:
             name = self.options.own_types()[0]
             check_given_poses(mapping, pairs, name, self.options.make_matcher(name), work)

@@ -1,7 +1,6 @@
-"""Neural fields of kapture maps: trained, kept in a folder, read again, rendered, refined by.
+"""Neural fields of kapture maps: training, storage, rendering and pose refinement.
 
-A folder has ``field.json``, what the field is and was trained on, and ``field.safetensors``, its
-tensors; nothing in either can run.
+A field folder has ``field.json`` (architecture and training data) and ``field.safetensors``.
 """
 
 from __future__ import annotations
@@ -64,24 +63,18 @@ from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, Device, Failure, ImageFeatures, Options, RigidTransform
 
 FIELD_FILE, MANIFEST_FILE = "field.safetensors", "field.json"
-STATE_FILE = "field.state.pt"  # while it is trained
-# of views between cameras: to how many others, and how far these may look elsewhere
+STATE_FILE = "field.state.pt"  # during training
+# neighbours per camera for views between cameras, and their largest viewing angle
 _NEIGHBOURS, _MAX_ANGLE_DEG = 2, 45.0
-# of the pose that was solved, each by a rendering from where the last one led
+# alignments after the pose is solved, each with a new rendering
 _ALIGNMENTS = 2
-# neighbouring rendered depths that differ by more, a share, are of an edge: not lifted
+# relative depth difference of neighbouring pixels above which they are an edge, not lifted
 _MAX_JUMP = 0.05
 _MAX_ERROR_PX = 3.0
 
 
 class FieldManifest(BaseModel):
-    """``field.json``.
-
-    Attributes
-    ----------
-    images : those trained on, in the order of the transient embeddings.
-    held_out_psnr_db : of each held-out image.
-    """
+    """``field.json``; ``images`` are in the order of the transient embeddings."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -99,18 +92,9 @@ def train_field_of_map(
     *,
     progress: Callable[[int, float, list[float]], None] | None = None,
 ) -> Mapping[str, float]:
-    """Train a field on the images of a map that have poses, and write it into a folder.
+    """Train a field on the posed images of a map, or resume an interrupted training.
 
-    Where an interrupted training of the same has left its state there, it goes on from it.
-
-    Parameters
-    ----------
-    mapping : kapture with images and poses; masks and depth are used where they are.
-    progress : see :meth:`~megloc_kapture.refinement.field_training.FieldTrainer.train`.
-
-    Returns
-    -------
-    PSNR in dB of each held-out image by name.
+    Masks and depth are used where available. Return the PSNR in dB of each held-out image.
     """
     from safetensors.torch import save
 
@@ -135,7 +119,7 @@ def train_field_of_map(
 
 
 def views_of(mapping: KaptureFolder) -> list[FieldView]:
-    """The images of a map that have poses, sorted by name, with their masks and depth."""
+    """Return the posed images of a map, sorted by name, with masks and depth."""
     scene = KaptureScene(mapping)
     return [
         FieldView(
@@ -151,12 +135,11 @@ def views_of(mapping: KaptureFolder) -> list[FieldView]:
 
 
 def open_field(folder: Path, device: Device = "auto") -> NeuralField:
-    """A field out of its folder; one that has been opened stays in memory."""
+    """Open a field folder; opened fields are cached in memory."""
     return _opened(weights_file(folder), device)
 
 
 def weights_file(folder: Path) -> WeightsFile:
-    """The tensors of a field."""
     if not (folder / FIELD_FILE).is_file():
         raise DataError(f"no {FIELD_FILE} here; megloc train-field writes one", path=folder)
     return describe(FIELD_FILE, (folder / FIELD_FILE).absolute())
@@ -173,10 +156,9 @@ def _opened(file: WeightsFile, device: Device) -> NeuralField:
 
 
 def views_between(data: KaptureData) -> KaptureData:
-    """Views that no camera took: halfway between each camera and the nearest that look its way.
+    """Create views halfway between each camera and its nearest neighbours of similar direction.
 
-    Poses, and cameras under sensors of their own, so that kapture merges the renderings with the
-    map; each has the camera of the first of its two images by name.
+    New sensor ids let kapture merge the renderings with the map.
     """
     names, poses = data.image_names(), data.poses()
     names = [name for name in names if name in poses]
@@ -201,8 +183,6 @@ def views_between(data: KaptureData) -> KaptureData:
 
 @dataclass(frozen=True)
 class _Renderer:
-    """Renders views of a field, in any process; attributes as of :func:`render_along`."""
-
     field: Path
     records: Path
     appearance: str | None
@@ -211,7 +191,6 @@ class _Renderer:
     options: NetworkOptions = NetworkOptions()
 
     def __call__(self, view: tuple[str, Camera, RigidTransform]) -> Camera | None:
-        """Write image and depth of a view; its camera, None where it shows too little."""
         name, camera, pose = view
         field = open_field(self.field, self.options.device)
         light = None if self.appearance is None else field.appearance_of(self.appearance)
@@ -226,7 +205,6 @@ class _Renderer:
 
 
 def _files_of(name: str) -> tuple[str, str]:
-    """Rendering and depth map of an image, below ``records_data``."""
     stem = Path(name).with_suffix("")
     return f"{stem}.png", f"{stem}.depth"
 
@@ -241,18 +219,13 @@ def render_along(
     min_shown: float = 0.0,
     work: Work = HERE,
 ) -> int:
-    """Render all images of a kapture that have poses, as a kapture with depth of its own.
+    """Render all posed images of a kapture as a kapture with depth; return their number.
 
     Parameters
     ----------
-    field : folder of the field.
-    appearance : image that was trained on, whose light it is; the mean of all unless given.
-    max_side_px : longer side of the renderings; larger cameras are reduced.
-    min_shown : views in which less than this share of the pixels has depth are left out.
-
-    Returns
-    -------
-    The number of renderings.
+    appearance : training image whose lighting is used; the mean of all by default.
+    max_side_px : longer side of the renderings; larger cameras are scaled down.
+    min_shown : smallest share of pixels with depth; views with less are left out.
     """
     poses = data.poses()
     if not poses:
@@ -278,7 +251,7 @@ def render_along(
         for one, kind in zip(ids, ("camera", "depth"), strict=True):
             written.sensors[one] = Sensor.from_camera(camera, sensor_type=kind)
             written.trajectories[timestamp, one] = pose
-        # kapture joins depth with an image by the rig that carries both
+        # kapture associates depth with an image by their common rig
         same = RigidTransform.identity()
         written.rigs[f"{sensor}_with_depth"] = dict.fromkeys(ids, same)
         written.records_camera[timestamp, ids[0]] = image
@@ -288,8 +261,6 @@ def render_along(
 
 
 class FieldRefinerOptions(Options):
-    """Options of the refinement by a neural field."""
-
     field: str = Field(default="", description="folder that megloc train-field wrote")
     device: Device = Field(default="auto", description="of the field: auto, cpu, cuda or cuda:N")
     features: PluginChoice = Field(
@@ -313,12 +284,10 @@ class FieldRefinerOptions(Options):
 class FieldRefiner:
     """Plugin ``field``: the query is matched with what a neural field shows at its pose.
 
-    Render, match, solve: colour and depth are rendered at the initial pose, local features of query
-    and rendering matched, lifted by the rendered depth, and the pose solved (as GS-CPR, Liu et al.,
-    ICLR 2025, does with splats). Renderings from there are aligned with the query as map images are
-    by ``rendering``, and the pose is accepted by its rules. The query's light is fitted on every
-    other square of it, and the others are what its pose is accepted by. Descending on colours from
-    the initial pose is slower and heals less.
+    Features of query and rendering are matched and lifted by rendered depth, and the pose is solved
+    (as in GS-CPR, Liu et al., ICLR 2025). New renderings are aligned with the query, and the pose
+    accepted, as by the ``rendering`` refiner. The lighting is fitted on alternate squares of the
+    query, and the others decide on acceptance.
     """
 
     name = "field"
@@ -336,11 +305,9 @@ class FieldRefiner:
         self._matcher: Matcher = load_plugin(MATCHERS, other.name, other.options)
 
     def plugins(self) -> tuple[object, ...]:
-        """Those it is made of."""
         return (self._features, self._matcher)
 
     def weights(self) -> dict[str, str]:
-        """The field's tensors, and those of features and matcher."""
         file = weights_file(Path(self.options.field))
         return {
             file.name: sha256_of(file),
@@ -356,7 +323,7 @@ class FieldRefiner:
         references: Sequence[str],
         scene: RankingScene,
     ) -> PoseRefinement:
-        """Refine the pose of a query; the references are not looked at."""
+        """Refine the pose of a query; ``references`` are ignored."""
         field = open_field(Path(self.options.field), self.options.device)
         image, mask = scene.query_image(query), scene.query_mask(query)
         fitted = _checkers(image.shape[:2])
@@ -395,7 +362,6 @@ class FieldRefiner:
     def _extract(
         self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None, camera: Camera
     ) -> ImageFeatures:
-        """Features of an image in the size of a camera."""
         size = camera.width, camera.height
         if image.shape[:2] != size[::-1]:
             image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
@@ -407,7 +373,6 @@ class FieldRefiner:
     def _solve(
         self, query: ImageFeatures, rendering: FieldRendering, pose: RigidTransform
     ) -> RigidTransform | Failure:
-        """The query's pose by its matches with a rendering at a pose near it."""
         shown = self._extract(rendering.image, rendering.depth_m > 0, rendering.camera)
         rows, _ = self._matcher.match(query, shown)
         px = shown.keypoints_px[rows[:, 1], :2].astype(np.float64)
@@ -425,7 +390,7 @@ class FieldRefiner:
 
 
 def _checkers(shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Every other of the squares, ten along the longer side, into which an image is divided."""
+    """Return a checkerboard mask with ten squares along the longer side."""
     height, width = shape
     squares = [np.arange(side) * 10 // max(shape) for side in (height, width)]
     return np.asarray((squares[0][:, None] + squares[1]) % 2 == 0)

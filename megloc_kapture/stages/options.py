@@ -1,4 +1,4 @@
-"""Every option of the pipeline in one frozen model, with defaults and units."""
+"""Options of the whole pipeline, with defaults and units."""
 
 from __future__ import annotations
 
@@ -36,12 +36,11 @@ from megloc_kapture.values import Device, Options
 
 
 def _first_twice(names: Sequence[str]) -> str | None:
-    """The first name, by the alphabet, that stands in a list more than once."""
     return min((name for name, count in Counter(names).items() if count > 1), default=None)
 
 
 class LocalFeaturesChoice(PluginChoice):
-    """An extractor of local features, its options, and how its features are matched."""
+    """A local feature extractor, its options, and the matching of its features."""
 
     matching: PluginChoice | None = Field(
         default=None, description="matcher of this type; none: that of the run"
@@ -109,81 +108,74 @@ class PipelineOptions(Options):
 
     @model_validator(mode="after")
     def _placed(self) -> PipelineOptions:
-        """Put device and precision into the options of the networks that name none."""
+        """Set device and precision of networks whose options name none."""
         for name in type(self).model_fields:
             self.__dict__[name] = with_device(getattr(self, name), self.device, self.precision)
         return self
 
     def make_extractors(self) -> list[LocalFeatureExtractor]:
-        """The extractors of local features, in order; raises PluginError, MissingWeightsError."""
         return [
             load_plugin(LOCAL_FEATURES, chosen.name, chosen.options)
             for chosen in self.local_features
         ]
 
     def make_given_extractor(self) -> LocalFeatureExtractor:
-        """The extractor of a given map's features."""
         extractor: LocalFeatureExtractor = load_plugin(
             LOCAL_FEATURES, self.given_features.name, self.given_features.options
         )
         return extractor
 
     def preprocesses(self) -> bool:
-        """Whether anything is done to the images before features are extracted."""
         return self.preprocessing != PreprocessingOptions()
 
     def changes_frames(self) -> bool:
-        """Whether the images become others in size or projection."""
+        """Return whether image size or projection changes."""
         masked = PreprocessingOptions(masks=self.preprocessing.masks)
         return self.preprocessing != masked
 
     def uses_given_map(self) -> bool:
-        """Whether the model that the dataset comes with is localized in."""
         return self.map == "given"
 
     def makes_points(self) -> bool:
-        """Whether the map has points of features that are extracted here."""
+        """Return whether the map has points of features extracted in this run."""
         return self.map != "given"
 
     def matches_again(self) -> bool:
-        """Whether pairs with few matches are tried again by guided pyramid matching."""
+        """Return whether guided pyramid matching is enabled."""
         return self.guided_pyramid.mode != "off"
 
     def triangulates(self) -> bool:
-        """Whether map images are matched with each other."""
         return self.map == "triangulate"
 
     def pairs_by_points(self) -> bool:
-        """Whether map images are paired by the points of the model that the dataset comes with."""
         return self.triangulates() and self.mapping_pairs.needs_points()
 
     def point_types(self) -> list[str]:
-        """Keypoints types of our own in the map: the pyramids' where map images were retried."""
+        """Return keypoints types with points made in this run, possibly pyramid types."""
         types = self.own_types()
         if self.matches_again() and self.triangulates():
             return [pyramid_type(local_type) for local_type in types]
         return types
 
     def query_types(self) -> list[str]:
-        """Keypoints types of the queries' matches; in the order of :meth:`local_types`."""
+        """Return keypoints types of the query matches, in the order of :meth:`local_types`."""
         types = self.local_types()
         return [pyramid_type(name) for name in types] if self.matches_again() else types
 
     def own_extractors(self) -> list[LocalFeatureExtractor]:
-        """Extractors of the types that get points of our own; none for a given map alone."""
+        """Create the extractors of types that get points in this run; none for a prebuilt map."""
         return self.make_extractors() if self.makes_points() else []
 
     def query_extractors(self) -> list[LocalFeatureExtractor]:
-        """Extractors of all types that queries are localized with, ours first."""
+        """Create the extractors of all query types, the prebuilt map's last."""
         given = [self.make_given_extractor()] if self.uses_given_map() else []
         return [*self.own_extractors(), *given]
 
     def own_types(self) -> list[str]:
-        """Keypoints types that are extracted here and get points."""
         return [extractor.name for extractor in self.own_extractors()]
 
     def local_types(self) -> list[str]:
-        """Keypoints types that queries are localized with, the one VLAD uses first."""
+        """Return the keypoints types used for localization, VLAD's type first."""
         types = [extractor.name for extractor in self.query_extractors()]
         if twice := _first_twice(types):
             raise OptionError(
@@ -193,15 +185,11 @@ class PipelineOptions(Options):
         return types
 
     def main_type(self) -> str:
-        """The keypoints type that VLAD uses; see :meth:`local_types`."""
+        """Return the keypoints type used by VLAD."""
         return self.local_types()[0]
 
     def retrieval(self) -> Retrieval:
-        """The global features that are compared, and how they are fused.
-
-        Raises OptionError: two of one type, or options that VLAD cannot have; PluginError,
-        MissingWeightsError: an extractor cannot be made.
-        """
+        """Return the global features to compare and their fusion weights."""
         main_type = self.main_type()
         types = [chosen.type_name(main_type) for chosen in self.global_features]
         if twice := _first_twice(types):
@@ -210,7 +198,6 @@ class PipelineOptions(Options):
         return Retrieval(tuple(types), weights, self.fusion)
 
     def matching_of(self, local_type: str) -> PluginChoice:
-        """How features of a type are matched."""
         if self.makes_points():
             for chosen, extractor in zip(self.local_features, self.make_extractors(), strict=True):
                 if extractor.name == base_type(local_type) and chosen.matching is not None:
@@ -218,19 +205,15 @@ class PipelineOptions(Options):
         return self.matching
 
     def make_matcher(self, local_type: str) -> Matcher:
-        """The matcher of a type."""
         chosen = self.matching_of(local_type)
         matcher: Matcher = load_plugin(MATCHERS, chosen.name, chosen.options)
         return matcher
 
     def verify_mapping(self) -> Verification:
-        """How mapping pairs are verified."""
         return NoVerification() if self.verification == "none" else self.mapping_verification
 
     def verify_photographs(self) -> Verification:
-        """How pairs of photographs without poses are verified."""
         return NoVerification() if self.verification == "none" else self.query_verification
 
     def verify_queries(self) -> Verification:
-        """How query pairs are verified."""
         return self.query_verification if self.verification == "geometric" else NoVerification()

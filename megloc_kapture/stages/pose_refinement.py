@@ -1,4 +1,4 @@
-"""Stage: better poses of localized queries, or the old ones with the reason why they stay."""
+"""Stage: pose refinement of localized queries."""
 
 from __future__ import annotations
 
@@ -67,13 +67,11 @@ from megloc_kapture.stages.stage import (
 from megloc_kapture.stages.work import HERE, FolderSpec, Work, ordered_map
 from megloc_kapture.values import Camera, Options, Pose, RefinementRow, RigidTransform
 
-# map images held out at once: of those, what comes behind the last that is needed is thrown away
+# map images held out at once; a larger window wastes work after the last one needed
 _WINDOW = 4
 
 
 class PoseRefinementOptions(Options):
-    """How the poses of localized queries are refined."""
-
     by: tuple[PluginChoice, ...] = Field(
         default=(), description="pose refiners, one after another; none: poses stay"
     )
@@ -89,29 +87,22 @@ class PoseRefinementOptions(Options):
     )
 
     def with_refiners(self, names: Sequence[str]) -> PoseRefinementOptions:
-        """With these refiners, in this order, each with the options that it has here."""
+        """Select refiners, in this order; known ones keep their options."""
         chosen = chosen_by_name(self.by, names)
         return PoseRefinementOptions.model_validate({**self.model_dump(), "by": chosen})
 
     def refines(self) -> bool:
-        """Whether anything is done."""
         return bool(self.by)
 
     def make_refiners(self) -> list[PoseRefiner]:
-        """The refiners, in order; raises PluginError, MissingWeightsError."""
         return [load_plugin(POSE_REFINERS, one.name, one.options) for one in self.by]
 
 
 class MapRefiners:
-    """The pose refiners of a map: the images they use, and the frames they are trusted in.
+    """Pose refiners of a map; thread-safe.
 
-    A refiner whose poses are as good as the map is consistent is used in those coordinate frames
-    only that prove to be: a sample of their images is held out. Threads may share it.
-
-    Parameters
-    ----------
-    mapping : kapture with poses, and whatever the refiners need: images, depth maps, points.
-    restrictions : the coordinate frames of the map's images, which are never mixed.
+    Refiners that need a consistent map are used only in coordinate frames that pass a test on
+    held-out map images.
     """
 
     def __init__(
@@ -141,11 +132,10 @@ class MapRefiners:
         }
 
     def _frame(self, pose: Pose) -> str:
-        """The coordinate frame of a pose, by the map images that it comes from."""
         return self._restrictions.frame(pose.candidates[0]) if pose.candidates else ""
 
     def test(self, poses: Iterable[Pose], *, work: Work = HERE) -> None:
-        """Test the frames of these poses that have not been tested."""
+        """Test the coordinate frames of these poses that are not tested yet."""
         with self._lock:
             for frame in sorted({self._frame(pose) for pose in poses} - set(self._verdicts)):
                 self._verdicts[frame] = [
@@ -160,7 +150,7 @@ class MapRefiners:
         return judge_consistency(ordered_map(hold_out, spread, work.executor, window=_WINDOW))
 
     def tested(self) -> list[ConsistencyRow]:
-        """The rows of ``map_consistency.csv``: by refiner, then by frame."""
+        """Return the rows of ``map_consistency.csv``."""
         return [
             _consistency_row(frame, refiner.name, verdict)
             for number, refiner in enumerate(self.refiners)
@@ -169,10 +159,7 @@ class MapRefiners:
         ]
 
     def uses(self, pose: Pose) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """References of a pose, and of each refiner why it is distrusted: see :func:`refine_pose`.
-
-        Its frame has been tested.
-        """
+        """Return ``references`` and ``distrusted`` for :func:`refine_pose`, in a tested frame."""
         frame = self._frame(pose)
         near = self._by_frame[frame].near(
             pose.cam_from_world,
@@ -183,7 +170,6 @@ class MapRefiners:
         return tuple(near), tuple(one.reason if one else "" for one in self._verdicts[frame])
 
     def refine(self, image: str, camera: Camera, pose: Pose, scene: RankingScene) -> Pose:
-        """Refine the pose of one query."""
         if not self.refiners:
             return pose
         self.test([pose])
@@ -211,17 +197,10 @@ def refine_pose(
     refiners: Sequence[PoseRefiner],
     scene: RankingScene,
 ) -> Pose:
-    """Refine the pose of one query by one refiner after another.
+    """Apply several refiners to the pose of one query; return the last accepted pose.
 
-    Parameters
-    ----------
-    references : map images that may show what the query sees, best first.
-    distrusted : of each refiner, why it must not be used in this map; empty where it may.
-
-    Returns
-    -------
-    The pose that the last accepted refiner gave, with its covariance; what each made of it stands
-    in its ``refinements``.
+    ``references`` are map images that may overlap with the query, best first. ``distrusted`` has a
+    reason not to use a refiner, or "", for each.
     """
     rows, seconds = [], dict(pose.seconds)
     for refiner, reason in zip(refiners, distrusted, strict=True):
@@ -234,7 +213,7 @@ def refine_pose(
         rows.append(_row(refiner, image, before, refined))
         if refined.accepted:
             after = refined.cam_from_world
-            w, x, y, z = map(float, after.quat_wxyz)  # a plugin may count in another precision
+            w, x, y, z = map(float, after.quat_wxyz)
             t_x, t_y, t_z = map(float, after.translation)
             after = RigidTransform((w, x, y, z), (t_x, t_y, t_z))
             pose = replace(pose, cam_from_world=after, covariance=refined.covariance)
@@ -274,20 +253,11 @@ def refine_poses(
     work: Work = HERE,
     timing: Path | None = None,
 ) -> dict[str, float]:
-    """Refine the poses of queries that were localized, and write them as a result of their own.
+    """Refine the poses of localized queries and write them as a new localization folder.
 
-    A query that failed, or has a fallback pose, is left as it is. What became of each pose stands
-    in ``status.csv``, with measures in ``refinement.csv``. A refiner whose poses are as good as the
-    map is consistent is used in those coordinate frames only that prove to be; the measurement
-    stands in ``map_consistency.csv``. Returns counts for the log.
-
-    Parameters
-    ----------
-    map_folder : kapture with poses, and whatever the refiners need: images, depth maps, points.
-    query : images of the queries, their masks and depth maps.
-    localized : what localization wrote.
-    restrictions : the coordinate frames of the map's images, which are never mixed.
-    timing : where to write seconds per query and refiner.
+    Failed queries and fallback poses stay unchanged. ``map_folder`` and ``query`` provide what the
+    refiners need: images, masks, depth maps, points. ``refinement.csv`` has the measures of each
+    refiner, ``map_consistency.csv`` those of each coordinate frame. Return counts for the log.
     """
     refiners = MapRefiners(map_folder, restrictions, options)
     statuses = read_status(localized.root / STATUS_FILE)

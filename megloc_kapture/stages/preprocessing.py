@@ -1,9 +1,6 @@
-"""Stage: images resized, undistorted and masked, as a kapture of its own.
+"""Stage: resized, undistorted and masked images, as a new kapture without features and points.
 
-Names, poses, rigs and records stay; a camera becomes the one that would have taken the new images,
-under its old id. What does not change is linked. Depth maps stay as they are: they are of sensors
-of their own, whose cameras are theirs. Features, matches and points are not carried along: they
-belong to the old pixels.
+Names, poses, rigs, records and sensor ids stay. Unchanged files and depth maps are linked.
 """
 
 from __future__ import annotations
@@ -59,8 +56,6 @@ REPORT_FILE = "preprocessing.json"
 
 
 class PreprocessingOptions(FrameOptions):
-    """What is done to images before anything looks at them; by default nothing."""
-
     masks: MaskOptions = MaskOptions()
 
 
@@ -69,12 +64,7 @@ def _process(
     classes: ClassMasks | None,
     job: tuple[str, Path, FramePlan, bool, Mapping[str, Path], Mapping[str, Mask]],
 ) -> dict[str, float]:
-    """Write one image and its mask.
-
-    ``job``: the image and its file; its frame; whether it is linked where it does not
-    change; its mask files, and the masks of its camera in original pixels. Returns the share of
-    its pixels masked by each source of masks, and by ``all`` of them; empty without masks.
-    """
+    """Write one image and its mask; return its masked shares by source and ``all``."""
     image, source, plan, link, mask_paths, standing = job
     sensors, camera = output / "sensors", plan.original
     write = partial(write_image, jpeg_quality=JPEG_QUALITY)
@@ -102,7 +92,7 @@ def _process(
 
 
 class CameraReport(BaseModel):
-    """One camera before and after: model, width, height and its parameters, as in sensors.txt."""
+    """One camera before and after: model, width, height and parameters, as in sensors.txt."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -112,11 +102,7 @@ class CameraReport(BaseModel):
 
 
 class PreprocessingReport(BaseModel):
-    """``sensors/preprocessing.json``: what was done to a kapture.
-
-    ``masked`` is the share of the pixels of all images that each source of masks ignores, ``all``
-    that they ignore together; ``remarks`` say what was asked for and could not be done.
-    """
+    """``sensors/preprocessing.json``; ``masked`` is the share of masked pixels by mask source."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -129,7 +115,6 @@ class PreprocessingReport(BaseModel):
 
 
 def read_report(root: Path) -> PreprocessingReport | None:
-    """What was done to a kapture; None where nothing was."""
     path = root / "sensors" / REPORT_FILE
     return read_json_model(path, PreprocessingReport) if path.is_file() else None
 
@@ -143,22 +128,11 @@ def preprocess_images(
     sequences: Sequence[KaptureFolder] = (),
     work: Work = HERE,
 ) -> dict[str, float]:
-    """Write a kapture with the images, cameras and masks that the options make of one.
+    """Write a kapture with pre-processed images, cameras and masks; return counts for the log.
 
-    ``sensors/masks/IMAGE.png`` (0 = ignore) for every image that has some source of masks or
-    shows what its original does not; ``sensors/classes`` what a segmenter saw; and
-    ``sensors/preprocessing.json``, a :class:`PreprocessingReport`.
-
-    Parameters
-    ----------
-    segmenter : the plugin; made of ``options.masks.segmenter`` unless given.
-    sequences : more folders to find the cameras' unchanging regions in; the map's, for queries.
-    work : its processes write the images, so they must see the same files.
-
-    Returns
-    -------
-    Counts for the log: images, how many of them changed and have a mask, and the shares of
-    pixels masked by each source.
+    ``sensors/masks/IMAGE.png`` (0 = ignore) exists for images with masked or invalid pixels,
+    ``sensors/classes`` has the segmenter's labels. ``sequences`` are more folders for finding
+    unchanging regions: the map's, for queries.
     """
     output = Path(output)
     if output.resolve().is_relative_to(folder.root.resolve()):
@@ -236,7 +210,6 @@ def _class_masks(options: MaskOptions, segmenter: Segmenter | None) -> ClassMask
 
 
 def _plans(data: KaptureData, options: FrameOptions) -> dict[str, FramePlan]:
-    """What becomes of each camera that took an image, by sensor id."""
     plans: dict[str, FramePlan] = {}
     for (_, sensor_id), image in sorted(data.records_camera.items()):
         if sensor_id not in plans:
@@ -245,10 +218,7 @@ def _plans(data: KaptureData, options: FrameOptions) -> dict[str, FramePlan]:
 
 
 def _remarks(regions: Mapping[str, UnchangingRegion], have_fallback: bool) -> list[str]:
-    """Of cameras without an unchanging region.
-
-    Refuses when none has the images to find one, unless a fixed mask stands in.
-    """
+    """Report cameras without an unchanging region; raise if none has one, without a fallback."""
     remarks = [f"camera {name}: {r.reason}" for name, r in sorted(regions.items()) if not r]
     if regions and not (have_fallback or any(region.frontier for region in regions.values())):
         raise OptionError(f"no unchanging region can be found: {remarks[0]}")
@@ -256,7 +226,7 @@ def _remarks(regions: Mapping[str, UnchangingRegion], have_fallback: bool) -> li
 
 
 def _with_cameras(data: KaptureData, plans: Mapping[str, FramePlan]) -> KaptureData:
-    """The same data with the processed cameras; one that stays keeps its very digits."""
+    """Replace the processed cameras; unchanged ones keep their exact digits."""
     sensors = dict(data.sensors)
     for sensor_id, plan in plans.items():
         if plan.processed != plan.original:
@@ -266,7 +236,7 @@ def _with_cameras(data: KaptureData, plans: Mapping[str, FramePlan]) -> KaptureD
 
 
 def _unlink_folders(output: Path) -> None:
-    """Take away folders that are links: what is written below them would be somebody else's."""
+    """Remove linked folders, through which user data would be overwritten."""
     for name in ("records_data", "masks", CLASSES):
         place = output / "sensors" / name
         try:
@@ -277,10 +247,7 @@ def _unlink_folders(output: Path) -> None:
 
 
 def _link_records(folder: KaptureFolder, output: Path, plans: Mapping[str, FramePlan]) -> bool:
-    """Link all records at once where no image changes; else the depth maps, one by one.
-
-    Returns whether the images are linked.
-    """
+    """Link all records if no image changes, else only depth maps; return True if all."""
     records = folder.root / "sensors" / "records_data"
     if records.is_dir() and not any(plan.changes_pixels for plan in plans.values()):
         link_records(output, {"": records})
@@ -327,7 +294,7 @@ class Preprocess(PipelineStage):
         options, counts = self.options.preprocessing, dict[str, float]()
         for folder in (mapping, *queries):
             name, out = folder.root.name, work.out / PREPROCESSED / folder.root.name
-            # the queries of one camera may be few, or all at night
+            # queries of one camera may be few, or all taken at night
             others = [] if folder is mapping else [mapping]
             found = preprocess_images(folder, out, options, sequences=others, work=work)
             counts |= {f"{name}_{key}": count for key, count in found.items()}

@@ -1,8 +1,7 @@
-"""Stages: guided pyramid matching of map images, and of queries; which add keypoints to images.
+"""Stages: guided pyramid matching of map images and of queries.
 
-The matches of all map images' variants are collected first; then the pairs are combined in order,
-so that the rows of added keypoints do not depend on the workers. Map images whose poses leave them
-no view in common are not tried.
+All variants are matched before pairs are combined, so that the order of the added keypoints does
+not depend on the workers.
 """
 
 from __future__ import annotations
@@ -83,28 +82,19 @@ def pyramid_mapping(
     num_found: Mapping[_Pair, int] | None = None,
     work: Work = HERE,
 ) -> dict[str, float]:
-    """Try mapping pairs with few matches again, each image's variants with the other as it is.
+    """Match mapping pairs with few matches again, using scaled and rotated variants of each image.
 
-    Parameters
-    ----------
-    mapping : images with poses, with the features and verified matches of ``local_type``.
-    pairs : those that were matched.
-    output : gets ``local_features/T-pyramid``: keypoints, descriptors, matches of all pairs, and
-        ``guided_pyramid.csv``, a row per pair that was tried.
-    num_found : matches of each pair before verification; as many as are stored unless given.
-
-    Returns
-    -------
-    Counts for the log, and ``seconds_per_tried_pair``, of one worker.
+    ``output`` receives ``local_features/T-pyramid`` and ``guided_pyramid.csv``, a row per retried
+    pair. ``num_found`` counts matches before verification, by default the stored ones. Return
+    counts for the log.
     """
     data, poses = mapping.read(), mapping.read().poses()
 
     def can_gain(a: str, b: str) -> bool:
         if not (a in poses and b in poses):
-            return False  # an image without a pose gives no points
+            return False  # cannot triangulate without a pose
         return views_can_overlap(data.camera_of(a), poses[a], data.camera_of(b), poses[b])
 
-    # kept in one file, so (a, b) and (b, a) are one pair
     named = sorted({(min(p.query, p.map), max(p.query, p.map)) for p in pairs})
     stored, keypoints = mapping.matches(local_type), mapping.keypoints(local_type)
     counts = {pair: len(stored.read(*pair)[0]) for pair in named}
@@ -114,7 +104,7 @@ def pyramid_mapping(
     others: dict[str, tuple[list[str], list[str]]] = defaultdict(lambda: ([], []))
     for a, b in hard:
         others[a][0].append(b)
-        # rotating one image is rotating the other: b is rotated only where it is scaled
+        # rotating either image is equivalent, so b only gets scaled
         others[b][1].append(a)
 
     features = PyramidFeatures(output, mapping, local_type)
@@ -184,7 +174,7 @@ def _match_again(
 
 @dataclass(eq=False)
 class _Added:
-    """Keypoints (A, C) added to an image, and a descriptor (D,) of each."""
+    """Keypoints (A, C) added to an image, and their descriptors (D,)."""
 
     keypoints_px: NDArray[np.float32]
     descriptors: list[NDArray[Any]] = field(default_factory=list)
@@ -192,16 +182,12 @@ class _Added:
 
 @dataclass(frozen=True, eq=False)
 class _Directed:
-    """Matches of an image's variants with one other image."""
-
     found: list[VariantMatches]
     num_variants: int
     skipped: str
 
 
 class _VariantsOfMap:
-    """The matches of all images' variants, by image and other image, and the added keypoints."""
-
     def __init__(self, keypoints: FeatureReader) -> None:
         self._keypoints = keypoints
         self._found: dict[_Pair, _Directed] = {}
@@ -209,7 +195,6 @@ class _VariantsOfMap:
         self.seconds = 0.0
 
     def put(self, image: str, others: Sequence[str], matched: MatchedVariants) -> None:
-        """Keep the matches of one image's variants with ``others``."""
         self.seconds += matched.seconds
         for other, own, count in zip(others, matched.found, matched.num_variants, strict=True):
             self._found[image, other] = _Directed(own, count, matched.skipped)
@@ -217,7 +202,7 @@ class _VariantsOfMap:
     def combine(
         self, pair: _Pair, base: tuple[NDArray[np.int64], NDArray[Any]], method: PyramidMethod
     ) -> tuple[Combined, list[str]]:
-        """The matches of a pair with those of the variants of both its images, and its row."""
+        """Combine a pair's matches with its variant matches; return them and the table row."""
         if method.options.mode == "off":
             raise ValueError("only pairs that are tried again are combined")
         directed = self._found[pair], self._found[pair[::-1]]
@@ -255,16 +240,10 @@ def pyramid_queries(
     num_found: Mapping[_Pair, int] | None = None,
     work: Work = HERE,
 ) -> dict[str, float]:
-    """Try query pairs with few matches again: the query's variants with the map's keypoints.
+    """Match query pairs with few matches again: variants of the query with the map's keypoints.
 
-    The map is neither extracted again nor changed. Where it has keypoints of ``T-pyramid`` the
-    variants are matched with those, which begin with those of T.
-
-    Parameters
-    ----------
-    query : images, with the features and the matches of ``local_type``.
-    mapping : images of the map with features of ``local_type``.
-    pairs, output, num_found : see :func:`pyramid_mapping`, as what is returned and raised.
+    The map stays unchanged; its keypoints of ``T-pyramid`` are used if it has any. See
+    :func:`pyramid_mapping`.
     """
     before = num_found or {}
     larger = pyramid_type(local_type)
@@ -321,7 +300,6 @@ def _retry(
 
 
 def _num_found(work: StageWork, matches: str, local_type: str) -> dict[_Pair, int]:
-    """Matches of each pair before verification, as the stage that matched them wrote them."""
     rows = read_match_counts(work.path(matches), local_type)
     return {(row.image, row.other): row.matches for row in rows}
 
@@ -335,7 +313,6 @@ class _PyramidStage(PipelineStage):
         return [*extractors, *(self.options.make_matcher(one.name) for one in extractors)]
 
     def _methods(self, verification: Verification) -> Iterator[tuple[str, PyramidMethod]]:
-        """How pairs are tried again, by keypoints type."""
         options = self.options
         for extractor in self._extractors():
             matcher = options.make_matcher(extractor.name)

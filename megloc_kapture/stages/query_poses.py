@@ -1,7 +1,7 @@
-"""Stage: localize the queries from their matches with map images, cluster by cluster.
+"""Stage: cluster-wise localization of queries from matches with map images.
 
-MegLoc, section "Cluster-wise localization": the candidates of a query are divided into places, each
-gives a pose, a ranker says which is right, and that one is refined with its own images alone.
+Candidates of a query are clustered by location and each cluster gives a pose. A ranker selects
+one, which is refined with the images of its cluster (MegLoc, "Cluster-wise localization").
 """
 
 from __future__ import annotations
@@ -60,15 +60,13 @@ from megloc_kapture.stages.work import (
 )
 from megloc_kapture.values import MIN_CONFIDENCE, Failure, Options, Pose, RigidTransform
 
-_FIRST_TURN = 5  # candidates; every turn has twice as many as the one before
-# of a pose that is sure: the right pose of a dozen inliers can be decimetres off, and more
-# candidates mend that (docs/performance.md)
+_FIRST_TURN = 5
+# below this even the right pose can be decimetres off, which more candidates improve
+# (docs/performance.md)
 _SURE_INLIERS = 30
 
 
 class LocalizationOptions(Options):
-    """How a query's pose is found from its matches."""
-
     clusters: ClusterOptions = ClusterOptions()
     rank: PluginChoice = Field(
         default=PluginChoice(name="distinctive"),
@@ -96,7 +94,6 @@ class LocalizationOptions(Options):
     )
 
     def make_ranker(self) -> PoseRanker:
-        """The ranker of candidate poses."""
         ranker: PoseRanker = load_plugin(POSE_RANKERS, self.rank.name, self.rank.options)
         return ranker
 
@@ -112,16 +109,15 @@ def localize_unit(
     scene: RankingScene,
     as_rig: bool = False,
 ) -> list[Pose | Failure]:
-    """Localize one query, or the cameras of a rig together, and say so of each camera.
+    """Localize one query, or the cameras of a rig together; return a result per camera.
 
-    A rig that has no pose is tried camera by camera.
+    A rig without a joint pose is localized camera by camera.
 
     Parameters
     ----------
-    views : with verified matches.
-    candidates : map images, best first, and ``frames``, the coordinate frame of each.
-    centers : of the candidates in the world, (3,) each.
-    as_rig : one result for all cameras, whose pose is ``rig_from_world``.
+    candidates : map images, best first, with a coordinate frame each in ``frames``.
+    centers : camera centres (3,) of the candidates in the world.
+    as_rig : return one result with the pose ``rig_from_world``.
     """
 
     def localize(together: Sequence[QueryView]) -> tuple[Pose | Failure, PoseProblem | None]:
@@ -166,10 +162,7 @@ def localize_unit(
 def in_turn(
     solve: Callable[[int], list[Pose | Failure]], num_candidates: int, options: LocalizationOptions
 ) -> list[Pose | Failure]:
-    """What ``solve`` makes of the best few candidates where that is sure, else of all.
-
-    ``solve``: localizes with so many of the candidates, best first.
-    """
+    """Localize with the first few candidates, and with more until the result is certain."""
     sure, few = options.sure_confidence, _FIRST_TURN
     while sure is not None and few < num_candidates:
         solved = solve(few)
@@ -182,14 +175,12 @@ def in_turn(
     return solve(num_candidates)
 
 
-# a unit, the candidates of each of its images, and the frames of these
+# a unit, the candidates of each image, and their coordinate frames
 _Job = tuple[Unit, Sequence[Sequence[str]], Mapping[str, str]]
 
 
 @dataclass(frozen=True)
 class _Localizer:
-    """Localizes units of queries, each with the candidates of its images."""
-
     map: FolderSpec
     query: FolderSpec
     matches: FolderSpec
@@ -245,7 +236,7 @@ def _for_writing(result: Pose | Failure, reading_s: float) -> Pose | Failure:
     result = replace(result, seconds={"reading": reading_s, **result.seconds})
     if isinstance(result, Failure):
         return result
-    # these are for who asked with arrays; the stage writes none of them
+    # only the Python API uses the arrays
     return replace(result, inliers=None, inlier_points_px=None, inlier_points_world=None)
 
 
@@ -264,14 +255,9 @@ def localize_from_matches(
     work: Work = HERE,
     scratch: Path | None = None,
 ) -> Iterator[tuple[str, Pose | Failure]]:
-    """Localize every query from stored matches: image and result; in order of units' names.
+    """Localize every query from stored matches of ``local_types``; yield results sorted by unit.
 
-    Parameters
-    ----------
-    local_types : keypoints types whose matches are used, together. The map may know a guided
-        pyramid's type by the type it was made of, whose keypoints come first in it.
-    restrictions : the coordinate frames of the map's images, which are never mixed.
-    scratch : folder for the map's index meanwhile, the system's unless given.
+    The map may use the base type of a guided pyramid type. ``scratch`` holds a temporary map index.
     """
     ranker = options.make_ranker()
     candidates = {name: tuple(images) for name, images in iterate_candidates(pairs)}
@@ -290,7 +276,7 @@ def localize_from_matches(
 
 
 def type_in_map(map_folder: KaptureFolder, local_type: str) -> str:
-    """The type that a map knows keypoints by; one without any point is known by its keypoints."""
+    """Return a map's name of a keypoints type: the type or its base type."""
     names = (local_type, base_type(local_type))
     known = (map_folder.observations(), map_folder.types("keypoints"))
     return next((name for where in known for name in names if name in where), names[-1])
@@ -339,7 +325,7 @@ class LocalizeQueries(PipelineStage):
         )
         return write_localized(
             work.out / self.layout.poses(),
-            work.folder(QUERY),  # as imported: the poses are theirs as well
+            work.folder(QUERY),
             chain(results, unreadable_queries(tables)),
             fallback=options.fallback,
             first_candidates=first_candidates(pairs, work.folder(MAPPING)),
@@ -350,7 +336,7 @@ class LocalizeQueries(PipelineStage):
 def first_candidates(
     pairs: Sequence[ImagePair], mapping: KaptureFolder
 ) -> dict[str, tuple[str, RigidTransform]]:
-    """Query to its best retrieved map image and that image's pose."""
+    """Map each query to its best retrieved map image and that image's pose."""
     poses = mapping.read().poses()
     best = {query: images[0] for query, images in iterate_candidates(pairs)}
     return {query: (image, poses[image]) for query, image in best.items() if image in poses}

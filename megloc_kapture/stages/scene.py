@@ -1,8 +1,4 @@
-"""What goes with an image of a kapture folder: siblings on its rig, mask, depth and points.
-
-Pose rankers and refiners look at them through :class:`KaptureScene`, which reads only what is asked
-for.
-"""
+"""Siblings on the rig, mask, depth and points of images in a kapture folder."""
 
 from __future__ import annotations
 
@@ -29,10 +25,9 @@ Unit = tuple[tuple[str, RigidTransform], ...]
 
 
 def query_units(data: KaptureData, *, rigs: bool) -> list[Unit]:
-    """The units of a query folder, sorted by their images; every image is in one.
+    """Group query images into units that are localized together, sorted by image.
 
-    ``rigs``: whether cameras of one rig and one timestamp are localized together. A camera on
-    several rigs goes with the first by name. Without, every image is by itself.
+    With ``rigs`` a unit is the cameras of one rig (the first by name) at one timestamp.
     """
     carried = _carried(data) if rigs else {}
     rigs_of = _rigs_of(carried)
@@ -56,16 +51,7 @@ def query_units(data: KaptureData, *, rigs: bool) -> list[Unit]:
 def poses_through_rig(
     data: KaptureData, localized: Mapping[str, Pose]
 ) -> dict[str, tuple[str, RigidTransform]]:
-    """For images that are not localized: the sibling that is, and the pose it gives them.
-
-    Siblings share the timestamp and a rig; of several, the one with the most inliers counts, then
-    the first by name.
-
-    Parameters
-    ----------
-    data : sensors, rigs (``sensor_from_rig``) and records of the images.
-    localized : the images that were localized.
-    """
+    """Derive poses of unlocalized images from the rig sibling with the most inliers."""
     carried = _carried(data)
     rigs_of = _rigs_of(carried)
     at_time: dict[int, list[tuple[str, str]]] = {}
@@ -88,13 +74,9 @@ def poses_through_rig(
 
 @dataclass(frozen=True)
 class DepthRecord:
-    """A depth map that was taken with an image.
+    """A depth map taken with an image.
 
-    Parameters
-    ----------
-    path : below ``records_data``.
-    camera : of the depth sensor.
-    image_from_depth : from the depth camera's frame to the image's.
+    ``path`` is below ``records_data``; ``image_from_depth`` maps depth camera frame to image frame.
     """
 
     path: str
@@ -103,10 +85,7 @@ class DepthRecord:
 
 
 def depth_records(data: KaptureData) -> dict[str, DepthRecord]:
-    """Image -> the depth map of its moment, of a depth sensor on one rig with its camera.
-
-    Where several depth sensors share the rig, the one nearest to the camera counts.
-    """
+    """Find the depth map of each image: same rig and timestamp, closest depth sensor."""
     carried = _carried(data)
     rigs_of = _rigs_of(carried)
     at_time: dict[int, list[tuple[str, str]]] = {}
@@ -128,7 +107,7 @@ def depth_records(data: KaptureData) -> dict[str, DepthRecord]:
 
 
 def read_depth(folder: KaptureFolder, record: DepthRecord) -> NDArray[np.float32]:
-    """Depth (H, W) of a record, 0 where nothing is known."""
+    """Read depth (H, W) of a record; 0 means unknown."""
     size = {"width": record.camera.width, "height": record.camera.height}
     return read_depth_map(folder.depth_path(record.path), **size)
 
@@ -137,10 +116,7 @@ _Carried = Mapping[str, Mapping[str, RigidTransform]]
 
 
 def _carried(data: KaptureData) -> _Carried:
-    """Of the rigs that are on no other: sensor -> ``sensor_from_rig``, through the rigs on them.
-
-    DataError: a rig contains itself.
-    """
+    """Return ``sensor_from_rig`` by sensor for each top-level rig, through nested rigs."""
 
     def members(rig: str, above: frozenset[str]) -> dict[str, RigidTransform]:
         if rig in above:
@@ -159,7 +135,6 @@ def _carried(data: KaptureData) -> _Carried:
 
 
 def _rigs_of(carried: _Carried) -> dict[str, list[str]]:
-    """The rigs that a sensor is on, sorted by name."""
     rigs_of: dict[str, list[str]] = {}
     for rig, members in sorted(carried.items()):
         for sensor in members:
@@ -170,7 +145,6 @@ def _rigs_of(carried: _Carried) -> dict[str, list[str]]:
 def _between(
     carried: _Carried, rigs_of: Mapping[str, list[str]], sensor: str, other: str
 ) -> RigidTransform | None:
-    """``sensor_from_other`` where one rig carries both."""
     for rig in rigs_of.get(sensor, ()):
         if other in carried[rig]:
             return carried[rig][sensor] @ carried[rig][other].inverse()
@@ -181,8 +155,6 @@ _NO_POINTS = np.zeros(0, np.int64)
 
 
 class _Images:
-    """Pixels, masks, depth and points of the images of one folder; what is looked up stays."""
-
     def __init__(self, folder: KaptureFolder) -> None:
         self.folder = folder
 
@@ -218,39 +190,34 @@ class _Images:
 
 @lru_cache(maxsize=4)
 def _images_of(folder: KaptureFolder) -> _Images:
-    """The same for every query of a run: a folder is opened once per process."""
     return _Images(folder)
 
 
 class QueryScene(Protocol):
-    """Pixels, mask and depth of query images by their names; see :class:`KaptureScene`."""
+    """Pixels, mask and depth of query images; see :class:`KaptureScene`."""
 
     def image(self, name: str) -> NDArray[np.uint8]:
         """RGB pixels (H, W, 3)."""
         ...
 
     def mask(self, name: str) -> NDArray[np.bool_] | None:
-        """Mask (H, W), True = use; None without one."""
+        """Mask (H, W), True = use, or None."""
         ...
 
     def depth(self, name: str) -> DepthView | None:
-        """Depth that was taken with the image; None without."""
+        """Depth taken with the image, or None."""
         ...
 
 
 def depth_of(folder: KaptureFolder, name: str) -> DepthView | None:
-    """Depth that was taken with an image of a folder; None without."""
+    """Return the depth taken with an image, or None."""
     return _images_of(folder).depth(name)
 
 
 class KaptureScene:
-    """A :class:`~megloc_kapture.plugins.RankingScene` of a map's folder and its queries; raises
-    DataError where a file cannot be read, or a map image has no pose.
+    """:class:`~megloc_kapture.plugins.RankingScene` of a map folder and its queries.
 
-    Parameters
-    ----------
-    query : the folder of the queries, or what else knows them; None: nothing does.
-    map_camera : camera of a map image by its name; as stored unless given.
+    ``map_camera`` returns the camera of a map image by name, by default the stored one.
     """
 
     def __init__(

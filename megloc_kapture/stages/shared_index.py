@@ -1,8 +1,4 @@
-"""A map's index: read from kapture once, shared by worker processes as memory-mapped arrays.
-
-Parsing a map of a million points takes a second and its arrays 200 MB; worker processes that map
-the same files share both. The arrays are plain ``.npy`` files, the names JSON: nothing is pickled.
-"""
+"""Map index: parsed from kapture once and shared by workers as memory-mapped arrays."""
 
 from __future__ import annotations
 
@@ -31,10 +27,9 @@ _SAMPLED_IMAGES = 32
 
 
 def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
-    """Read the points, their uncertainty and the observations of one keypoints type.
+    """Read points, uncertainties and observations of one keypoints type.
 
-    A type whose keypoints the map has, but none with a point, has an index without points: nothing
-    of it could be triangulated.
+    A type with keypoints but no triangulated point gives an empty index.
     """
     observations = folder.observations().get(local_type)
     if observations is None:
@@ -57,10 +52,9 @@ def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
 def observed_keypoints(
     folder: KaptureFolder, index: MapIndex, images: Iterable[str]
 ) -> list[ObservedKeypoints]:
-    """Images that have a pose and keypoints, which are as they are stored.
+    """Read stored keypoints of posed images.
 
-    Points that were lifted from their keypoint fit it by themselves and say nothing of the map:
-    they are left out of a map that has others.
+    Points lifted from a single keypoint fit it exactly and are left out if the map has others.
     """
     data, keypoints = folder.read(), folder.keypoints(index.local_type)
     poses = data.poses()
@@ -77,10 +71,9 @@ def observed_keypoints(
 
 
 def with_noise(folder: KaptureFolder, index: MapIndex) -> MapIndex:
-    """The index with the median angle and distance between observations and their points.
+    """Add the median angle and distance between observations and points, from a sample of images.
 
-    Of a sample of the images; it stays as it is where there is none, and where all points were
-    lifted from the one keypoint that observes them, which they fit whatever its noise.
+    Points lifted from the one keypoint that observes them give none, as they fit exactly.
     """
     if index.seen_once[index.point_ids].all() or index.local_type not in folder.types("keypoints"):
         return index
@@ -102,7 +95,6 @@ def _finite_median(parts: Sequence[NDArray[np.float64]]) -> float:
 
 
 def write_index(index: MapIndex, folder: Path) -> None:
-    """Write an index as files in a folder, which is made where it is missing."""
     arrays = [name for name in _ARRAYS if getattr(index, name) is not None]
     for name in arrays:
         write_array(folder / f"{name}.npy", getattr(index, name))
@@ -113,13 +105,12 @@ def write_index(index: MapIndex, folder: Path) -> None:
 
 
 def open_index(folder: Path) -> MapIndex:
-    """Open an index of :func:`write_index`: read-only memory-mapped arrays."""
     try:
         names, images, others = json.loads((folder / "index.json").read_bytes())
         files = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in names}
     except (OSError, ValueError) as error:
         raise DataError(f"cannot read a map's index: {error}", path=folder) from error
-    # plain views: the compiled loops know no other kind of array
+    # compiled loops need plain arrays
     arrays: dict[str, Any] = {name: np.asarray(array) for name, array in files.items()}
     rows = {name: row for row, name in enumerate(images)}
     return MapIndex(row_of_image=rows, **arrays, **others)
@@ -129,11 +120,7 @@ def open_index(folder: Path) -> MapIndex:
 def shared_index(
     indices: Mapping[str, MapIndex], scratch: Path | None = None
 ) -> Iterator[dict[str, Path]]:
-    """Indices by keypoints type as folders for :func:`open_index`; gone after the block.
-
-    Who has one open by then may go on using it. ``scratch``: folder for them meanwhile, the
-    system's unless given.
-    """
+    """Share indices by keypoints type as temporary folders; open indices stay valid afterwards."""
     where = tempfile.gettempdir() if scratch is None else scratch
     try:
         place = tempfile.TemporaryDirectory(
@@ -150,6 +137,6 @@ def shared_index(
 
 
 def write_array(path: Path, array: NDArray[Any]) -> None:
-    """Write an array as numpy does, atomically; the same array gives the same bytes."""
+    """Write an array as npy, atomically and reproducibly."""
     with atomic_write(path) as file:
         np.lib.format.write_array(file, np.ascontiguousarray(array), allow_pickle=False)

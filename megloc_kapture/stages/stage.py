@@ -1,8 +1,6 @@
-"""A stage: what it is called, what it reads and writes in a workspace, and what it does.
+"""Base class of stages; ``docs/plugins.md`` has an example.
 
-All else follows from that: which stages it runs behind (those that write what it reads), when it
-has to run again (its options, its version or what it reads have changed), its manifest and, for a
-stage of another package, its command. ``docs/plugins.md`` has an example.
+Inputs and outputs determine the order of the stages; they, options and version when a stage reruns.
 """
 
 from __future__ import annotations
@@ -27,16 +25,16 @@ if TYPE_CHECKING:
     from megloc_kapture.stages.options import PipelineOptions
 
 
-_UNITS = {"px": "px", "m": "m", "percent": "%"}  # last words of a count's name
+_UNITS = {"px": "px", "m": "m", "percent": "%"}
 
 
 def count_label(name: str, value: float) -> tuple[str, str]:
-    """A count of a stage as words and figure, e.g. ``keypoints``, ``33,485,000``."""
+    """Format a stage's count as words and figure, e.g. ``keypoints``, ``33,485,000``."""
     words, _, last = name.replace("_", " ").rpartition(" ")
     unit = f" {_UNITS[last]}" if words and last in _UNITS else ""
     words = words if unit else f"{words} {last}".lstrip()
     if isinstance(value, int):
-        if value == 1 and not unit:  # queries, matches, images
+        if value == 1 and not unit:  # singular
             words = re.sub(
                 r"(ie|(?<=ch)e|)s\b", lambda end: "y" if end[1] == "ie" else "", words, count=1
             )
@@ -46,40 +44,36 @@ def count_label(name: str, value: float) -> tuple[str, str]:
 
 
 def count_text(name: str, value: float) -> str:
-    """A count of a stage in a sentence: ``12 images``, ``mean reprojection error: 0.74 px``."""
+    """Format a stage's count: ``12 images``, ``mean reprojection error: 0.74 px``."""
     words, figure = count_label(name, value)
     is_number = isinstance(value, int) and figure[-1].isdigit()
     return f"{figure} {words}" if is_number else f"{words}: {figure}"
 
 
-# as imported; kapture folders
+# imported kapture folders
 MAPPING, QUERY, QUERY_GT, REFERENCE = "mapping", "query", "query_gt", "reference"
 PREPROCESSED = "preprocessed"
 POSED, PHOTOGRAPH_MATCHES = "posed", "matches/photographs"  # of photographs without poses
 LOCAL_FEATURES, GLOBAL_FEATURES = "local_features", "global_features"
 MAPPING_PAIRS, QUERY_PAIRS = "pairs/mapping.txt", "pairs/query.txt"
-QUERY_CANDIDATES = "pairs/query_candidates.txt"  # before they are reranked
+QUERY_CANDIDATES = "pairs/query_candidates.txt"  # before reranking
 MAPPING_MATCHES, QUERY_MATCHES = "matches/mapping", "matches/query"
 MAPPING_PYRAMID, QUERY_PYRAMID = "pyramid/mapping", "pyramid/query"
 UNREFINED, SPARSE, MAP = "map_unrefined", "map_sparse", "map"
 UNREFINED_POSES, REFINEMENT_TIMING = "localized_unrefined", "timing_refinement.csv"
 LOCALIZED, SUBMISSIONS, EVALUATION = "localized", "submissions", "evaluation"
 TIMING = "timing.csv"
-FEATURES = ""  # features folder of local and global features: the workspace itself
+FEATURES = ""  # the workspace itself holds local and global features
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where, with these options, the images, features and poses are that stages read.
-
-    ``posed``: the map's images are photographs that have got poses.
-    """
+    """Workspace paths for given options; ``posed``: poses of the map images were estimated."""
 
     options: PipelineOptions
     posed: bool = False
 
     def paths(self, parts: Sequence[LayoutPath]) -> list[str]:
-        """The paths in the workspace that the parts stand for."""
         found: list[str] = []
         for part in parts:
             one = part if isinstance(part, str) else part(self)
@@ -87,49 +81,42 @@ class Layout:
         return found
 
     def mapping(self) -> str:
-        """Kapture folder of the map's images, as everything after pre-processing sees them."""
+        """Return the kapture folder after pre-processing."""
         if self.posed:
             return POSED
         return f"{PREPROCESSED}/{MAPPING}" if self.options.preprocesses() else MAPPING
 
     def query(self) -> str:
-        """Kapture folder of the queries' images; see :meth:`mapping`."""
         return f"{PREPROCESSED}/{QUERY}" if self.options.preprocesses() else QUERY
 
     def reference(self) -> tuple[str, ...]:
-        """The model that the dataset comes with, where the map has points of it."""
+        """Return the dataset's prebuilt model, if the map has its points."""
         return (REFERENCE,) if self.options.uses_given_map() else ()
 
     def pairing_points(self) -> tuple[str, ...]:
-        """The model that the dataset comes with, where map images are paired by its points."""
+        """Return the dataset's prebuilt model, if its points are used to pair map images."""
         return (REFERENCE,) if self.options.pairs_by_points() else ()
 
     def given_map(self) -> tuple[str, ...]:
-        """The map, where it has features of its own that queries are matched with."""
         return (MAP,) if self.options.uses_given_map() else ()
 
     def mapping_matches(self) -> tuple[str, ...]:
-        """Features folders with the matches of map images."""
         if not self.options.triangulates():
             return ()
         again = self.options.matches_again()
         return (MAPPING_MATCHES, MAPPING_PYRAMID) if again else (MAPPING_MATCHES,)
 
     def query_matches(self) -> tuple[str, ...]:
-        """Features folders with the matches of queries."""
         again = self.options.matches_again()
         return (QUERY_MATCHES, QUERY_PYRAMID) if again else (QUERY_MATCHES,)
 
     def sparse_map(self) -> str:
-        """The map before depth is estimated, where it is."""
         return MAP if self.options.mvs.mode == "off" else SPARSE
 
     def candidates(self) -> str:
-        """Pairs of the queries that are matched; some of them are localized with."""
         return QUERY_CANDIDATES if self.options.reranking.reranks() else QUERY_PAIRS
 
     def poses(self) -> str:
-        """The localized queries before poses are refined."""
         return UNREFINED_POSES if self.options.pose_refinement.refines() else LOCALIZED
 
 
@@ -138,7 +125,7 @@ LayoutPath = str | Callable[[Layout], str | tuple[str, ...]]
 
 
 def files_fingerprint(root: Path, files: Iterable[Path]) -> str:
-    """Return a hash of the files' names relative to ``root``, their sizes and times."""
+    """Return a hash of the files' names relative to ``root``, sizes and modification times."""
     digest = hashlib.sha256()
     for file in sorted(files):
         try:
@@ -152,37 +139,28 @@ def files_fingerprint(root: Path, files: Iterable[Path]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class StageWork(Work):
-    """What a stage works with.
-
-    Attributes
-    ----------
-    root : the workspace; nothing is written there.
-    out : folder to write into, under the names that the stage says it writes.
-    """
+    """Workspace ``root``, which is read-only, output folder ``out``, and execution context."""
 
     root: Path
     out: Path
 
     def path(self, name: str) -> Path:
-        """Something in the workspace."""
         return self.root / name
 
     def folder(self, name: str, *features: str) -> KaptureFolder:
-        """A kapture folder of the workspace, with features folders of the workspace."""
         return KaptureFolder(self.path(name), features_dirs=[self.path(one) for one in features])
 
     def folders(self, names: Sequence[str], *features: str) -> list[KaptureFolder]:
-        """Those of the kapture folders that are there: a map may be made without queries."""
+        """Open the existing ones of these kapture folders."""
         return [self.folder(name, *features) for name in names if self.path(name).is_dir()]
 
 
 CODE_OF = "code of "
 ROOT = "root"  # the imported folder, among the inputs of an import
-PROTOCOL = "protocol"  # of the evaluation, among the options of an import
+PROTOCOL = "protocol"
 
 
 def is_below(path: str, folder: str) -> bool:
-    """Whether a path in the workspace is that of a folder, or of something in it."""
     return path == folder or path.startswith(f"{folder}/")
 
 
@@ -191,11 +169,9 @@ class Stage(ABC):
 
     Attributes
     ----------
-    name : of its manifest, as ``--from`` and ``--until`` take it.
-    version : to be raised when the output changes for the same options and inputs.
-    reads, writes : paths in the workspace; a path stands for all that is below it.
-    root : folder of the user's data that it imports; None where it imports none. A workspace holds
-        the data of one root.
+    version : increase it when the output changes for the same options and inputs.
+    reads, writes : paths in the workspace; a folder includes its contents.
+    root : folder of user data to import, or None; the same for a whole workspace.
     """
 
     root: Path | None = None
@@ -208,7 +184,7 @@ class Stage(ABC):
         self.options: Any = options
 
     def settings(self) -> dict[str, Any]:
-        """What determines the output beside what is read, as plain JSON values."""
+        """Return settings that determine the output, as plain JSON values."""
         chosen: dict[str, Any] = self.options.model_dump(mode="json")
         return chosen
 
@@ -217,28 +193,28 @@ class Stage(ABC):
         return {}
 
     def plugins(self) -> Sequence[object]:
-        """The plugins at work, whose code and weights determine the output."""
+        """Return the plugins whose code and weights determine the output."""
         return ()
 
     def code(self) -> dict[str, str]:
-        """Versions of the plugins' code, and of a stage's of another package; see `code_of`."""
+        """Return code versions of plugins and of stages of other packages."""
         found = [*self.plugins(), *(() if is_ours(type(self)) else (self,))]
         for plugin in self.plugins():
-            found += getattr(plugin, "plugins", tuple)()  # what it is made of
+            found += getattr(plugin, "plugins", tuple)()
         kinds = {type(plugin) for plugin in found}
         names = {f"{CODE_OF}{kind.__module__}.{kind.__qualname__}": kind for kind in kinds}
-        # mypy does not take a class for something that can be hashed
+        # mypy does not consider classes hashable
         return {name: code_of(kind) for name, kind in names.items()}  # type: ignore[arg-type]
 
     def check(self) -> None:  # noqa: B027  # most stages read only what others write
-        """Raise what :meth:`run` would refuse, as far as that shows quickly; for dry runs."""
+        """Raise the errors of :meth:`run` that can be found quickly; for dry runs."""
 
     @abstractmethod
     def run(self, work: StageWork) -> Mapping[str, float]:
-        """Write the outputs; returns counts for the log, see :func:`count_text`."""
+        """Write the outputs; return counts for the log, see :func:`count_text`."""
 
 
-# the options that decide which types of local features there are
+# options that determine the local feature types
 LOCAL_TYPES = ("map", "local_features.name", "local_features.options", "given_features")
 
 
@@ -247,10 +223,8 @@ class PipelineStage(Stage):
 
     Attributes
     ----------
-    uses : keys of the options that determine the output; ``local_features.name`` means the
-        names of all choices.
-    explained_by : keys of the options that say best whether and how the stage runs.
-    inputs, outputs : paths that are read and written; some depend on the options.
+    uses : option keys that determine the output; ``local_features.name`` covers all choices.
+    explained_by : option keys that best explain whether and how the stage runs.
     """
 
     uses: ClassVar[tuple[str, ...]] = ()
@@ -271,15 +245,13 @@ class PipelineStage(Stage):
         return self.layout.paths(self.outputs)
 
     def is_wanted(self) -> bool:
-        """Return whether the options ask for the stage."""
         return True
 
     def explain(self) -> str:
-        """Return the values of the options in :attr:`explained_by`."""
         return ", ".join(f"{key} = {_option_text(self.options, key)}" for key in self.explained_by)
 
     def settings(self) -> dict[str, Any]:
-        # where networks compute is no part: what is done stays done when it goes on elsewhere
+        # exclude the device, so that finished stages stay valid on another machine
         dump = json.loads(
             json.dumps(self.options.model_dump(mode="json")),
             object_hook=lambda table: {k: v for k, v in table.items() if k != "device"},
@@ -294,7 +266,6 @@ class PipelineStage(Stage):
 def wanted_stages(
     kinds: Iterable[type[PipelineStage]], options: PipelineOptions
 ) -> list[PipelineStage]:
-    """The stages that the options ask for, in order."""
     return [stage for kind in kinds if (stage := kind(options)).is_wanted()]
 
 
@@ -307,7 +278,6 @@ def _option_text(options: Any, key: str) -> str:
 
 
 def _selected(dump: Any, paths: Sequence[Sequence[str]]) -> Any:
-    """The parts of nested values that stand at paths; of a list, those of each of its members."""
     if not all(paths):
         return dump
     if isinstance(dump, list):

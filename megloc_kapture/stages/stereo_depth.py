@@ -1,10 +1,9 @@
-"""Depth by multi-view stereo as a map holds it: beside its images, its sensors and its points.
+"""Storage of multi-view stereo depth in a map.
 
-The maps are ordinary kapture depth records of a sensor ``CAMERA_mvs`` that shares the camera's
-centre, float32 in the map's unit, 0 where nothing is known. Beside them, which kapture does not
-know and ignores: ``sensors/mvs/IMAGE.sigma.npy`` (float32, the standard deviation of depth),
-``IMAGE.normals.npy`` (int8 (H, W, 3), 127 times the unit normal in the camera's frame, towards it)
-and ``reconstruction/depth.csv``, a row per image.
+Depth maps are kapture depth records of a sensor ``CAMERA_mvs`` at the camera's centre, float32,
+0 = unknown. Files outside the kapture format are ``sensors/mvs/IMAGE.sigma.npy`` (float32, standard
+deviation of depth), ``IMAGE.normals.npy`` (int8 (H, W, 3), 127 times the unit normal in the camera
+frame, towards the camera) and ``reconstruction/depth.csv``, a row per image.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ from megloc_kapture.stages.scene import depth_records, read_depth
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import RigidTransform
 
-FOLDER = "mvs"  # of depth maps below records_data, and of what is beside them below sensors
+FOLDER = "mvs"  # folder of depth maps below records_data, and of side files below sensors
 DEPTH_FILE = "reconstruction/depth.csv"
 
 Floats = NDArray[np.float64]
@@ -53,7 +52,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class LiftedPoints:
-    """Points (N, 3) and covariances (N, 6) in the world, of keypoints (N,)."""
+    """World points (N, 3), covariances (N, 6) and keypoint ids (N,)."""
 
     xyz: Floats
     covariances: Floats
@@ -61,31 +60,25 @@ class LiftedPoints:
 
 
 def stereo_images(folder: KaptureFolder) -> dict[str, tuple[str, ...]]:
-    """The images that have depth by stereo, by name, each with those it was compared with.
-
-    Empty where there is no densified map.
-    """
+    """Return the images with stereo depth, each with the source images it was compared with."""
     path = folder.root / DEPTH_FILE
     rows = read_depth_rows(path) if path.is_file() else []
     return {row.image: row.sources for row in sorted(rows, key=lambda r: r.image) if not row.reason}
 
 
 def depth_path(image: str) -> str:
-    """The depth map of an image, below ``records_data``."""
     return f"{FOLDER}/{image}.depth"
 
 
 def side_file(root: Path, image: str, kind: Literal["sigma", "normals"]) -> Path:
-    """What lies beside the depth map of an image in the kapture at ``root``; see the module."""
+    """Return the path of a side file in the kapture at ``root``; see the module."""
     return safe_join(root / "sensors" / FOLDER, f"{image}.{kind}.npy")
 
 
 def read_beside(
     root: Path, image: str, kind: Literal["sigma", "normals"]
 ) -> NDArray[np.float32] | None:
-    """Standard deviations (H, W) or normals (H, W, 3) of an image's depth by stereo, float32, 0
-    where nothing is known; None without.
-    """
+    """Read float32 standard deviations (H, W) or normals (H, W, 3); None if missing."""
     path = side_file(root, image, kind)
     if not path.is_file():
         return None
@@ -97,7 +90,7 @@ def read_beside(
 
 
 def with_depth_sensors(data: KaptureData, images: Sequence[str], max_size_px: int) -> KaptureData:
-    """The sensors with a depth sensor on one rig with each camera whose images have depth."""
+    """Add a depth sensor on a common rig to each camera whose images have depth."""
     found = replace(
         data,
         sensors=dict(data.sensors),
@@ -124,7 +117,6 @@ def with_depth_sensors(data: KaptureData, images: Sequence[str], max_size_px: in
 
 
 def link_images_and_masks(source: KaptureFolder, output: Path) -> None:
-    """Link a map's images, beside which depth maps lie now, and its masks."""
     records = source.root / "sensors" / "records_data"
     link_records(output, {entry.name: entry for entry in sorted(records.iterdir())})
     link_images(source.root, output, ("masks",))
@@ -133,9 +125,9 @@ def link_images_and_masks(source: KaptureFolder, output: Path) -> None:
 def write_points(
     source: KaptureFolder, output: Path, lifted: Mapping[str, Mapping[str, LiftedPoints]]
 ) -> int:
-    """Write a map's points, unchanged, and behind them those of keypoints that were lifted.
+    """Write a map's points, followed by the lifted ones; return the number of lifted points.
 
-    ``lifted``: by keypoints type and image. Returns the number of lifted points.
+    ``lifted`` is keyed by keypoints type and image.
     """
     points = source.points3d()
     covariances = read_point_covariances(source.root, len(points))
@@ -171,8 +163,11 @@ def write_points(
 
 
 class Cloud(NamedTuple):
-    """Points of depth maps in the world: coordinates (N, 3), colours (N, 3) from 0 to 255, unit
-    normals (N, 3), standard deviations (N,), and the rows of their images (N,), all float64."""
+    """World points of depth maps, float64.
+
+    Coordinates (N, 3), colours (N, 3) from 0 to 255, unit normals (N, 3), standard deviations (N,)
+    and image rows (N,).
+    """
 
     xyz: NDArray[np.float64]
     colours: NDArray[np.float64]
@@ -189,15 +184,10 @@ def fused_cloud(
     max_points: int | None = None,
     work: Work = HERE,
 ) -> Cloud:
-    """The depth maps of images as one cloud.
+    """Fuse the depth maps of images into one cloud.
 
-    A pixel is left out where one of the sources that come before its image, by name, agrees with
-    it: its surface is in the cloud.
-
-    Parameters
-    ----------
-    images : some of :func:`stereo_images`.
-    max_points : about so many pixels are looked at, the same ones each time; None: all.
+    A pixel is skipped if an earlier source of its image, by name, has the same surface.
+    ``max_points`` is the approximate number of pixels to sample, deterministically.
     """
     records = depth_records(densified.read())
     cameras = [records[image].camera for image in images if image in records]
@@ -216,10 +206,7 @@ def fused_cloud(
 def fuse_depth(
     densified: KaptureFolder, cloud: Path, agreement: AgreementOptions, *, work: Work = HERE
 ) -> int:
-    """Write the depth maps of :mod:`.densifying` as a PLY cloud with normals and deviations.
-
-    Returns number of points.
-    """
+    """Write a PLY cloud with normals and deviations; return the number of points."""
     path = densified.root / DEPTH_FILE
     if not path.is_file():
         raise DataError("no densified map: reconstruction/depth.csv is missing", path=path)

@@ -1,4 +1,4 @@
-"""Stages: photographs without poses are matched, and COLMAP's mapper finds their poses."""
+"""Stages: matching of photographs without poses, and structure from motion by COLMAP."""
 
 from __future__ import annotations
 
@@ -50,12 +50,11 @@ _log = logging.getLogger(__name__)
 
 
 class StructureOptions(Options):
-    """How photographs get poses, and what tells the scale of their world.
+    """Options of structure from motion, and the source of the metric scale.
 
     Attributes
     ----------
-    known_cameras : the cameras stay as they are given.
-    distance : two images and the metres between their camera centres.
+    distance : two images and the distance of their camera centres in metres.
     gps : latitude and longitude in degrees and height in metres, by image.
     """
 
@@ -162,12 +161,12 @@ class FindPoses(PipelineStage):
 
 
 def write_posed(output: Path, data: KaptureData, model: Model) -> None:
-    """Write sensors, records and poses of the images of a model, without the others."""
+    """Write sensors, records and poses of a model's images."""
     records, sensors = {}, {}
     for (timestamp, device), name in data.records_camera.items():
         if name in model.poses:
             sensor = model.sensors[name]
-            # one that turned out to have another camera
+            # the image got another camera
             own = sensor if sensor in data.sensors else f"{device}_{data.record_of(sensor)[0]}"
             records[timestamp, own] = name
             sensors[own] = Sensor.from_camera(model.cameras[sensor], name=data.sensors[device].name)
@@ -178,7 +177,7 @@ def write_posed(output: Path, data: KaptureData, model: Model) -> None:
 
 
 def _scaled(model: Model, structure: StructureOptions) -> tuple[World, Model, dict[str, float]]:
-    """The model in metres where they are known, its world, and counts for the log."""
+    """Return the model, in metres if the scale is known, its world, and counts for the log."""
     if structure.distance is not None:
         first, second, metres = structure.distance
         for name in (first, second):
@@ -204,7 +203,7 @@ def _scaled(model: Model, structure: StructureOptions) -> tuple[World, Model, di
 
 
 def _moved(model: Model, scale: float, turned: RigidTransform = _UNTURNED) -> Model:
-    """The model in the world ``turned(scale * x)``."""
+    """Return the model in the world ``turned(scale * x)``."""
     back, poses = turned.inverse(), {}
     for name, pose in model.poses.items():
         x, y, z = (scale * np.array(pose.translation)).tolist()

@@ -1,8 +1,7 @@
-"""Per-image and per-pair work: in order, with bounded memory and a progress bar.
+"""Ordered per-image and per-pair work with bounded memory and a progress bar.
 
-It runs on an executor, whose processes have a processor each. Networks on a GPU of this machine
-run in this process, the only one that has it: threads read ahead, one computes batches, and the
-executor does what follows.
+Work runs on an executor with one core per process. Networks on a GPU of this machine run in this
+process only: threads read ahead, one thread computes batches, and the executor does the rest.
 """
 
 from __future__ import annotations
@@ -25,10 +24,9 @@ from megloc_kapture.stages.devices import most_at_once, on_gpu
 
 
 class FinishedItems:
-    """The finished items of a stage, which a stopped run leaves for the next one.
+    """Finished items of a stage, kept when a run is interrupted.
 
-    The first line of the file is the stage's fingerprint. A line of JSON per item follows,
-    appended once the item's files are written.
+    The file has the stage's fingerprint, then a JSON line per item whose files are complete.
     """
 
     def __init__(self, path: Path, fingerprint: str) -> None:
@@ -37,7 +35,7 @@ class FinishedItems:
         for line in self._lines():
             try:
                 kind, name, values = json.loads(line)
-            except ValueError:  # cut when the run was killed
+            except ValueError:  # truncated when the run was killed
                 continue
             self._found[kind, name] = values
         self.num_kept = len(self._found)
@@ -48,11 +46,9 @@ class FinishedItems:
         return self._path.read_text(encoding="utf-8", errors="replace").splitlines()[1:]
 
     def of(self, kind: str) -> dict[str, Any]:
-        """Return the items of one kind: name to the values that were noted."""
         return {name: values for (of, name), values in self._found.items() if of == kind}
 
     def add(self, kind: str, name: str, values: Any) -> None:
-        """Note a finished item with plain JSON values."""
         try:
             with open(self._path, "a", encoding="utf-8") as file:
                 if file.tell() == 0:
@@ -63,7 +59,6 @@ class FinishedItems:
 
 
 def is_resumable(path: Path, fingerprint: str) -> bool:
-    """Return whether a file of finished items belongs to a stage with this fingerprint."""
     if not path.is_file():
         return False
     with open(path, encoding="utf-8", errors="replace") as file:
@@ -72,18 +67,15 @@ def is_resumable(path: Path, fingerprint: str) -> bool:
 
 @dataclass
 class Items:
-    """Items of one kind: the finished ones, with the values noted for each."""
-
     kind: str = ""
     done: dict[str, Any] = field(default_factory=dict)
     finished: FinishedItems | None = None
 
     def label(self, text: str) -> str:
-        """Return the label of a progress bar, with the number of items that are kept."""
         return f"{text}, {len(self.done)} kept" if self.done else text
 
     def add(self, name: str, values: Any = None) -> None:
-        """Note that an item is finished; its files must be written."""
+        """Note an item as finished, after its files are written."""
         self.done[name] = values
         if self.finished is not None:
             self.finished.add(self.kind, name, values)
@@ -95,13 +87,12 @@ _READERS = 4  # threads that read ahead for a GPU
 
 
 class Track(Protocol):
-    """Shows progress: yields the items as they are, one by one."""
+    """Progress display: yields the items unchanged."""
 
     def __call__(self, items: Iterable[Item], total: int, label: str) -> Iterator[Item]: ...
 
 
 def untracked(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
-    """Show nothing; see :class:`Track`."""
     return iter(items)
 
 
@@ -112,10 +103,7 @@ def ordered_map(
     *,
     window: int = 32,
 ) -> Iterator[Result]:
-    """Like ``map``, on an executor, results in order, at most ``window`` items under way.
-
-    An executor with an attribute ``window`` has at least so many, to keep its workers busy.
-    """
+    """Map on an executor, in order, with at most ``window`` items in flight."""
     if executor is None:
         yield from map(function, items)
         return
@@ -129,14 +117,13 @@ def ordered_map(
         while waiting:
             yield waiting.popleft().result()
     except GeneratorExit:
-        # not on errors: a pool that breaks stumbles over futures that are cancelled meanwhile
+        # not on errors: a breaking pool fails on futures that were cancelled meanwhile
         for future in waiting:
             future.cancel()
         raise
 
 
 def batched(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
-    """The items in lists of at most ``size``."""
     waiting = iter(items)
     while batch := list(islice(waiting, size)):
         yield batch
@@ -144,17 +131,14 @@ def batched(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
 
 @dataclass(frozen=True)
 class Batched(Generic[Item, Result]):
-    """A function of several items in steps, each of a module, so that a plugin gets them at once.
+    """A function of several items, in module-level steps, so that plugins get batches.
 
     Attributes
     ----------
-    read : the arrays of an item.
-    compute : of several items with their arrays, by the plugin; a result each.
-    plugin : whose device computes.
-    many : its method that takes several items; see :func:`most_at_once`.
-    alike : items go together that have the same of this and stand one behind the other; None: each
-        is a batch by itself.
-    finish : of an item with what was computed; needs no device. None: that is the result.
+    read : reads the arrays of an item.
+    compute : a result per item, by ``plugin``, whose batch method is ``many``.
+    alike : consecutive items with equal keys share a batch; None means single items.
+    finish : optional last step for an item and its result; needs no device.
     """
 
     read: Callable[[Item], Any]
@@ -165,12 +149,10 @@ class Batched(Generic[Item, Result]):
     finish: Callable[[tuple[Item, Any]], Result] | None = None
 
     def __call__(self, items: Sequence[Item]) -> Sequence[Result]:
-        """All steps with items that are alike."""
         found = self.computed([(item, self.read(item)) for item in items])
         return found if self.finish is None else list(map(self.finish, found))
 
     def computed(self, batch: Sequence[tuple[Item, Any]]) -> list[Any]:
-        """What the last step takes, of items that are alike with their arrays."""
         items, arrays = zip(*batch, strict=True)
         found = self.compute(items, arrays)
         return list(found if self.finish is None else zip(items, found, strict=True))
@@ -178,14 +160,14 @@ class Batched(Generic[Item, Result]):
 
 @dataclass(frozen=True)
 class Work:
-    """Where the work of a stage runs, and how its progress is shown.
+    """Execution context of a stage.
 
     Attributes
     ----------
-    executor : None stands for this process.
-    num_threads : for what has threads of its own, as COLMAP's triangulation.
-    finished : items that a stopped run has finished; None outside a workspace.
-    force : go on where the given data contradict themselves.
+    executor : None means this process.
+    num_threads : for libraries with internal threads, such as COLMAP.
+    finished : items finished by an interrupted run; None outside a workspace.
+    force : continue despite contradictory input data.
     """
 
     executor: Executor | None = None
@@ -203,15 +185,10 @@ class Work:
         *,
         plugins: Sequence[object] = (),
     ) -> Iterator[Result]:
-        """Results in the order of the items, with a progress bar.
+        """Yield results in the order of the items, with a progress bar.
 
-        Parameters
-        ----------
-        function : of a module, so that it can be sent to another process; or :class:`Batched`.
-        items : paths and numbers; arrays of an image are read where the work is done.
-        total : number of items, where they have no length.
-        plugins : those that the function calls. Where one of them computes on a GPU of this
-            machine, threads of this process do the work, and no other process takes memory of it.
+        ``function`` must be picklable. If one of its ``plugins`` uses a GPU of this machine,
+        threads of this process do the work, so that no other process takes GPU memory.
         """
         if total is None:
             items = items if isinstance(items, Sequence) else list(items)
@@ -229,7 +206,7 @@ class Work:
             yield from ordered_map(function, items, executor)
 
     def _has_gpu(self, plugins: Sequence[object]) -> bool:
-        # machines of a cluster have GPUs of their own
+        # cluster machines have separate GPUs
         return not getattr(self.executor, "is_elsewhere", False) and any(map(on_gpu, plugins))
 
     def _in_batches(self, steps: Batched[Item, Result], items: Iterable[Item]) -> Iterator[Result]:
@@ -239,19 +216,18 @@ class Work:
             batches = _alike(items, most, alike)
             yield from chain.from_iterable(ordered_map(steps, batches, self.executor))
             return
-        # threads read ahead of the one that computes, while what it had computed is finished
+        # reading ahead and finishing overlap with computing
         with ThreadPoolExecutor(_READERS) as readers, ThreadPoolExecutor(1) as computing:
             ahead = most + _READERS
             read = ordered_map(lambda one: (one, steps.read(one)), items, readers, window=ahead)
             ready = _alike(read, most, lambda pair: alike(pair[0]))
             found = chain.from_iterable(ordered_map(steps.computed, ready, computing, window=2))
-            if steps.finish is None:  # no other process need see it
+            if steps.finish is None:
                 yield from found
             else:
                 yield from ordered_map(steps.finish, found, self.executor)
 
     def items(self, kind: str) -> Items:
-        """Return the items of a kind that a stopped run of the stage has finished."""
         if self.finished is None:
             return Items()
         return Items(kind, self.finished.of(kind), self.finished)
@@ -268,13 +244,12 @@ HERE = Work()
 
 
 class FolderSpec:
-    """A kapture folder that is cheap to send and opened once per process and run."""
+    """A kapture folder that is cheap to pickle and opened once per process and run."""
 
     def __init__(self, folder: KaptureFolder) -> None:
         self.key = (folder.root, folder.features_dirs, folder.allow_links_below, uuid4().hex)
 
     def open(self) -> KaptureFolder:
-        """The folder; the same object for every item of this run in this process."""
         return _open_folder(*self.key)
 
 

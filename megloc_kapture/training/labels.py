@@ -74,7 +74,7 @@ class Labels:
     partner_b: NDArray[np.int64]
 
     def matches(self) -> NDArray[np.int64]:
-        """The partners, int64 (K, 2), sorted by the row in a."""
+        """Return the matches, int64 (K, 2), sorted by the row in a."""
         rows = np.flatnonzero(self.partner_a >= 0)
         return np.stack([rows, self.partner_a[rows]], axis=1)
 
@@ -176,7 +176,6 @@ _Side = tuple[NDArray[np.floating[Any]], Floats, NDArray[np.bool_], NDArray[np.b
 
 
 def _labels(a: _Side, b: _Side, options: LabelOptions) -> Labels:
-    """Labels of sides (pixels, where the other image has them, known, visible)."""
     px_a, a_in_b, known_a, visible_a = a
     px_b, b_in_a, known_b, visible_b = b
     if not len(px_a) or not len(px_b):

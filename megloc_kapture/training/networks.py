@@ -1,9 +1,7 @@
-"""What is trained, its loss, and its figures on held-out pairs.
+"""Trained networks, their loss and their metrics on held-out pairs.
 
-SuperGlue is trained on frozen features, or a descriptor network under a frozen detector. The split
-is MegLoc's (section on local features): a second network of the same kind describes the detector's
-keypoints, and the gradient comes through SuperGlue, which is trained with it, or through the
-optimal transport of the descriptors' own products.
+SuperGlue is trained on frozen features, or a descriptor network under a frozen detector, as in
+MegLoc (section on local features).
 """
 
 from __future__ import annotations
@@ -64,7 +62,6 @@ class PreparedPair:
 
     @property
     def usable(self) -> bool:
-        """Whether there are keypoints in both images."""
         return all(len(one.keypoints_px) > 0 for one in self.features)
 
 
@@ -79,7 +76,6 @@ class FrozenFeatures:
         self._kept: dict[str, ImageFeatures] = {}
 
     def prepare(self, pair: TrainingPair) -> PreparedPair:
-        """Features and labels of a pair; raises DataError."""
         keys = pair.keys or (None, None)
         a, b = (self._of(image, key) for image, key in zip(pair.images, keys, strict=True))
         labels = pair.label(a.keypoints_px[:, :2], b.keypoints_px[:, :2])
@@ -336,7 +332,6 @@ def pose_error_deg(pair: PreparedPair, matches: NDArray[np.int64]) -> float:
 
 
 def relative_pose_error_deg(found: RigidTransform, truth: RigidTransform) -> float:
-    """See :func:`pose_error_deg`."""
     rotation = rotation_angles_deg(np.array(found.quat_wxyz), np.array(truth.quat_wxyz))
     a, b = np.array(found.translation), np.array(truth.translation)
     lengths = np.linalg.norm(a) * np.linalg.norm(b)

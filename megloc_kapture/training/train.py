@@ -43,7 +43,6 @@ class TrainingData:
     held_out: Sequence[KaptureFolder] = ()
 
     def check(self) -> None:
-        """Raise OptionError for data that contradict themselves."""
         trained = [folder.root for folder in self.kaptures]
         if not (trained or self.photographs):
             raise OptionError("nothing to train on: give a kapture with depth, or photographs")
@@ -114,13 +113,11 @@ class _Files:
         self.overlaps = output.with_suffix(".overlaps")
 
     def begin(self, *, force: bool) -> None:
-        """Remove what training would go on from, where none was begun, or it begins again."""
         if force or not (self.output.exists() or self.manifest.exists()):
             remove(self.state)
             remove(self.overlaps)
 
     def claim(self, record: Mapping[str, Any], *, force: bool) -> None:
-        """Refuse what is not this training's."""
         if force or not (self.output.exists() or self.manifest.exists()):
             return
         try:

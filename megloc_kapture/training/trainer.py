@@ -89,8 +89,6 @@ class DescriptorOptions(TrainingOptions):
 
 @dataclass
 class TrainingState:
-    """How far a training is."""
-
     step: int
     rows: list[list[float]]  # of the curves so far, COLUMNS; NaN where nothing is held out
 
@@ -132,8 +130,6 @@ def model_of(options: TrainingOptions, extractor: LocalFeatureExtractor) -> Pair
 
 
 class Trainer:
-    """A model and its optimizer."""
-
     def __init__(self, options: TrainingOptions) -> None:
         self.options = options
         choice = options.features

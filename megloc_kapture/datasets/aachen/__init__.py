@@ -1,8 +1,4 @@
-"""Files of Aachen Day-Night: the official layout, or the folders that kapture distributes.
-
-v1.0 has an NVM with a list of cameras, v1.1 a COLMAP model. kapture has ``mapping/`` and
-``query/``, or the queries by day and at night apart.
-"""
+"""Files of Aachen Day-Night: official layout (NVM in v1.0, COLMAP in v1.1) or kapture folders."""
 
 from __future__ import annotations
 
@@ -27,22 +23,21 @@ Wanted = Literal["auto", "1.0", "1.1"]
 
 DAY, NIGHT = "day", "night"
 DATABASE_FOLDER, SEQUENCES_FOLDER, QUERY_FOLDER = "db", "sequences", "query"
-# v1.1's night list replaces v1.0's and has these beside the old ones
+# v1.1's night list contains v1.0's queries and these
 ADDITIONAL_NIGHT = "query/night/nexus5x_additional_night/"
 
-# the first timestamp of each list; map images count from 0
+# first timestamp of each list; map images start at 0
 _FIRST_TIMESTAMP = {DAY: 100_000, NIGHT: 200_000}
 _IMAGE_FOLDERS = ("images_upright", "images/images_upright")
-# the archive's name and the folder's swap an underscore; both are met
+# archive and folder differ by an underscore; both occur
 _MODEL_FOLDERS = ("aachen_v_1_1", "aachen_v1_1")
 
-# in the folder kapture's archives unpack to
 _NAME_OF_V1_1 = ("v1.1", "v1_1", "v11")
 
 
 @dataclass
 class AachenImages:
-    """The images of an import; ``conditions`` are by query in the order of the lists, day first."""
+    """The images of an import; ``conditions`` by query in list order, day first."""
 
     version: Version
     mapping: KaptureData = field(default_factory=KaptureData)
@@ -65,7 +60,7 @@ class AachenImages:
 
 
 class Layout:
-    """The dataset's official files below ``root``; the feature database is that of v1.0's model."""
+    """Official files below ``root``; the feature database belongs to v1.0's model."""
 
     def __init__(self, root: Path) -> None:
         self.root = Path(root)
@@ -80,12 +75,11 @@ class Layout:
         return self.root / "queries" / f"{condition}_time_queries_with_intrinsics.txt"
 
     def absent(self) -> list[str]:
-        """Return the names of the layout's folders that are not there."""
         wanted = (self.images, self.query_list(DAY).parent, self.nvm.parent)
         return [folder.name for folder in wanted if not folder.is_dir()]
 
     def version(self, wanted: Wanted) -> Version:
-        """``wanted``, or the latest whose model is there; DataError where it is not."""
+        """Return ``wanted``, or the latest version that has a model."""
         if wanted == "auto":
             wanted = "1.1" if self.colmap_model.is_dir() else "1.0"
         model = self.nvm if wanted == "1.0" else self.colmap_model
@@ -98,19 +92,17 @@ class Layout:
         return wanted
 
     def model_files(self, version: Version, *, with_points: bool) -> tuple[Path, ...]:
-        """The files that poses and cameras of the map come from; those that are there."""
         if version == "1.1":
             return colmap_model_files(self.colmap_model, with_points=with_points)
         files = (self.nvm, self.database_intrinsics)
         return tuple(file for file in files if file.is_file())
 
     def image_files(self) -> Iterator[Path]:
-        """Every file below the folders of images."""
         for folder in (DATABASE_FOLDER, SEQUENCES_FOLDER, QUERY_FOLDER):
             yield from sorted(path for path in (self.images / folder).rglob("*") if path.is_file())
 
     def read(self, version: Version, missing: Missing) -> tuple[AachenImages, int]:
-        """Read the images that are on disk, and how many of v1.1's queries a v1.0 leaves out."""
+        """Read the existing images, and count v1.1's queries omitted from v1.0."""
         images = AachenImages(version)
         if version == "1.1":
             model = read_colmap_model(self.colmap_model, with_points=False)
@@ -124,7 +116,7 @@ class Layout:
         return images, self._add_queries(images, missing)
 
     def read_points(self, version: Version) -> tuple[tuple[str, ...], SparsePoints]:
-        """Names of all images of a version's model, and its points; DataError if it is broken."""
+        """Return the names of all images of a version's model, and its points."""
         if version == "1.1":
             model = read_colmap_model(self.colmap_model)
             return tuple(image.name for image in model.images), model.points
@@ -132,7 +124,6 @@ class Layout:
         return nvm.names, nvm.points
 
     def _add_nvm(self, images: AachenImages, missing: Missing) -> None:
-        """Each image has a camera of its own, with the image's position as its id."""
         nvm = read_nvm(self.nvm, with_points=False)
         listed = None
         if missing.require(self.database_intrinsics):
@@ -149,10 +140,7 @@ class Layout:
                 images.add_map_image(name, position, position, camera, pose)
 
     def _centred(self, nvm: NvmModel, position: int) -> Camera:
-        """The camera of the NVM, with the image's size and the principal point in its middle.
-
-        The published list has the same cameras, as far as is known.
-        """
+        """Return the NVM's camera, which equals the published one, as far as is known."""
         name = nvm.names[position]
         width, height = image_size(self.images / name)
         focal, k = float(nvm.focal_px[position]), float(nvm.k_colmap[position])
@@ -181,7 +169,6 @@ class Layout:
 
 
 def _first(folders: Iterable[Path]) -> Path:
-    """The first folder that is there; else the first of all, where it should be."""
     candidates = list(folders)
     return next((folder for folder in candidates if folder.is_dir()), candidates[0])
 
@@ -214,11 +201,7 @@ def _listed(line: Line) -> tuple[str, Camera]:
 def from_kapture(
     form: KaptureForm, wanted: Wanted, missing: Missing
 ) -> tuple[AachenImages, dict[str, Path]]:
-    """Return the images of kapture folders, and the file of each.
-
-    Map images are in the order of their times, which is that of the model; queries of each
-    condition likewise, which is the order of the official list.
-    """
+    """Return the images of kapture folders in the official order, and the file of each."""
     found = form.read(missing)
     images = AachenImages(_version_of(form, wanted, found))
     cameras: dict[str, int] = {}

@@ -38,9 +38,9 @@ from megloc_kapture.values import Options
 
 _NUM_DATABASE, _NUM_SEQUENCES = 4328, 2369
 _NUM_DAY, _NUM_NIGHT = 824, {"1.0": 98, "1.1": 191}
-# of v1.1's map images and night queries together
+# of v1.1's map images and night queries
 _NUM_CAMERAS = 5234
-# the names by which visuallocalization.net tells the versions' pose files apart
+# visuallocalization.net recognises versions by these file names
 _POSE_FILE_STEMS = {"1.0": "Aachen", "1.1": "Aachen_v1_1"}
 _WRONG_IMAGE = "db/1228.jpg"
 
@@ -58,16 +58,12 @@ class AachenOptions(Options):
     @field_validator("version", mode="before")
     @classmethod
     def _as_text(cls, version: Any) -> Any:
-        # on the command line and in TOML 1.1 is a number
+        # the command line and TOML read 1.1 as a number
         return str(version) if isinstance(version, float) else version
 
 
 class Aachen:
-    """Adapter of Aachen Day-Night.
-
-    The queries are those of the lists: the folders hold more images. World and poses are the
-    published ones.
-    """
+    """Adapter of Aachen Day-Night; queries are the listed images only."""
 
     name = "aachen"
     Options = AachenOptions
@@ -88,7 +84,6 @@ class Aachen:
         self.options = options or AachenOptions()
 
     def check(self, root: Path) -> None:
-        """Raise MeglocError, quickly, when ``root`` cannot be what is wanted of Aachen."""
         if (form := _kapture_form(root)) is not None:
             if self.options.reference_model:
                 raise form.without_model()
@@ -102,7 +97,6 @@ class Aachen:
             check_model_files(files)
 
     def input_files(self, root: Path) -> Iterator[Path]:
-        """Every file an import may depend on, images included."""
         if (form := _kapture_form(root)) is not None:
             yield from form.input_files()
         else:
@@ -117,7 +111,6 @@ class Aachen:
         yield from ground_truth_files(Path(root))
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
-        """Read the dataset."""
         self.check(root)
         missing = Missing(Path(root))
         if (form := _kapture_form(root)) is not None:
@@ -147,7 +140,6 @@ class Aachen:
         remarks: list[str],
         **more: Any,
     ) -> OfficialDataset:
-        """The dataset; ``more`` is what depends on the layout of the images."""
         truth, _ = read_ground_truth(missing.root, images.query, World())  # names tell conditions
         if _WRONG_IMAGE in images.mapping.records_camera.values():
             wrong = (
@@ -172,7 +164,6 @@ class Aachen:
         )
 
     def _remarks(self, layout: Layout, version: Version, left_out: int) -> list[str]:
-        """Sentences for the user about this import."""
         remarks = []
         if version == "1.0" and not layout.database_intrinsics.is_file():
             remarks.append(
@@ -197,18 +188,15 @@ class Aachen:
 
 
 def _kapture_form(root: Path) -> KaptureForm | None:
-    """The kapture folders, where the official files are not there."""
     return KaptureForm.find(root) if Layout(root).absent() else None
 
 
 def _descriptors(layout: Layout, version: Version) -> Path | None:
-    """The database with the descriptors of a version's model, if it is there."""
     there = version == "1.0" and layout.feature_database.is_file()
     return layout.feature_database if there else None
 
 
 def _pose_file_names(images: AachenImages, lists: Callable[[str], Path]) -> dict[str, str]:
-    """Last parts of the names, in the order of the lists."""
     names: dict[str, str] = {}
     taken: dict[str, str] = {}
     for query, condition in images.conditions.items():

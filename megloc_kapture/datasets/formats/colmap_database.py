@@ -1,8 +1,7 @@
-"""COLMAP's databases: images, keypoints and descriptors, read by sqlite.
+"""Images, keypoints and descriptors of COLMAP's databases, read with sqlite.
 
-pycolmap opens a database to write: it adds the tables of its own version to the user's file, and
-fails in a read-only folder. Here the file is opened as ``immutable``, so that sqlite does not put
-files next to a database in WAL mode either.
+pycolmap opens databases for writing: it adds tables to the user's file and fails in read-only
+folders. Here they are opened as ``immutable``, which creates no files even in WAL mode.
 """
 
 from __future__ import annotations
@@ -22,14 +21,14 @@ from megloc_kapture.io.files import check_relative
 
 
 class FeatureType(NamedTuple):
-    """A type of features: its name in kapture, and the dtype of its descriptors."""
+    """A feature type: kapture name, and dtype of the descriptors."""
 
     name: str
     dtype: str
 
 
-# COLMAP's feature/types.h; names are those of our extractors, or of their weights.
-# COLMAP stores all descriptors as bytes, those of networks are float32.
+# ids of COLMAP's feature/types.h with the names of our extractors or weights; COLMAP stores all
+# descriptors as bytes, those of networks are float32
 _SIFT, _UNDEFINED = 0, -1
 _TYPES = {
     _UNDEFINED: FeatureType("colmap-undefined", "u1"),
@@ -43,12 +42,7 @@ _SIFT_SIZE = 128
 
 
 class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
-    """An open database. Use as a context manager.
-
-    Attributes
-    ----------
-    images : name (without ``./``) -> id, sorted by name.
-    """
+    """An open database; ``images`` maps names (without ``./``) to ids. Use as a context manager."""
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
@@ -81,15 +75,12 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
         return np.empty((0, 2), np.float32) if found is None else np.ascontiguousarray(found[:, :2])
 
     def feature_type(self) -> FeatureType | None:
-        """Return the type of all features; None without descriptors.
-
-        Unknown types are named after COLMAP's number.
-        """
+        """Return the type of all features, or None without descriptors."""
         with self._reading():
             if self._has_types():
                 rows = self._rows("SELECT DISTINCT type FROM descriptors WHERE rows > 0")
                 kinds = {int(kind) for (kind,) in rows}
-            else:  # before version 4: SIFT, or features that somebody imported
+            else:  # before version 4: SIFT, or imported features
                 rows = self._rows("SELECT DISTINCT cols FROM descriptors WHERE rows > 0")
                 kinds = {_SIFT if size == _SIFT_SIZE else _UNDEFINED for (size,) in rows}
         found = [_TYPES.get(kind) or FeatureType(f"colmap-{kind}", "u1") for kind in kinds]
@@ -99,7 +90,7 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
         return found[0] if found else None
 
     def descriptors(self, name: str, expected: FeatureType = _TYPES[_SIFT]) -> NDArray[Any] | None:
-        """Return the descriptors of an image, (N, D) of the type's dtype; None without any."""
+        """Return the descriptors of an image, (N, D) of the type's dtype, or None."""
         return self._array("descriptors", name, expected.dtype)
 
     def _array(self, table: str, name: str, dtype: str) -> NDArray[Any] | None:
@@ -110,7 +101,7 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
             rows, columns, content = next(self._rows(query), (0, 0, b""))
             if not rows:
                 return None
-            # columns of descriptors count bytes
+            # descriptor columns count bytes
             size = columns // np.dtype(dtype).itemsize if table == "descriptors" else columns
             array = np.frombuffer(content, dtype).reshape(rows, size)
         if not np.isfinite(array).all():

@@ -1,8 +1,7 @@
 """The text files of 4Seasons and of the MLAD challenges on it.
 
-Fields are separated by commas or blanks, ``#`` begins a comment line. Timestamps are integer
-nanoseconds and never pass through a float, which would lose their last digits. Rotations are
-x y z w; distances are metres, or in a recording's own unit.
+Commas or blanks separate fields, ``#`` begins a comment line. Timestamps are integer nanoseconds
+and are never converted to float, which would lose digits. Quaternions are x y z w.
 """
 
 from __future__ import annotations
@@ -45,13 +44,10 @@ Row = TypeVar("Row")
 
 @dataclass(frozen=True, slots=True)
 class StereoCalibration:
-    """The cameras of the undistorted images.
+    """The PINHOLE cameras of the undistorted images, cam0 left and cam1 right.
 
-    Parameters
-    ----------
-    cam0, cam1 : left and right, PINHOLE.
-    cam1_from_cam0 : metres. The dataset's page words it "from the right to the left camera"; its
-        camchain.yaml, its sign and every user of the data say cam1 from cam0.
+    ``cam1_from_cam0`` is in metres. The dataset's page says "from the right to the left camera",
+    but camchain.yaml, the sign and all users of the data agree on cam1 from cam0.
     """
 
     cam0: Camera
@@ -60,7 +56,6 @@ class StereoCalibration:
 
 
 def read_calibration(folder: Path) -> StereoCalibration:
-    """Read the three files of a calibration folder."""
     cam0, cam1 = (read_pinhole(folder / name) for name in CAMERA_FILES)
     return StereoCalibration(cam0, cam1, read_rigid_matrix(folder / STEREO_FILE, comments=True))
 
@@ -89,14 +84,10 @@ def read_pinhole(path: Path) -> Camera:
 
 @dataclass(frozen=True, slots=True)
 class GnssPose:
-    """A row of ``GNSSPoses.txt``.
+    """A row of ``GNSSPoses.txt``; None if a field is missing.
 
-    Parameters
-    ----------
-    slam_from_cam : pose of the undistorted left camera in the recording's SLAM world. Its
-        translation is in that world's unit: metres are ``scale`` times as many.
-    scale : metres per unit; None where the row ends before it.
-    fusion_quality : 2 fused with GNSS, 1 interpolated, 0 none; None where the row ends before it.
+    ``slam_from_cam`` is the undistorted left camera's pose in SLAM units, ``scale`` metres per
+    unit, ``fusion_quality`` 2 for fused with GNSS, 1 for interpolated, 0 for none.
     """
 
     slam_from_cam: RigidTransform
@@ -105,15 +96,15 @@ class GnssPose:
 
 
 def read_times(path: Path) -> list[int]:
-    """Read ``times.txt``: timestamps (ns) of a recording's frames, published or not."""
+    """Read ``times.txt``: timestamps (ns) of all frames of a recording."""
     return list(_by_timestamp(path, lambda line: None))
 
 
 def read_gnss_poses(path: Path) -> dict[int, GnssPose]:
-    """Read ``GNSSPoses.txt``: rows by their timestamps (ns).
+    """Read ``GNSSPoses.txt`` by timestamp (ns).
 
-    A row has 8 to 11 fields, ``timestamp tx ty tz qx qy qz qw [scale [fusion_quality [v3]]]``; the
-    published header announces 11, the published rows have 10.
+    A row is ``timestamp tx ty tz qx qy qz qw [scale [fusion_quality [v3]]]``; published rows have
+    10 fields, their header announces 11.
     """
     counts: list[int] = []
 
@@ -127,17 +118,14 @@ def read_gnss_poses(path: Path) -> dict[int, GnssPose]:
         return GnssPose(_transform(line, fields[1:8]), scale, quality)
 
     poses = _by_timestamp(path, parse)
-    # a last number that was cut short is still a number
+    # a truncated number is still a number
     if counts[-1] < max(counts) and not read_text(path).endswith("\n"):
         raise DataError("the last row is incomplete: the file may be cut short", path=path)
     return poses
 
 
 def read_poses(path: Path) -> dict[int, RigidTransform]:
-    """Read ``poses.txt`` of the ECCV 2020 challenge: ``world_from_cam`` by timestamp (ns), metres.
-
-    Rows are ``timestamp tx ty tz qx qy qz qw``.
-    """
+    """Read ``poses.txt`` (ECCV 2020 challenge): ``world_from_cam`` by timestamp (ns), metres."""
     return _by_timestamp(path, lambda line: _transform(line, line.comma_fields[1:]))
 
 
@@ -147,7 +135,7 @@ def read_keyframe_accuracy(path: Path) -> set[int]:
 
 
 def timestamp_of_name(stem: str) -> int | None:
-    """Return the time (ns) that is a file's name; None for other names."""
+    """Return the time (ns) encoded in a file name; None for other names."""
     return int(stem) if _TIMESTAMP.fullmatch(stem) else None
 
 
@@ -187,14 +175,10 @@ def _scale(line: Line, text: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Transformations:
-    """The way from a recording's SLAM world to the earth.
+    """The transforms from a recording's SLAM world to the earth (ECEF), e.
 
-    Parameters
-    ----------
-    s_from_as : the SLAM world, scaled to metres, made level; also called w, the visual world.
-    w_from_gpsw : from the scene's east-north-up frame to the visual world.
-    e_from_gpsw : from the scene's east-north-up frame to the earth (ECEF).
-    gnss_scale : metres per unit of the SLAM world; None where the file does not say.
+    The level visual world is w, the scene's east-north-up frame is gpsw. ``gnss_scale`` is metres
+    per SLAM unit, or None.
     """
 
     s_from_as: RigidTransform
@@ -228,15 +212,10 @@ def read_transformations(path: Path) -> Transformations:
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A keyframe's file, ``KeyFrameData/KeyFrame_<timestamp>.txt``, as its odometry left it.
+    """A keyframe's file, written by the odometry, with the undistorted left camera.
 
-    Parameters
-    ----------
-    timestamp : nanoseconds.
-    camera : PINHOLE, the undistorted left camera.
-    world_from_cam : in the odometry's own world and unit, not the one of ``GNSSPoses.txt``;
-        motions between keyframes are the same in both.
-    points : float64 (P, 3): u and v in pixels, inverse depth per unit of the odometry's world.
+    ``world_from_cam`` is in the odometry's world and unit, not that of ``GNSSPoses.txt``; relative
+    motions are equal. ``points`` is float64 (P, 3): u and v in pixels, inverse depth.
     """
 
     timestamp: int
@@ -246,7 +225,7 @@ class Keyframe:
 
 
 def read_keyframe(path: Path) -> Keyframe:
-    """Read ``KeyFrame_<timestamp>.txt``, whose parts begin with comment lines that name them."""
+    """Read ``KeyFrame_<timestamp>.txt``; comment lines name its parts."""
     lines = read_lines(path, blank=True)
     timestamp_line = _part(lines, "timestamp", path)[0]
     line = _part(lines, "fx", path)[0]
@@ -255,7 +234,7 @@ def read_keyframe(path: Path) -> Keyframe:
     width, height, num_points = (line.count_of(text, "size") for text in line.comma_fields[4:])
     with line.named():
         camera = Camera("PINHOLE", width, height, tuple(params))
-    # of each point a line of numbers and a line of colours
+    # each point has a line of numbers and a line of colours
     rows = _part(lines, "Point Cloud", path, may_be_empty=num_points == 0)[::2]
     if len(rows) != num_points:
         raise DataError(f"{len(rows)} points, {num_points} are announced", path=path)
@@ -273,7 +252,6 @@ def read_keyframe(path: Path) -> Keyframe:
 def _part(
     lines: Sequence[Line], title: str, path: Path, *, may_be_empty: bool = False
 ) -> list[Line]:
-    """The lines after the comments that begin with ``# title``, up to a blank line."""
     part: list[Line] = []
     begun = False
     for line in lines:
@@ -292,13 +270,7 @@ def _part(
 
 @dataclass(frozen=True, slots=True)
 class RelocalizationRow:
-    """A pair of keyframes.
-
-    Parameters
-    ----------
-    reference, query : timestamps, ns.
-    query_from_reference : between their left cameras, metres; None where it is withheld.
-    """
+    """A pair of keyframes (ns); ``query_from_reference`` (metres) is None if withheld."""
 
     reference: int
     query: int
@@ -306,10 +278,7 @@ class RelocalizationRow:
 
 
 def parse_relocalization_name(name: str) -> tuple[str | None, str] | None:
-    """Return the source (None where the name leaves it out) and target recording of a file's name.
-
-    None for the name of another file.
-    """
+    """Return source and target recording of a file name; the source may be omitted."""
     for pattern in _RELOCALIZATION_NAMES:
         if found := pattern.fullmatch(name):
             parts = found.groupdict()
@@ -318,7 +287,6 @@ def parse_relocalization_name(name: str) -> tuple[str | None, str] | None:
 
 
 def read_relocalization(path: Path) -> list[RelocalizationRow]:
-    """Read the pairs of a relocalization file, in its order, each once."""
     rows: dict[tuple[int, int], RelocalizationRow] = {}
     for line in read_lines(path, comments=True):
         fields = line.comma_fields

@@ -1,7 +1,7 @@
-"""NVM files, VisualSFM's format of models, as COLMAP exports and challenges publish them.
+"""NVM files of VisualSFM, as exported by COLMAP and published by challenges.
 
-Cameras have centres instead of translations, and distortion of the other sign than COLMAP's.
-The file has neither image sizes nor principal points; pixels are those of COLMAP's exporter.
+Cameras have centres instead of translations, and distortion of the opposite sign to COLMAP's. The
+file has no image sizes and principal points.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from megloc_kapture.io.files import check_relative, named, reading
 from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.values import RigidTransform
 
-_ROWS = 50_000  # points that are parsed at once
+_ROWS = 50_000  # points parsed at once
 
 
 @dataclass(frozen=True, eq=False)
 class NvmModel:
-    """One model of C images, whose ``points`` have positions in ``names`` as image ids.
+    """A model of C images; the image ids of ``points`` are positions in ``names``.
 
     Rotations ``quat_wxyz`` (C, 4) are from world to camera, ``centers`` (C, 3) in the world;
-    ``k_colmap`` (C,) is radial distortion with COLMAP's sign (SIMPLE_RADIAL).
+    ``k_colmap`` (C,) is SIMPLE_RADIAL distortion.
     """
 
     names: tuple[str, ...]
@@ -39,7 +39,6 @@ class NvmModel:
     points: SparsePoints
 
     def cam_from_world(self, index: int) -> RigidTransform:
-        """Pose of an image by its position in ``names``."""
         w, x, y, z = self.quat_wxyz[index].tolist()
         rotation = RigidTransform((w, x, y, z), (0.0, 0.0, 0.0)).rotation_matrix()
         tx, ty, tz = (-rotation @ self.centers[index]).tolist()
@@ -47,10 +46,7 @@ class NvmModel:
 
 
 def read_nvm(path: Path, *, with_points: bool = True) -> NvmModel:
-    """Read the only model of a file; DataError where there are several.
-
-    A second model without points, which lists the images that were not registered, is not read.
-    """
+    """Read the only model of a file; an extra list of unregistered images is ignored."""
     with reading(path), open(path, encoding="utf-8-sig", errors="surrogateescape") as file:
         if not file.readline().startswith("NVM_V3"):
             raise DataError("not an NVM file: the first line must begin with NVM_V3", path=path)
@@ -93,7 +89,7 @@ def _read_cameras(rows: Iterator[str], count: int) -> tuple[tuple[str, ...], NDA
 
 
 def _read_points(rows: Iterator[str], count: int, images: int, with_points: bool) -> SparsePoints:
-    """Points are rows of X Y Z R G B, a number of observations, and these: image feature x y."""
+    """Read rows of X Y Z R G B, the number of observations, and these: image feature x y."""
     parts = []
     while count:
         lines = list(islice(rows, min(_ROWS, count)))

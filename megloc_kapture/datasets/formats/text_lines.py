@@ -1,4 +1,4 @@
-"""Lines of small text files, and their fields as names and numbers; errors name file and line."""
+"""Lines and fields of small text files, with errors that name file and line."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import named, read_text
 from megloc_kapture.values import RigidTransform
 
-# larger distances are errors and would overflow further on; ECEF coordinates are below 1e7
+# larger distances are errors and would overflow later; ECEF coordinates are below 1e7
 MAX_DISTANCE_M = 1e9
-# of R^T R from the identity; published matrices have six decimals
+# of R^T R - I; published matrices have six decimals
 MAX_ROTATION_ERROR = 1e-3
 
 _SHOWN = 40
@@ -27,34 +27,30 @@ _SHOWN = 40
 
 @dataclass(frozen=True)
 class Line:
-    """One line of a file: its number, and its text without blanks around it."""
-
     path: Path
     number: int
     text: str
 
     @cached_property
     def fields(self) -> list[str]:
-        """The fields between blanks."""
         return self.text.split()
 
     @cached_property
     def comma_fields(self) -> list[str]:
-        """The fields between commas; between blanks in a line without commas."""
+        """Return comma-separated fields; blank-separated fields in lines without commas."""
         if "," not in self.text:
             return self.fields
         return [field.strip() for field in self.text.removesuffix(",").split(",")]
 
     def error(self, message: str) -> DataError:
-        """Return the error for this line."""
         return DataError(message, path=self.path, line=self.number)
 
     def named(self) -> AbstractContextManager[None]:
-        """Let DataErrors that name no file name this line."""
+        """Add this line to DataErrors that name no file."""
         return named(self.path, self.number)
 
     def expect(self, fields: Sequence[str], counts: int | Iterable[int], form: str) -> None:
-        """Raise DataError for another number of fields; ``form`` lists them."""
+        """Raise DataError for another number of fields; ``form`` lists their names."""
         expected = (counts,) if isinstance(counts, int) else tuple(counts)
         if len(fields) not in expected:
             raise self.error(
@@ -62,7 +58,6 @@ class Line:
             )
 
     def number_of(self, text: str, what: str) -> float:
-        """Return a finite number."""
         try:
             value = float(text)
         except ValueError:
@@ -72,19 +67,16 @@ class Line:
         return value
 
     def numbers_of(self, texts: Iterable[str], what: str) -> list[float]:
-        """Return finite numbers."""
         return [self.number_of(text, what) for text in texts]
 
     def count_of(self, text: str, what: str) -> int:
-        """Return a whole number of at least 0."""
         if not re.fullmatch("[0-9]{1,18}", text):
             raise self.error(f"{what} {shown(text)} is not a whole number of at least 0")
         return int(text)
 
     def rigid_transform(self, matrix: NDArray[np.float64]) -> RigidTransform:
-        """Return the transform of a 4x4 matrix."""
         rotation, position = matrix[:3, :3], matrix[:3, 3]
-        # huge elements may overflow to infinity, which is not below the limit
+        # huge elements may overflow to infinity
         with np.errstate(over="ignore", invalid="ignore"):
             error = np.abs(rotation.T @ rotation - np.eye(3)).max()
             proper = error < MAX_ROTATION_ERROR and np.linalg.det(rotation) > 0
@@ -98,13 +90,7 @@ class Line:
 
 
 def read_lines(path: Path, *, blank: bool = False, comments: bool = False) -> list[Line]:
-    """Return the lines of a text file.
-
-    Parameters
-    ----------
-    blank : keep blank lines, except an empty last one.
-    comments : leave out lines that begin with #.
-    """
+    """Read stripped lines; ``blank`` keeps blank lines, ``comments`` drops # lines."""
     texts = [text.strip() for text in read_text(path).split("\n")]
     if not texts[-1]:
         texts.pop()
@@ -116,7 +102,7 @@ def read_lines(path: Path, *, blank: bool = False, comments: bool = False) -> li
 
 
 def read_rigid_matrix(path: Path, *, comments: bool = False) -> RigidTransform:
-    """Return the transform of a file with a 4x4 matrix, numbers between commas or blanks."""
+    """Read a 4x4 matrix of comma- or blank-separated numbers as a transform."""
     lines = read_lines(path, comments=comments)
     if [len(line.comma_fields) for line in lines] != [4] * 4:
         raise DataError("expected four lines of four numbers", path=path)
@@ -125,7 +111,6 @@ def read_rigid_matrix(path: Path, *, comments: bool = False) -> RigidTransform:
 
 
 def shown(text: str) -> str:
-    """Return a text in quotes for an error, shortened."""
     return repr(text if len(text) <= _SHOWN else text[:_SHOWN] + "...")
 
 

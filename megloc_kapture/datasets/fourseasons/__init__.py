@@ -1,4 +1,4 @@
-"""4Seasons' recordings on disk, the relocalization files between them, and the choice of both."""
+"""4Seasons' recordings on disk, relocalization files, and the selection of both."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TRANSFORMATIONS, TIMES, KEYFRAMES = "Transformations.txt", "times.txt", "KeyFram
 _IMAGES = "undistorted_images"
 _MARKS = (_IMAGES, GNSS_POSES, POSES, TIMES)
 _RELOCALIZATION_FOLDERS = (".", "RelocalizationFiles*", "*", "*/RelocalizationFiles*")
-# pairs of source and target -> their number, from the challenges' pages
+# number of pairs by (source, target), from the challenges' pages
 _PUBLISHED_PAIRS = {
     ("recording_2020-10-08_09-57-28", "recording_2021-01-07_14-03-57"): 227,
     ("recording_2020-10-08_11-53-41", "recording_2021-05-10_19-51-14"): 227,
@@ -41,24 +41,15 @@ _PUBLISHED_PAIRS = {
 
 @dataclass(frozen=True)
 class Recording:
-    """One drive.
-
-    Parameters
-    ----------
-    name : of its folder, which is also what relocalization files call it.
-    folder : of its files.
-    """
-
     name: str
     folder: Path
 
     @property
     def has_poses(self) -> bool:
-        """True where poses of its keyframes are published and here."""
         return (self.folder / GNSS_POSES).is_file() or (self.folder / POSES).is_file()
 
     def image(self, timestamp: int, camera: str) -> str:
-        """Name of an image below the dataset's root."""
+        """Return the name of an image below the dataset's root."""
         return f"{self.name}/{_IMAGES}/{camera}/{timestamp}.png"
 
     def file_of(self, image: str) -> Path:
@@ -68,26 +59,22 @@ class Recording:
         return self.folder / _IMAGES / camera / f"{timestamp}.png"
 
     def keyframe_file(self, timestamp: int) -> Path:
-        """Return the file of a keyframe's point cloud."""
         return self.folder / KEYFRAMES / f"KeyFrame_{timestamp}.txt"
 
     def times_on_disk(self, camera: str) -> list[int]:
-        """Timestamps (ns) of a camera's undistorted images, sorted."""
+        """Return the timestamps (ns) of a camera's images, sorted."""
         images = (self.folder / _IMAGES / camera).glob("*.png")
         times = (timestamp_of_name(path.stem) for path in images)
         return sorted(time for time in times if time is not None)
 
     def calibration(self, root: Path) -> StereoCalibration:
-        """The cameras of its undistorted images."""
         return read_calibration(self.calibration_folder(root))
 
     def calibration_files(self, root: Path) -> list[Path]:
-        """The files of :meth:`calibration`; raises what it raises where there are none."""
         folder = self.calibration_folder(root)
         return [folder / name for name in (*CAMERA_FILES, STEREO_FILE)]
 
     def calibration_folder(self, root: Path) -> Path:
-        """The folder of a calibration: its own, or the dataset's; DataError without one."""
         for folder in (self.folder, root):
             for name in CALIBRATION_FOLDERS:
                 if (folder / name).is_dir():
@@ -101,13 +88,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class RelocalizationFile:
-    """A list of pairs that a challenge asks for.
-
-    Parameters
-    ----------
-    path : of the file; the file to hand in has the same name.
-    source, target : recordings, of the map and of the queries.
-    """
+    """A list of pairs requested by a challenge; the result file has the same name."""
 
     path: Path
     source: str
@@ -115,17 +96,14 @@ class RelocalizationFile:
 
     @cached_property
     def rows(self) -> list[RelocalizationRow]:
-        """Its pairs; raises DataError that names file and line."""
         return read_relocalization(self.path)
 
     def count(self) -> Count:
-        """Its pairs, beside those published."""
         published = _PUBLISHED_PAIRS.get((self.source, self.target))
         return Count(f"pairs in {self.path.name}", len(self.rows), published)
 
 
 def find_recordings(root: Path) -> dict[str, Recording]:
-    """The recordings below a dataset's root by name, sorted; DataError where there is none."""
     found = {
         folder.name: Recording(folder.name, folder)
         for folder in _folders(root)
@@ -146,11 +124,7 @@ def _folders(root: Path) -> list[Path]:
 
 
 def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[RelocalizationFile]:
-    """The relocalization files below a dataset's root, sorted by source and name.
-
-    A file whose name leaves out its source must lie in the source's folder. DataError where two
-    have one name, for so would the files to hand in.
-    """
+    """Find relocalization files; without a source in their names they lie in its folder."""
     known = set(recordings)
     found: dict[str, RelocalizationFile] = {}
     for folder in _RELOCALIZATION_FOLDERS:
@@ -174,20 +148,13 @@ def find_relocalization_files(root: Path, recordings: Iterable[str]) -> list[Rel
     return sorted(found.values(), key=lambda file: (file.source, file.path.name))
 
 
-# stands in the list of what is missing where there is a recording for the map only
+# listed as missing if there is only a map recording
 ANOTHER_RECORDING = "<another recording, for the queries>"
 
 
 @dataclass(frozen=True)
 class Selection:
-    """The recordings that are imported.
-
-    Parameters
-    ----------
-    recordings : all that are there, by name.
-    references, queries : those of the map and those of the queries, sorted by name.
-    files : the relocalization files between them.
-    """
+    """All ``recordings``, the imported ones, and their relocalization files."""
 
     recordings: dict[str, Recording]
     references: list[Recording]
@@ -200,8 +167,7 @@ def select(
 ) -> Selection:
     """Choose recordings by name, or by relocalization files.
 
-    Without names the map is made of the sources of the relocalization files (without such files of
-    the first recording with poses), and the queries are of their targets (of all other recordings).
+    Without either, the first recording with poses is the map and the others are queries.
     """
     recordings = find_recordings(root)
     files = find_relocalization_files(root, recordings)

@@ -1,10 +1,7 @@
-"""4Seasons and the MLAD challenges on it: one recording localized in another.
+"""4Seasons and the MLAD challenges: localization of one recording in another.
 
-A root has recordings, folders of the published names, and ``calibration/`` beside or in them. The
-map is made of the keyframes of the reference recordings, whose poses are published; queries are
-images of other recordings. Where relocalization files of a challenge lie below the root, they say
-which recordings are meant, which of their images are asked for, and near which keyframe each was
-taken.
+Relocalization files of a challenge below the root select the recordings and the queries, and assign
+a nearby keyframe to each query.
 """
 
 from __future__ import annotations
@@ -58,7 +55,7 @@ from megloc_kapture.io.kapture import KaptureData
 from megloc_kapture.values import Options, RigidTransform
 
 NAME = "4seasons"
-# of other long-term benchmarks, where no challenge asks
+# of other long-term benchmarks, used without a challenge
 _GENERAL_THRESHOLDS = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 
 
@@ -112,13 +109,11 @@ class FourSeasons:
         self.options = options or FourSeasonsOptions()
 
     def check(self, root: Path) -> None:
-        """Raise DataError, quickly, when ``root`` has not the recordings or no calibration."""
         chosen = self._select(root, Missing(root))
         for recording in (*chosen.references, *chosen.queries):
             recording.calibration(root)
 
     def input_files(self, root: Path) -> Iterator[Path]:
-        """Every file an import depends on: text files, images, point clouds where asked for."""
         dataset = self.read(root, allow_missing=True)
         chosen = self._select(root, Missing(root))
         yield from (file.path for file in chosen.files)
@@ -139,7 +134,6 @@ class FourSeasons:
         yield from ground_truth_files(root)
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
-        """Read the selected recordings."""
         missing = Missing(root)
         suffixes: dict[StereoCalibration, str] = {}
         chosen = self._select(root, missing)
@@ -169,7 +163,7 @@ class FourSeasons:
         query_gt = _known_poses(query.data, truth, beside)
         used = (*chosen.references, *chosen.queries)
         rules: dict[str, Any] = {"conditions": tuple(one.name for one in chosen.queries)}
-        if not chosen.files:  # without a challenge nobody takes a pose file: absolute poses in ECEF
+        if not chosen.files:  # no challenge: write absolute poses in ECEF
             rules |= {"thresholds": _GENERAL_THRESHOLDS, "pose_file": "ltvl"}
         return OfficialDataset(
             mapping=mapping.data,
@@ -205,7 +199,7 @@ class FourSeasons:
     ) -> dict[str, KeyframePoses]:
         found = {}
         for recording in references:
-            # the frame of a poses.txt is its recording's own
+            # each poses.txt has a separate frame
             poses = self._poses(recording, missing, on_earth=len(references) > 1)
             if poses is None:
                 raise DataError(
@@ -263,7 +257,7 @@ def _known_poses(
     published: Mapping[tuple[int, str], RigidTransform],
     beside: KaptureData | None,
 ) -> KaptureData | None:
-    """The queries with the poses that are published; where none is, with those beside the data."""
+    """Return the queries with published poses, else with poses of ``ground_truth/``."""
     times = {timestamp for timestamp, _ in query.records_camera}
     poses = {key: pose for key, pose in published.items() if key[0] in times}
     known = with_poses(query, poses)
@@ -277,10 +271,7 @@ def _known_poses(
 def _image_groups(
     chosen: Selection, mapping: KaptureData, query: KaptureData
 ) -> dict[str, ImageGroup]:
-    """Groups of all images: a query's condition is its recording.
-
-    Scored are left images; where relocalization files ask for images of a recording, these.
-    """
+    """Return the groups; conditions are recordings, only (requested) left images are scored."""
     groups = {
         image: ImageGroup(location=image.partition("/")[0]) for image in mapping.image_names()
     }
@@ -305,7 +296,6 @@ def _summary(
     query: KaptureData,
     query_gt: KaptureData | None,
 ) -> list[Count]:
-    """Counts of the import, beside those published."""
     counts = [Count("recordings", len(chosen.recordings))]
     images = [image.partition("/")[0] for data in (mapping, query) for image in data.image_names()]
     for part, recordings in (("map", chosen.references), ("query", chosen.queries)):
@@ -337,7 +327,6 @@ def _remarks(
     tables: ChallengeTables,
     min_fusion_quality: int,
 ) -> list[str]:
-    """Sentences for the user."""
     told = []
     for name, of in poses.items():
         if of.dropped:

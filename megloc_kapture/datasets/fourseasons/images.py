@@ -1,12 +1,8 @@
-"""4Seasons' images as kapture, their sparse depth, the pairs of the MLAD challenges, and keyframes'
-poses in one metric frame.
+"""4Seasons as kapture: images, sparse depth, challenge pairs, keyframe poses.
 
-Every recording has a SLAM world and a scene (an east-north-up frame) of its own; only the earth is
-common to all. The poses of all recordings are brought into the scene of the reference recording,
-less an origin amid its keyframes: metric, level, and small numbers.
-
+Poses are in the reference recording's scene (east-north-up), with an origin near its keyframes.
 ``ECEF_from_cam = e_from_gpsw * inv(w_from_gpsw) * s_from_as * scale * slam_from_cam``, with the
-scale of the pose's own row.
+scale of the pose's row.
 """
 
 from __future__ import annotations
@@ -48,7 +44,7 @@ DEPTH_FOLDER = "keyframe_depth"
 
 @dataclass(frozen=True)
 class DepthJob:
-    """A depth map to be made of a keyframe's file, with the metres per unit of its SLAM world."""
+    """A depth map to be written; ``scale`` is metres per SLAM unit."""
 
     keyframe: Path
     timestamp: int
@@ -59,12 +55,7 @@ class DepthJob:
 
 @dataclass
 class ImageRecords:
-    """The images of the map or of the queries.
-
-    ``suffixes`` end the ids of each calibration's car and sensors, shared by both parts: the first
-    car has none, a car of another calibration the name of its first recording. ``stereo`` takes the
-    right camera too.
-    """
+    """Images of the map or of the queries; ``suffixes`` of ids are shared by both."""
 
     suffixes: dict[StereoCalibration, str]
     missing: Missing
@@ -75,7 +66,7 @@ class ImageRecords:
     def add(
         self, recording: Recording, calibration: StereoCalibration, times: Iterable[int]
     ) -> str:
-        """Record a recording's images at these times (ns); returns the id of the car."""
+        """Add a recording's images at these times (ns); return the id of the car."""
         fresh = f"_{recording.name}" if self.suffixes else ""
         suffix = self.suffixes.setdefault(calibration, fresh)
         car = RIG + suffix
@@ -100,10 +91,7 @@ class ImageRecords:
     def add_depth(
         self, recording: Recording, calibration: StereoCalibration, scales: Mapping[int, float]
     ) -> None:
-        """Record the keyframes' point clouds as depth maps, for the recorded times of ``scales``.
-
-        ``scales`` are metres per unit of the SLAM world by timestamp (ns).
-        """
+        """Add the keyframes' depth maps; ``scales`` are metres per SLAM unit by timestamp (ns)."""
         suffix = self.suffixes[calibration]
         sensor, camera = DEPTH + suffix, calibration.cam0
         self.data.sensors[sensor] = Sensor.from_camera(camera, name=DEPTH, sensor_type="depth")
@@ -119,7 +107,6 @@ class ImageRecords:
 
 
 def write_depth_maps(jobs: Iterable[DepthJob], output: Path) -> None:
-    """Write the depth maps below an import's ``mapping/``."""
     for job in jobs:
         keyframe = read_keyframe(job.keyframe)
         size = (keyframe.camera.width, keyframe.camera.height)
@@ -134,12 +121,9 @@ def write_depth_maps(jobs: Iterable[DepthJob], output: Path) -> None:
 
 
 def depth_map(keyframe: Keyframe, scale: float) -> NDArray[np.float32]:
-    """Depth along the optical axis, float32 (H, W), metres; 0 where the cloud has no point.
+    """Return the depth along the optical axis, float32 (H, W), metres; 0 without a point.
 
-    Parameters
-    ----------
-    scale : metres per unit of the keyframe's depths. Of several points in a pixel the nearest
-        counts; points outside the image or without a positive inverse depth do not.
+    ``scale`` is metres per unit of the keyframe's depths.
     """
     width, height = keyframe.camera.width, keyframe.camera.height
     columns, rows, inverse = keyframe.points.T
@@ -153,7 +137,7 @@ def depth_map(keyframe: Keyframe, scale: float) -> NDArray[np.float32]:
     return np.where(np.isfinite(nearest), nearest, np.float32(0))
 
 
-# a query may be matched with the map images of so many keyframes before and after its reference
+# a query may be matched with map images of this many keyframes before and after its reference
 NEIGHBOURS = 20
 
 
@@ -161,12 +145,8 @@ NEIGHBOURS = 20
 class ChallengeTables:
     """The relocalization files in terms of imported images.
 
-    Attributes
-    ----------
-    pairs : in the files' order.
-    priors : query image -> map images around its reference keyframes.
-    truth : (recording, timestamp) of a query -> ``cam0_from_local``, where a file has it.
-    lost : pairs whose reference has no pose or image, or whose query has no image.
+    ``priors`` maps queries to permitted map images, ``truth`` maps (recording, timestamp) to
+    ``cam0_from_local``; ``lost`` counts pairs without pose or images.
     """
 
     pairs: list[RelocalizationPair] = field(default_factory=list)
@@ -182,18 +162,13 @@ def challenge_tables(
     mapping: KaptureData,
     query: KaptureData,
 ) -> ChallengeTables:
-    """Return the pairs, priors and true poses of relocalization files.
-
-    ``cams_from_local`` are poses of the left camera by recording and timestamp. A pair counts where
-    both of its images were imported.
-    """
+    """Return the pairs, priors and true poses; ``cams_from_local`` is for left cameras."""
     tables = ChallengeTables()
     map_images, query_images = set(mapping.image_names()), set(query.image_names())
     around: dict[tuple[str, int], set[str]] = {}
     for file in files:
         source, target = recordings[file.source], recordings[file.target]
         poses = cams_from_local[source.name]
-        # only what is in the map can be a neighbour
         times = [t for t in sorted(poses) if source.image(t, CAMERAS[0]) in map_images]
         indices = {timestamp: index for index, timestamp in enumerate(times)}
         for row in file.rows:
@@ -223,14 +198,10 @@ def challenge_tables(
 
 @dataclass(frozen=True)
 class KeyframePoses:
-    """The poses of one recording's keyframes.
+    """The poses of one recording's keyframes, by timestamp (ns).
 
-    Parameters
-    ----------
-    scene_from_cam : of the undistorted left camera by timestamp (ns), metres, sorted.
-    earth_from_scene : to ECEF; None where it is not published.
-    scales : metres per unit of the recording's SLAM world by timestamp, where known.
-    dropped : timestamps of keyframes whose fusion with GNSS is too poor.
+    ``scene_from_cam`` is for the undistorted left camera, in metres; ``earth_from_scene`` goes to
+    ECEF; ``scales`` are metres per SLAM unit; ``dropped`` keyframes have poor GNSS fusion.
     """
 
     scene_from_cam: Mapping[int, RigidTransform]
@@ -241,26 +212,19 @@ class KeyframePoses:
 
 @dataclass(frozen=True)
 class LocalFrame:
-    """The frame of the map: a recording's scene, moved to an origin near its keyframes.
-
-    Parameters
-    ----------
-    earth_from_scene : of the reference recording; None where it is not on earth.
-    origin : in the scene, metres.
-    """
+    """The frame of the map: a recording's scene, moved to ``origin`` (metres)."""
 
     earth_from_scene: RigidTransform | None
     origin: tuple[float, float, float]
 
     @classmethod
     def around(cls, poses: KeyframePoses) -> LocalFrame:
-        """The frame of a reference recording; the origin is a whole number of metres."""
+        """Choose an origin in whole metres near the keyframes of a reference recording."""
         centers = np.array([pose.translation for pose in poses.scene_from_cam.values()])
         x, y, z = np.round(centers.mean(axis=0)).tolist()
         return cls(poses.earth_from_scene, (x, y, z))
 
     def cams_from_local(self, poses: KeyframePoses) -> dict[int, RigidTransform]:
-        """``cam_from_local`` by timestamp; ValueError where only one recording is on earth."""
         if (poses.earth_from_scene is None) != (self.earth_from_scene is None):
             raise ValueError("no way leads from one recording's scene to the other's")
         x, y, z = self.origin
@@ -274,7 +238,7 @@ class LocalFrame:
         }
 
     def world(self) -> World:
-        """The way back: to ECEF, or to the frame of ``poses.txt``."""
+        """Return the transform back to ECEF, or to the frame of ``poses.txt``."""
         scene = self.earth_from_scene or RigidTransform.identity()
         official_from_local = scene @ RigidTransform((1.0, 0.0, 0.0, 0.0), self.origin)
         return World(
@@ -288,10 +252,7 @@ class LocalFrame:
 def read_keyframe_poses(
     recording: Recording, *, min_fusion_quality: int, on_earth: bool, missing: Missing
 ) -> KeyframePoses | None:
-    """Return the published poses of a recording's keyframes, None without any.
-
-    ``on_earth`` takes ``GNSSPoses.txt`` only; else ``poses.txt`` is preferred.
-    """
+    """Return the published keyframe poses, or None; ``on_earth`` excludes ``poses.txt``."""
     plain = recording.folder / POSES
     if not on_earth and plain.is_file():
         poses = read_poses(plain)
@@ -334,7 +295,6 @@ def _gnss_poses(recording: Recording, min_fusion_quality: int) -> KeyframePoses:
 
 
 def _scales_beside(recording: Recording) -> dict[int, float]:
-    """Scales of a recording's SLAM world where its ``GNSSPoses.txt`` is there too."""
     path = recording.folder / GNSS_POSES
     if not path.is_file():
         return {}

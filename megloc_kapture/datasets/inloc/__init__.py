@@ -1,8 +1,8 @@
-"""Files of InLoc: floors, scans and their cutouts with the points that were scanned, queries.
+"""Files of InLoc: floors, scans, cutouts with scanned points, queries.
 
-``<BLD>_cutout_<SCAN>_<YAW>_<PITCH>.jpg`` is cut out of the panorama of a scan, and what the scanner
-measured in each of its pixels is in ``<image>.mat``, in the scan's frame (metres, z up). The scan
-stands in its floor as ``<BLD>_trans_<SCAN>.txt`` says.
+``<BLD>_cutout_<SCAN>_<YAW>_<PITCH>.jpg`` is cut out of a scan's panorama; ``<image>.mat`` has the
+scanned point of each pixel in the scan's frame (metres, z up). ``<BLD>_trans_<SCAN>.txt`` is the
+pose of the scan in its floor.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ FLOORS = ("DUC1", "DUC2")
 DISTRACTOR_FLOORS = ("CSE3", "CSE4", "CSE5")
 YAWS_DEG = tuple(range(0, 360, 30))
 PITCHES_DEG = (-30, 0, 30)
-POINTS_SUFFIX = ".mat"  # behind the image's name
+POINTS_SUFFIX = ".mat"  # appended to the image's name
 
 LAYOUT = (
     "database/cutouts/DUC1/000/DUC_cutout_000_0_0.jpg (and .jpg.mat), "
     "database/alignments/DUC1/transformations/DUC_trans_000.txt, query/iphone7/IMG_0000.JPG"
 )
 
-# what archives and their redistributions call the folders, most official first
+# folder names in archives and redistributions, most official first
 _ROOTS = ("", "dataset")
 _CUTOUTS = ("database/cutouts", "cutouts", "database/cutouts_imageonly", "cutouts_imageonly")
 _ALIGNMENTS = ("database/alignments", "alignments")
 _QUERIES = ("query/iphone7", "queries/iphone7", "iphone7")
-# the published archive spells it without the "n", the documentation with it
+# the published archive omits the "n", the documentation does not
 _WRONG_SCANS = ("know_incorrect.txt", "known_incorrect.txt")
 _SCAN = re.compile(r"[0-9]{3}")
 _PHOTOGRAPH = (".jpg", ".jpeg")
@@ -51,7 +51,7 @@ _SCAN_NUMBER = re.compile(r"(?<![0-9])[0-9]{1,3}(?![0-9])")
 
 @dataclass(frozen=True, slots=True)
 class Cutout:
-    """A cutout, as its name describes it; the yaw is to the right of the scan's -x axis."""
+    """A cutout described by its name; the yaw is to the right of the scan's -x axis."""
 
     building: str
     scan: str
@@ -67,10 +67,10 @@ class Cutout:
         return f"{self.building}_trans_{self.scan}.txt"
 
     def cam_from_scan(self) -> RigidTransform:
-        """The cutout's pose in its scan, whose origin is its centre.
+        """Return the cutout's pose in its scan; both share their origin.
 
-        From the scan's axes (z up) to a camera that looks along -x, then turned by the yaw to the
-        right and by the pitch upwards.
+        The camera looks along the scan's -x axis (z up), rotated by the yaw to the right and by the
+        pitch upwards.
         """
         yaw, pitch = np.radians(-self.yaw_deg), np.radians(-self.pitch_deg)
         pano_from_scan = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
@@ -88,22 +88,17 @@ class Cutout:
 
 
 def parse_cutout_name(name: str) -> Cutout:
-    """The cutout that the name of its image describes; DataError where it is another name."""
     found = _CUTOUT.fullmatch(name)
     if found is None or int(found[3]) >= 360 or abs(int(found[4])) > 90:
         raise DataError(f"{name!r} is not named <BUILDING>_cutout_<SCAN>_<YAW>_<PITCH>.jpg")
     cutout = Cutout(found[1], found[2], int(found[3]), int(found[4]))
-    if cutout.image != name:  # "_030_", "_-0": one view would have two names
+    if cutout.image != name:  # "_030_", "_-0": a view must have one name
         raise DataError(f"{name!r} is {cutout.image!r} with superfluous digits")
     return cutout
 
 
 def read_transformation(path: Path | str) -> RigidTransform:
-    """``floor_from_scan`` of a scan, after refinement.
-
-    The file has two 4x4 matrices, before refinement and after it, row by row; what else stands in
-    it is text.
-    """
+    """Read ``floor_from_scan``: the second 4x4 matrix of the file, after refinement."""
     path = Path(path)
     rows = [line for line in read_lines(path) if _has_four_numbers(line)]
     if len(rows) != 8:
@@ -118,13 +113,13 @@ def read_transformation(path: Path | str) -> RigidTransform:
 
 
 def read_wrong_scans(path: Path | str) -> frozenset[str]:
-    """Return the scans that the authors list as wrongly placed: any number of up to 3 digits."""
+    """Read the numbers of wrongly placed scans, of up to 3 digits."""
     lines = read_lines(Path(path))
     return frozenset(n.zfill(3) for line in lines for n in _SCAN_NUMBER.findall(line.text))
 
 
 def read_cutout_points(path: Path | str, width: int, height: int) -> NDArray[np.float64]:
-    """Return the scanned points float64 (height, width, 3), metres in the scan's frame, or NaN."""
+    """Read the scanned points float64 (height, width, 3), metres in the scan's frame, or NaN."""
     points = read_mat_array(path, POINTS)
     if points.shape != (height, width, 3):
         found = "x".join(map(str, points.shape))
@@ -141,12 +136,7 @@ def _has_four_numbers(line: Line) -> bool:
 
 @dataclass(frozen=True)
 class Layout:
-    """The folders of an InLoc download.
-
-    Parameters
-    ----------
-    alignments : has a folder for each floor.
-    """
+    """The folders of an InLoc download; ``alignments`` has a folder per floor."""
 
     cutouts: Path
     alignments: Path
@@ -154,7 +144,6 @@ class Layout:
 
     @classmethod
     def find(cls, root: Path) -> Layout:
-        """The folders below ``root``; DataError where one of the three is not there."""
         if not root.is_dir():
             raise DataError("no such folder", path=root)
         for name in _ROOTS:
@@ -170,11 +159,9 @@ class Layout:
         raise DataError(f"{_CUTOUTS[0]}/ is missing; InLoc lies as {LAYOUT}", path=root)
 
     def alignment(self, floor: str) -> Path:
-        """The folder of what is known about where a floor's scans stand."""
         return self.alignments / floor
 
     def queries(self) -> list[str]:
-        """File names of the query images, sorted; DataError where no pose file can hold one."""
         names = [name for name in _listed(self.query) if name.lower().endswith(_PHOTOGRAPH)]
         for name in names:
             if name.split() != [name] or "," in name or has_control_characters(name):
@@ -185,7 +172,6 @@ class Layout:
         return names
 
     def scans(self, floor: str, missing: Missing) -> list[Scan]:
-        """The scans of a floor, sorted; DataError where an image is named or lies otherwise."""
         folder = self.cutouts / floor
         if not missing.require(folder):
             return []
@@ -196,12 +182,10 @@ class Layout:
         ]
 
     def wrong_scans(self, floor: str) -> frozenset[str]:
-        """The scans whose transformations the authors call wrong."""
         path = _first(self.alignment(floor), _WRONG_SCANS)
         return frozenset() if path is None else read_wrong_scans(path)
 
     def input_files(self, floors: tuple[str, ...], *, with_points: bool) -> Iterator[Path]:
-        """All files of these floors and of the queries that an import may read."""
         for floor in floors:
             alignments = self.alignment(floor)
             yield from sorted(alignments.glob("transformations/*.txt"))
@@ -231,7 +215,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Scan:
-    """One scan of a floor: its cutouts, sorted by name, and those that have points."""
+    """A scan of a floor: its sorted cutouts, and the names of those with points."""
 
     floor: str
     number: str
@@ -241,7 +225,7 @@ class Scan:
     transformation: Path
 
     def poses(self) -> dict[str, RigidTransform]:
-        """``cam_from_floor`` by image, of the cutouts whose pose is known."""
+        """Return ``cam_from_floor`` by image, for cutouts with a known pose."""
         if not self.transformation.exists():
             return {}
         scan_from_floor = read_transformation(self.transformation).inverse()
@@ -249,7 +233,6 @@ class Scan:
 
     @property
     def location(self) -> str:
-        """Its name in groups."""
         return f"{self.floor}/{self.number}"
 
 
@@ -275,7 +258,6 @@ def _first(folder: Path, names: tuple[str, ...]) -> Path | None:
 
 
 def _listed(folder: Path) -> list[str]:
-    """Names in a folder, sorted; hidden ones (an archiver's leavings) do not count."""
     try:
         return sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
     except OSError as error:

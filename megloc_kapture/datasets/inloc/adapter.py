@@ -1,7 +1,7 @@
-"""InLoc: cutouts of laser scans as the map, with depth; telephone images as queries.
+"""InLoc: cutouts of laser scans with depth as the map, phone images as queries.
 
-Every floor is a coordinate frame of its own. A cutout's pose follows from its name and from where
-its scan stands in the floor; its depth from the points the scanner measured in its pixels.
+Each floor has a separate coordinate frame. A cutout's pose follows from its name and the pose of
+its scan in the floor; its depth comes from the scanned points.
 """
 
 from __future__ import annotations
@@ -44,16 +44,16 @@ from megloc_kapture.values import Camera, Options, RigidTransform
 
 CUTOUTS, QUERIES, DEPTH = "database/cutouts", "query/iphone7", "depth"
 DATASET = "inloc"
-# iPhone 7: 28 mm lens on a 36 mm film, 4032 px along the longer side
+# iPhone 7: 28 mm lens, 36 mm film, 4032 px along the longer side
 _FOCAL_SHARE = 28 / 36
-# the cutouts' horizontal field of view is 60 degrees; 0.5 / tan(30 deg)
+# horizontal field of view of 60 degrees: 0.5 / tan(30 deg)
 _CUTOUT_FOCAL_SHARE = 3**0.5 / 2
-# the 277 scans of the paper's 9,972 cutouts, by floor as the scans' authors publish them
+# the 277 scans of the paper's 9,972 cutouts, with the floors published by the authors
 _PUBLISHED_SCANS = {"DUC1": 50, "DUC2": 80, "CSE3": 7, "CSE4": 75, "CSE5": 65}
 _PUBLISHED_QUERIES = 356
 _EXIF_ORIENTATION = 0x0112
 _MANY_GIGABYTES = 5
-# the points of another image are off by a good part of its width, those of its own by little
+# points of a wrong image are off by a large part of its width
 _MAX_OFFSET = 0.03
 _CHECKED_EVERY = 8  # rows and columns
 
@@ -92,23 +92,19 @@ class InLoc:
 
     @property
     def floors(self) -> tuple[str, ...]:
-        """The floors that are imported."""
         return FLOORS + DISTRACTOR_FLOORS * self.options.distractor_floors
 
     def check(self, root: Path) -> None:
-        """Raise DataError when ``root`` cannot be InLoc."""
         layout = Layout.find(root)
         if not any((layout.cutouts / floor).is_dir() for floor in self.floors):
             raise DataError(f"none of {', '.join(self.floors)} is there", path=layout.cutouts)
 
     def input_files(self, root: Path) -> Iterator[Path]:
-        """Every file an import of ``root`` may depend on."""
         layout = Layout.find(root)
         yield from layout.input_files(self.floors, with_points=self.options.depth)
         yield from ground_truth_files(root)
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
-        """Read the dataset; the depth maps are made when it is written."""
         self.check(root)
         layout, missing = Layout.find(root), Missing(root)
         map_ = _Map(self.options)
@@ -198,7 +194,6 @@ class InLoc:
 
 
 def _camera(path: Path, focal_share: float, *, longer: bool) -> Camera:
-    """The camera of an image, of a focal length in parts of its width or longer side."""
     width, height = image_size(path)
     focal = focal_share * (max(width, height) if longer else width)
     return Camera("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))
@@ -206,15 +201,12 @@ def _camera(path: Path, focal_share: float, *, longer: bool) -> Camera:
 
 @dataclass
 class _Map:
-    """The map's images as they are collected, scan by scan."""
-
     options: InLocOptions
     data: KaptureData = field(default_factory=KaptureData)
     groups: dict[str, ImageGroup] = field(default_factory=dict)
     depth_jobs: list[DepthJob] = field(default_factory=list)
 
     def add(self, scan: Scan, missing: Missing) -> None:
-        """A scan's cutouts with their poses; nothing of those whose pose is not known."""
         without = [c.image for c in scan.cutouts if c.image not in scan.with_points]
         if self.options.depth:
             missing.files += [scan.folder / f"{image}{POINTS_SUFFIX}" for image in without]
@@ -240,7 +232,6 @@ class _Map:
                 self.depth_jobs.append(DepthJob(points, cutout, camera, record))
 
     def _sensor(self, camera: Camera) -> str:
-        """Id of the cutouts' camera of a size; with depth, beside a depth sensor on a rig."""
         sensor = f"cutout_{camera.width}x{camera.height}"
         if sensor not in self.data.sensors:
             self.data.sensors[sensor] = Sensor.from_camera(camera, name=sensor)
@@ -265,7 +256,7 @@ def _rig(sensor: str) -> str:
 
 
 def _timestamp(scan: Scan, cutout: Cutout) -> int:
-    """A moment of its own for each cutout, the same whatever else is there."""
+    """Return a unique timestamp that does not depend on the other images."""
     floor = (FLOORS + DISTRACTOR_FLOORS).index(scan.floor) + 1
     return ((floor * 1000 + int(scan.number)) * 1000 + cutout.yaw_deg) * 1000 + (
         cutout.pitch_deg + 90
@@ -273,7 +264,6 @@ def _timestamp(scan: Scan, cutout: Cutout) -> int:
 
 
 def _queries(names: list[str], folder: Path) -> tuple[KaptureData, int]:
-    """Sensors and records of the queries, and how many are stored turned."""
     data, turned = KaptureData(), 0
     for timestamp, name in enumerate(names):
         path = folder / last_part(name)
@@ -291,7 +281,7 @@ def _is_turned(path: Path) -> bool:
     try:
         with Image.open(path) as image:
             return image.getexif().get(_EXIF_ORIENTATION, 1) != 1
-    except Exception:  # pillow raises many kinds on broken metadata, which nobody needs
+    except Exception:  # pillow raises many types on broken metadata, which is optional
         return False
 
 
@@ -300,7 +290,7 @@ def _is_turned(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class DepthJob:
-    """One depth map to make: of a cutout's points, for its camera, as a record's file."""
+    """A depth map to be written from a cutout's points."""
 
     points: Path
     cutout: Cutout
@@ -309,10 +299,7 @@ class DepthJob:
 
 
 def depth_camera(camera: Camera, step: int) -> Camera:
-    """The SIMPLE_PINHOLE camera of every ``step``-th pixel of each row and column, from the first.
-
-    The centre of a kept pixel is that of the pixel it was: (0.5, 0.5) stays where it is.
-    """
+    """Return the camera of every ``step``-th row and column; kept pixels keep their centres."""
     focal, cx, cy = camera.params
     return Camera(
         "SIMPLE_PINHOLE",
@@ -323,12 +310,7 @@ def depth_camera(camera: Camera, step: int) -> Camera:
 
 
 def cutout_depth(job: DepthJob, step: int) -> NDArray[np.float32]:
-    """Depth of a cutout's measured points along its camera's axis.
-
-    Returns
-    -------
-    float32 (H, W) of :func:`depth_camera`, metres; 0 where nothing came back.
-    """
+    """Return the depth along the optical axis, float32 (H, W), metres; 0 without measurement."""
     camera = job.camera
     points = read_cutout_points(job.points, camera.width, camera.height)
     rotation = job.cutout.cam_from_scan().rotation_matrix()
@@ -338,13 +320,12 @@ def cutout_depth(job: DepthJob, step: int) -> NDArray[np.float32]:
 
 
 def write_depth_maps(jobs: Sequence[DepthJob], step: int, records: Path) -> None:
-    """Write depth maps below ``records``, see :func:`cutout_depth`; OutputError where it fails."""
     for job in jobs:
         write_depth_map(records / job.record, cutout_depth(job, step))
 
 
 def _check_place(job: DepthJob, in_camera: NDArray[np.float64]) -> None:
-    """Refuse points that are not seen where they stand in the file."""
+    """Raise DataError if the points do not project to their pixels."""
     focal, cx, cy = job.camera.params
     rows, columns = (np.arange(n) * _CHECKED_EVERY + 0.5 for n in in_camera.shape[:2])
     seen = np.isfinite(in_camera).all(axis=2)

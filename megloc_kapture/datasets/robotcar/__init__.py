@@ -1,8 +1,4 @@
-"""Files of RobotCar Seasons and the published counts: images, models, lists of queries.
-
-Images are named ``<condition>/<camera>/<microseconds>``; the files say ``.png`` or ``.jpg`` for the
-same image, and some begin a name with ``./``.
-"""
+"""Files of RobotCar Seasons, with images named ``<condition>/<camera>/<microseconds>``."""
 
 from __future__ import annotations
 
@@ -41,7 +37,7 @@ _IMAGE = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class ImageKey:
-    """An image: its condition, ``""`` where a list leaves it out, its camera and its time."""
+    """An image of a condition (``""`` if the list omits it), a camera and a time."""
 
     condition: str
     camera: str
@@ -49,17 +45,16 @@ class ImageKey:
 
     @property
     def timestamp(self) -> int:
-        """The time in microseconds."""
         return int(self.stem)
 
     @property
     def path(self) -> str:
-        """Path below ``images/``, without the file type."""
+        """Return the path below ``images/`` without the file type."""
         return f"{self.condition}/{self.camera}/{self.stem}"
 
 
 class ListedImage(NamedTuple):
-    """An image of a list, its line, and its pose; the identity where the list has no poses."""
+    """A listed image with its line and its pose (the identity in lists without poses)."""
 
     image: ImageKey
     line: Line
@@ -67,7 +62,7 @@ class ListedImage(NamedTuple):
 
 
 def parse_image(text: str) -> ImageKey | None:
-    """The image a name stands for, with or without condition; None where it is no image name."""
+    """Parse an image name, with or without condition; return None for other names."""
     found = _IMAGE.fullmatch(text.removeprefix("./"))
     if found is None:
         return None
@@ -75,7 +70,7 @@ def parse_image(text: str) -> ImageKey | None:
 
 
 def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
-    """Read ``<camera>_intrinsics.txt``: fx, fy, cx, cy in pixels, in any order."""
+    """Read fx, fy, cx, cy in pixels from ``<camera>_intrinsics.txt``."""
     values: dict[str, float] = {}
     for line in read_lines(path):
         if len(line.fields) != 2 or line.fields[0] not in INTRINSICS_KEYS:
@@ -93,12 +88,12 @@ def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
 
 
 def read_query_location(path: Path) -> list[ListedImage]:
-    """Read ``queries_location_NNN.txt``, in its order."""
+    """Read ``queries_location_NNN.txt``."""
     return [_listed(line, line.text) for line in _some_lines(path)]
 
 
 def read_test_list(path: Path) -> list[ListedImage]:
-    """Read ``robotcar_v2_test.txt``, in its order; its names have no condition (``rear/1.png``)."""
+    """Read ``robotcar_v2_test.txt``; its names have no condition (``rear/1.png``)."""
     listed: dict[tuple[str, str], ListedImage] = {}
     for line in _some_lines(path):
         entry = _listed(line, line.text, conditions=False)
@@ -137,31 +132,26 @@ def _listed(line: Line, text: str, *, conditions: bool = True) -> ListedImage:
 
 
 class Layout:
-    """The official layout below ``root``."""
-
     def __init__(self, root: Path) -> None:
         self.root = Path(root)
         self.images = self.root / "images"
         self.models = self.root / "3D-models"
         self.merged_model = self.models / "all-merged" / "all.nvm"
         self.feature_database = self.models / "overcast-reference.db"
-        # of version 2: rear query images whose poses are public, and those to be found
+        # version 2: rear query images with public poses, and those with withheld poses
         self.train_list = self.root / "robotcar_v2_train.txt"
         self.test_list = self.root / "robotcar_v2_test.txt"
 
     def absent(self) -> list[str]:
-        """Return the names of the layout's folders that are not there."""
         return [path.name for path in (self.images, self.models) if not path.is_dir()]
 
     def intrinsics(self, camera: str) -> Path:
         return self.root / "intrinsics" / f"{camera}_intrinsics.txt"
 
     def extrinsics(self, camera: str) -> Path:
-        """Return the file with the pose of a camera on the car."""
         return self.root / "extrinsics" / f"{camera}_extrinsics.txt"
 
     def individual_model(self, location: str) -> Path:
-        """Return the folder of the COLMAP model of a location."""
         return self.models / "individual" / "colmap_reconstructions" / f"{location}_aligned"
 
     def query_list(self, location: str) -> Path:
@@ -169,7 +159,6 @@ class Layout:
         return folder / f"queries_location_{location}.txt"
 
     def individual_models(self) -> dict[str, Path]:
-        """Return the folders of the COLMAP models that are there, by location, sorted."""
         return {
             found[1]: folder
             for folder in sorted(self.individual_model("").parent.glob("*_aligned"))
@@ -177,7 +166,6 @@ class Layout:
         }
 
     def query_lists(self) -> dict[str, Path]:
-        """Return the lists of queries that are there, by location, sorted."""
         return {
             found[1]: path
             for path in sorted(self.query_list("").parent.glob("queries_location_*.txt"))
@@ -185,20 +173,17 @@ class Layout:
         }
 
     def is_merged(self, model: ModelChoice) -> bool:
-        """Return whether the reference poses come from the merged model."""
         return model == "merged" or (
             model == "auto" and (self.merged_model.is_file() or not self.individual_models())
         )
 
     def points_files(self, model: ModelChoice) -> list[Path]:
-        """Return the files that :func:`read_points` reads."""
         if self.is_merged(model):
             return [self.merged_model]
         folders = self.individual_models().values()
         return [file for folder in folders for file in colmap_model_files(folder)]
 
     def image_files(self) -> Iterator[Path]:
-        """Yield every image that is there, sorted folder by folder."""
         for condition in _sorted_names(self.images):
             for camera in CAMERAS:
                 folder = self.images / condition / camera
@@ -207,16 +192,12 @@ class Layout:
                         yield folder / name
 
     def num_reference_images(self) -> int:
-        """Return the number of images of the reference traversal that are there."""
         files = self.image_files()
         return sum(path.parent.parent.name == REFERENCE_CONDITION for path in files)
 
 
 def image_finder(layout: Layout, missing: Missing) -> Callable[[ImageKey], str | None]:
-    """Make a function that returns an image's path below ``images/``, with its file type on disk.
-
-    For an image that is not there it returns None, and notes it as missing.
-    """
+    """Return a function that finds an image's path below ``images/``, or records it as missing."""
     names = cache(lambda folder: frozenset(_sorted_names(folder)))
 
     def find(image: ImageKey) -> str | None:
@@ -236,7 +217,7 @@ def _sorted_names(folder: Path) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """``cam_from_world`` by image, in the models' order; locations as far as models tell."""
+    """Poses ``cam_from_world`` by image, in model order, and the known locations."""
 
     poses: Mapping[ImageKey, RigidTransform]
     locations: Mapping[ImageKey, str]
@@ -246,11 +227,7 @@ class Reference:
 def read_reference(
     layout: Layout, model: ModelChoice, wanted: Sequence[str], missing: Missing
 ) -> Reference:
-    """Read the poses of the reference images, and which location each is of.
-
-    Of an image in several individual models the first counts; all share one world. Individual
-    models of ``wanted`` locations are missing where the poses have to come from them.
-    """
+    """Read poses and locations; the first of several individual models (one world) wins."""
     individual = layout.individual_models()
     merged = layout.is_merged(model)
     locations: dict[ImageKey, str] = {}
@@ -279,7 +256,7 @@ def read_reference(
 
 
 def read_points(layout: Layout, *, merged: bool) -> tuple[list[ImageKey], SparsePoints]:
-    """The images and points of the merged model, or of all individual ones behind one another."""
+    """Read images and points of the merged model, or of all individual models concatenated."""
     if merged:
         nvm = read_nvm(layout.merged_model, with_points=True)
         return _keys(nvm.names, layout.merged_model), nvm.points
@@ -296,9 +273,8 @@ def read_points(layout: Layout, *, merged: bool) -> tuple[list[ImageKey], Sparse
 
 
 def _keys(names: Sequence[str], path: Path) -> list[ImageKey]:
-    """The images of a model, in its order."""
     keys: dict[ImageKey, str] = {}
-    for name in names:  # each once, of which the models' readers take care
+    for name in names:  # the readers of models guarantee unique names
         image = parse_image(name)
         if image is None or not image.condition or image.camera not in CAMERAS:
             known = ", ".join(CAMERAS)
@@ -313,16 +289,7 @@ def _keys(names: Sequence[str], path: Path) -> list[ImageKey]:
 
 @dataclass(frozen=True, eq=False)
 class Queries:
-    """The content of the lists of queries.
-
-    Parameters
-    ----------
-    locations : query -> the locations that list it, in the order of the lists.
-    train : rear image -> its published pose, in the order of the list.
-    test : rear image -> its name in the pose file, in the order of the list.
-    unlisted : how many images of version 2's lists no location lists; only where missing data was
-        allowed.
-    """
+    """The lists of queries: poses of ``train``, pose file names of ``test``, by rear image."""
 
     locations: Mapping[ImageKey, tuple[str, ...]]
     train: Mapping[ImageKey, RigidTransform]
@@ -331,7 +298,7 @@ class Queries:
 
 
 def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missing: bool) -> Queries:
-    """Read the lists of queries of a version; public poses are read for both versions."""
+    """Read the lists of queries; public poses are read for both versions if available."""
     lists = layout.query_lists()
     if not lists:
         missing.files.append(layout.query_list("001"))
@@ -346,7 +313,7 @@ def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missin
     train: dict[ImageKey, RigidTransform] = {}
     test: dict[ImageKey, str] = {}
     unlisted = 0
-    # version 1 is the better for the public poses, but does not need them
+    # optional for version 1
     wanted = version == 2 and missing.require(layout.train_list)
     if wanted or layout.train_list.is_file():
         for entry in read_train_poses(layout.train_list):
@@ -367,11 +334,7 @@ def read_test_names(
     *,
     allow_missing: bool,
 ) -> tuple[dict[ImageKey, str], int]:
-    """Read version 2's list of test images: query -> its text in the list, in its order.
-
-    Also returns how many entries are not queries. ``at_time``: (camera, time) -> query, as the list
-    leaves conditions out.
-    """
+    """Read version 2's test list: query -> its text in the list; count unknown entries."""
     test: dict[ImageKey, str] = {}
     unlisted = 0
     for entry in read_test_list(path):
@@ -389,7 +352,7 @@ def note_time(
     at_time: dict[tuple[str, int], ImageKey],
     error: Callable[[str], DataError],
 ) -> None:
-    """Note the camera and time of an image; raise ``error`` where another has them."""
+    """Register camera and time of an image; raise ``error`` if another image has both."""
     if image.camera not in CAMERAS:
         known = ", ".join(CAMERAS)
         raise error(f"{image.path} is of camera {image.camera!r}; known: {known}")
@@ -401,7 +364,6 @@ def note_time(
 def _scored_query(
     entry: ListedImage, at_time: Mapping[tuple[str, int], ImageKey], allow_missing: bool
 ) -> ImageKey | None:
-    """The query an image of version 2's lists is; a list may leave out its condition."""
     image = entry.image
     if image.camera != SCORED_CAMERA:
         raise entry.line.error(

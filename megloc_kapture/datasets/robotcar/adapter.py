@@ -49,7 +49,7 @@ from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.dataset_tables import ImageGroup, World
 from megloc_kapture.values import Options
 
-# what is published, or was counted by others in the published lists
+# published counts, or counts of the published lists
 _NUM_LOCATIONS = 49
 _NUM_REFERENCE_IMAGES = 26_121
 _NUM_REGISTERED = 20_862
@@ -100,11 +100,9 @@ class RobotCarOptions(Options):
 
 
 class RobotCar:
-    """Adapter of RobotCar Seasons.
+    """Adapter of RobotCar Seasons: all locations form one map in one metric frame.
 
-    All locations become one map in one metric frame; the side tables say which images belong to
-    which location. ``names.csv`` holds what has to be handed in; scored are also the images whose
-    poses version 2 publishes, so that recall can be measured with them.
+    Version 2's images with public poses are scored too, so that recall can be measured.
     """
 
     name = "robotcar"
@@ -131,7 +129,6 @@ class RobotCar:
         self.options = options or RobotCarOptions()
 
     def check(self, root: Path) -> None:
-        """Raise MeglocError, quickly, when ``root`` cannot be what is wanted of RobotCar."""
         if (form := _kapture_form(root)) is not None:
             if self.options.reference_model:
                 raise form.without_model()
@@ -141,7 +138,6 @@ class RobotCar:
             check_model_files(Layout(root).points_files(self.options.model))
 
     def input_files(self, root: Path) -> Iterator[Path]:
-        """Every file an import may depend on, images included."""
         layout = Layout(root)
         if (form := _kapture_form(root)) is not None:
             yield from (path for path in [layout.test_list] if path.is_file())
@@ -159,7 +155,6 @@ class RobotCar:
         yield from ground_truth_files(Path(root))
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
-        """Read the dataset."""
         self.check(root)
         missing = Missing(Path(root))
         options = self.options
@@ -232,7 +227,6 @@ class RobotCar:
         reference_images: int,
         **more: Any,
     ) -> OfficialDataset:
-        """The dataset; ``more`` is what depends on the layout of the images."""
         car = car.with_rig_of(selection.reference)
         mapping, query = mapping_data(selection, car), car.data(selection.query_images)
         beside, _ = read_ground_truth(missing.root, query, World())  # names tell conditions
@@ -258,7 +252,6 @@ class RobotCar:
         )
 
     def _about_reference(self, layout: Layout) -> list[str]:
-        """Sentences for the user about the reference model."""
         database = layout.feature_database
         if not self.options.reference_model or database.is_file():
             return []
@@ -277,19 +270,16 @@ class RobotCar:
 
 
 def _kapture_form(root: Path) -> KaptureForm | None:
-    """The kapture folders, where the official files are not there."""
     return KaptureForm.find(root, with_locations=True) if Layout(root).absent() else None
 
 
 def _read_points(layout: Layout, selection: Selection) -> tuple[list[str], SparsePoints]:
-    """Names of the images of the dataset's own model, in its order, and its points."""
     images, points = read_points(layout, merged=selection.reference.merged)
-    # an image that is not on disk keeps its position in the list
+    # missing images keep their positions
     return [selection.map_images.get(image, f"{image.path}.jpg") for image in images], points
 
 
 def _image_groups(selection: Selection) -> dict[str, ImageGroup]:
-    """Condition and location of all images, and which queries are scored."""
     locations = selection.queries.locations
     groups = {}
     for image, path in selection.map_images.items():
@@ -307,11 +297,9 @@ def _image_groups(selection: Selection) -> dict[str, ImageGroup]:
 def _query_priors(
     selection: Selection, groups: Mapping[str, ImageGroup]
 ) -> dict[str, tuple[str, ...]]:
-    """The permitted map images of each query: those of its location and camera.
+    """Return the permitted map images of each query: same location (or unknown) and camera.
 
-    Map images whose location is not known are permitted to all queries of their camera. Where
-    the map has nothing of the kind, the query's own location stands there all the same: it may
-    not be matched with others.
+    A query without permitted map images keeps its location: it must not be matched with others.
     """
     map_paths = (*selection.map_images.values(), *selection.train_images.values())
     known = {groups[path].location for path in map_paths}
@@ -323,7 +311,6 @@ def _query_priors(
 
 
 def _pose_file_names(selection: Selection) -> dict[str, str]:
-    """Rows of the pose file, in the order of the list: the images the server scores."""
     paths = selection.query_images
     if selection.version == 2:
         names = selection.queries.test
@@ -336,7 +323,6 @@ def _pose_file_names(selection: Selection) -> dict[str, str]:
 
 
 def _summary(selection: Selection, reference_images: int) -> list[Count]:
-    """Counts of models and lists, and of what is imported; of reference images those on disk."""
     queries, reference = selection.queries, selection.reference
     locations = {location for listed in queries.locations.values() for location in listed}
     counts = [
@@ -361,7 +347,6 @@ def _summary(selection: Selection, reference_images: int) -> list[Count]:
 
 
 def _remarks(selection: Selection) -> list[str]:
-    """Sentences for the user about this import."""
     said = [
         "The rig is the one that the reference model's poses show, as extrinsics/ does not agree "
         "well with them; where the model has fewer than ten moments of all cameras, it is that of "

@@ -33,22 +33,13 @@ from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.values import Camera, RigidTransform
 
 RIG_ID = "car"
-# all images are published in this size; for a download without any
+# size of all published images, for a download without images
 _SIZE_PX = (1024, 1024)
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The images of an import, as they are on disk.
-
-    Parameters
-    ----------
-    version : of the benchmark, 1 or 2.
-    reference, queries : all that the models and lists say.
-    map_images, train_images, query_images : image -> its path below ``images/``: those of the
-        reference traversal, version 2's training images where they join the map, the queries.
-        They keep the order of the models and lists.
-    """
+    """The existing images, with paths below ``images/``; ``train_images`` join the map."""
 
     version: int
     reference: Reference
@@ -58,7 +49,7 @@ class Selection:
     query_images: Mapping[ImageKey, str]
 
     def is_scored(self, query: ImageKey) -> bool:
-        """True where the benchmark, or its public half, asks for a query's pose."""
+        """Return whether the benchmark, or its public half, evaluates a query."""
         if self.version == 1:
             return query.camera == SCORED_CAMERA
         return query in self.queries.test or query in self.queries.train
@@ -74,21 +65,14 @@ def select(
     cameras: Collection[str],
     find: Callable[[ImageKey], str | None],
 ) -> Selection:
-    """Choose the images of these cameras.
-
-    Parameters
-    ----------
-    part : ``all``, or only the moments of version 2's list ``train`` or ``test``.
-    train_as_map : version 2's training images are map images.
-    find : path of an image below ``images/``; None where it is not there.
-    """
+    """Choose the images of these cameras; ``part`` selects moments of version 2's lists."""
     wanted: Iterable[ImageKey] = queries.locations
     if part != "all":
         wanted = _of_moments(wanted, queries.train if part == "train" else queries.test)
     train: Iterable[ImageKey] = ()
     if train_as_map:
         train = queries.train
-        # neither are the other cameras of these moments queries: the map knows where they were
+        # drop the other cameras of these moments too: the map reveals their poses
         taken = set(_of_moments(queries.locations, train))
         wanted = [image for image in wanted if image not in taken]
 
@@ -107,20 +91,19 @@ def select(
 
 
 def _of_moments(images: Iterable[ImageKey], others: Iterable[ImageKey]) -> list[ImageKey]:
-    """Those of ``images`` that were taken at the moments of ``others``, by whichever camera."""
     moments = {(other.condition, other.timestamp) for other in others}
     return [image for image in images if (image.condition, image.timestamp) in moments]
 
 
 @dataclass(frozen=True, eq=False)
 class Car:
-    """The cameras by name, and ``sensor_from_rig`` of those whose pose on the car is known."""
+    """The cameras by name, and their known ``sensor_from_rig``."""
 
     sensors: Mapping[str, Sensor]
     members: Mapping[str, RigidTransform]
 
     def with_rig_of(self, reference: Reference) -> Car:
-        """The car with the rig that the model's poses show, where they are enough to tell."""
+        """Return the car with the rig estimated from the model's poses, if they suffice."""
         of_model = rig_of_model(reference.poses)
         return (
             replace(self, members=of_model)
@@ -129,7 +112,6 @@ class Car:
         )
 
     def data(self, images: Mapping[ImageKey, str]) -> KaptureData:
-        """Its images, without poses."""
         return KaptureData(
             sensors=dict(self.sensors),
             rigs={RIG_ID: dict(self.members)} if self.members else {},
@@ -142,7 +124,7 @@ def _record(image: ImageKey) -> tuple[int, str]:
 
 
 def read_car(layout: Layout, selection: Selection, missing: Missing) -> Car:
-    """Read intrinsics and extrinsics; an image of each camera tells its size."""
+    """Read intrinsics and extrinsics; image sizes come from one image per camera."""
     images = {**selection.map_images, **selection.train_images, **selection.query_images}
     example = {image.camera: path for image, path in reversed(images.items())}
     sensors = {}
@@ -163,7 +145,7 @@ def read_car(layout: Layout, selection: Selection, missing: Missing) -> Car:
 
 
 def mapping_data(selection: Selection, car: Car) -> KaptureData:
-    """The map's images; each camera has its own pose, which no rig fits exactly."""
+    """Return the map's images; each has a separate pose, as no rig fits exactly."""
     images = {**selection.map_images, **selection.train_images}
     poses = {**selection.reference.poses, **selection.queries.train}
     return with_poses(car.data(images), {_record(image): poses[image] for image in images})
@@ -172,7 +154,6 @@ def mapping_data(selection: Selection, car: Car) -> KaptureData:
 def query_truth(
     selection: Selection, query: KaptureData, beside: KaptureData | None
 ) -> KaptureData:
-    """Public poses of the queries: version 2's training images, and what lies beside the data."""
     poses = {} if beside is None else dict(beside.trajectories)
     for image, pose in selection.queries.train.items():
         if image in selection.query_images:
@@ -182,20 +163,13 @@ def query_truth(
 
 _ROOT = "rear"  # the rig's frame
 _MIN_MOMENTS = 10
-# poses of single images are wrong at times: farther than so many medians off has no say
+# some poses are wrong: rotations this many medians off are ignored
 _OUTLIER = 3.0
 _ROUNDS = 3
 
 
 def rig_of_model(poses: Mapping[ImageKey, RigidTransform]) -> dict[str, RigidTransform]:
-    """``sensor_from_rig`` of every camera, the rear camera's frame being the rig's.
-
-    Empty where a camera shares too few moments with the rear one to tell.
-
-    Parameters
-    ----------
-    poses : ``cam_from_world`` of the model's images.
-    """
+    """Estimate ``sensor_from_rig``, rear camera as rig frame; empty with too few moments."""
     rear = {key.timestamp: pose for key, pose in poses.items() if key.camera == _ROOT}
     members = {_ROOT: RigidTransform.identity()}
     for camera in CAMERAS:
@@ -213,11 +187,7 @@ def rig_of_model(poses: Mapping[ImageKey, RigidTransform]) -> dict[str, RigidTra
 
 
 def middle_transform(transforms: Sequence[RigidTransform]) -> RigidTransform:
-    """The middle of transforms that should be one: mean rotation, median translation.
-
-    The mean quaternion is Markley's (Averaging Quaternions, J. Guidance 2007), of the transforms
-    whose rotation is not far off.
-    """
+    """Return a robust mean rotation (Markley, J. Guidance 2007) and median translation."""
     quats, translations = stack_poses(transforms)
     kept = np.ones(len(quats), bool)
     mean = quats[0]
@@ -235,7 +205,6 @@ def middle_transform(transforms: Sequence[RigidTransform]) -> RigidTransform:
 
 
 def read_kapture_images(form: KaptureForm, missing: Missing) -> dict[ImageKey, KaptureImage]:
-    """Return the images of kapture folders."""
     found: dict[ImageKey, KaptureImage] = {}
     cameras: dict[str, Camera] = {}
     at_time: dict[tuple[str, int], ImageKey] = {}
@@ -257,7 +226,6 @@ def read_kapture_images(form: KaptureForm, missing: Missing) -> dict[ImageKey, K
 
 
 def car_of_kapture(form: KaptureForm, images: Mapping[ImageKey, KaptureImage]) -> Car:
-    """Return the cameras, and where they sit on the car."""
     cameras = {key.camera: image.camera for key, image in images.items()}
     names = {image.sensor_id: key.camera for key, image in images.items()}
     sensors = {name: Sensor.from_camera(cameras[name], name=name) for name in sorted(cameras)}
@@ -265,7 +233,6 @@ def car_of_kapture(form: KaptureForm, images: Mapping[ImageKey, KaptureImage]) -
 
 
 def reference_of_kapture(images: Mapping[ImageKey, KaptureImage]) -> Reference:
-    """Return the images of the reference traversal that have a pose."""
     poses = {
         key: image.cam_from_world
         for key, image in images.items()
@@ -281,10 +248,10 @@ def queries_of_kapture(
     *,
     allow_missing: bool,
 ) -> tuple[int, Queries]:
-    """Return the images under other conditions, and the version; None finds it out.
+    """Return the images under other conditions, and the version (detected if None).
 
-    Images of the rear camera that have a pose are version 2's training images. Without its test
-    list, which kapture leaves out, the poses of all others of that camera are handed in.
+    Rear images with a pose are version 2's training images; without a test list, all others are
+    test images.
     """
     keys = sorted(
         (key for key in images if key.condition != REFERENCE_CONDITION),

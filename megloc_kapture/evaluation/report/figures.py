@@ -58,7 +58,6 @@ _STYLE: dict[Any, Any] = {
 
 @contextmanager
 def _figure(width: float, height: float) -> Iterator[Figure]:
-    """A figure in our style, bound to no window and to no global state of pyplot."""
     with matplotlib.rc_context(rc=matplotlib.rcParamsDefault), warnings.catch_warnings():
         # names in scripts that matplotlib's font lacks
         warnings.filterwarnings("ignore", message="Glyph")
@@ -75,7 +74,6 @@ def _svg(figure: Figure) -> bytes:
 
 
 def _label(name: str) -> str:
-    """``name`` as matplotlib shows it: one that starts with an underscore would be left out."""
     return f" {name}" if name.startswith("_") else name or "(no condition)"
 
 

@@ -71,7 +71,6 @@ _Readers = tuple[FeatureReader, FeatureReader, MatchesReader]
 
 
 def _open_matches(context: ResultContext) -> _Readers | None:
-    """Readers of the first type of keypoints that has matches; None without matches."""
     queries, mapping = context.queries, context.mapping
     if queries is None or mapping is None:
         return None
@@ -87,7 +86,6 @@ def _open_matches(context: ResultContext) -> _Readers | None:
 def _stored_matches(
     readers: _Readers | None, query: str, images: Sequence[str]
 ) -> dict[str, tuple[Points, Points]]:
-    """Map image -> matched pixels (M, 2) of the query and of the image, of those with matches."""
     found: dict[str, tuple[Points, Points]] = {}
     if readers is None or query not in readers[0]:
         return found
@@ -232,7 +230,6 @@ def side_by_side(
 
 
 def _read(folder: KaptureFolder, image: str, box: tuple[int, int]) -> tuple[Pixels, float]:
-    """An image made to fit into a width and height, never larger; and the scale."""
     import cv2  # only a report with images waits for it
 
     pixels = read_image_rgb(folder.image_path(image))

@@ -58,7 +58,6 @@ def top_view(quats_wxyz: NDArray[np.float64], centers: NDArray[np.float64]) -> T
 
 
 def _axes(spread: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Principal directions (3, 3) as rows, widest first."""
     return np.asarray(np.linalg.eigh(spread.T @ spread)[1].T[::-1], dtype=np.float64)
 
 
@@ -68,7 +67,6 @@ def _signed(direction: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _along_axes(vertical: int, *, positive: bool) -> TopView:
-    """The page spanned by the two other world axes, not mirrored."""
     first, second = ((1, 2), (2, 0), (0, 1))[vertical]
     names = "xyz"
     if not positive:  # seen from the other side: swap to keep the page right-handed

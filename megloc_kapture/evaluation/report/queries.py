@@ -108,7 +108,6 @@ def shown_queries(result: Evaluation | ResultWithoutTruth) -> list[ShownQuery]:
 
 
 def _color(query: QueryResult, thresholds: Sequence[Threshold]) -> tuple[str, str]:
-    """Colour of a query with a pose, and its meaning."""
     if thresholds:
         shown = thresholds[: len(_SCALE) - 1]
         for color, threshold in zip(_SCALE, shown, strict=False):
@@ -174,7 +173,6 @@ class StoredInliers:
 
     @property
     def known(self) -> bool:
-        """Whether matches and points are there at all."""
         return bool(self._sources or self.context.localized)
 
     def of(self, query: ShownQuery) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -106,7 +106,6 @@ def write_report(
 
 
 def report_text(reported: AnyReported) -> str:
-    """The report as plain text, ended by a newline."""
     parts = _text_without_truth(reported) if isinstance(reported, WithoutTruth) else _text(reported)
     return "\n\n".join(parts) + "\n"
 
@@ -161,7 +160,6 @@ def _wrapped(text: str) -> str:
 
 
 def report_data(reported: AnyReported) -> dict[str, Any]:
-    """The data of the report's JSON file."""
     if isinstance(reported, Evaluation):
         return _recall_data(reported)
     if isinstance(reported, WithoutTruth):
@@ -234,7 +232,6 @@ class Section:
     pictures: Sequence[Picture] = ()
 
     def table(self, frame: DataFrame | None) -> None:
-        """Add a table; nothing without one."""
         if frame is not None:
             import pandas as pd
 
@@ -243,7 +240,6 @@ class Section:
             self.body.append(Markup('<div class="scroll">{}</div>').format(Markup(html)))
 
     def figure(self, svg: bytes | None) -> None:
-        """Add a drawing; nothing without one."""
         if svg is not None:
             data = base64.b64encode(svg).decode("ascii")
             self.body.append(Markup('<img src="data:image/svg+xml;base64,{}">').format(data))
@@ -311,7 +307,6 @@ def _results(reported: AnyReported) -> _Results:
 
 
 def _numbers(evaluation: Evaluation) -> list[tuple[str, str, str]]:
-    """Recall at each threshold and the median error, as large figures."""
     overall = evaluation.row()
     shown = [
         (
@@ -328,7 +323,6 @@ def _numbers(evaluation: Evaluation) -> list[tuple[str, str, str]]:
 
 
 def _sections(reported: Evaluation | Comparison) -> list[Section]:
-    """Recall and errors of one result, or of several side by side."""
     from megloc_kapture.evaluation.report import figures  # loads matplotlib
 
     several = isinstance(reported, Comparison)
@@ -382,7 +376,6 @@ def _sections_without_truth(found: WithoutTruth) -> list[Section]:
 def _sections_of(
     result: Evaluation | ResultWithoutTruth, map_poses: Poses, *, several: bool
 ) -> list[Section]:
-    """What is shown of each result: from above, confidence, refinement, and its worst queries."""
     from megloc_kapture.evaluation.report import figures, gallery
 
     whose = f"{result.label}: " if several else ""
@@ -427,7 +420,6 @@ def _query_list(evaluation: Evaluation, queries: Sequence[ShownQuery]) -> Sectio
 
 
 def _confidence(evaluation: Evaluation, whose: str) -> Section:
-    """The worth of a result's confidences and covariances."""
     from megloc_kapture.evaluation.report import figures
 
     section = Section(f"{whose}Confidence")
@@ -451,7 +443,6 @@ def _confidence(evaluation: Evaluation, whose: str) -> Section:
 
 
 def _view(reported: AnyReported) -> str | None:
-    """The 3D view of a single result; None where no camera has a pose, or the map is broken."""
     from megloc_kapture.evaluation.report.scene import render_view, scene_of
 
     results = _results(reported)

@@ -250,7 +250,6 @@ def corner_rays(camera: Camera) -> NDArray[np.float64]:
 def _rays(
     folder: KaptureFolder | None, images: Sequence[str], cameras: Mapping[str, Camera]
 ) -> NDArray[np.float64]:
-    """Corner rays (N, 4, 3) of images; of a camera that is not known those of a usual one."""
     known: dict[Camera, NDArray[np.float64]] = {}
     found = []
     for image in images:
@@ -267,7 +266,6 @@ def _rays(
 def _frusta(
     poses: Sequence[RigidTransform | None], rays: NDArray[np.float64], origin: NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    """Centres relative to ``origin`` and corner rays in the world, (N, 5, 3)."""
     found = np.full((len(poses), 5, 3), np.nan, np.float32)
     for own, pose, of_camera in zip(found, poses, rays, strict=True):
         if pose is not None:
@@ -277,7 +275,6 @@ def _frusta(
 
 
 def _frame_of(query: ShownQuery, context: ResultContext, frame_of: Mapping[str, str]) -> str:
-    """The frame of a query's pose: its own, or that of the images it was estimated from."""
     if query.image in context.frames:
         return context.frames[query.image]
     known = (frame_of[image] for image in query.candidates if image in frame_of)
@@ -285,7 +282,6 @@ def _frame_of(query: ShownQuery, context: ResultContext, frame_of: Mapping[str, 
 
 
 def _positions(frames: Sequence[str], known: Sequence[str]) -> NDArray[np.uint8]:
-    """Positions among the known frames; of one that is not there, the first."""
     at = {name: position for position, name in enumerate(known)}
     return np.array([at.get(name, 0) for name in frames], np.uint8)
 
@@ -293,7 +289,6 @@ def _positions(frames: Sequence[str], known: Sequence[str]) -> NDArray[np.uint8]
 def _point_frames(
     mapping: KaptureFolder | None, frame_of: Mapping[str, str], frames: Sequence[str], number: int
 ) -> NDArray[np.uint8]:
-    """The frame of each point of the map: that of the images that observe it."""
     found = np.zeros(number, np.uint8)
     if mapping is not None and number and len(frames) > 1:
         for seen in mapping.observations().values():
@@ -305,7 +300,6 @@ def _point_frames(
 def _dense_points(
     mapping: KaptureFolder | None, notes: list[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8], list[str]]:
-    """Points (N, 3) of depth by stereo with their colours (N, 3) and images; none without any."""
     from megloc_kapture.mvs.views import AgreementOptions  # loads more than others wait for
     from megloc_kapture.stages.stereo_depth import fused_cloud, stereo_images
 
@@ -355,7 +349,6 @@ def _colors(
 def _color_from_images(
     colors: NDArray[np.uint8], position: NDArray[np.int64], mapping: KaptureFolder
 ) -> None:
-    """Set the colours of points to those of the pixels that observe them."""
     for name, seen in mapping.observations().items():
         keypoints = mapping.keypoints(name)
         order = np.argsort(seen.image_ids, kind="stable")

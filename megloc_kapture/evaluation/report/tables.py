@@ -204,7 +204,6 @@ def _condition(row: _Named) -> dict[str, str]:
 
 
 def _localized(row: RecallRow | RowWithoutTruth) -> str:
-    """The number of localized queries, and of fallback poses where there are any."""
     return (
         f"{row.num_localized} (+{row.num_fallback})" if row.num_fallback else f"{row.num_localized}"
     )
@@ -220,6 +219,5 @@ def _medians(pairs: Iterable[tuple[float, float]]) -> str:
 
 
 def _shortened(name: str) -> str:
-    """A name that leaves room for the other columns: names differ at either end."""
     half = (_MAX_WIDTH - 3) // 2
     return name if len(name) <= _MAX_WIDTH else f"{name[:half]}...{name[-half:]}"

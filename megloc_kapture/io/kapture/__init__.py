@@ -1,4 +1,4 @@
-"""kapture folders: what other subpackages use of them, under one name."""
+"""kapture folders: the interface for other subpackages."""
 
 from megloc_kapture.io.kapture.features import (
     FeatureConfig,

@@ -1,4 +1,4 @@
-"""Many small binary files ("blobs"), each by its path below a folder, as files or in one tar."""
+"""Many small binary files ("blobs"), by path below a folder, as files or in one tar."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ class FolderBlobs:
         self._folder, self._suffix = folder, suffix
 
     def names(self) -> list[str]:
-        """Names of all blobs, sorted."""
         found = []
         for folder, _, files in os.walk(self._folder):
             below = folder[len(str(self._folder)) :].lstrip("/")
@@ -33,34 +32,27 @@ class FolderBlobs:
             return False
 
     def size(self, name: str) -> int:
-        """Number of bytes of a blob."""
         path = safe_join(self._folder, name)
         with reading(path):
             return path.stat().st_size
 
     def read(self, name: str) -> bytes:
-        """The content of a blob."""
-        path = f"{self._folder}/{check_relative(name)}"  # much faster to make than a Path
+        path = f"{self._folder}/{check_relative(name)}"  # much faster than a Path
         with reading(path), open(path, "rb", buffering=0) as file:
             return file.readall()
 
     def where(self, name: str) -> str:
-        """The file that holds a blob, for messages."""
         return str(self._folder / name)
 
 
 class TarBlobs:
-    """Blobs in an uncompressed tar, kapture's form for large sets.
-
-    Of members with one name the last counts. Only the index is kept, so that any number of threads
-    and processes can read.
-    """
+    """Blobs in an uncompressed tar, kapture's form for large sets; thread-safe."""
 
     def __init__(self, path: Path, suffix: str) -> None:
         self._path = path
         self._index: dict[str, tuple[int, int]] = {}
         if path.stat().st_size == 0:
-            return  # kapture makes a tar by touching it
+            return  # kapture creates an empty tar by touch
         try:
             with named(path), tarfile.open(path, "r:") as tar:
                 for member in tar:
@@ -71,18 +63,15 @@ class TarBlobs:
             raise DataError(f"not a readable uncompressed tar ({error})", path=path) from error
 
     def names(self) -> list[str]:
-        """Names of all blobs, sorted."""
         return sorted(self._index)
 
     def __contains__(self, name: str) -> bool:
         return name in self._index
 
     def size(self, name: str) -> int:
-        """Number of bytes of a blob."""
         return self._index[name][1]
 
     def read(self, name: str) -> bytes:
-        """The content of a blob."""
         offset, size = self._index[name]
         with reading(self._path), open(self._path, "rb", buffering=0) as file:
             content = os.pread(file.fileno(), size, offset)
@@ -91,7 +80,6 @@ class TarBlobs:
         return content
 
     def where(self, name: str) -> str:
-        """The tar and the member that hold a blob, for messages."""
         return f"{self._path}[{name}]"
 
 
@@ -99,17 +87,15 @@ BlobSource: TypeAlias = FolderBlobs | TarBlobs
 
 
 class BlobWriter:
-    """Writes blobs below a folder, each atomically; a context manager."""
+    """Atomic writer of blobs below a folder; a context manager."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def has(self, name: str) -> bool:
-        """True for a blob that is written already."""
         return safe_join(self._folder, name).is_file()
 
     def put(self, name: str, content: bytes) -> Path:
-        """Write a blob and return its file."""
         path = safe_join(self._folder, name)
         write_bytes(path, content)
         return path

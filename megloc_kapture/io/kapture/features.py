@@ -1,12 +1,9 @@
 """Keypoints, descriptors and global features: one binary array per image.
 
-They lie inside a kapture (``reconstruction/<kind>/T/``) or in kapture-localization's orphan
+They are stored inside a kapture (``reconstruction/<kind>/T/``) or in kapture-localization's orphan
 layout (``local_features/T/<kind>/``, ``global_features/T/global_features/``), as files or as one
-tar. ``T``, the folder's name, is the type name by which they are found; the ``name`` inside the
-configuration file may differ and is not used.
-
-Arrays are raw, little-endian, row-major, without a header: only the size of a file can be checked
-against its configuration.
+tar. The folder name ``T`` is the type name; the ``name`` in the configuration file is not used.
+Arrays are raw, little-endian, row-major, without a header.
 """
 
 from __future__ import annotations
@@ -39,7 +36,7 @@ CONFIG_HEADER: dict[str, str] = {
     "descriptors": "# name, dtype, dsize, keypoints_type, metric_type",
     "global_features": "# name, dtype, dsize, metric_type",
 }
-# the four names kapture knows; it evaluates the text, we look it up
+# kapture's four names; kapture evaluates the text
 DTYPES: dict[str, np.dtype[Any]] = {
     name: np.dtype(code)
     for name, code in (("float32", "<f4"), ("float64", "<f8"), ("int32", "<i4"), ("uint8", "u1"))
@@ -50,13 +47,7 @@ DTYPES: dict[str, np.dtype[Any]] = {
 class FeatureConfig:
     """The row of one ``keypoints.txt``, ``descriptors.txt`` or ``global_features.txt``.
 
-    Parameters
-    ----------
-    name : of the method; free text.
-    dtype : float32, float64, int32 or uint8.
-    dsize : numbers per keypoint, or the length of a descriptor.
-    keypoints_type : descriptors only: the type (folder) of the keypoints they belong to.
-    metric_type : descriptors and global features: how to compare them, e.g. ``"L2"``.
+    ``dsize`` counts numbers per row; ``metric_type`` is the distance, e.g. ``"L2"``.
     """
 
     name: str
@@ -80,7 +71,6 @@ class FeatureConfig:
 
 
 def feature_folder(root: Path, kind: FeatureKind, type_name: str, *, orphan: bool) -> Path:
-    """The folder of one type, inside a kapture or below a features folder (``orphan``)."""
     parent = _types_folder(root, kind, orphan) / check_component(type_name)
     return parent / kind if orphan else parent
 
@@ -92,7 +82,7 @@ def _types_folder(root: Path, kind: FeatureKind, orphan: bool) -> Path:
 
 
 def list_types(root: Path, kind: FeatureKind, *, orphan: bool) -> list[str]:
-    """Type names of one kind that a kapture or features folder holds, sorted."""
+    """List the type names of one kind in a kapture or features folder, sorted."""
     parent = _types_folder(root, kind, orphan)
     if not parent.is_dir():
         return []
@@ -111,7 +101,6 @@ def list_types(root: Path, kind: FeatureKind, *, orphan: bool) -> list[str]:
 
 
 def read_config(path: Path, kind: ArrayKind) -> FeatureConfig:
-    """Read one configuration file. kapture evaluates the dtype's text; here it is looked up."""
     with read_rows(path) as rows:
         for fields in rows:
             check_columns(fields, CONFIG_HEADER[kind].count(",") + 1)
@@ -127,7 +116,6 @@ def read_config(path: Path, kind: ArrayKind) -> FeatureConfig:
 
 
 def format_config(kind: ArrayKind, config: FeatureConfig) -> bytes:
-    """The bytes of a configuration file."""
     row = [config.name, config.dtype.name, str(config.dsize)]
     if kind == "descriptors":
         if config.keypoints_type is None:
@@ -139,18 +127,14 @@ def format_config(kind: ArrayKind, config: FeatureConfig) -> bytes:
 
 
 def blob_sources(folder: Path, kind: FeatureKind) -> list[BlobSource]:
-    """The tar of a type's folder, where there is one, before its loose files."""
+    """Return the tar of a type's folder, if any, and its loose files."""
     files = FolderBlobs(folder, SUFFIX[kind])
     tar = folder / f"{kind}.tar"
     return [TarBlobs(tar, SUFFIX[kind]), files] if tar.is_file() else [files]
 
 
 class FeatureReader:
-    """The features of one kind and type, from one or several folders.
-
-    Where several folders hold an image, the first counts. Reading is safe from many threads.
-    Raises DataError: a broken configuration, or folders whose dtypes or sizes differ.
-    """
+    """Features of one kind and type, from the first folder that holds an image; thread-safe."""
 
     def __init__(self, kind: ArrayKind, type_name: str, folders: Sequence[Path]) -> None:
         self.kind, self.type_name = kind, type_name
@@ -168,7 +152,6 @@ class FeatureReader:
 
     @property
     def names(self) -> list[str]:
-        """Images that have these features, sorted."""
         if self._names is None:
             cut = len(SUFFIX[self.kind])
             self._names = sorted({n[:-cut] for s in self._sources for n in s.names()})
@@ -179,19 +162,19 @@ class FeatureReader:
         return any(name in source for source in self._sources)
 
     def length(self, image: str) -> int:
-        """Number of rows of an image, from the size of its file alone."""
+        """Return the number of rows of an image from its file size."""
         source, name = self._source(image)
         return self._num_rows(source.size(name), source, name)
 
     def read(self, image: str) -> NDArray[Any]:
-        """The array of an image, (N, dsize); (dsize,) for global features. Writable."""
+        """Read an image's array, (N, dsize) or (dsize,) for global features; finite, writable."""
         array = self.read_unchecked(image)
         if not np.isfinite(array).all():
             raise DataError("not all values are finite", path=self.where(image))
         return array.copy()
 
     def read_unchecked(self, image: str) -> NDArray[Any]:
-        """The array of an image, read-only; its values may be infinite or NaN."""
+        """Read an image's array, read-only, without the check for infinity and NaN."""
         source, name = self._source(image)
         content = source.read(name)
         rows = self._num_rows(len(content), source, name)
@@ -199,7 +182,6 @@ class FeatureReader:
         return array if self.kind == "global_features" else array.reshape(rows, self.config.dsize)
 
     def where(self, image: str) -> str:
-        """The file (or member of a tar) that holds an image's array, for messages."""
         source, name = self._source(image)
         return source.where(name)
 
@@ -223,10 +205,9 @@ class FeatureReader:
 
 
 class FeatureWriter(BlobWriter):
-    """Write the features of one kind and type; each image's file is atomic.
+    """Writer for the features of one kind and type, a context manager; files are atomic.
 
-    Opening writes the configuration, or checks that the one there is the same, so that a stopped
-    run can go on: ``image in writer`` tells what is written already. Use as a context manager.
+    A stopped run can resume with the same configuration: ``image in writer`` is True if written.
     """
 
     def __init__(
@@ -252,10 +233,7 @@ class FeatureWriter(BlobWriter):
         return self.has(image + SUFFIX[self.kind])
 
     def write(self, image: str, array: ArrayLike) -> tuple[Path, Path]:
-        """Write one image's array, (N, dsize), or (dsize,) for global features.
-
-        Returns the configuration file and the array's.
-        """
+        """Write an image's array, (N, dsize) or (dsize,); return the configuration and its file."""
         given = np.asarray(array)
         shape = given.shape
         dsize = self.config.dsize

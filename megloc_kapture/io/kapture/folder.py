@@ -1,4 +1,4 @@
-"""One kapture folder, read lazily and never written."""
+"""Lazy, read-only access to a kapture folder."""
 
 from __future__ import annotations
 
@@ -30,18 +30,10 @@ _ARRAY_KINDS: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_featu
 
 
 class KaptureFolder:
-    """Lazy reader of a kapture folder and of feature folders in the orphan layout beside it.
+    """Lazy, read-only access to a kapture folder and to feature folders in the orphan layout.
 
-    The kapture's own features come first: a feature folder adds types, and images to a type.
-    Links may lead to below any of the folders given here, those of images under
-    ``sensors/records_data`` anywhere; the folders themselves may be links.
-
-    Parameters
-    ----------
-    root : folder with ``sensors/`` and perhaps ``reconstruction/``.
-    features_dirs : folders with ``local_features/`` and ``global_features/``.
-    allow_links_below : further folders that links may lead to. kapture-localization's proxy
-        folders consist of links: to be read, their targets must be named here.
+    The kapture's own features take precedence. Links may lead below any given folder, including
+    ``allow_links_below``; links of images in ``sensors/records_data`` anywhere.
     """
 
     def __init__(
@@ -61,19 +53,13 @@ class KaptureFolder:
         self._observations: dict[str, Observations] | None = None
 
     def with_features(self, features_dirs: Sequence[Path | str]) -> KaptureFolder:
-        """The same folder, with these feature folders instead of its own."""
+        """Return a reader of the same folder with other feature folders."""
         return KaptureFolder(
             self.root, features_dirs=features_dirs, allow_links_below=self.allow_links_below
         )
 
     def check_features_apart(self, other: KaptureFolder) -> None:
-        """Refuse two images that share a name and, because features go by names, their features.
-
-        They may share both where they are the same file. Features that cannot be read are left to
-        those who need them.
-
-        Raises DataError: names the image and the features.
-        """
+        """Refuse readable features shared by two different images of one name."""
         for image in sorted(set(self.read().image_names()) & set(other.read().image_names())):
             if _same_content(self.image_path(image), other.image_path(image)):
                 continue
@@ -89,7 +75,7 @@ class KaptureFolder:
                         )
 
     def read(self) -> KaptureData:
-        """Sensors, rigs, trajectories and records; parsed once."""
+        """Return sensors, rigs, trajectories and records; parsed once."""
         if self._data is None:
             self._data = read_kapture_data(
                 self.root, allow_links_below=(*self.features_dirs, *self.allow_links_below)
@@ -97,45 +83,35 @@ class KaptureFolder:
         return self._data
 
     def image_path(self, image: str) -> Path:
-        """Path of an image; the file need not exist and may be a link."""
+        """Return the path of an image, which need not exist and may be a link."""
         return safe_join(self.root / "sensors" / "records_data", image)
 
     def depth_path(self, name: str) -> Path:
-        """Path of a depth map; see :meth:`image_path`."""
         return self.image_path(name)
 
     def types(self, kind: FeatureKind) -> list[str]:
-        """Type names of one kind of features, sorted."""
         found = set(list_types(self.root, kind, orphan=False))
         for folder in self.features_dirs:
             found.update(list_types(folder, kind, orphan=True))
         return sorted(found)
 
     def keypoints(self, type_name: str) -> FeatureReader:
-        """Keypoints of a type."""
         return self._features("keypoints", type_name)
 
     def descriptors(self, type_name: str) -> FeatureReader:
-        """Descriptors of a type."""
         return self._features("descriptors", type_name)
 
     def global_features(self, type_name: str) -> FeatureReader:
-        """Global features of a type."""
         return self._features("global_features", type_name)
 
     def matches(self, type_name: str) -> MatchesReader:
-        """Matches of a keypoints type."""
         return MatchesReader(type_name, self._folders("matches", type_name))
 
     def has_points(self) -> bool:
-        """True where there are 3D points and observations, which localization needs."""
         return self._points_path.is_file() and self._observations_path.is_file()
 
     def points3d(self) -> NDArray[np.float64]:
-        """3D points, float64 (N, 6): X Y Z R G B; colours 0 where there are none.
-
-        Read once; the array is shared and cannot be written to.
-        """
+        """Return 3D points, float64 (N, 6): X Y Z R G B (0 if missing); cached, read-only."""
         if self._points is None:
             points = read_points3d(self._inside(self._points_path))
             points.setflags(write=False)
@@ -143,12 +119,7 @@ class KaptureFolder:
         return self._points
 
     def observations(self) -> dict[str, Observations]:
-        """Observations of the 3D points, by keypoints type.
-
-        Read once; the arrays are shared and cannot be written to. Point ids are checked against
-        the points, keypoint ids against the keypoints of every image that has some (an image
-        without any was taken out of the map).
-        """
+        """Return the observations of the 3D points by keypoints type; cached, read-only."""
         if self._observations is None:
             path = self._inside(self._observations_path)
             found = read_observations(path)
@@ -165,12 +136,7 @@ class KaptureFolder:
         return dict(self._observations)
 
     def validate(self, *, deep: bool = False) -> None:
-        """Cross-check everything that is there.
-
-        Configurations, sizes and values of all feature files; descriptors against keypoints;
-        observations against points and keypoints. With ``deep`` also every image is decoded and
-        compared with its camera's size, and every match checked against the keypoints.
-        """
+        """Cross-check sensors, features and points; ``deep`` adds images and matches."""
         self.read()
         readers = {
             kind: {name: self._features(kind, name) for name in self.types(kind)}
@@ -198,7 +164,6 @@ class KaptureFolder:
         return FeatureReader(kind, type_name, self._folders(kind, type_name))
 
     def _inside(self, path: Path, root: Path | None = None) -> Path:
-        """Return a path if no link on its way leads elsewhere than below the folders given here."""
         folders = (root or self.root, self.root, *self.features_dirs, *self.allow_links_below)
         return check_no_escape(folders, path)
 

@@ -1,9 +1,8 @@
-"""kapture's records in memory (sensors, rigs, trajectories, images), and its grammar of text files.
+"""kapture's records in memory (sensors, rigs, trajectories, images) and its text format.
 
-Fields of a text file are separated by commas, spaces around a field do not count, a line that
-starts with ``#`` is a comment. Our own reader of these few tables takes 20 ms where importing
-kapture's takes most of a second (and 100 MB in each worker), and its messages name file and line.
-Timestamps and ids are integers of any length, never floats.
+Fields are separated by commas, with optional spaces; lines that start with ``#`` are comments.
+Timestamps and ids are integers of any length, never floats. kapture's own reader takes most of a
+second to import and 100 MB per worker; this one takes 20 ms and names file and line in errors.
 """
 
 from __future__ import annotations
@@ -24,10 +23,10 @@ UNKNOWN_CAMERA = "UNKNOWN_CAMERA"
 
 FORMAT_VERSION = "1.1"
 FORMAT_LINE = f"# kapture format: {FORMAT_VERSION}"
-_READ_VERSIONS = ("1.0", FORMAT_VERSION)  # the tables that are read here are the same in both
+_READ_VERSIONS = ("1.0", FORMAT_VERSION)  # the tables are the same in both
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 
-# Python's float() takes more ("1_0", "nan", digits of other scripts) than the format allows
+# stricter than float(), which takes "1_0", "nan" and digits of other scripts
 FLOAT_PATTERN = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _VERSION_PATTERN = re.compile(r"# kapture format:\s*([0-9]+\.[0-9]+)")
 _INTEGER_PATTERN = re.compile(r"[+-]?[0-9]{1,40}")
@@ -35,22 +34,13 @@ _INTEGER_PATTERN = re.compile(r"[+-]?[0-9]{1,40}")
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """One row of ``sensors.txt``.
-
-    Parameters
-    ----------
-    name : free text, may be empty.
-    sensor_type : ``"camera"``, ``"depth"``, ``"gnss"``, ...
-    params : the remaining fields as text; for cameras the model, width, height and the model's
-        parameters.
-    """
+    """One row of ``sensors.txt``; a camera's ``params`` are model, width, height, parameters."""
 
     name: str
     sensor_type: str
     params: tuple[str, ...]
 
     def camera(self) -> Camera:
-        """The intrinsics of a sensor of type camera or depth; DataError where it has none."""
         if self.sensor_type not in CAMERA_SENSOR_TYPES:
             raise DataError(f"a sensor of type {self.sensor_type!r} has no camera model")
         if not self.params:
@@ -73,7 +63,7 @@ class Sensor:
 
     @classmethod
     def from_camera(cls, camera: Camera, *, name: str = "", sensor_type: str = "camera") -> Sensor:
-        """The sensor whose :meth:`camera` is exactly ``camera``."""
+        """Build the sensor whose :meth:`camera` is exactly ``camera``."""
         params = (camera.model, str(int(camera.width)), str(int(camera.height)))
         return cls(name, sensor_type, params + tuple(_shortest(p) for p in camera.params))
 
@@ -82,15 +72,9 @@ class Sensor:
 class KaptureData:
     """Sensors, rigs, trajectories and image records of one kapture.
 
-    The dicts may be changed freely until poses are asked for; then, members of a rig that is there
-    already stay.
-
-    Parameters
-    ----------
-    sensors : by sensor id.
-    rigs : rig id -> sensor id (or the id of another rig) -> ``sensor_from_rig``.
-    trajectories : (timestamp, device id) -> ``device_from_world``; a device is a sensor or a rig.
-    records_camera, records_depth : (timestamp, sensor id) -> path below ``records_data``.
+    The dicts may change; once poses were requested, the members of existing rigs must not. ``rigs``
+    hold ``sensor_from_rig`` of sensors or rigs, ``trajectories`` ``device_from_world`` by
+    (timestamp, sensor or rig id); records are paths below ``records_data`` by (time, sensor id).
     """
 
     sensors: dict[str, Sensor] = field(default_factory=dict)
@@ -107,14 +91,13 @@ class KaptureData:
     _num_rigs: int = field(default=0, init=False, repr=False, compare=False)
 
     def image_names(self) -> list[str]:
-        """Paths of all camera images, sorted."""
         return sorted(self.records_camera.values())
 
     def record_of(self, image: str) -> tuple[int, str]:
-        """``(timestamp, sensor id)`` of an image; DataError: none, or two of that name."""
+        """Return ``(timestamp, sensor id)`` of an image."""
         index = self._record_by_image
         key = index.get(image)
-        # the entry proves itself; the index is built again after any change that matters
+        # rebuild the index after any relevant change
         if (
             key is None
             or len(index) != len(self.records_camera)
@@ -132,7 +115,6 @@ class KaptureData:
         return key
 
     def camera_of(self, image: str) -> Camera:
-        """Intrinsics of the camera that took an image; see :meth:`Sensor.camera`."""
         sensor_id = self.record_of(image)[1]
         if sensor_id not in self.sensors:
             raise DataError(f"image {image!r} was taken by the unknown sensor {sensor_id!r}")
@@ -140,18 +122,15 @@ class KaptureData:
             return self.sensors[sensor_id].camera()
 
     def cam_from_world(self, image: str) -> RigidTransform | None:
-        """Pose of an image: its camera's own, else through the (nested) rigs that carry it.
-
-        None without a pose. Of several rigs with a pose at that time, the first by id counts.
-        """
+        """Return the pose of an image from its camera or the first (nested) rig with a pose."""
         return self.device_from_world(*self.record_of(image))
 
     def device_from_world(self, timestamp: int, device_id: str) -> RigidTransform | None:
-        """Pose of a sensor or rig at a time, own or through rigs; None where there is none."""
+        """Return the pose of a sensor or rig at a time, directly or through rigs; None without."""
         return self._device_from_world(timestamp, device_id, frozenset())
 
     def poses(self) -> dict[str, RigidTransform]:
-        """``cam_from_world`` of every image that has one, by image name, sorted."""
+        """Return ``cam_from_world`` of every image that has one, sorted by image name."""
         poses = {image: self.cam_from_world(image) for image in self.image_names()}
         return {image: pose for image, pose in poses.items() if pose is not None}
 
@@ -187,7 +166,7 @@ def _pixels(text: str) -> int:
 
 
 def _shortest(value: float) -> str:
-    """Shortest text that reads back as the same float64; whole numbers as kapture has them."""
+    """Return the shortest text of a float64; whole numbers are written as in kapture."""
     value = float(value)
     return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
 
@@ -197,10 +176,7 @@ def _shortest(value: float) -> str:
 
 @contextlib.contextmanager
 def read_rows(path: Path, *, version_required: bool = False) -> Iterator[Iterator[list[str]]]:
-    """Rows of a kapture CSV file as stripped fields; comments left out.
-
-    A DataError of the block that names no file gets the path and the line of the row read last.
-    """
+    """Read rows of stripped fields, without comments; a DataError of the block gets the line."""
     lines = read_text(path).split("\n")
     check_version(path, lines[0], required=version_required)
     number = 0
@@ -220,7 +196,6 @@ def read_rows(path: Path, *, version_required: bool = False) -> Iterator[Iterato
 
 
 def check_version(path: Path, first_line: str, *, required: bool) -> None:
-    """Refuse a file whose first line names a format version that is not read."""
     found = _VERSION_PATTERN.search(first_line)
     if found is None:
         if required:
@@ -231,20 +206,18 @@ def check_version(path: Path, first_line: str, *, required: bool) -> None:
 
 
 def check_columns(fields: Sequence[str], expected: int) -> None:
-    """Raise DataError unless there are so many fields."""
     if len(fields) != expected:
         raise DataError(f"expected {expected} columns, got {len(fields)}")
 
 
 def parse_integer(text: str, what: str) -> int:
-    """A decimal integer, exactly; never through float."""
+    """Parse a decimal integer exactly, never through float."""
     if not _INTEGER_PATTERN.fullmatch(text):
         raise DataError(f"{what} {text!r} is not an integer")
     return int(text)
 
 
 def parse_float(text: str, what: str) -> float:
-    """A finite decimal number."""
     try:
         value = float(text)
     except ValueError as error:
@@ -255,8 +228,7 @@ def parse_float(text: str, what: str) -> float:
 
 
 def writable_name(name: str) -> str:
-    """A name in which ``_`` replaces what :func:`format_table` refuses: a comma, a space at an
-    end, and # at the beginning."""
+    """Replace commas, outer spaces and a first #, which :func:`format_table` refuses, by ``_``."""
     name = name.replace(",", "_")
     middle = name.strip()
     left = len(name) - len(name.lstrip())
@@ -265,7 +237,7 @@ def writable_name(name: str) -> str:
 
 
 def check_field(name: str) -> str:
-    """Return an image name that is a plain path and can stand in a CSV field, else raise."""
+    """Return an image name that is a plain path and a valid CSV field, else raise DataError."""
     check_relative(name)
     if "," in name or name != name.strip():
         raise DataError(f"image name {name!r} has a comma or a space at its end")
@@ -273,11 +245,7 @@ def check_field(name: str) -> str:
 
 
 def format_table(header: str, rows: Iterable[Sequence[str]]) -> bytes:
-    """A kapture CSV file: the version line, the column header, the rows.
-
-    Raises DataError: a field that would not be read back as it is (comma, line break, outer
-    spaces).
-    """
+    """Format a kapture CSV file: version line, column header, rows."""
     lines = [FORMAT_LINE, header]
     for row in rows:
         for text in row:

@@ -1,8 +1,8 @@
-"""Matches between two images, and pairs of images worth matching.
+"""Matches between two images, and pairs of images to match.
 
-Matches are keypoint indices and scores. kapture stores a pair under its lexicographically smaller
-name, as float64 (M, 3): index, index, score. Its own writers do not order the pair, so the other
-order is found too. Pairs files are kapture-localization's: query image, map image, score.
+kapture stores the matches of a pair under its lexicographically smaller name, as float64 (M, 3):
+index, index, score. Its own writers do not order the pair, so both orders are read. Pairs files are
+kapture-localization's: query image, map image, score.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from megloc_kapture.io.kapture.format import (
 
 _BETWEEN = ".overlapping/"
 _ROW_BYTES = 3 * 8
-# kapture stores indices as float64; beyond this they would not be exact
+# kapture stores indices as float64, which is exact up to this value
 _MAX_INDEX = 2**53
 
 
 class MatchesReader:
-    """The matches of one keypoints type, from one or several folders; the first one counts."""
+    """Matches of one keypoints type from one or several folders; the first match file is used."""
 
     def __init__(self, type_name: str, folders: Sequence[Path]) -> None:
         self.type_name = type_name
@@ -42,7 +42,6 @@ class MatchesReader:
 
     @property
     def pairs(self) -> list[tuple[str, str]]:
-        """Matched pairs ``(a, b)`` with ``a < b``, sorted."""
         if self._pairs is None:
             found = set()
             for source in self._sources:
@@ -58,18 +57,12 @@ class MatchesReader:
         return self._find(*pair) is not None
 
     def length(self, a: str, b: str) -> int:
-        """Number of matches of a pair, from the size of its file alone; 0 where there is none."""
+        """Return the number of matches of a pair from its file size; 0 without a file."""
         found = self._find(a, b)
         return 0 if found is None else found[0].size(found[1]) // _ROW_BYTES
 
     def read(self, a: str, b: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Matches of a pair in either order.
-
-        Returns
-        -------
-        indices : int64 (M, 2), the first column into ``a``'s keypoints, the second into ``b``'s.
-        scores : float64 (M,).
-        """
+        """Read the indices int64 (M, 2) into ``a`` and ``b`` and scores float64 (M,) of a pair."""
         found = self._find(a, b)
         if found is None:
             raise DataError(f"no matches of type {self.type_name!r} for {a!r} and {b!r}")
@@ -103,16 +96,13 @@ class MatchesReader:
 
 
 class MatchesWriter(BlobWriter):
-    """Write matches of one keypoints type; each pair's file is atomic.
-
-    ``(a, b) in writer`` tells what is written already. Use as a context manager.
-    """
+    """Writer for matches of one keypoints type, a context manager; files are atomic."""
 
     def __init__(self, root: Path, type_name: str, *, orphan: bool = False) -> None:
         self.type_name = type_name
         folder = feature_folder(Path(root), "matches", type_name, orphan=orphan)
         try:
-            # kapture lists a type by its folder, so there must be one even without a pair
+            # kapture lists a type by its folder, even without pairs
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise output_error(folder, error) from error
@@ -122,7 +112,7 @@ class MatchesWriter(BlobWriter):
         return self.has(_name(min(pair), max(pair)))
 
     def write(self, a: str, b: str, indices: ArrayLike, scores: ArrayLike) -> Path:
-        """Write a pair: integer indices (M, 2) in the order ``a``, ``b``, scores (M,); its file."""
+        """Write indices (M, 2) in the order ``a``, ``b`` and scores (M,); return the file."""
         pairs = np.asarray(indices).reshape(-1, 2)
         rows = np.empty((len(pairs), 3), dtype="<f8")
         rows[:, :2] = pairs if a < b else pairs[:, ::-1]
@@ -140,7 +130,7 @@ PAIRS_HEADER = "# query_image, map_image, score"
 
 @dataclass(frozen=True, order=True, slots=True)
 class ImagePair:
-    """Two images worth matching; the higher the score, the sooner."""
+    """Two images to match; pairs with higher scores come first."""
 
     query: str
     map: str
@@ -148,7 +138,7 @@ class ImagePair:
 
 
 def read_pairs(path: Path | str) -> list[ImagePair]:
-    """Read a pairs file in its order; a repeated pair counts once, where it is first."""
+    """Read a pairs file in its order, without repeated pairs."""
     pairs: list[ImagePair] = []
     seen: set[tuple[str, str]] = set()
     with read_rows(Path(path)) as rows:
@@ -163,7 +153,6 @@ def read_pairs(path: Path | str) -> list[ImagePair]:
 
 
 def write_pairs(path: Path | str, pairs: Iterable[ImagePair]) -> None:
-    """Write a pairs file in the given order, atomically."""
     rows = []
     for pair in pairs:
         score = float(pair.score)

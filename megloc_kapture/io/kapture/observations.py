@@ -1,7 +1,6 @@
 """``reconstruction/observations.txt``: the keypoints that observe each 3D point of a map.
 
-kapture's own reader keeps a list per point and takes half a minute for ten million observations;
-this one fills flat arrays, block by block.
+kapture's reader takes half a minute for ten million observations; this one fills flat arrays.
 """
 
 from __future__ import annotations
@@ -28,15 +27,9 @@ _ROWS_AT_ONCE = 1 << 14
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Keypoints that observe 3D points, of one keypoints type.
+    """Observations of 3D points, sorted by point, in file order among equals.
 
-    Parameters
-    ----------
-    keypoints_type : type name of the keypoints.
-    image_names : sorted.
-    point_ids : int64 (O,), rows of the points; sorted, in file order among equals.
-    image_ids : int32 (O,), indices into ``image_names``.
-    keypoint_ids : int32 (O,), rows of the image's keypoints.
+    ``image_ids`` index the sorted ``image_names``; ``keypoint_ids`` are rows of their keypoints.
     """
 
     keypoints_type: str
@@ -49,7 +42,6 @@ class Observations:
         return len(self.point_ids)
 
     def sorted_by_point(self) -> Observations:
-        """The same observations in the order of the points."""
         if not (np.diff(self.point_ids) < 0).any():
             return self
         order = np.argsort(self.point_ids, kind="stable")
@@ -66,7 +58,7 @@ class Observations:
 
 
 class _Numbers(dict[str, int]):
-    """Number of each name in the order met; a name is checked when it is new."""
+    """Numbers names in order of appearance and checks each once."""
 
     def __init__(self, check: Callable[[str], str]) -> None:
         super().__init__()
@@ -80,8 +72,6 @@ class _Numbers(dict[str, int]):
 
 
 class _Block(NamedTuple):
-    """The observations of some lines; ``rows``: point and type of a line, repeated for each."""
-
     point_ids: NDArray[np.int64]
     type_ids: NDArray[np.int32]
     image_ids: NDArray[np.int32]
@@ -89,7 +79,6 @@ class _Block(NamedTuple):
 
 
 def read_observations(path: Path) -> dict[str, Observations]:
-    """Read ``observations.txt``, by keypoints type; DataError names file and line."""
     images, types = _Numbers(check_relative), _Numbers(check_component)
     blocks: list[_Block] = []
     number = 1
@@ -166,7 +155,7 @@ def _parse(lines: Sequence[str], images: _Numbers, types: _Numbers) -> _Block:
 
 
 def _integers(texts: Sequence[str]) -> NDArray[np.int64]:
-    """Integers as int64 in a quarter of the time that ``int`` takes; ValueError for other text."""
+    """Parse int64 in a quarter of the time of ``int``; ValueError for other text."""
     if not texts:
         return np.zeros(0, np.int64)
     numbers = np.fromstring(",".join(texts), np.int64, sep=",")
@@ -192,12 +181,12 @@ def _raise_for_line(
 
 
 def write_observations(root: Path, observations: Mapping[str, Observations]) -> None:
-    """Write ``reconstruction/observations.txt``: sorted by point, then by type."""
+    """Write ``reconstruction/observations.txt``, sorted by point, then by type."""
     for keypoints_type, of_type in observations.items():
         check_component(keypoints_type)
         for name in of_type.image_names:
             check_field(name)
-    # point and type of a row are never those of another
+    # point and type of a row are unique
     rows = merge(*(_rows(name, of_type) for name, of_type in sorted(observations.items())))
     with atomic_write(Path(root) / "reconstruction" / "observations.txt") as file:
         file.write(f"{FORMAT_LINE}\n{OBSERVATIONS_HEADER}\n".encode())
@@ -211,7 +200,7 @@ def write_observations(root: Path, observations: Mapping[str, Observations]) -> 
 
 
 def _rows(keypoints_type: str, observations: Observations) -> Iterator[tuple[int, str, str]]:
-    """Point, type and text of the pairs of each row."""
+    """Yield point, type and text of the pairs of each row."""
     ordered = observations.sorted_by_point()
     points = np.asarray(ordered.point_ids)
     names = [f", {name}, " for name in ordered.image_names]

@@ -1,4 +1,4 @@
-"""``reconstruction/points3d.txt``: 3D points, their uncertainty, and PLY files for viewers."""
+"""3D points of a kapture map, their covariances, and PLY files for viewers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PLY_TYPES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
 
 
 def read_points3d(path: Path) -> NDArray[np.float64]:
-    """Read ``points3d.txt`` as float64 (N, 6): X Y Z R G B, colours 0 where there are none."""
+    """Read ``points3d.txt`` as float64 (N, 6): X Y Z R G B, colours 0 if missing."""
     with reading(path), open(path, encoding="utf-8-sig", errors="replace") as file:
         check_version(path, file.readline(), required=False)
         file.seek(0)
@@ -31,7 +31,7 @@ def read_points3d(path: Path) -> NDArray[np.float64]:
             try:
                 points = np.loadtxt(file, delimiter=",", comments="#", ndmin=2)
             except ValueError as error:
-                message = str(error).partition(";")[0]  # numpy's advice is for programmers
+                message = str(error).partition(";")[0]  # without numpy's advice to programmers
                 line = _line_of_another_length(path)
                 message = f"expected 3 or 6 columns in all rows: {message}"
                 raise DataError(message, path=path, line=line) from error
@@ -46,7 +46,7 @@ def read_points3d(path: Path) -> NDArray[np.float64]:
 
 
 def _line_of_another_length(path: Path) -> int | None:
-    """The first line whose number of columns is not that of the first row."""
+    """Return the first line whose number of columns differs from the first row's."""
     columns = None
     for number, text in enumerate(path.read_text(errors="replace").splitlines(), start=1):
         if text.strip() and not text.startswith("#"):
@@ -57,10 +57,7 @@ def _line_of_another_length(path: Path) -> int | None:
 
 
 def write_points3d(root: Path, points: ArrayLike) -> None:
-    """Write ``reconstruction/points3d.txt``: (N, 3) coordinates or (N, 6) with colours.
-
-    Each number is the shortest that reads back as the same float64.
-    """
+    """Write ``reconstruction/points3d.txt``, (N, 3) or (N, 6) with colours, without loss."""
     rows = np.asarray(points, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[1] not in POINTS_HEADERS:
         raise ValueError(f"expected points of shape (N, 3) or (N, 6), got {rows.shape}")
@@ -78,23 +75,14 @@ def write_points3d(root: Path, points: ArrayLike) -> None:
 
 
 def write_point_covariances(root: Path, covariances: NDArray[np.float64]) -> None:
-    """Write ``reconstruction/point_covariances.npy``, which kapture does not know and ignores.
-
-    Parameters
-    ----------
-    covariances : float64 (N, 6), row i of point i of ``points3d.txt``: xx, xy, xz, yy, yz, zz for a
-        noise of 1 px, NaN: unknown.
-    """
+    """Write covariances (N, 6) for a noise of 1 px: xx, xy, xz, yy, yz, zz; NaN where unknown."""
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(covariances, dtype=np.float64), allow_pickle=False)
     write_bytes(root / COVARIANCES_FILE, buffer.getvalue())
 
 
 def read_point_covariances(root: Path, num_points: int) -> NDArray[np.float64] | None:
-    """Return the covariances (N, 6) of a map, memory-mapped; None without any.
-
-    Raises DataError: not such an array, or not of so many points: another map's.
-    """
+    """Return the covariances (N, 6) of a map, memory-mapped; None without the file."""
     path = root / COVARIANCES_FILE
     if not path.is_file():
         return None
@@ -102,7 +90,7 @@ def read_point_covariances(root: Path, num_points: int) -> NDArray[np.float64] |
         return np.zeros((0, 6))  # an empty file cannot be mapped
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # numpy reads the header as Python's tokens and literals
+    except Exception as error:  # numpy parses the header as Python literals
         raise DataError(f"no array of numpy: {error}", path=path) from error
     if array.dtype != np.float64 or array.shape != (num_points, 6):
         raise DataError(
@@ -122,14 +110,9 @@ def write_ply(
     edges: Sequence[tuple[int, int]] = (),
     **properties: ArrayLike,
 ) -> None:
-    """Write coloured points, and lines between them, as a binary PLY file that every viewer opens.
+    """Write points, float64, and lines between them (pairs of rows) as a binary PLY file.
 
-    Parameters
-    ----------
-    xyz : (N, 3), written as float64: a map in a world frame keeps its digits.
-    colours : uint8 (N, 3), red, green, blue.
-    edges : pairs of rows that a line joins.
-    properties : further values (N,), one float32 each, by name.
+    Colours are RGB; further ``properties`` (N,) are written as float32.
     """
     xyz, colours = np.asarray(xyz, dtype=np.float64), np.asarray(colours, dtype=np.uint8)
     columns = [

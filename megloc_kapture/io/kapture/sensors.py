@@ -1,9 +1,7 @@
-"""The tables below a kapture's ``sensors/``: sensors, rigs, trajectories and records.
+"""Tables in a kapture's ``sensors/``: sensors, rigs, trajectories and records.
 
-Floats are written with as many digits as bring back the same float64 (up to 17).
-
-Poses: kapture allows partial ones (blank fields). A row whose rotation or whose translation is
-entirely blank is no pose, and is skipped; a row with only some of them blank is an error.
+Floats are written with the digits that restore the same float64 (up to 17). kapture allows partial
+poses: rows with an entirely blank rotation or translation are skipped, other blanks are errors.
 """
 
 from __future__ import annotations
@@ -29,9 +27,9 @@ from megloc_kapture.io.kapture.format import (
 )
 from megloc_kapture.values import RigidTransform
 
-# |q| may be off by this much (texts with few digits), and is then normalised
+# |q| may differ from 1 by less than this (few digits in the text) and is normalised
 MAX_QUATERNION_ERROR = 1e-3
-# below this |q| is one up to rounding: normalising again would only change the last bits
+# |q| is one up to rounding: normalising would only change the last bits
 _QUATERNION_ROUNDING = 1e-14
 
 _POSE_COLUMNS = "qw, qx, qy, qz, tx, ty, tz"
@@ -48,12 +46,7 @@ _HEADERS = {
 
 
 def read_kapture_data(root: Path, *, allow_links_below: Sequence[Path] = ()) -> KaptureData:
-    """Read and check ``sensors/`` of the kapture at ``root``; only sensors.txt must exist.
-
-    Parameters
-    ----------
-    allow_links_below : folders beside ``root`` that links may lead to.
-    """
+    """Read and check ``sensors/`` of a kapture; only sensors.txt must exist."""
     folder = root / "sensors"
     if not root.exists():
         raise DataError("no such kapture folder", path=root)
@@ -81,7 +74,7 @@ def read_kapture_data(root: Path, *, allow_links_below: Sequence[Path] = ()) -> 
 
 
 def read_sensors(path: Path) -> dict[str, Sensor]:
-    """Read ``sensors.txt``; cameras' models and parameters are checked."""
+    """Read ``sensors.txt`` and check the camera parameters."""
     sensors: dict[str, Sensor] = {}
     with read_rows(path, version_required=True) as rows:
         for fields in rows:
@@ -96,7 +89,7 @@ def read_sensors(path: Path) -> dict[str, Sensor]:
 
 
 def check_sensor(sensor: Sensor) -> None:
-    """Refuse a camera or depth sensor whose intrinsics are wrong; ``UNKNOWN_CAMERA`` is fine."""
+    """Refuse a camera or depth sensor with invalid intrinsics; ``UNKNOWN_CAMERA`` is valid."""
     if sensor.sensor_type not in CAMERA_SENSOR_TYPES:
         return
     if sensor.params[:1] != (UNKNOWN_CAMERA,):
@@ -108,8 +101,7 @@ def check_sensor(sensor: Sensor) -> None:
 def read_rigs(path: Path, sensors: Collection[str]) -> dict[str, dict[str, RigidTransform]]:
     """Read ``rigs.txt``: rig id -> sensor or rig id -> ``sensor_from_rig``.
 
-    Rows of sensors that ``sensors.txt`` does not list are left out, as kapture does: someone took
-    these cameras out of the dataset.
+    Sensors missing from ``sensors.txt`` are skipped, as in kapture.
     """
     rigs: dict[str, dict[str, RigidTransform]] = {}
     with read_rows(path) as rows:
@@ -148,10 +140,7 @@ def read_trajectories(
 def read_records(
     path: Path, sensors: dict[str, Sensor], sensor_type: str
 ) -> dict[tuple[int, str], str]:
-    """Read ``records_camera.txt`` or ``records_depth.txt``.
-
-    A path that is listed twice is refused: an image name is the identity of its features.
-    """
+    """Read ``records_camera.txt`` or ``records_depth.txt``; a repeated path is refused."""
     records: dict[tuple[int, str], str] = {}
     names: set[str] = set()
     with read_rows(path) as rows:
@@ -194,10 +183,7 @@ def _pose(fields: Sequence[str]) -> RigidTransform | None:
 def unit_quaternion(
     quat_wxyz: tuple[float, float, float, float],
 ) -> tuple[float, float, float, float]:
-    """Return the quaternion with length one; DataError where its length is off by 1e-3 or more.
-
-    One of length one up to rounding is returned unchanged.
-    """
+    """Normalise a quaternion; DataError if its length differs from 1 by 1e-3 or more."""
     norm = math.hypot(*quat_wxyz)
     if not abs(norm - 1.0) < MAX_QUATERNION_ERROR:
         raise DataError(f"rotation is not a unit quaternion (length {norm:.6g})")
@@ -211,10 +197,7 @@ def unit_quaternion(
 
 
 def write_sensors(root: Path, data: KaptureData) -> None:
-    """Write ``sensors/*.txt`` of the kapture at ``root``; images and features are not touched.
-
-    Rows are sorted; a table without rows has no file, and an older file of it is removed.
-    """
+    """Write the tables of the kapture at ``root``, sorted, and remove old files of empty tables."""
     tables = {
         "sensors": _sensor_rows(data),
         "rigs": _rig_rows(data),
@@ -252,7 +235,7 @@ def _rig_rows(data: KaptureData) -> list[list[str]]:
 def _trajectory_rows(data: KaptureData) -> list[list[str]]:
     rows = []
     for (timestamp, device_id), pose in sorted(data.trajectories.items()):
-        # a rig without sensors has no row in rigs.txt, and so would be unknown to readers
+        # a rig without sensors has no row in rigs.txt, so readers would not know it
         if device_id not in data.sensors and not data.rigs.get(device_id):
             raise DataError(f"trajectories name the unknown device {device_id!r}")
         where = f"trajectory of {device_id!r} at {timestamp}"

@@ -1,4 +1,4 @@
-"""The global features of many images at once: blocks of unit rows, float32."""
+"""Global features of many images as blocks of unit rows, float32."""
 
 from __future__ import annotations
 
@@ -10,16 +10,12 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture.features import FeatureReader
 
-_ROWS_AT_ONCE = 256  # a chunk that stays in the processor's cache
-_ROUNDING = 4e-7  # rows whose squared length is one up to this are left as they are
+_ROWS_AT_ONCE = 256  # a chunk fits the processor's cache
+_ROUNDING = 4e-7  # rows whose squared length is one up to this stay unchanged
 
 
 class KaptureVectors:
-    """Global features of images as blocks of unit rows; zero rows stay zero.
-
-    A source of blocks for ``megloc_kapture.retrieval.search.VectorBlocks``: nothing is kept between
-    reads, so any number of images will do.
-    """
+    """Global features of images as blocks of unit rows, without a cache; zero rows stay zero."""
 
     def __init__(self, reader: FeatureReader, images: Sequence[str]) -> None:
         self._reader = reader
@@ -30,26 +26,21 @@ class KaptureVectors:
 
     @property
     def dimension(self) -> int:
-        """Length D of a vector."""
         return self._reader.config.dsize
 
     def part(self, start: int, stop: int) -> KaptureVectors:
-        """The vectors of the images ``start`` to ``stop``."""
         return KaptureVectors(self._reader, self._images[start:stop])
 
     def read(
         self, start: int, stop: int, out: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32]:
-        """Unit rows of the images ``start`` to ``stop``, float32 (stop - start, D), in ``out``.
-
-        Raises DataError: an image has no vector, a truncated one, or one that is not finite.
-        """
+        """Read unit rows of the images ``start`` to ``stop``, (stop - start, D), into ``out``."""
         images = self._images[start:stop]
         rows = np.empty((len(images), self.dimension), np.float32) if out is None else out
         for begin in range(0, len(images), _ROWS_AT_ONCE):
             chunk = rows[begin : begin + _ROWS_AT_ONCE]
             some = images[begin : begin + _ROWS_AT_ONCE]
-            with np.errstate(over="ignore"):  # float64 that float32 cannot hold is refused below
+            with np.errstate(over="ignore"):  # overflow of float32 is refused below
                 for row, image in zip(chunk, some, strict=True):
                     row[:] = self._reader.read_unchecked(image)
             with np.errstate(over="ignore", invalid="ignore"):

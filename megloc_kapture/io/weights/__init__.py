@@ -1,12 +1,9 @@
-"""Weights of networks: the registry of published checkpoints, and the folder they lie in.
+"""Network weights: the registry of published checkpoints and the folder that holds them.
 
-``registry.toml`` beside this file gives the file, page, licence and sha256 of each network's
-checkpoint. Checkpoints lie in the folder of MEGLOC_WEIGHTS, else in ``megloc-kapture/weights`` of
-the user's cache, or in a folder of it. Read are what torch saves, with ``weights_only=True``, and
-safetensors; ``scripts/convert_weights.py`` converts other containers once.
-
-Processes of a machine share what they read: the first of them writes the tensors into a folder of
-the run; it and the others map that file into memory, so that the system keeps it once.
+``registry.toml`` lists each checkpoint's file, page, licence and sha256. The folder is
+MEGLOC_WEIGHTS or ``megloc-kapture/weights`` in the user's cache. Torch files (read with
+``weights_only=True``) and safetensors are supported; ``scripts/convert_weights.py`` converts
+others.
 """
 
 from __future__ import annotations
@@ -39,10 +36,10 @@ if TYPE_CHECKING:
     import torch
 
 FOLDER_VARIABLE = "MEGLOC_WEIGHTS"
-UNVERIFIED = "unverified"  # folder of files that a user has instead of the published ones
+UNVERIFIED = "unverified"  # folder of user files that replace published ones
 _shared_folder: Path | None = None
 _REGISTRY = Path(__file__).with_name("registry.toml")
-# under these keys training scripts keep the state dict
+# keys under which training scripts keep the state dict
 _STATE_KEYS = ("state_dict", "model_state", "model", "extractor")
 _Url = Annotated[str, StringConstraints(pattern=r"^https?://[\w.:-]+/\S*$")]
 _Text = Annotated[str, StringConstraints(min_length=1)]
@@ -57,18 +54,17 @@ class _Entry(BaseModel):
 
 
 class PublishedFile(_Entry):
-    """One file that a network's weights are published in; None where a value is unknown."""
+    """One published file of a network's weights; None where a value is unknown."""
 
     name: _FileName  # in the folder of weights
-    also: tuple[_FileName, ...] = ()  # names that other tools give the same file
-    url: _Url | None = None  # None: only a person can fetch it, from the network's page
+    also: tuple[_FileName, ...] = ()  # alternative names
+    url: _Url | None = None  # None: available only by hand from the network's page
     size: Annotated[int, Field(gt=0)] | None = None  # bytes
     sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")] | None = None
-    convert: bool = False  # scripts/convert_weights.py must make safetensors of it
+    convert: bool = False  # needs scripts/convert_weights.py
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All names that the file may have."""
         return (self.name, *self.also)
 
 
@@ -77,33 +73,31 @@ class Weights(_Entry):
 
     name: Annotated[str, AfterValidator(check_component)]
     purpose: _Text
-    page: _Url  # where a person finds it
+    page: _Url
     licence: _Text  # short name
-    terms: _Text  # what one may do, in plain words
-    commercial: bool  # whether commercial use is plainly allowed
+    terms: _Text  # licence terms in plain words
+    commercial: bool  # commercial use is plainly allowed
     files: Annotated[tuple[PublishedFile, ...], Field(min_length=1)]  # preferred first
-    unverified: str = ""  # what nobody has confirmed on the original file
+    unverified: str = ""  # facts not confirmed on the original file
 
     @property
     def converted(self) -> str:
-        """Name of the file with the converted tensors."""
         return f"{self.name}.safetensors"
 
     @property
     def to_fetch(self) -> PublishedFile | None:
-        """The file that a program can fetch."""
+        """The file that can be downloaded automatically."""
         return next((file for file in self.files if file.url), None)
 
 
 @lru_cache(maxsize=1)
 def registry() -> Mapping[str, Weights]:
-    """Return all networks by name, in the order of the file."""
+    """Return all networks by name, in the order of ``registry.toml``."""
     table = tomllib.loads(_REGISTRY.read_text(encoding="utf-8"))
     return MappingProxyType({name: Weights(name=name, **entry) for name, entry in table.items()})
 
 
 def lookup(name: str) -> Weights:
-    """Return the entry of a network; OptionError lists the known names."""
     if name not in registry():
         hint = suggestion(name, registry(), listed="there are ")
         raise OptionError(f"no weights {name!r} in the registry; {hint}")
@@ -111,12 +105,11 @@ def lookup(name: str) -> Weights:
 
 
 def by_sha256(sha256: str) -> tuple[Weights, PublishedFile] | None:
-    """Find the network and file of a checksum."""
     return next((found for found in _all_files() if found[1].sha256 == sha256), None)
 
 
 def by_file_name(name: str) -> tuple[Weights, PublishedFile] | None:
-    """Find the network and file of a name without folders."""
+    """Find the network and file of a file name."""
     for weights, file in _all_files():
         if name in [path.rpartition("/")[2] for path in file.names]:
             return weights, file
@@ -131,7 +124,7 @@ def _all_files() -> list[tuple[Weights, PublishedFile]]:
 
 
 class MissingWeightsError(DataError):
-    """Checkpoints are missing; says where each is published and the command that adds it."""
+    """Missing checkpoints, with their sources and the command that adds each."""
 
     def __init__(
         self,
@@ -142,7 +135,7 @@ class MissingWeightsError(DataError):
         line: int | None = None,
     ) -> None:
         super().__init__(message, path=path, line=line)
-        self.names = tuple(names)  # the networks in the registry
+        self.names = tuple(names)
 
     def lines(self) -> list[str]:
         return str(self).splitlines()
@@ -150,16 +143,16 @@ class MissingWeightsError(DataError):
 
 @dataclass(frozen=True)
 class WeightsFile:
-    """A checkpoint on disk; hashable, so that a module can be kept for it."""
+    """A checkpoint on disk; hashable, to serve as a cache key."""
 
-    name: str  # the network in the registry, or the file's name where it is a user's own
+    name: str  # of the network in the registry, or of a user's file
     path: Path
     size: int  # bytes
     mtime_ns: int
 
     @property
     def published(self) -> PublishedFile | None:
-        """The registry's file that it should be; None for a user's own and for converted ones."""
+        """The registry's file expected here; None for user files and converted ones."""
         known = registry().get(self.name)
         if known is None or self.path.is_relative_to(weights_folder() / UNVERIFIED):
             return None
@@ -169,17 +162,13 @@ class WeightsFile:
 
 
 def weights_folder() -> Path:
-    """Return the folder of weights, which may not exist yet."""
     if folder := os.environ.get(FOLDER_VARIABLE):
         return Path(os.path.abspath(Path(folder).expanduser()))
     return user_cache() / "weights"
 
 
 def find_weights(name: str) -> WeightsFile:
-    """Find the checkpoint of a network of the registry, or a user's own by its path.
-
-    MissingWeightsError names the file, its folder and the command that adds it.
-    """
+    """Find the checkpoint of a registered network, or a user's file by path."""
     if name in registry():
         weights = registry()[name]
         path = next(files_of(weights), None)
@@ -195,7 +184,7 @@ def find_weights(name: str) -> WeightsFile:
 
 
 def find_all_weights(names: Sequence[str]) -> list[WeightsFile]:
-    """Find the checkpoints of a network that needs several; one error names all missing ones."""
+    """Find several checkpoints; one MissingWeightsError names all missing ones."""
     found, missing = [], []
     for name in names:
         try:
@@ -208,20 +197,19 @@ def find_all_weights(names: Sequence[str]) -> list[WeightsFile]:
 
 
 def all_missing(errors: Iterable[MissingWeightsError]) -> MissingWeightsError:
-    """Join several errors into one, a line for each checkpoint."""
     by_line = {line: None for error in errors for line in error.lines()}
     names = dict.fromkeys(name for error in errors for name in error.names)
     return MissingWeightsError("\n".join(by_line), names=list(names))
 
 
 def files_of(weights: Weights) -> Iterator[Path]:
-    """Yield the files of a network that can be read, the preferred one first."""
+    """Yield a network's readable files, the preferred one first."""
     names = [name for file in weights.files if not file.convert for name in file.names]
     yield from _in_folder([*names, weights.converted])
 
 
 def to_convert(weights: Weights) -> Path | None:
-    """Find a published file of a network that is there, but must be converted first."""
+    """Find a published file that is present but needs conversion."""
     return next(_in_folder([n for file in weights.files if file.convert for n in file.names]), None)
 
 
@@ -233,7 +221,7 @@ def _in_folder(names: Iterable[str]) -> Iterator[Path]:
 
 
 def how_to_get(weights: Weights) -> str:
-    """Say in one line what is missing and how to get it."""
+    """Return a one-line message: the missing checkpoint and how to get it."""
     names = " or ".join(file.name for file in weights.files)
     fetch = f"megloc weights fetch {weights.name}"
     if found := to_convert(weights):
@@ -253,12 +241,10 @@ def how_to_get(weights: Weights) -> str:
 
 
 def how_to_convert(weights: Weights, path: Path | str) -> str:
-    """Return the command that converts a published file (docs/weights.md)."""
     return f"python scripts/convert_weights.py {weights.name} {path}"
 
 
 def describe(name: str, path: Path) -> WeightsFile:
-    """Return the checkpoint at a path, as it is now."""
     with reading(path):
         state = path.stat()
     return WeightsFile(name, path, state.st_size, state.st_mtime_ns)
@@ -266,7 +252,6 @@ def describe(name: str, path: Path) -> WeightsFile:
 
 @lru_cache(maxsize=256)
 def sha256_of(file: WeightsFile) -> str:
-    """Compute the sha256 of a checkpoint, hexadecimal."""
     with reading(file.path), open(file.path, "rb") as content:
         return hashlib.file_digest(content, "sha256").hexdigest()
 
@@ -275,12 +260,7 @@ def sha256_of(file: WeightsFile) -> str:
 
 
 def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
-    """Read all tensors of a checkpoint by name; no code of the file is run.
-
-    Names are without the prefix ``module.`` of parallel training. DataError names a file that is
-    damaged, holds objects that are never loaded, or has another sha256 than the registry's. With
-    :func:`share_weights`, only the first process reads the file.
-    """
+    """Read the tensors of a checkpoint by name, without ``module.``; none of its code runs."""
     if _shared_folder is None:
         return _read(file)
     import torch
@@ -289,24 +269,24 @@ def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
     found: dict[str, torch.Tensor] = {}
     try:
         with open(path.with_suffix(".lock"), "wb") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # the others wait for the first
+            fcntl.flock(lock, fcntl.LOCK_EX)
             if not path.is_file():
                 found = _read(file)
                 with atomic_write(path) as written:
-                    # clones: a view would be written with the whole tensor that it is a part of
+                    # clones: a view would be written with its whole base tensor
                     torch.save({name: t.contiguous().clone() for name, t in found.items()}, written)
-    except (OSError, OutputError, RuntimeError):  # torch's, too, where the disk is full
+    except (OSError, OutputError, RuntimeError):  # torch raises RuntimeError on a full disk
         with suppress(OSError):
             path.unlink()
         return found or _read(file)
     found = torch.load(path, mmap=True, weights_only=True)
-    for tensor in found.values():  # ``load_strictly`` takes the memory as it is
+    for tensor in found.values():  # ``load_strictly`` keeps such memory
         tensor.is_shared_file = True  # type: ignore[attr-defined]
     return found
 
 
 def share_weights(folder: Path | None) -> None:
-    """Share what this process reads with the others that use the same folder."""
+    """Share loaded tensors with other processes that use the same folder."""
     global _shared_folder
     _shared_folder = folder
 
@@ -320,13 +300,13 @@ def _read(file: WeightsFile) -> dict[str, torch.Tensor]:
             return _state_dict(load_file(file.path), file.path)
         except DataError:
             raise
-        except Exception as error:  # the library has an error of its own
+        except Exception as error:  # safetensors has its own error class
             raise DataError(f"no safetensors file: {error}", path=file.path) from error
     return _state_dict(_load_torch(file.path), file.path)
 
 
 def check_sha256(file: WeightsFile) -> None:
-    """Raise DataError where the registry knows another checksum of the file."""
+    """Raise DataError if the sha256 differs from the registry's."""
     known = file.published and file.published.sha256
     if known and known != sha256_of(file):
         raise DataError(
@@ -340,7 +320,7 @@ def _load_torch(path: Path) -> Any:
     import numpy as np
     import torch
 
-    # a score that training scripts keep beside the weights (DeepLabV3+: best_score)
+    # training scripts keep a score next to the weights (DeepLabV3+: best_score)
     scalar = np._core.multiarray.scalar  # type: ignore[attr-defined]
     names = ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
     of_scores: list[Any] = [np.dtype, type(np.dtype("f4")), type(np.dtype("f8"))]

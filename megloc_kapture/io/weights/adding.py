@@ -1,4 +1,4 @@
-"""Weights brought into their folder: downloaded, or added from a file."""
+"""Downloading weights, or adding them from a file."""
 
 from __future__ import annotations
 
@@ -24,20 +24,16 @@ from megloc_kapture.io.weights import (
     weights_folder,
 )
 
-SOURCE_KEY = "source_sha256"  # of a converted file's metadata
+SOURCE_KEY = "source_sha256"  # in a converted file's metadata
 _TIMEOUT_S = 60.0
 
 
 class TransferError(MeglocError):
-    """The server cannot be reached, refuses, or the transfer broke."""
+    """An unreachable server, a refusal, or a broken transfer."""
 
 
 def fetch(url: str, path: Path, *, sha256: str | None = None, progress: Any = None) -> None:
-    """Download a file, which gets its name when it is complete and its sha256 is right.
-
-    ``progress`` has tqdm's interface: ``total``, ``update``, ``reset`` and ``close``. Raises
-    TransferError, DataError for another file than expected, and OutputError.
-    """
+    """Download a file, named once complete and verified; ``progress`` has tqdm's interface."""
     import pooch
     import requests
 
@@ -48,11 +44,10 @@ def fetch(url: str, path: Path, *, sha256: str | None = None, progress: Any = No
         path.parent.mkdir(parents=True, exist_ok=True)
         pooch.core.stream_download(url, path, known, downloader)
     except requests.exceptions.HTTPError as error:
-        # such as "404 Client Error: Not Found for url: ..."
         raise TransferError(f"{url}: the server answers {error}") from error
     except requests.exceptions.RequestException as error:
         raise TransferError(f"{url}: the transfer broke: {error}") from error
-    except ValueError as error:  # another sha256
+    except ValueError as error:  # pooch: wrong sha256
         raise DataError(f"what came is not the published file: {error}", path=url) from error
     except OSError as error:
         raise output_error(path, error) from error
@@ -61,13 +56,9 @@ def fetch(url: str, path: Path, *, sha256: str | None = None, progress: Any = No
 def add_weights(
     source: Path, *, name: str | None = None, force: bool = False, unverified: bool = False
 ) -> WeightsFile:
-    """Copy a file into the folder of weights under the name it is looked for by.
+    """Copy a file into the folder of weights under its registered name.
 
-    Parameters
-    ----------
-    name : the network it is for; found by the sha256 or the file's name unless given.
-    unverified : take it though it is not the published file, e.g. one trained anew. It is kept in
-        the folder ``unverified``, and used where the published file is missing.
+    An ``unverified`` file may differ from the published one, and is used where that is missing.
     """
     if not source.is_file():
         raise DataError("no such file", path=source)
@@ -90,7 +81,7 @@ def add_weights(
 
 
 def prove(file: WeightsFile, published: PublishedFile | None, weights: Weights) -> None:
-    """Raise DataError unless a file is the published one, where its sha256 is known, and loads."""
+    """Raise DataError unless a file loads and has the published sha256, where known."""
     if published and published.sha256 and sha256_of(file) != published.sha256:
         raise DataError(
             f"is not the published {published.name} of {weights.name}: "
@@ -101,7 +92,7 @@ def prove(file: WeightsFile, published: PublishedFile | None, weights: Weights) 
 
 
 def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:
-    """Write all tensors of a checkpoint as safetensors, with its sha256; returns their number."""
+    """Convert a checkpoint to safetensors with its sha256; return the number of tensors."""
     from safetensors.torch import save
 
     if output.suffix != ".safetensors":
@@ -111,14 +102,13 @@ def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:
     if not source.is_file():
         raise DataError("no such file", path=source)
     file = describe(source.name, source)
-    # views of one memory are stored one by one
+    # views of shared memory are stored separately
     tensors = {name: tensor.contiguous().clone() for name, tensor in read_weights(file).items()}
     write_bytes(output, save(tensors, {SOURCE_KEY: sha256_of(file)}))
     return len(tensors)
 
 
 def _recognised(source: Path, sha256: str, name: str | None) -> tuple[Weights, str]:
-    """Return the network, and the name the file gets."""
     if name is None:
         found = by_sha256(sha256) or by_file_name(source.name)
         if found is not None:
