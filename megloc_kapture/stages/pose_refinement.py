@@ -165,7 +165,8 @@ class MapRefiners:
             pose.cam_from_world,
             pose.candidates,
             max_references=self._options.max_references,
-            only_first=self._options.references == "cluster",
+            # a pose made elsewhere comes from no cluster
+            only_first=self._options.references == "cluster" and bool(pose.candidates),
         )
         return tuple(near), tuple(one.reason if one else "" for one in self._verdicts[frame])
 
