@@ -13,6 +13,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 from importlib import import_module
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Protocol
 
 from megloc_kapture.errors import MeglocError, OptionError, missing_extra, suggestion
@@ -111,25 +112,24 @@ def _parser(given: Sequence[str]) -> Any:
 
     import tyro
 
-    from megloc_kapture.plugin_loading import plugin_names
-    from megloc_kapture.plugins import STAGES
-
-    stages = [name.replace("_", "-") for name in plugin_names(STAGES)]
+    # not by plugin_loading, whose imports take longer than the help
+    entries = entry_points(group="megloc_kapture.stages")
+    stages = sorted({entry.name.replace("_", "-") for entry in entries})
     if given and not given[0].startswith("-") and given[0] not in [*COMMANDS, *stages]:
-        commands = suggestion(given[0], [*COMMANDS, *stages], listed="commands: ")
-        raise OptionError(f"unknown command {given[0]!r}; {commands}")
+        known = suggestion(given[0], [*COMMANDS, *stages], listed="commands: ")
+        raise OptionError(f"unknown command {given[0]!r}; {known}")
     annotated: Any = Annotated  # of runtime types, which mypy does not follow
     completes = given[:1] and given[0].startswith("--tyro-")  # shell completion needs all commands
     texts = {name: f"Run the stage {name}, of another package." for name in stages}
     texts |= {name: text for name, (_, text) in COMMANDS.items()}
-    entries = []
+    commands = []
     for name in [*COMMANDS, *(name for name in stages if name not in COMMANDS)]:
         # a stage that fails to load must not break other commands
         asked = name in given[:1] or (completes and name in COMMANDS)
         kind = command_class(name) if asked else make_dataclass(name.replace("-", "_"), [])
         text = kind.__doc__ if asked and name not in COMMANDS else texts[name]
-        entries.append(annotated[kind, tyro.conf.subcommand(name, description=text)])
-    return functools.reduce(operator.or_, entries)
+        commands.append(annotated[kind, tyro.conf.subcommand(name, description=text)])
+    return functools.reduce(operator.or_, commands)
 
 
 def _terminate(number: int, frame: object) -> NoReturn:
