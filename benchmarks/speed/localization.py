@@ -213,7 +213,6 @@ def ours(index: MapIndex, query: Query) -> Centre:
         clusters,
         OPTIONS,
         rank=lambda poses: np.array([float(p.views[0].inliers.sum()) for p in poses]),
-        max_clusters=len(clusters),
     )
     return found.cam_from_world.center() if isinstance(found, Pose) else None
 

@@ -26,7 +26,13 @@ from megloc_kapture.mapping.uncertainty import point_deviations
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, PixelOriginChoice
 from megloc_kapture.pipeline.local_types import local_types_of
 from megloc_kapture.pipeline.map_retrieval import MapRetrieval
-from megloc_kapture.pipeline.presets import DEFAULT_PRESET, Option, options_of, options_of_preset
+from megloc_kapture.pipeline.presets import (
+    BASIC_OPTIONS,
+    DEFAULT_PRESET,
+    Option,
+    options_of,
+    options_of_preset,
+)
 from megloc_kapture.pipeline.queries import Preprocessor
 from megloc_kapture.plugin_loading import load_plugin, plugin_class, plugin_names
 from megloc_kapture.plugins import (
@@ -206,9 +212,13 @@ class OptionsCommand(Common):
     """Those of a step (localization.pose), one of them, or those of a plugin (aliked)."""
     preset: str = DEFAULT_PRESET
     """Show the values of this preset."""
+    basic: bool = False
+    """Only the ten options that people change."""
 
     def run(self, console: Console) -> None:
         every = list(options_of(options_of_preset(self.preset)))
+        if self.basic:
+            every = [option for option in every if option.key in BASIC_OPTIONS]
         found = [one for one in every if _is_below(one.key, self.key)]
         if not found:
             found = list(_options_of_plugins(self.key))

@@ -160,7 +160,7 @@ class Densify(Reading, StageCommand):
                 + (f"; {counts['points_lifted']} keypoints lifted" if self.points else "")
             )
             if self.fuse is not None:
-                agreement = fitted_to_poses(source, options)[0].agreement
+                agreement = fitted_to_poses(source, options.max_size_px).agreement
                 fused = fuse_depth(KaptureFolder(out), self.fuse, agreement, work=work)
                 console.say(f"{fused} points in {self.fuse}")
 

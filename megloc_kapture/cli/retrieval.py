@@ -89,7 +89,7 @@ class PairsMapping(Reading, StageCommand):
         options = chosen.mapping_pairs
         covisible = self.covisibility_map
         if covisible is not None and not options.needs_points():
-            raise OptionError("--covisibility-map is for --by covisibility, or poses.min_overlap")
+            raise OptionError("--covisibility-map is for --by covisibility")
         retrieval = None
         if "retrieval" in self.by:
             retrieval = _retrieval(mapping, self.features, self.fusion, chosen)

@@ -281,7 +281,7 @@ class Preprocess(Linked, Computing, Working):
     user_masks: Path | None = None
     """Folder of masks IMAGE.png, 0 where the image is ignored."""
     set: Texts = ()
-    """Change another option: key=value (upscale, multiple_of, blank_pixels); may be repeated."""
+    """Change another option: key=value (upscale); may be repeated."""
     force: Force = False
 
     def run(self, console: Console) -> None:

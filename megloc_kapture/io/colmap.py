@@ -92,14 +92,14 @@ def px_from_cam(camera: Camera, points_in_cam: NDArray[np.float64]) -> NDArray[n
     return out
 
 
-def undistorted_pinhole(camera: Camera, *, blank_pixels: float = 0.0) -> Camera:
+def undistorted_pinhole(camera: Camera) -> Camera:
     """Return the PINHOLE camera of COLMAP's undistorted image, with the same focal lengths.
 
-    ``blank_pixels`` ranges from 0 (no pixel outside the distorted image) to 1 (all of its content).
+    No pixel lies outside the distorted image.
     """
     pycolmap = load_pycolmap()
     options = pycolmap.UndistortCameraOptions()
-    options.blank_pixels = blank_pixels
+    options.blank_pixels = 0.0
     found = pycolmap.undistort_camera(options, colmap_camera(camera))
     return replace(Camera.from_colmap(found), focal_deviation=camera.focal_deviation)
 
@@ -141,15 +141,13 @@ def focal_from_matches(
 # ------------------------------------------------------------------------------- triangulation
 
 
-class TriangulationOptions(Options):
-    """Options of COLMAP's triangulation with known poses, with COLMAP's defaults."""
+# COLMAP's defaults: reprojection error of an observation, and angle between the rays of a point
+_MAX_REPROJECTION_ERROR_PX, _MIN_ANGLE_DEG = 4.0, 1.5
 
-    max_reprojection_error_px: float = Field(
-        default=4.0, gt=0, description="of an observation; one that is farther off is left out"
-    )
-    min_angle_deg: float = Field(
-        default=1.5, ge=0, description="between the rays of a point; narrower ones make none"
-    )
+
+class TriangulationOptions(Options):
+    """Options of COLMAP's triangulation with known poses."""
+
     two_view_tracks: bool = Field(
         default=False, description="keep points that only two images observe"
     )
@@ -226,11 +224,11 @@ def triangulate(
         # used for tracks of many images only; no effect on a point is known
         pipeline.random_seed = pipeline.triangulation.random_seed = 0
         pipeline.triangulation.ignore_two_view_tracks = not options.two_view_tracks
-        pipeline.triangulation.min_angle = options.min_angle_deg
-        pipeline.triangulation.merge_max_reproj_error = options.max_reprojection_error_px
-        pipeline.triangulation.complete_max_reproj_error = options.max_reprojection_error_px
-        pipeline.mapper.filter_max_reproj_error = options.max_reprojection_error_px
-        pipeline.mapper.filter_min_tri_angle = options.min_angle_deg
+        pipeline.triangulation.min_angle = _MIN_ANGLE_DEG
+        pipeline.triangulation.merge_max_reproj_error = _MAX_REPROJECTION_ERROR_PX
+        pipeline.triangulation.complete_max_reproj_error = _MAX_REPROJECTION_ERROR_PX
+        pipeline.mapper.filter_max_reproj_error = _MAX_REPROJECTION_ERROR_PX
+        pipeline.mapper.filter_min_tri_angle = _MIN_ANGLE_DEG
         result_path = Path(folder) / "result"
         result_path.mkdir()
         result = pycolmap.triangulate_points(

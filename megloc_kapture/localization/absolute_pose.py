@@ -43,6 +43,12 @@ _MAX_STEPS = 20
 _LAST_STEP = 1e-5
 # initial damping after a rejected step
 _DAMPING = 1e-4
+# RANSAC of absolute poses
+_MIN_ITERATIONS, _MAX_ITERATIONS, _CONFIDENCE = 100, 20_000, 0.9999
+# largest standard deviation of the camera's centre, as a share of its inliers' median depth
+_MAX_CENTER_DEVIATION = 0.2
+# noise of the map's keypoints as a share of the residuals' (docs/experiments/pose.md)
+_MAP_NOISE = 1 / 3
 Floats = NDArray[np.float64]
 
 
@@ -51,32 +57,15 @@ class AbsolutePoseOptions(Options):
 
     max_error_px: float = Field(default=12.0, gt=0, description="reprojection error of an inlier")
     min_inliers: int = Field(default=12, ge=4, description="fewer is a failure")
-    max_center_deviation: float = Field(
-        default=0.2,
-        gt=0,
-        description="largest standard deviation of the camera's centre, as a share of its "
-        "inliers' median depth; more is a failure",
-    )
-    map_noise: float = Field(
-        default=1 / 3,
-        ge=0,
-        description="noise of the keypoints that the map's points come from, as a share of the "
-        "residuals'; 0: points count as exact",
-    )
-    min_iterations: int = Field(default=100, gt=0, description="RANSAC's")
-    max_iterations: int = Field(default=20_000, gt=0, description="RANSAC's")
-    confidence: float = Field(
-        default=0.9999, gt=0, lt=1, description="RANSAC stops when it is as sure of its best pose"
-    )
     seed: int = Field(default=0, ge=0, description="of RANSAC's samples")
 
     def for_poselib(self) -> dict[str, Any]:
         """Return the RANSAC options under poselib's names."""
         return {
             "max_reproj_error": self.max_error_px,
-            "min_iterations": self.min_iterations,
-            "max_iterations": self.max_iterations,
-            "success_prob": self.confidence,
+            "min_iterations": _MIN_ITERATIONS,
+            "max_iterations": _MAX_ITERATIONS,
+            "success_prob": _CONFIDENCE,
             "seed": self.seed,
         }
 
@@ -337,7 +326,7 @@ def refine_pose(
         rows = np.flatnonzero(inliers)
         if len(rows) < options.min_inliers:
             return _too_few_agree(len(rows), count, options)
-        whitening = _whitening(problem, projected, pose, options.map_noise)
+        whitening = _whitening(problem, projected, pose, _MAP_NOISE)
         whitened = _whitened(projected.residuals[rows], whitening[rows])
         squared = (whitened**2).sum(axis=1)
         sigma = max(_median(squared) ** 0.5 / _RAYLEIGH_MEDIAN, _MIN_SIGMA_PX)
@@ -411,11 +400,11 @@ def check_stable(
     ``depth`` is the inliers' median depth in the unit of the map.
     """
     deviation = center_deviation(covariance) / depth
-    if deviation <= options.max_center_deviation:
+    if deviation <= _MAX_CENTER_DEVIATION:
         return pose
     return Failure(
         f"the pose is unstable: its centre's standard deviation is {deviation:.2g} of the "
-        f"inliers' median depth, at most {options.max_center_deviation:g} is allowed",
+        f"inliers' median depth, at most {_MAX_CENTER_DEVIATION:g} is allowed",
         num_matches=pose.num_matches,
         num_inliers=pose.num_inliers,
     )

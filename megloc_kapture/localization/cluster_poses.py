@@ -46,6 +46,12 @@ Found = Sequence[Sequence[Correspondences]]
 """2D-3D matches of each view, by keypoints type."""
 
 
+# images with fewer points in common belong to no common cluster
+_MIN_SHARED_POINTS = 10
+# clusters with the most matches; each gets a pose
+MAX_CLUSTERS = 10
+
+
 class ClusterOptions(Options):
     """Options of the clusters of a query's candidates."""
 
@@ -59,12 +65,6 @@ class ClusterOptions(Options):
         gt=0,
         description="poses: centres this close, in the map's unit, belong together, and so do "
         "all that are joined by such steps",
-    )
-    min_shared_points: int = Field(
-        default=10, gt=0, description="covisibility: images with so many points in common"
-    )
-    max_clusters: int = Field(
-        default=10, gt=0, description="clusters tried, those with the most matches"
     )
 
     @model_validator(mode="after")
@@ -123,7 +123,7 @@ def cluster_candidates(
                 (index.shared_points(names) for index in indices),
                 np.zeros((len(names), len(names)), np.int64),
             )
-            labels = cluster_by_shared_points(shared, options.min_shared_points)
+            labels = cluster_by_shared_points(shared, _MIN_SHARED_POINTS)
         else:
             labels = np.zeros(len(names), np.int64)
         clusters += [
@@ -153,7 +153,6 @@ def localize_in_clusters(
     options: AbsolutePoseOptions,
     *,
     rank: Rank,
-    max_clusters: int,
     frames: Sequence[str] | None = None,
     centers: Mapping[str, NDArray[np.float64]] | None = None,
     min_confidence: float | None = None,
@@ -169,7 +168,6 @@ def localize_in_clusters(
     ----------
     clusters : map images of each, see :func:`cluster_candidates`.
     rank : scores of poses, higher is better.
-    max_clusters : number of clusters tried, those with the most matches.
     frames : coordinate frame of each cluster; clusters of different frames are not merged.
     centers : of the map images, (3,) each; needed for ``min_confidence``.
     min_confidence : lower confidences are failures; None computes no confidence.
@@ -186,7 +184,7 @@ def localize_in_clusters(
     every = [typed for view in views for typed in view.matches]
     counts = [sum(int(typed.are_with(cluster).sum()) for typed in every) for cluster in clusters]
     by_matches = sorted(range(len(clusters)), key=lambda at: (-counts[at], at))
-    tried = sorted(at for at in by_matches[:max_clusters] if counts[at])
+    tried = sorted(at for at in by_matches[:MAX_CLUSTERS] if counts[at])
     clock.lap("correspondences")
 
     def attempt(cluster: Sequence[str], frame: str) -> _Attempt:

@@ -25,20 +25,17 @@ _ROUNDS = 6
 _SETTLED = 0.01
 # one over the noise, in pixels, that a deviation of estimated depth is due to
 _PIXELS_OF_SIGMA = 3.0
+# the four depths around a keypoint may differ by this share of the smallest; beyond, it lies on an
+# edge and has no depth
+MAX_DEPTH_JUMP = 0.1
+# noise of keypoints, and of poses as seen in the images, which makes points uncertain: with the
+# sensor's noise alone half the points would go (docs/experiments/map-refinement.md)
+_KEYPOINT_NOISE_PX = 2.0
+# a point agrees with any depth this near: allows for edges and registration of image and depth
+_WINDOW_PX = 3
 _SAME_CENTRE_M = 1e-9  # an offset that is left over from composing transforms
 # coefficients of z^0, z^1, z^2 of 0.0012 + 0.0019 (z - 0.4)^2
 _STRUCTURED_LIGHT = (0.001504, -0.00152, 0.0019)
-
-
-class LiftingOptions(Options):
-    """Options of lifting."""
-
-    max_jump: float = Field(
-        default=0.1,
-        gt=0,
-        description="the four depths around a keypoint may differ by this share of the smallest; "
-        "beyond, it lies on an edge and has no depth",
-    )
 
 
 def lift_keypoints(
@@ -47,7 +44,6 @@ def lift_keypoints(
     image_camera: Camera,
     depth_camera: Camera,
     image_from_depth: RigidTransform,
-    options: LiftingOptions | None = None,
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """3D points of an image's keypoints, through a depth map of the same moment.
 
@@ -65,7 +61,6 @@ def lift_keypoints(
     Points float64 (N, 3) in the image camera's frame, metres, NaN where there is no depth; and a
         mask.
     """
-    options = options or LiftingOptions()
     rays = bearing_rays(image_camera, np.asarray(keypoints_px, np.float64)[:, :2])
     depth_from_image = image_from_depth.inverse()
     points = np.full(rays.shape, np.nan)
@@ -77,7 +72,7 @@ def lift_keypoints(
     settled = np.zeros(len(rays), bool)
     for _ in range(1 if same_centre else _ROUNDS):
         in_depth = depth_from_image.apply(rays * z[:, None])
-        depth = sample_depth(depth_m, px_from_cam(depth_camera, in_depth), options.max_jump)
+        depth = sample_depth(depth_m, px_from_cam(depth_camera, in_depth), MAX_DEPTH_JUMP)
         with np.errstate(invalid="ignore", divide="ignore"):
             lifted = image_from_depth.apply(in_depth * (depth / in_depth[:, 2])[:, None])
             change = np.abs(lifted[:, 2] - z)
@@ -95,7 +90,6 @@ def lift_with_covariances(
     sigma_m: NDArray[np.float32],
     image_camera: Camera,
     depth_camera: Camera,
-    options: LiftingOptions,
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """:func:`lift_keypoints` through a depth map of the image's own centre, with covariances.
 
@@ -105,7 +99,7 @@ def lift_with_covariances(
     camera's frame for a noise of 1 px, between the points and the mask.
     """
     same = RigidTransform.identity()
-    points, valid = lift_keypoints(keypoints_px, depth_m, image_camera, depth_camera, same, options)
+    points, valid = lift_keypoints(keypoints_px, depth_m, image_camera, depth_camera, same)
     pixels = np.floor(np.nan_to_num(px_from_cam(depth_camera, points))).astype(np.int64)
     rows = np.clip(pixels[:, 1], 0, depth_m.shape[0] - 1)
     columns = np.clip(pixels[:, 0], 0, depth_m.shape[1] - 1)
@@ -132,7 +126,7 @@ def sample_depth(
     ----------
     depth_m : float32 (H, W), 0 or less where unknown.
     pixels : float64 (N, 2) of the depth map, COLMAP's pixel origin; may be NaN.
-    max_jump : see :class:`LiftingOptions`.
+    max_jump : see ``MAX_DEPTH_JUMP``.
     whole : all four depths around a pixel must be known, else some of them.
     """
     height, width = depth_m.shape
@@ -179,18 +173,6 @@ class DepthVerificationOptions(Options):
         default=_STRUCTURED_LIGHT,
         description="a, b, c of the noise a + b z + c z^2 at depth z, in the map's unit",
     )
-    keypoint_noise_px: float = Field(
-        default=2.0,
-        ge=0,
-        description="noise of keypoints, and of poses as seen in the images: times a point's "
-        "deviation, what it may be off by itself; 0: only the sensor's noise counts",
-    )
-    window_px: int = Field(
-        default=3,
-        ge=0,
-        description="a point agrees with any depth that lies this near, in pixels of the depth "
-        "map: allows for edges, and for what image and depth are registered by",
-    )
 
     @field_validator("noise")
     @classmethod
@@ -233,7 +215,7 @@ def contradicted_by_depth(
     Masks (N,): contradicted, never where there is no depth; and where there is depth to compare
         with.
     """
-    own = 0.0 if deviations is None else np.nan_to_num(deviations) * options.keypoint_noise_px
+    own = 0.0 if deviations is None else np.nan_to_num(deviations) * _KEYPOINT_NOISE_PX
     before, behind, checked = compare_with_depth(
         points_in_image, depth_m, depth_camera, image_from_depth, options, own
     )
@@ -270,7 +252,7 @@ def compare_with_depth(
     rows = np.flatnonzero(inside)
     # the centre of the first pixel is (0.5, 0.5): the whole part is the pixel
     column, line = np.floor(pixels[rows]).astype(np.int64).T
-    reach = np.arange(-options.window_px, options.window_px + 1)
+    reach = np.arange(-_WINDOW_PX, _WINDOW_PX + 1)
     columns = np.clip(column[:, None, None] + reach[None, None, :], 0, width - 1)
     lines = np.clip(line[:, None, None] + reach[None, :, None], 0, height - 1)
     window = depth_m[lines, columns].reshape(len(rows), len(reach) ** 2).astype(np.float64)

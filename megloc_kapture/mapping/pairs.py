@@ -49,17 +49,7 @@ class PairsByPosesOptions(Options):
     """Options of pairs by poses; the distance is per image, so it needs no metric scale."""
 
     num_neighbours: int = Field(default=20, gt=0, description="nearest centres taken per image")
-    max_distance: float | None = Field(
-        default=None, gt=0, description="in the map's unit; none: no bound"
-    )
     max_angle_deg: float = Field(default=60.0, gt=0, le=180, description="between optical axes")
-    min_overlap: float | None = Field(
-        default=None,
-        gt=0,
-        le=1,
-        description="share of one image's points in the other's view, of the pairs so found; "
-        "needs points; none: no bound",
-    )
 
 
 def pairs_by_poses(
@@ -77,8 +67,6 @@ def pairs_by_poses(
     centers = np.array([pose.center() for pose in cams_from_world])
     axes = np.array([pose.rotation_matrix()[2] for pose in cams_from_world])
     min_cosine = np.cos(np.radians(options.max_angle_deg))
-    # the tree's own bound is exclusive
-    bound = np.inf if options.max_distance is None else np.nextafter(options.max_distance, np.inf)
     tree = cKDTree(centers)
     found = [np.zeros((0, 2), dtype=np.int64)]
     waiting = np.arange(count)
@@ -90,15 +78,13 @@ def pairs_by_poses(
         block = max(1, _BLOCK_ELEMENTS // size)
         for start in range(0, len(waiting), block):
             part = waiting[start : start + block]
-            distance, index = tree.query(centers[part], k=size, distance_upper_bound=bound)
-            valid = np.isfinite(distance) & (index != part[:, None])
-            other = np.where(valid, index, 0)
-            cosine = np.einsum("nd,nkd->nk", axes[part], axes[other])
+            _, index = tree.query(centers[part], k=size)
+            valid = index != part[:, None]
+            cosine = np.einsum("nd,nkd->nk", axes[part], axes[index])
             good = valid & (cosine >= min_cosine - 1e-12)
             rank = np.cumsum(good, axis=1)
             # an image whose neighbours look elsewhere searches further
-            done = (rank[:, -1] >= options.num_neighbours) | ~np.isfinite(distance[:, -1])
-            done |= size >= largest
+            done = (rank[:, -1] >= options.num_neighbours) | (size >= largest)
             take = good & (rank <= options.num_neighbours) & done[:, None]
             rows, columns = np.nonzero(take)
             found.append(np.stack([part[rows], index[rows, columns]], axis=1))
@@ -108,11 +94,14 @@ def pairs_by_poses(
     return unique_pairs(np.concatenate(found))
 
 
+# points both images observe: as many as the matches of a verified pair
+_MIN_SHARED_POINTS = 15
+
+
 class PairsByCovisibilityOptions(Options):
     """Options of pairs by co-visibility."""
 
     top_k: int = Field(default=20, gt=0, description="images taken that share most points")
-    min_shared_points: int = Field(default=15, gt=0, description="points both images observe")
 
 
 def pairs_by_covisibility(
@@ -144,7 +133,7 @@ def pairs_by_covisibility(
     starts = np.append(0, np.cumsum(np.bincount(images, minlength=num_images)))
     best = np.full((num_images, options.top_k), -1, dtype=np.int64)
     observed = (starts, of_image, images, track, track_starts)
-    rest = (_TRACK_WINDOW, options.min_shared_points, best)
+    rest = (_TRACK_WINDOW, _MIN_SHARED_POINTS, best)
     kernels.in_chunks(
         num_images, _IMAGES_AT_ONCE, lambda a, b: kernels.most_shared(a, b, *observed, *rest)
     )
@@ -209,49 +198,3 @@ def _reaches(first: Camera, second: Camera, second_from_first: RigidTransform) -
         seen = px_from_cam(second, np.concatenate(points))
         inside = ((seen >= 0) & (seen <= (second.width, second.height))).all(axis=1)
     return bool(inside.any())
-
-
-def frustum_overlap(
-    pairs: NDArray[np.int64],
-    cameras: Sequence[Camera],
-    cams_from_world: Sequence[RigidTransform],
-    xyz: NDArray[np.float64],
-    point_ids: NDArray[np.integer[Any]],
-    image_ids: NDArray[np.integer[Any]],
-) -> NDArray[np.float64]:
-    """Share of the points an image observes that fall into the other's image, for pairs of images.
-
-    The larger of a pair's two shares: a near view and a far one overlap though the far one sees
-    much besides. Nothing is known of what hides a point.
-
-    Parameters
-    ----------
-    pairs : int64 (P, 2), rows of ``cameras`` and ``cams_from_world``.
-    xyz : float64 (N, 3) in the world.
-    point_ids, image_ids : (O,), the observations, rows of ``xyz`` and of ``cameras``; in any order.
-
-    Returns
-    -------
-    float64 (P,) from 0 to 1, NaN where neither image observes a point.
-    """
-    from megloc_kapture.geometry.projection import packed_views
-    from megloc_kapture.mapping import kernels
-
-    shares = np.full(len(pairs), np.nan)
-    if len(pairs) == 0:
-        return shares
-    keys = each_once(np.asarray(image_ids, dtype=np.int64) * max(len(xyz), 1) + point_ids)
-    images, points = np.divmod(keys, max(len(xyz), 1))
-    arguments = (
-        np.ascontiguousarray(pairs, dtype=np.int64),
-        np.append(0, np.cumsum(np.bincount(images, minlength=len(cameras)))),
-        points,
-        np.ascontiguousarray(xyz, dtype=np.float64),
-        *packed_views(cameras, cams_from_world),
-        np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64),
-        shares,
-    )
-    kernels.in_chunks(
-        len(pairs), _PAIRS_AT_ONCE, lambda a, b: kernels.shares_seen(a, b, *arguments)
-    )
-    return shares

@@ -130,6 +130,10 @@ def _covered(length: int, scaled: int) -> tuple[NDArray[np.int64], NDArray[np.in
     return at * length // scaled, -((at + 1) * -length // scaled)
 
 
+# an image is not enlarged beyond this; memory grows with the pixels
+_MAX_SIDE_PX = 1600
+
+
 class GuidedPyramidOptions(Options):
     """Options of guided pyramid matching."""
 
@@ -151,11 +155,6 @@ class GuidedPyramidOptions(Options):
     )
     rotations_deg: tuple[int, ...] = Field(
         default=(0, 90, 180, 270), min_length=1, description="multiples of 90"
-    )
-    max_side_px: int = Field(
-        default=1600,
-        gt=0,
-        description="an image is not enlarged beyond this; memory grows with the pixels",
     )
 
     @field_validator("scales")
@@ -180,10 +179,10 @@ class GuidedPyramidOptions(Options):
     def variants(self, width: int, height: int) -> list[ImageVariant]:
         """List the variants of an image of this size, sorted; not the image as it is.
 
-        A scale that would enlarge it beyond ``max_side_px`` is reduced to it, and left out where
+        A scale that would enlarge it beyond ``_MAX_SIDE_PX`` is reduced to it, and left out where
         that is hardly more than the next smaller scale.
         """
-        limit = max(1.0, self.max_side_px / max(width, height))
+        limit = max(1.0, _MAX_SIDE_PX / max(width, height))
         scales = [scale for scale in self.scales if scale <= limit]
         if len(scales) < len(self.scales) and limit >= _MIN_STEP * max([1.0, *scales[-1:]]):
             scales.append(limit)

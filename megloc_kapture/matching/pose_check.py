@@ -49,11 +49,13 @@ def count_fitting(
     Of matched rays and slopes as in :func:`verify_with_poses`; ``side_px`` is the images' larger
     side.
     """
-    options = KnownPoseOptions(max_error_px=_MAX_ERROR_SHARE * side_px, min_matches=0)
+    options = KnownPoseOptions(max_error_px=_MAX_ERROR_SHARE * side_px)
     counts = []
     for read in (lambda pose: pose, *CONVENTIONS.values()):
         a, b = map(read, poses)
-        good = verify_with_poses(rays_a, slopes_a, rays_b, slopes_b, b @ a.inverse(), options)
+        good = verify_with_poses(
+            rays_a, slopes_a, rays_b, slopes_b, b @ a.inverse(), options, min_matches=0
+        )
         counts.append(int(good.sum()))
     return tuple(counts)
 

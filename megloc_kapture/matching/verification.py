@@ -44,13 +44,15 @@ _THRESHOLDS = (1.0, 0.5, 0.25)
 # matches of one thing in two images are not independent of each other, so few must be expected
 _MAX_FALSE_ALARMS = 1e-10
 _MAX_WRONG_PAIRS = 20_000
+# a pair with fewer verified matches counts as not overlapping
+MIN_MATCHES = 15
+_MIN_ITERATIONS, _CONFIDENCE = 20, 0.999  # RANSAC of relative poses
 
 
 class KnownPoseOptions(Options):
     """Options of verification with the known poses."""
 
     max_error_px: float = Field(default=4.0, gt=0, description="Sampson distance in the images")
-    min_matches: int = Field(default=15, ge=0, description="a pair with fewer left has none")
 
 
 class TwoViewOptions(Options):
@@ -59,11 +61,8 @@ class TwoViewOptions(Options):
     max_error_px: float = Field(
         default=4.0, gt=0, description="distance from the epipolar line of an inlier"
     )
-    min_matches: int = Field(default=15, ge=5, description="a pair with fewer inliers has none")
-    max_iterations: int = Field(default=100, gt=0, description="RANSAC's")
-    min_iterations: int = Field(default=20, gt=0, description="RANSAC's")
-    confidence: float = Field(
-        default=0.999, gt=0, lt=1, description="RANSAC stops when it is as sure of its best model"
+    max_iterations: int = Field(
+        default=100, gt=0, description="RANSAC's; more for matchers whose scores say little"
     )
     seed: int = Field(default=0, ge=0, description="of RANSAC's samples")
 
@@ -139,6 +138,8 @@ def verify_with_poses(
     slopes_b: Floats,
     b_from_a: RigidTransform,
     options: KnownPoseOptions | None = None,
+    *,
+    min_matches: int = MIN_MATCHES,
 ) -> NDArray[np.bool_]:
     """Mask (N,) of the matches that agree with a known relative pose.
 
@@ -150,7 +151,7 @@ def verify_with_poses(
         return np.zeros(0, dtype=bool)
     error = sampson_error_px(rays_a, slopes_a, rays_b, slopes_b, b_from_a)
     good = (error <= options.max_error_px) & in_front_of_both(rays_a, rays_b, b_from_a)
-    if good.sum() < options.min_matches:
+    if good.sum() < min_matches:
         good[:] = False
     return good
 
@@ -166,7 +167,7 @@ def verify_two_view(
 
     Of matched keypoints (N, 2), the best matches first, see
     :func:`~.guided_pyramid.verify_best_first`; in any other order it takes more iterations. All
-    False when no model has ``min_matches`` inliers; False where a camera's distortion cannot be
+    False when no model has ``MIN_MATCHES`` inliers; False where a camera's distortion cannot be
     undone.
     """
     options = options or TwoViewOptions()
@@ -174,7 +175,7 @@ def verify_two_view(
     rays_a = bearing_rays(camera_a, keypoints_a_px)
     rays_b = bearing_rays(camera_b, keypoints_b_px)
     usable = np.isfinite(rays_a).all(axis=1) & np.isfinite(rays_b).all(axis=1)
-    if usable.sum() < options.min_matches:
+    if usable.sum() < MIN_MATCHES:
         return none
     focal = 0.5 * (focal_px(camera_a) + focal_px(camera_b))
     best_first = {"progressive_sampling": True, "max_prosac_iterations": options.max_iterations}
@@ -182,7 +183,7 @@ def verify_two_view(
     unrefined = {"max_iterations": 0}
     _, info = _ransac(rays_a[usable], rays_b[usable], focal, options, best_first, unrefined)
     inliers = np.asarray(info["inliers"], dtype=bool)
-    if len(inliers) != usable.sum() or inliers.sum() < options.min_matches:
+    if len(inliers) != usable.sum() or inliers.sum() < MIN_MATCHES:
         return none
     good = none.copy()
     good[usable] = inliers
@@ -231,7 +232,7 @@ def two_view_of_variants(
             return found
         other_rays = bearing_rays(other_camera, other_px[:, :2])
         other_slopes = ray_slopes(other_camera, other_px[:, :2], other_rays)
-        exact = KnownPoseOptions(max_error_px=options.max_error_px, min_matches=0)
+        exact = KnownPoseOptions(max_error_px=options.max_error_px)
         kept = []
         for one in found:
             px = one.keypoints_px[:, :2]
@@ -240,7 +241,13 @@ def two_view_of_variants(
             slopes = ray_slopes(camera, px, rays) / _precision(one.variant)
             others = one.other_rows
             good = verify_with_poses(
-                rays, slopes, other_rays[others], other_slopes[others], other_from_image, exact
+                rays,
+                slopes,
+                other_rays[others],
+                other_slopes[others],
+                other_from_image,
+                exact,
+                min_matches=0,
             )
             if good.sum() >= _MIN_AGREEING * len(good):
                 kept.append(one.only(good))
@@ -274,17 +281,22 @@ def known_pose_of_variants(
 
 
 def relative_pose(
-    rays: Floats, other_rays: Floats, focal: float, options: TwoViewOptions
+    rays: Floats,
+    other_rays: Floats,
+    focal: float,
+    options: TwoViewOptions,
+    *,
+    min_matches: int = MIN_MATCHES,
 ) -> RigidTransform | None:
     """Estimate ``other_from_image`` of matched rays, with a translation of length 1, by RANSAC.
 
     Of homogeneous rays (N, 3), last component 1, at a focal length in pixels, at which an error
     counts. None where no model has ``min_matches`` inliers.
     """
-    if len(rays) < options.min_matches:
+    if len(rays) < min_matches:
         return None
     pose, info = _ransac(rays, other_rays, focal, options, {}, {})
-    if info["num_inliers"] < options.min_matches:
+    if info["num_inliers"] < min_matches:
         return None
     return RigidTransform.from_matrix(np.asarray(pose.R), np.asarray(pose.t))
 
@@ -304,9 +316,9 @@ def _ransac(
     pinhole = {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0.0, 0.0]}
     ransac = {
         "max_epipolar_error": options.max_error_px,
-        "min_iterations": options.min_iterations,
+        "min_iterations": _MIN_ITERATIONS,
         "max_iterations": options.max_iterations,
-        "success_prob": options.confidence,
+        "success_prob": _CONFIDENCE,
         "seed": options.seed,
     }
     pixels = rays_a[:, :2] * focal, rays_b[:, :2] * focal
@@ -341,7 +353,7 @@ def agree_by_chance(
     from scipy.stats import binom
 
     number = len(keypoints_a_px)
-    if number <= max(_SAMPLE, options.min_matches - 1):
+    if number <= max(_SAMPLE, MIN_MATCHES - 1):
         return True
     rays_a = bearing_rays(camera_a, keypoints_a_px)
     rays_b = bearing_rays(camera_b, keypoints_b_px)

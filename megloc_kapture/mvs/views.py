@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from megloc_kapture.geometry.cameras import (
     PINHOLE_MODELS,
@@ -18,7 +17,7 @@ from megloc_kapture.geometry.cameras import (
 )
 from megloc_kapture.io.colmap import undistorted_pinhole
 from megloc_kapture.plugins import DepthEstimate, StereoView
-from megloc_kapture.values import Camera, Options, RigidTransform
+from megloc_kapture.values import Camera, RigidTransform
 
 Floats = NDArray[np.float64]
 Projections = Sequence[tuple[Floats, Floats]]
@@ -28,6 +27,10 @@ Projections = Sequence[tuple[Floats, Floats]]
 _BEST_ANGLES_DEG = (5.0, 20.0)
 _WIDENED = (0.8, 1.25)
 _MIN_REGION_PX = 40  # smaller islands are chance agreements
+# other views that confirm a pixel; 2 loses a tenth of the pixels for one percent within 2 cm
+_MIN_VIEWS = 1
+# standard deviation of depth as a share of it; beyond lie surfaces without texture
+_MAX_RELATIVE_SIGMA = 0.03
 
 
 def stereo_camera(camera: Camera, max_size_px: int) -> Camera:
@@ -155,29 +158,25 @@ def depth_range(depths: Floats) -> tuple[float, float] | None:
     return float(low * _WIDENED[0]), float(high * _WIDENED[1])
 
 
-class AgreementOptions(Options):
-    min_views: int = Field(
-        default=1, ge=0, description="other views whose depth agrees, for a pixel to keep its own"
-    )
-    max_error_px: float = Field(
-        default=1.0, gt=0, description="distance at which a pixel comes back from another view"
-    )
-    max_relative_error: float = Field(
-        default=0.01, gt=0, description="difference in depth, as a share of it"
-    )
-    max_relative_sigma: float = Field(
-        default=0.03,
-        gt=0,
-        description="standard deviation of depth, as a share of it, beyond which there is none: "
-        "surfaces without texture",
-    )
+@dataclass(frozen=True)
+class Agreement:
+    """How far the depth of two views may differ, see docs/experiments/mvs.md.
+
+    Attributes
+    ----------
+    max_error_px : distance at which a pixel comes back from another view.
+    max_relative_error : difference in depth, as a share of it.
+    """
+
+    max_error_px: float = 1.0
+    max_relative_error: float = 0.01
 
 
 def agreeing_views(
     view: StereoView,
     depth_m: NDArray[np.float32],
     others: Sequence[tuple[StereoView, NDArray[np.float32]]],
-    options: AgreementOptions,
+    agreement: Agreement,
 ) -> NDArray[np.uint8]:
     """Count other views (H, W) whose depth agrees in both directions."""
     from megloc_kapture.mvs.kernels import count_agreeing
@@ -186,7 +185,7 @@ def agreeing_views(
     inverse = _inverted(depth_m)
     for other, other_depth_m in others:
         forth, back = relative_projection(view, other), relative_projection(other, view)
-        limits = options.max_error_px, options.max_relative_error
+        limits = agreement.max_error_px, agreement.max_relative_error
         count_agreeing(inverse, _inverted(other_depth_m), *forth, *back, *limits, counts)
     return counts
 
@@ -211,12 +210,12 @@ def confirmed(
     view: StereoView,
     estimate: DepthEstimate,
     others: Sequence[tuple[StereoView, NDArray[np.float32]]],
-    options: AgreementOptions,
+    agreement: Agreement,
 ) -> DepthEstimate:
     """Keep depths that are confirmed by other views, certain, unmasked and no island."""
-    counts = agreeing_views(view, estimate.depth_m, others, options)
-    known = (estimate.depth_m > 0) & (counts >= options.min_views)
-    known &= estimate.sigma_m <= options.max_relative_sigma * estimate.depth_m
+    counts = agreeing_views(view, estimate.depth_m, others, agreement)
+    known = (estimate.depth_m > 0) & (counts >= _MIN_VIEWS)
+    known &= estimate.sigma_m <= _MAX_RELATIVE_SIGMA * estimate.depth_m
     if view.mask is not None:
         known &= view.mask
     if known.any():

@@ -92,6 +92,20 @@ PRESETS: dict[str, PipelineOptions] = {
 }
 DEFAULT_PRESET = "classic"
 
+# the options that people change
+BASIC_OPTIONS = (
+    "device",
+    "preprocessing.max_size_px",
+    "local_features",
+    "matching",
+    "global_features",
+    "mapping_pairs.by",
+    "query_pairs.top_k",
+    "guided_pyramid.mode",
+    "localization.min_confidence",
+    "pose_refinement.by",
+)
+
 
 def options_of_preset(
     preset: str = DEFAULT_PRESET,

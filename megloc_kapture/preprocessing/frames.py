@@ -141,6 +141,9 @@ def _sampled_at(plan: FramePlan, samples: int) -> tuple[Float32, Float32]:
     return maps[0], maps[1]
 
 
+_SIDE_STEP_PX = 8  # of preprocessed images
+
+
 class FrameOptions(Options):
     """Size and projection of the images; by default they stay as they are."""
 
@@ -150,20 +153,8 @@ class FrameOptions(Options):
     upscale: bool = Field(
         default=False, description="smaller images get that larger side too, not only larger ones"
     )
-    multiple_of: int = Field(
-        default=8,
-        gt=0,
-        description="of both sides where images are resized or undistorted; what is more is cut "
-        "off at the right and at the bottom",
-    )
     undistort: bool = Field(
         default=False, description="images as a pinhole camera would have taken them"
-    )
-    blank_pixels: float = Field(
-        default=0.0,
-        ge=0,
-        le=1,
-        description="undistorted images show, 0: no pixel that was not seen; 1: all that was seen",
     )
 
 
@@ -206,7 +197,7 @@ def plan_frame(camera: Camera, options: FrameOptions) -> FramePlan:
     """Plan size and projection of a camera's images."""
     lens = camera
     if options.undistort:
-        lens = undistorted_camera(camera, blank_pixels=options.blank_pixels)
+        lens = undistorted_camera(camera)
     warps = not same_lens(camera, lens)
     width, height = lens.width, lens.height
     if options.max_size_px is not None:
@@ -215,7 +206,7 @@ def plan_frame(camera: Camera, options: FrameOptions) -> FramePlan:
         )
     processed = scaled_camera(lens, width, height)
     if warps or options.max_size_px is not None:
-        cropped_width, cropped_height = cropped_size(width, height, options.multiple_of)
+        cropped_width, cropped_height = cropped_size(width, height)
         processed = replace(processed, width=cropped_width, height=cropped_height)
     shrink = max(lens.width / width, lens.height / height)
     return FramePlan(camera, processed, (width, height), shrink)
@@ -264,13 +255,13 @@ def fitted_size(
     return (max_size_px, smaller) if width >= height else (smaller, max_size_px)
 
 
-def cropped_size(width: int, height: int, multiple_of: int) -> tuple[int, int]:
-    """Return the largest size within an image with sides that are multiples of ``multiple_of``."""
-    if min(width, height) < multiple_of:
+def cropped_size(width: int, height: int) -> tuple[int, int]:
+    """Crop at the right and at the bottom to multiples of 8, as networks' feature maps need."""
+    if min(width, height) < _SIDE_STEP_PX:
         raise OptionError(
-            f"an image of {width}x{height} cannot be cropped to multiples of {multiple_of}"
+            f"an image of {width}x{height} cannot be cropped to multiples of {_SIDE_STEP_PX}"
         )
-    return width - width % multiple_of, height - height % multiple_of
+    return width - width % _SIDE_STEP_PX, height - height % _SIDE_STEP_PX
 
 
 def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
@@ -302,15 +293,11 @@ def resized(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uin
     return np.asarray(cv2.resize(image, (width, height), interpolation=interpolation))
 
 
-def undistorted_camera(camera: Camera, *, blank_pixels: float = 0.0) -> Camera:
-    """Return the pinhole camera of an undistorted image, as COLMAP chooses it.
-
-    With ``blank_pixels`` 0 all of its pixels are in the original; with 1 it shows the whole
-    original.
-    """
+def undistorted_camera(camera: Camera) -> Camera:
+    """Return the pinhole camera of an undistorted image without blank pixels."""
     if camera.model in PINHOLE_MODELS:
         return camera
     lens = with_two_focals(camera)
     if lens.model in _POLYNOMIAL_MODELS and not any(lens.params[4:]):
         return replace(lens, model="PINHOLE", params=lens.params[:4])
-    return undistorted_pinhole(camera, blank_pixels=blank_pixels)
+    return undistorted_pinhole(camera)

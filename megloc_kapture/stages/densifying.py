@@ -22,9 +22,9 @@ from megloc_kapture.io.files import remove, safe_join
 from megloc_kapture.io.images import write_depth_map
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
 from megloc_kapture.io.tables import DepthRow, write_depth_rows
-from megloc_kapture.mapping.depth import LiftingOptions, lift_with_covariances
+from megloc_kapture.mapping.depth import lift_with_covariances
 from megloc_kapture.mvs.views import (
-    AgreementOptions,
+    Agreement,
     agreeing_views,
     choose_sources,
     confirmed,
@@ -68,6 +68,9 @@ _KEYPOINT_ERROR_PX = 0.3
 # views have absorbed half of the variance
 _ERROR_PX, _DIFFERENCE, _DEVIATION = 0.5, 5.0, 2 / 1.1774
 
+# map images an image is compared with; more where poses are not exact
+_NUM_SOURCES, _MAX_SOURCES = 4, 16
+
 Floats = NDArray[np.float64]
 
 
@@ -82,17 +85,30 @@ class DensifyOptions(Options):
     estimator: PluginChoice = Field(
         default=PluginChoice(name="sweep"), description="sweep, colmap or a plugin"
     )
-    num_sources: int = Field(
-        default=4, ge=1, le=16, description="other map images that an image is compared with"
-    )
     max_size_px: int = Field(default=800, ge=64, description="longer side of the depth maps")
-    agreement: AgreementOptions = AgreementOptions()
 
     def make_estimator(self) -> DepthEstimator:
         found: DepthEstimator = load_plugin(
             DEPTH_ESTIMATORS, self.estimator.name, self.estimator.options
         )
         return found
+
+
+@dataclass(frozen=True)
+class StereoFit:
+    """What stereo of a map can confirm, given the accuracy of its poses.
+
+    Attributes
+    ----------
+    max_size_px : longer side of the depth maps.
+    num_sources : map images that an image is compared with.
+    error_px : error of the poses in pixels of the depth maps; 0 if unknown.
+    """
+
+    max_size_px: int
+    num_sources: int
+    agreement: Agreement
+    error_px: float
 
 
 @dataclass(frozen=True)
@@ -103,8 +119,7 @@ class _Job:
     image: str
     sources: tuple[str, ...]
     range_m: tuple[float, float]
-    options: DensifyOptions
-    error_px: float
+    fit: StereoFit
     estimator: DepthEstimator
     seen: Mapping[str, NDArray[np.int32]]
 
@@ -128,8 +143,8 @@ def densify_map(
     estimator = estimator or options.make_estimator()
     data = source.read()
     _check(source, data)
-    options, error_px = fitted_to_poses(source, options)
-    jobs, rows = _plan(source, output, options, error_px, estimator, restrictions)
+    fit = fitted_to_poses(source, options.max_size_px)
+    jobs, rows = _plan(source, output, options, fit, estimator, restrictions)
     reasons = work.map(_estimate, jobs, "depth", plugins=(estimator,))
     failed = {job.image: reason for job, reason in zip(jobs, list(reasons), strict=True) if reason}
     done = [job for job in jobs if job.image not in failed]
@@ -143,9 +158,7 @@ def densify_map(
     if jobs:
         remove(jobs[0].scratch)
     rows = [replace(row, fill=fills.get(row.image, 0.0)) for row in rows]
-    write_sensors(
-        output, with_depth_sensors(data, [job.image for job in done], options.max_size_px)
-    )
+    write_sensors(output, with_depth_sensors(data, [job.image for job in done], fit.max_size_px))
     link_images_and_masks(source, output)
     copy_features(source, output, link_own=link_features)
     num_lifted = write_points(source, output, lifted)
@@ -155,8 +168,8 @@ def densify_map(
         "images_with_depth": len(done),
         "share_with_depth": round(float(np.mean(list(fills.values()))), 4) if fills else 0.0,
         "points_lifted": num_lifted,
-        "max_size_px": options.max_size_px,
-        "map_error_px": round(error_px, 4),
+        "max_size_px": fit.max_size_px,
+        "map_error_px": round(fit.error_px, 4),
     }
 
 
@@ -176,12 +189,11 @@ def _check(source: KaptureFolder, data: KaptureData) -> None:
 # ------------------------------------------------------------------------------------ planning
 
 
-def fitted_to_poses(source: KaptureFolder, options: DensifyOptions) -> tuple[DensifyOptions, float]:
-    """Adapt options to the pose error: the median reprojection error beyond keypoint noise.
+def fitted_to_poses(source: KaptureFolder, max_size_px: int) -> StereoFit:
+    """Fit stereo to the pose error: the median reprojection error beyond keypoint noise.
 
     Images are reduced until it is at most half a pixel, as no view could confirm finer detail, and
-    compared with proportionally more sources. Views may differ by five times the error. Return the
-    options and the error in depth-map pixels, 0 if unknown.
+    compared with proportionally more sources. Views may differ by five times the error.
     """
     indices = [index_map(source, local_type) for local_type in source.observations()]
     angles = [with_noise(source, index).noise_rad for index in indices]
@@ -191,27 +203,23 @@ def fitted_to_poses(source: KaptureFolder, options: DensifyOptions) -> tuple[Den
     side = int(np.median([max(camera.width, camera.height) for camera in cameras]))
     error_px = error_rad * float(np.median([focal_px(camera) for camera in cameras]))
     share = float(np.sqrt(max(error_px**2 - _KEYPOINT_ERROR_PX**2, 0.0))) / side
-    size = min(options.max_size_px, side)
+    size = min(max_size_px, side)
     reduced = max(64, int(min(size, _ERROR_PX / share))) if share else size
-    error_px, limits = share * reduced, options.agreement
+    error_px, limits = share * reduced, Agreement()
     wider = max(1.0, _DIFFERENCE * error_px / limits.max_error_px)
-    changes = {
-        "max_error_px": wider * limits.max_error_px,
-        "max_relative_error": wider * limits.max_relative_error,
-    }
-    changed = {
-        "max_size_px": reduced if reduced < size else options.max_size_px,
-        "num_sources": min(16, round(options.num_sources * size / reduced)),
-        "agreement": limits.model_copy(update=changes),
-    }
-    return options.model_copy(update=changed), error_px
+    return StereoFit(
+        max_size_px=reduced if reduced < size else max_size_px,
+        num_sources=min(_MAX_SOURCES, round(_NUM_SOURCES * size / reduced)),
+        agreement=Agreement(wider * limits.max_error_px, wider * limits.max_relative_error),
+        error_px=error_px,
+    )
 
 
 def _plan(
     source: KaptureFolder,
     output: Path,
     options: DensifyOptions,
-    error_px: float,
+    fit: StereoFit,
     estimator: DepthEstimator,
     restrictions: Restrictions,
 ) -> tuple[list[_Job], list[DepthRow]]:
@@ -247,7 +255,7 @@ def _plan(
             continue
         found = depth_range(poses[image].apply(xyz[points_of[row]])[:, 2])
         chosen = choose_sources(
-            row, members[keys[row]], xyz, points_of, images_of, centers, options.num_sources
+            row, members[keys[row]], xyz, points_of, images_of, centers, fit.num_sources
         )
         sources = tuple(
             images[other] for other in chosen if source.image_path(images[other]).is_file()
@@ -258,9 +266,7 @@ def _plan(
             continue
         lifts = indices if options.mode == "points" else ()
         seen = {index.local_type: index.observed(image)[0] for index in lifts}
-        jobs.append(
-            _Job(spec, scratch, output, image, sources, found, options, error_px, estimator, seen)
-        )
+        jobs.append(_Job(spec, scratch, output, image, sources, found, fit, estimator, seen))
         rows.append(replace(blank, sources=sources, near_m=found[0], far_m=found[1]))
     return jobs, rows
 
@@ -284,7 +290,7 @@ def _view(folder: KaptureFolder, image: str, max_size_px: int) -> StereoView:
 
 def _estimate(job: _Job) -> str:
     """Estimate one image's depth into the scratch folder; return why it failed, or ""."""
-    folder, size = job.folder.open(), job.options.max_size_px
+    folder, size = job.folder.open(), job.fit.max_size_px
     try:
         views = [_view(folder, image, size) for image in (job.image, *job.sources)]
         found = job.estimator.estimate(views[0], views[1:], job.range_m)
@@ -298,7 +304,7 @@ def _estimate(job: _Job) -> str:
 
 def _confirm(job: _Job) -> tuple[float, dict[str, LiftedPoints]]:
     """Write the depth that the sources confirm; return its share and the lifted points."""
-    folder, size = job.folder.open(), job.options.max_size_px
+    folder, size = job.folder.open(), job.fit.max_size_px
     view = _view(folder, job.image, size)
     names = ("depth", "sigma", "normals")
     estimate = DepthEstimate(*(np.load(_scratch(job, job.image, name)) for name in names))
@@ -308,9 +314,9 @@ def _confirm(job: _Job) -> tuple[float, dict[str, LiftedPoints]]:
         for other, source in zip(job.sources, sources, strict=True)
         if (path := _scratch(job, other, "depth")).is_file()
     ]
-    agreement = job.options.agreement
+    agreement = job.fit.agreement
     kept = confirmed(view, estimate, others, agreement)
-    kept = with_pose_errors(view, sources, kept, job.range_m, _DEVIATION * job.error_px)
+    kept = with_pose_errors(view, sources, kept, job.range_m, _DEVIATION * job.fit.error_px)
     records = job.out / "sensors" / "records_data"
     write_depth_map(safe_join(records, depth_path(job.image)), kept.depth_m)
     write_array(side_file(job.out, job.image, "sigma"), kept.sigma_m)
@@ -339,7 +345,7 @@ def _lift(
     sigma_m: NDArray[np.float32],
 ) -> LiftedPoints:
     points, covariances, valid = lift_with_covariances(
-        keypoints_px[ids], depth_m, sigma_m, camera, view.camera, LiftingOptions()
+        keypoints_px[ids], depth_m, sigma_m, camera, view.camera
     )
     turned = view.cam_from_world.rotation_matrix()
     world = np.einsum("ji,njk,kl->nil", turned, covariances[valid], turned)

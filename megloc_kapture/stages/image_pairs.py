@@ -13,7 +13,7 @@ from pydantic import Field
 
 from megloc_kapture.errors import DataError, OptionError, suggestion
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
-from megloc_kapture.io.kapture import ImagePair, KaptureData, KaptureFolder, read_pairs, write_pairs
+from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.io.kapture.vectors import KaptureVectors
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.mapping.pairs import (
@@ -21,7 +21,6 @@ from megloc_kapture.mapping.pairs import (
     PairsByPosesOptions,
     PairsBySequenceOptions,
     exhaustive_pairs,
-    frustum_overlap,
     pairs_by_covisibility,
     pairs_by_poses,
     pairs_by_sequence,
@@ -53,7 +52,7 @@ from megloc_kapture.stages.stage import (
     StageWork,
 )
 from megloc_kapture.stages.work import HERE, Work
-from megloc_kapture.values import Options, RigidTransform
+from megloc_kapture.values import Options
 
 PairingMethod = Literal["poses", "covisibility", "retrieval", "sequence", "exhaustive"]
 
@@ -68,16 +67,15 @@ class MappingPairsOptions(Options):
     sequence: PairsBySequenceOptions = PairsBySequenceOptions()
 
     def needs_points(self) -> bool:
-        overlap = "poses" in self.by and self.poses.min_overlap is not None
-        return overlap or "covisibility" in self.by
+        return "covisibility" in self.by
 
 
 def _seen_points(
     folder: KaptureFolder, images: Sequence[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return points (N, 3), and the point ids and image rows (O,) of the observations."""
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the point ids and image rows (O,) of the observations."""
     if not folder.has_points():
-        raise DataError("co-visibility and overlap need a map's points", path=folder.root)
+        raise DataError("co-visibility needs a map's points", path=folder.root)
     row_of = {image: row for row, image in enumerate(images)}
     points, seeing = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
     for _, observations in sorted(folder.observations().items()):
@@ -88,10 +86,7 @@ def _seen_points(
     point_ids = np.concatenate(points)
     if len(point_ids) == 0:
         raise DataError("no image to be paired observes its points", path=folder.root)
-    return folder.points3d()[:, :3], point_ids, np.concatenate(seeing)
-
-
-_NOTHING_SEEN = np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64)
+    return point_ids, np.concatenate(seeing)
 
 
 def pair_map_images(
@@ -107,14 +102,14 @@ def pair_map_images(
 
     If no image has a pose, pair all images by methods that need no poses. The score is the cosine
     similarity for pairs found by retrieval, else 1. ``covisible`` is a map of the same images whose
-    points are used for co-visibility and overlap, by default ``mapping``.
+    points are used for co-visibility, by default ``mapping``.
     """
     data = mapping.read()
     poses = data.poses()
     images = sorted(poses) or data.image_names()
-    xyz, point_ids, image_ids = _NOTHING_SEEN
+    point_ids, image_ids = np.zeros(0, np.int64), np.zeros(0, np.int64)
     if options.needs_points():
-        xyz, point_ids, image_ids = _seen_points(covisible or mapping, images)
+        point_ids, image_ids = _seen_points(covisible or mapping, images)
     found, similarities = [np.zeros((0, 2), dtype=np.int64)], [np.zeros(0)]
     for members in restrictions.frames(images):
         names = [images[member] for member in members]
@@ -130,7 +125,7 @@ def pair_map_images(
                 vectors = vectors_of(retrieval.readers(mapping), names)
                 pairs, similarity = _most_similar(vectors, retrieval, options.top_k, work)
             elif method == "poses":
-                pairs = _by_poses(data, poses, names, xyz, seen, options.poses)
+                pairs = pairs_by_poses([poses[name] for name in names], options.poses)
             elif method == "sequence":
                 records = [data.record_of(name) for name in names]
                 cameras, timestamps = [sensor for _, sensor in records], [t for t, _ in records]
@@ -142,24 +137,6 @@ def pair_map_images(
             found.append(members[pairs])
             similarities.append(np.full(len(pairs), -np.inf) if similarity is None else similarity)
     return _united(images, np.concatenate(found), np.concatenate(similarities))
-
-
-def _by_poses(
-    data: KaptureData,
-    poses: Mapping[str, RigidTransform],
-    names: Sequence[str],
-    xyz: NDArray[np.float64],
-    seen: tuple[NDArray[np.int64], NDArray[np.int64]],
-    options: PairsByPosesOptions,
-) -> NDArray[np.int64]:
-    of_images = [poses[name] for name in names]
-    pairs = pairs_by_poses(of_images, options)
-    if options.min_overlap is None:
-        return pairs
-    cameras = [data.camera_of(name) for name in names]
-    overlap = frustum_overlap(pairs, cameras, of_images, xyz, *seen)
-    # overlap is NaN where neither image observes a point; such pairs are kept
-    return pairs[~(overlap < options.min_overlap)]
 
 
 def _united(

@@ -23,7 +23,7 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.io.kapture.matches import MatchesReader
-from megloc_kapture.mapping.depth import LiftingOptions, lift_keypoints
+from megloc_kapture.mapping.depth import lift_keypoints
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.stages.given_map import check_given_type, copy_features, given_map
 from megloc_kapture.stages.scene import DepthRecord, depth_records, read_depth
@@ -218,7 +218,6 @@ def lift_map(
     mapping: KaptureFolder,
     local_types: Sequence[str],
     output: Path,
-    options: LiftingOptions,
     *,
     work: Work = HERE,
 ) -> dict[str, float]:
@@ -242,7 +241,7 @@ def lift_map(
     for local_type in local_types:
         image_ids: list[NDArray[np.int32]] = []
         keypoint_ids: list[NDArray[np.int32]] = []
-        lift = partial(_lift, spec, local_type, options)
+        lift = partial(_lift, spec, local_type)
         results = work.map(lift, jobs, f"lifting {local_type}")
         for image, (lifted, ids) in zip(with_depth, results, strict=True):
             points.append(poses[image].inverse().apply(lifted))
@@ -267,7 +266,7 @@ def lift_map(
 
 
 def _lift(
-    spec: FolderSpec, local_type: str, options: LiftingOptions, job: tuple[str, DepthRecord]
+    spec: FolderSpec, local_type: str, job: tuple[str, DepthRecord]
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Return points in the camera frame (N, 3) and their keypoint ids (N,)."""
     image, depth = job
@@ -278,7 +277,6 @@ def _lift(
         folder.read().camera_of(image),
         depth.camera,
         depth.image_from_depth,
-        options,
     )
     return points[valid], np.flatnonzero(valid).astype(np.int32)
 
@@ -306,7 +304,7 @@ class LiftPoints(PipelineStage):
     """Make the map's points of keypoints, by the depth of its images."""
 
     name = "points"
-    uses = ("map", "lifting", "local_features.name", "local_features.options")
+    uses = ("map", "local_features.name", "local_features.options")
     explained_by = ("map",)
     inputs = (Layout.mapping, LOCAL_FEATURES, GLOBAL_FEATURES)
     outputs = (UNREFINED,)
@@ -316,7 +314,7 @@ class LiftPoints(PipelineStage):
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         mapping, types = work.folder(self.layout.mapping(), FEATURES), self.options.own_types()
-        return lift_map(mapping, types, work.out / UNREFINED, self.options.lifting, work=work)
+        return lift_map(mapping, types, work.out / UNREFINED, work=work)
 
 
 class TriangulatePoints(PipelineStage):

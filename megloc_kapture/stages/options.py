@@ -10,7 +10,6 @@ from pydantic import Field, model_validator
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.colmap import TriangulationOptions
-from megloc_kapture.mapping.depth import LiftingOptions
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, base_type, pyramid_type
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.plugin_loading import load_plugin
@@ -96,7 +95,6 @@ class PipelineOptions(Options):
         default=PluginChoice(name="sift"), description="what a given model was made of"
     )
     triangulation: TriangulationOptions = TriangulationOptions()
-    lifting: LiftingOptions = LiftingOptions()
     refinement: MapRefinementOptions = MapRefinementOptions()
     mvs: DensifyOptions = DensifyOptions()
     localization: LocalizationOptions = LocalizationOptions()

@@ -69,6 +69,8 @@ from megloc_kapture.values import Camera, Options, Pose, RefinementRow, RigidTra
 
 # map images held out at once; a larger window wastes work after the last one needed
 _WINDOW = 4
+# map images a refiner may choose from: the nearest that look the query's way
+_MAX_REFERENCES = 30
 
 
 class PoseRefinementOptions(Options):
@@ -79,11 +81,6 @@ class PoseRefinementOptions(Options):
         default="cluster",
         description="map images a refiner may choose from: those of the cluster that the pose "
         "comes from, or others of its coordinate frame as well",
-    )
-    max_references: int = Field(
-        default=30,
-        gt=0,
-        description="map images a refiner may choose from: that look the query's way, the nearest",
     )
 
     def with_refiners(self, names: Sequence[str]) -> PoseRefinementOptions:
@@ -164,7 +161,7 @@ class MapRefiners:
         near = self._by_frame[frame].near(
             pose.cam_from_world,
             pose.candidates,
-            max_references=self._options.max_references,
+            max_references=_MAX_REFERENCES,
             # a pose made elsewhere comes from no cluster
             only_first=self._options.references == "cluster" and bool(pose.candidates),
         )

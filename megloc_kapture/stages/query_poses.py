@@ -142,7 +142,6 @@ def localize_unit(
             clusters,
             options.pose,
             rank=lambda hypotheses: ranker.score(hypotheses, scene),
-            max_clusters=options.clusters.max_clusters,
             frames=[frame_of[cluster[0]] for cluster in clusters],
             centers=centers,
             min_confidence=options.min_confidence,

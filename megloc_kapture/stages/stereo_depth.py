@@ -32,7 +32,7 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.io.kapture.points import write_ply
 from megloc_kapture.io.tables import read_depth_rows
 from megloc_kapture.mvs.views import (
-    AgreementOptions,
+    Agreement,
     agreeing_views,
     pinhole_matrix,
     stereo_camera,
@@ -179,7 +179,7 @@ class Cloud(NamedTuple):
 def fused_cloud(
     densified: KaptureFolder,
     images: dict[str, tuple[str, ...]],
-    agreement: AgreementOptions,
+    agreement: Agreement,
     *,
     max_points: int | None = None,
     work: Work = HERE,
@@ -204,7 +204,7 @@ def fused_cloud(
 
 
 def fuse_depth(
-    densified: KaptureFolder, cloud: Path, agreement: AgreementOptions, *, work: Work = HERE
+    densified: KaptureFolder, cloud: Path, agreement: Agreement, *, work: Work = HERE
 ) -> int:
     """Write a PLY cloud with normals and deviations; return the number of points."""
     path = densified.root / DEPTH_FILE
@@ -217,7 +217,7 @@ def fuse_depth(
 
 
 def _points(
-    spec: FolderSpec, agreement: AgreementOptions, share: float, job: tuple[int, str, Sequence[str]]
+    spec: FolderSpec, agreement: Agreement, share: float, job: tuple[int, str, Sequence[str]]
 ) -> Cloud:
     (row, image, earlier), folder = job, spec.open()
     view, depth = _view_with_depth(folder, image)

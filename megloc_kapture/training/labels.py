@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from megloc_kapture.geometry.cameras import bearing_rays, px_from_cam
-from megloc_kapture.mapping.depth import LiftingOptions, lift_keypoints, sample_depth
+from megloc_kapture.mapping.depth import MAX_DEPTH_JUMP, lift_keypoints, sample_depth
 from megloc_kapture.matching.verification import ray_slopes, sampson_error_px
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, Options, RigidTransform
@@ -24,7 +24,6 @@ from megloc_kapture.values import Camera, Options, RigidTransform
 UNMATCHED, IGNORED = -1, -2
 # pixels across and down that overlap is measured at
 _GRID = (24, 18)
-_LIFTING = LiftingOptions()
 
 Floats = NDArray[np.float64]
 
@@ -145,14 +144,12 @@ def reproject(
     """
     options = options or LabelOptions()
     points, known = lift_keypoints(
-        px, a.depth.depth_m, a.camera, a.depth.camera, a.depth.image_from_depth, _LIFTING
+        px, a.depth.depth_m, a.camera, a.depth.camera, a.depth.image_from_depth
     )
     in_b = (b.cam_from_world @ a.cam_from_world.inverse()).apply(points)
     there = px_from_cam(b.camera, in_b)
     in_depth = b.depth.image_from_depth.inverse().apply(in_b)
-    measured = sample_depth(
-        b.depth.depth_m, px_from_cam(b.depth.camera, in_depth), _LIFTING.max_jump
-    )
+    measured = sample_depth(b.depth.depth_m, px_from_cam(b.depth.camera, in_depth), MAX_DEPTH_JUMP)
     with np.errstate(invalid="ignore"):
         seen = np.abs(measured - in_depth[:, 2]) <= options.max_depth_error * in_depth[:, 2]
     return there, known, known & seen & _inside(there, b.camera.width, b.camera.height)

@@ -48,7 +48,7 @@ _CONFIDENT = 0.2  # the matcher's own threshold
 
 Image = NDArray[np.uint8]
 AUC_DEG = (5, 10, 20)
-_TWO_VIEWS = TwoViewOptions(max_error_px=2.0, min_matches=6)
+_TWO_VIEWS = TwoViewOptions(max_error_px=2.0)
 _SAME_CENTRE = 1e-9
 
 
@@ -327,7 +327,7 @@ def pose_error_deg(pair: PreparedPair, matches: NDArray[np.int64]) -> float:
     ]
     usable = np.isfinite(rays[0]).all(axis=1) & np.isfinite(rays[1]).all(axis=1)
     focal = 0.5 * (focal_px(views[0].camera) + focal_px(views[1].camera))
-    found = relative_pose(rays[0][usable], rays[1][usable], focal, _TWO_VIEWS)
+    found = relative_pose(rays[0][usable], rays[1][usable], focal, _TWO_VIEWS, min_matches=6)
     return np.inf if found is None else relative_pose_error_deg(found, truth)
 
 

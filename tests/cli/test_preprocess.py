@@ -39,13 +39,12 @@ def flags(*arguments: str) -> Preprocess:
 
 def test_flags_make_the_options() -> None:
     options = flags(
-        *("--resize", "1600", "--undistort", "--set", "blank_pixels=0.5", "--unchanging"),
+        *("--resize", "1600", "--undistort", "--set", "upscale=true", "--unchanging"),
         *("--bottom-share", "rear=0.2", "--bottom-share", "left/a=b*.jpg=0.1"),
         *("--polygon", "c=0,0.8 1,0.8 1,1", "--mask-file", "c=a/b.png"),
         *("--segmenter", "deeplab", "--dynamic", "car", "bus", "--user-masks", "m"),
     ).options()
-    assert (options.max_size_px, options.undistort, options.blank_pixels) == (1600, True, 0.5)
-    assert options.multiple_of == 8 and not options.upscale
+    assert (options.max_size_px, options.undistort, options.upscale) == (1600, True, True)
     assert options.masks.fixed == (
         FixedMask(camera="rear", bottom_share=0.2),
         FixedMask(camera="left/a=b*.jpg", bottom_share=0.1),

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError, OutputError
+from megloc_kapture.io import colmap as module
 from megloc_kapture.io.colmap import (
     MapImage,
     TriangulatedPoints,
@@ -182,25 +183,28 @@ def test_two_images_only_give_points_if_asked_for() -> None:
     assert set(kept.image_ids.tolist()) == {1, 3}
 
 
-def test_the_reprojection_error_is_bounded() -> None:
+def test_the_reprojection_error_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     points, images, matches = scene(CAMERAS["PINHOLE"])
     keypoints = images[0].keypoints_px.copy()
     shift = np.zeros(len(keypoints), dtype=bool)
     shift[::2] = True
     keypoints[shift] += (0.0, 6.0)  # across the epipolar lines
     images[0] = replace(images[0], keypoints_px=keypoints)
-    strict = triangulate(images, matches, TriangulationOptions(max_reprojection_error_px=2.0))
+    monkeypatch.setattr(module, "_MAX_REPROJECTION_ERROR_PX", 2.0)
+    strict = triangulate(images, matches)
     rows = strict.keypoint_ids[strict.image_ids == 0]
     assert not shift[rows].any() and len(rows) == 30
-    loose = triangulate(images, matches, TriangulationOptions(max_reprojection_error_px=12.0))
+    monkeypatch.setattr(module, "_MAX_REPROJECTION_ERROR_PX", 12.0)
+    loose = triangulate(images, matches)
     assert shift[loose.keypoint_ids[loose.image_ids == 0]].any()
 
 
-def test_rays_that_are_nearly_parallel_give_no_point() -> None:
+def test_rays_that_are_nearly_parallel_give_no_point(monkeypatch: pytest.MonkeyPatch) -> None:
     points, images, matches = scene(CAMERAS["PINHOLE"], num_images=3)
     # three cameras within about eight degrees
-    assert len(triangulate(images, matches, TriangulationOptions(min_angle_deg=1.5)).xyz) == 60
-    assert len(triangulate(images, matches, TriangulationOptions(min_angle_deg=30.0)).xyz) == 0
+    assert len(triangulate(images, matches).xyz) == 60
+    monkeypatch.setattr(module, "_MIN_ANGLE_DEG", 30.0)
+    assert len(triangulate(images, matches).xyz) == 0
 
 
 def test_keypoints_may_have_more_columns_and_images_none() -> None:

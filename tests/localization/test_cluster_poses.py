@@ -14,6 +14,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.geometry.cameras import project
+from megloc_kapture.localization import cluster_poses as module
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import (
     ClusterOptions,
@@ -92,14 +93,14 @@ def by_inliers(hypotheses: Sequence[PoseHypothesis]) -> NDArray[np.float64]:
 def localize(
     *views: QueryView, clusters: Sequence[Sequence[str]] = PLACES, **more: object
 ) -> tuple[Pose | Failure, PoseProblem | None]:
-    settings: dict[str, object] = {"rank": by_inliers, "max_clusters": 10} | more
+    settings: dict[str, object] = {"rank": by_inliers} | more
     return localize_in_clusters(views, clusters, AbsolutePoseOptions(), **settings)  # type: ignore[arg-type]
 
 
 SHARES = {"wrong/1": 60, "right/1": 80, "right/2": 90, "wrong/2": 20}
 
 
-def test_each_cluster_has_its_pose_and_the_best_is_kept() -> None:
+def test_each_cluster_has_its_pose_and_the_best_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     result, problem = localize(view(SHARES))
     assert isinstance(result, Pose)
     assert np.linalg.norm(result.cam_from_world.center() - TRUTH.center()) < 1e-5
@@ -114,7 +115,8 @@ def test_each_cluster_has_its_pose_and_the_best_is_kept() -> None:
     steps = {"correspondences", "estimation", "ranking", "refinement"}
     assert result.covariance is not None and set(result.seconds) == steps
     # only the clusters with the most matches are tried
-    result, _ = localize(view(SHARES), clusters=PLACES[::-1], max_clusters=1)
+    monkeypatch.setattr(module, "MAX_CLUSTERS", 1)
+    result, _ = localize(view(SHARES), clusters=PLACES[::-1])
     assert [cluster.images for cluster in result.clusters] == [PLACES[0]]
 
 
@@ -280,15 +282,19 @@ AC, BD = ("a", "c"), ("b", "d")
         ({"by": "poses", "radius": 1.0}, "xxxx", 1, [AC, ("b",), ("d",)]),
         ({"by": "poses", "radius": 1.5}, "xxxx", 1, [("a", "c", "d"), ("b",)]),
         ({"by": "poses", "radius": 100.0}, "xxxy", 1, [("a", "b", "c"), ("d",)]),
-        ({"min_shared_points": 2}, "xxxx", 1, [AC, BD]),
-        ({"min_shared_points": 1}, "xxxx", 1, [NAMES]),
+        ({"by": "covisibility"}, "xxxx", 1, [AC, BD]),
         # c and d share one point in each of two keypoints types
-        ({"min_shared_points": 2}, "xxxx", 2, [NAMES]),
+        ({"by": "covisibility"}, "xxxx", 2, [NAMES]),
     ],
 )
 def test_candidates_are_divided_as_asked_and_frames_never_mixed(
-    options: dict[str, object], frames: str, types: int, expected: list[tuple[str, ...]]
+    options: dict[str, object],
+    frames: str,
+    types: int,
+    expected: list[tuple[str, ...]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(module, "_MIN_SHARED_POINTS", 2)
     chosen = ClusterOptions.model_validate(options)
     indices = [small_index()] * types
     found = cluster_candidates(NAMES, tuple(frames), chosen, centers=CENTERS, indices=indices)

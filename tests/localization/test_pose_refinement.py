@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px, project, px_from_cam
+from megloc_kapture.localization import absolute_pose as module
 from megloc_kapture.localization.absolute_pose import (
     AbsolutePoseOptions,
     PoseEstimate,
@@ -27,9 +28,13 @@ Array = NDArray[np.float64]
 F, CX, CY = 500.0, 321.0, 238.5
 PINHOLE = Camera("PINHOLE", 640, 480, (F, 510.0, CX, CY))
 AT_ORIGIN = RigidTransform.identity()
-ANY_DEVIATION = AbsolutePoseOptions(max_center_deviation=1e9)
-# points count by all of their covariance
-LOOSE = AbsolutePoseOptions(max_error_px=100, map_noise=1.0)
+LOOSE = AbsolutePoseOptions(max_error_px=100)
+
+
+@pytest.fixture
+def whole_covariance(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Points count by all of their covariance."""
+    monkeypatch.setattr(module, "_MAP_NOISE", 1.0)
 
 
 def random_pose(rng: np.random.Generator) -> RigidTransform:
@@ -96,6 +101,7 @@ def noisy_view(
     return View(camera, AT_ORIGIN, pixels, world)
 
 
+@pytest.mark.usefixtures("whole_covariance")
 @pytest.mark.parametrize("model", CAMERA_MODEL_NUM_PARAMS)
 def test_the_covariance_of_a_rig_is_by_finite_differences(
     cameras: dict[str, Camera], model: str
@@ -165,6 +171,7 @@ def test_without_covariances_it_is_poselibs_refinement(sigma_px: float) -> None:
         assert np.sqrt(off) < 0.01
 
 
+@pytest.mark.usefixtures("whole_covariance")
 @given(
     st.sampled_from(sorted(CAMERA_MODEL_NUM_PARAMS)),
     st.integers(0, 2**32 - 1),
@@ -185,6 +192,7 @@ def test_the_minimum_is_found_from_nearby_under_any_model(
     assert pose.num_inliers == 40
 
 
+@pytest.mark.usefixtures("whole_covariance")
 @pytest.mark.parametrize("sigma_px", [0.4, 2.0])
 @pytest.mark.parametrize("size", [1e-9, 0.02])
 def test_the_covariance_is_that_of_repeated_estimates(size: float, sigma_px: float) -> None:
@@ -217,7 +225,7 @@ def test_wrong_matches_among_the_inliers_do_not_inflate_the_covariance() -> None
     assert 5.0 < np.mean(squared) < 7.2
 
 
-def test_points_count_by_the_noise_of_the_map() -> None:
+def test_points_count_by_the_noise_of_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """Half the noise in the map is a quarter of the covariances; none makes the points exact."""
     rng = np.random.default_rng(8)
     truth = random_pose(rng)
@@ -225,8 +233,8 @@ def test_points_count_by_the_noise_of_the_map() -> None:
     covariances = six(random_covariances(rng, 60, 0.03))
 
     def pose(of: View, map_noise: float) -> RigidTransform:
-        options = AbsolutePoseOptions(map_noise=map_noise)
-        return located(refined(of, truth, options)).cam_from_world
+        monkeypatch.setattr(module, "_MAP_NOISE", map_noise)
+        return located(refined(of, truth)).cam_from_world
 
     known = replace(view, point_covariances=covariances)
     quarter = replace(view, point_covariances=covariances / 4)
@@ -286,7 +294,7 @@ def test_what_is_not_usable_takes_no_part() -> None:
     assert first.inliers is not None and not first.inliers[:20].any()
 
 
-def test_an_unstable_pose_is_a_failure_that_says_so() -> None:
+def test_an_unstable_pose_is_a_failure_that_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     """All points within some millimetres of a line: the camera may nearly turn about it."""
     rng = np.random.default_rng(8)
     truth = random_pose(rng)
@@ -299,7 +307,8 @@ def test_an_unstable_pose_is_a_failure_that_says_so() -> None:
     assert isinstance(result, Failure)
     assert result.reason.startswith("the pose is unstable: its centre's standard deviation is ")
     assert result.num_matches == result.num_inliers == 30
-    pose = located(refined(view, truth, ANY_DEVIATION))
+    monkeypatch.setattr(module, "_MAX_CENTER_DEVIATION", 1e9)
+    pose = located(refined(view, truth))
     assert pose.covariance is not None
     # the criterion: the centre's deviation over the median depth, whatever the unit
     deviation = np.sqrt(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1])
@@ -307,8 +316,8 @@ def test_an_unstable_pose_is_a_failure_that_says_so() -> None:
     for unit in (1.0, 1e-3, 1e3):
         scaled = replace(view, points_world=unit * world)
         for factor, stable in ((0.99, False), (1.01, True)):
-            options = AbsolutePoseOptions(max_center_deviation=factor * deviation / depth)
-            assert bool(refined(scaled, in_unit(truth, unit), options)) == stable
+            monkeypatch.setattr(module, "_MAX_CENTER_DEVIATION", factor * deviation / depth)
+            assert bool(refined(scaled, in_unit(truth, unit))) == stable
 
 
 def test_too_few_inliers_after_refinement_say_so() -> None:

@@ -250,12 +250,11 @@ def test_the_covariance_is_that_of_repeated_estimates() -> None:
     """Errors over their covariance follow chi-squared with six degrees of freedom."""
     rng = np.random.default_rng(7)
     truth, views = rig(30)
-    options = AbsolutePoseOptions(min_iterations=10, max_iterations=50)
     squared = []
     for _ in range(150):
         noise = rng.normal(size=(3, 30, 2))
         noisy = [replace(v, points_px=v.points_px + n) for v, n in zip(views, noise, strict=True)]
-        pose = located(rig_pose(noisy, options))
+        pose = located(rig_pose(noisy))
         off = truth @ pose.cam_from_world.inverse()
         turn = Rotation.from_matrix(off.rotation_matrix()).as_rotvec()
         error = np.concatenate([turn, off.translation])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,9 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from megloc_kapture.mapping import depth as module
 from megloc_kapture.mapping.depth import (
     DepthVerificationOptions,
-    LiftingOptions,
     contradicted_by_depth,
     depth_noise,
     lift_keypoints,
@@ -27,9 +29,15 @@ BESIDE = RigidTransform.from_matrix(
 )
 SMALL = Camera("PINHOLE", 64, 48, (60.0, 60.0, 32.0, 24.0))
 ASIDE = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.05, 0.0, 0.0))
-EXACT = DepthVerificationOptions(
-    max_sigmas=3.0, noise=(0.01, 0.0, 0.0), keypoint_noise_px=0.0, window_px=0
-)
+EXACT = DepthVerificationOptions(max_sigmas=3.0, noise=(0.01, 0.0, 0.0))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_window() -> Iterator[None]:
+    """Depth of a pixel alone, so that limits are exact."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_WINDOW_PX", 0)
+        yield
 
 
 def plane_depth(camera: Camera) -> NDArray[np.float32]:
@@ -72,7 +80,7 @@ def test_the_centre_of_the_first_pixel_is_half() -> None:
     np.testing.assert_allclose(points[:, 2], [4.9, 4.95, 5.0], rtol=1e-6)
 
 
-def test_an_edge_has_no_depth() -> None:
+def test_an_edge_has_no_depth(monkeypatch: pytest.MonkeyPatch) -> None:
     depth = np.full((100, 100), 2.0, np.float32)
     depth[:, 50:] = 4.0
     camera = Camera("PINHOLE", 100, 100, (100.0, 100.0, 50.0, 50.0))
@@ -80,8 +88,8 @@ def test_an_edge_has_no_depth() -> None:
     points, valid = lift_keypoints(keypoints, depth, camera, camera, IDENTITY)
     assert valid.tolist() == [True, False, True]
     assert np.isnan(points[1]).all()
-    loose = LiftingOptions(max_jump=1.5)
-    assert lift_keypoints(keypoints, depth, camera, camera, IDENTITY, loose)[1].all()
+    monkeypatch.setattr(module, "MAX_DEPTH_JUMP", 1.5)
+    assert lift_keypoints(keypoints, depth, camera, camera, IDENTITY)[1].all()
 
 
 def test_missing_depth_falls_back_to_the_nearest_that_is_there() -> None:
@@ -122,29 +130,29 @@ def test_the_offset_between_the_cameras_counts() -> None:
     assert not contradicted_by_depth(point, depth, SMALL, ASIDE, EXACT)[0].any()
 
 
-def test_near_an_edge_either_surface_may_be_meant() -> None:
+def test_near_an_edge_either_surface_may_be_meant(monkeypatch: pytest.MonkeyPatch) -> None:
     depth = np.full((48, 64), 2.0, np.float32)
     depth[:, 32:] = 1.0
-    options = EXACT.model_copy(update={"window_px": 2})
+    monkeypatch.setattr(module, "_WINDOW_PX", 2)
     # pixel columns 28 to 35: one metre away is right from column 30 on, two up to 33
     near = np.column_stack([(np.arange(28, 36) + 0.5 - 32.0) / 60.0, np.zeros(8), np.ones(8)])
     wrong = {1.0: [True] * 2 + [False] * 6, 2.0: [False] * 6 + [True] * 2}
     for metres, expected in (wrong | {2.5: [True] * 8}).items():  # behind both there is nothing
-        found, checked = contradicted_by_depth(near * metres, depth, SMALL, IDENTITY, options)
+        found, checked = contradicted_by_depth(near * metres, depth, SMALL, IDENTITY, EXACT)
         assert checked.all() and found.tolist() == expected
 
 
 @pytest.mark.parametrize("missing", [0.0, -1.0, np.nan, np.inf])
-def test_missing_depth_says_nothing(missing: float) -> None:
+def test_missing_depth_says_nothing(missing: float, monkeypatch: pytest.MonkeyPatch) -> None:
     depth = np.full((48, 64), 2.0, np.float32)
     depth[20:28, 28:36] = missing
     wrong = np.array([[0.0, 0.0, 5.0]])
-    options = EXACT.model_copy(update={"window_px": 1})
+    monkeypatch.setattr(module, "_WINDOW_PX", 1)
     for point in (wrong, wrong + [0.3, 0.0, 0.0]):  # in the hole, and one pixel beside it
-        for judged in contradicted_by_depth(point, depth, SMALL, IDENTITY, options):
+        for judged in contradicted_by_depth(point, depth, SMALL, IDENTITY, EXACT):
             assert not judged.any()
     far_from_it = wrong + [1.0, 0.0, 0.0]
-    assert contradicted_by_depth(far_from_it, depth, SMALL, IDENTITY, options)[0].all()
+    assert contradicted_by_depth(far_from_it, depth, SMALL, IDENTITY, EXACT)[0].all()
     # neither is judged what is outside or behind
     points = np.array([[0.0, 0.0, -2.0], [10.0, 0.0, 2.0], [0.0, -10.0, 2.0], [0.0, 0.0, 0.0]])
     for judged in contradicted_by_depth(points, depth, SMALL, IDENTITY, EXACT):
@@ -154,12 +162,11 @@ def test_missing_depth_says_nothing(missing: float) -> None:
 def test_an_uncertain_point_may_be_farther_off() -> None:
     depth = np.full((48, 64), 2.0, np.float32)
     points = np.repeat([[0.0, 0.0, 2.5]], 4, axis=0)
-    options = EXACT.model_copy(update={"keypoint_noise_px": 2.0})
     # 0.5 off: 3 sigmas of hypot(0.01, 2 * deviation)
     least = np.sqrt((0.5 / 3) ** 2 - 0.01**2) / 2.0
     deviations = np.array([0.0, np.nan, 0.999 * least, 1.001 * least])
     contradicted, _ = contradicted_by_depth(
-        points, depth, SMALL, IDENTITY, options, deviations=deviations
+        points, depth, SMALL, IDENTITY, EXACT, deviations=deviations
     )
     assert contradicted.tolist() == [True, True, True, False]
 

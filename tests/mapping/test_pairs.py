@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.geometry.cameras import bearing_rays, project
+from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.mapping import pairs as module
 from megloc_kapture.mapping.pairs import (
     PairsByCovisibilityOptions,
@@ -22,7 +22,6 @@ from megloc_kapture.mapping.pairs import (
     PairsBySequenceOptions,
     each_once,
     exhaustive_pairs,
-    frustum_overlap,
     pairs_by_covisibility,
     pairs_by_poses,
     pairs_by_sequence,
@@ -79,8 +78,7 @@ def by_all_distances(
         for j in range(len(cameras)):
             distance = float(np.linalg.norm(centers[i] - centers[j]))
             angle = np.degrees(np.arccos(np.clip(axes[i] @ axes[j], -1, 1)))
-            near = options.max_distance is None or distance <= options.max_distance
-            if i != j and near and angle <= options.max_angle_deg:
+            if i != j and angle <= options.max_angle_deg:
                 candidates.append((distance, j))
         for _, j in sorted(candidates)[: options.num_neighbours]:
             found.add((min(i, j), max(i, j)))
@@ -91,7 +89,6 @@ def by_all_distances(
     st.integers(0, 60),
     st.integers(0, 2**32 - 1),
     st.integers(1, 8),
-    st.sampled_from([None, 5.0, 20.0]),
     st.sampled_from([15.0, 60.0, 180.0]),
     st.integers(1, 100),
 )
@@ -100,14 +97,11 @@ def test_equal_to_all_pairs(
     count: int,
     seed: int,
     num_neighbours: int,
-    max_distance: float | None,
     max_angle_deg: float,
     block: int,
 ) -> None:
     cameras = random_cameras(count, seed)
-    options = PairsByPosesOptions(
-        num_neighbours=num_neighbours, max_distance=max_distance, max_angle_deg=max_angle_deg
-    )
+    options = PairsByPosesOptions(num_neighbours=num_neighbours, max_angle_deg=max_angle_deg)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "_BLOCK_ELEMENTS", block)
         found = pairs_by_poses(cameras, options)
@@ -128,11 +122,9 @@ def test_an_angle_of_180_degrees_is_no_bound() -> None:
     assert min(cosines) < -1.0
 
 
-def test_a_distance_of_exactly_the_maximum_is_near_and_many_may_stand_at_one_place() -> None:
-    cameras = [camera_at(np.array([10.0 * k, 0, 0]), Rotation.identity()) for k in range(4)]
-    found = pairs_by_poses(cameras, PairsByPosesOptions(max_distance=10.0))
-    assert found.tolist() == [[0, 1], [1, 2], [2, 3]]
-    found = pairs_by_poses(120 * cameras[:1], PairsByPosesOptions(num_neighbours=3))
+def test_many_may_stand_at_one_place() -> None:
+    cameras = 120 * [camera_at(np.zeros(3), Rotation.identity())]
+    found = pairs_by_poses(cameras, PairsByPosesOptions(num_neighbours=3))
     assert (found[:, 0] < found[:, 1]).all() and len(found) <= 120 * 3
     assert np.bincount(found.ravel(), minlength=120).min() >= 3
 
@@ -160,7 +152,7 @@ def test_an_image_searches_so_far_and_no_further(monkeypatch: pytest.MonkeyPatch
 
 
 def by_sets(
-    num_images: int, observations: Sequence[tuple[int, int]], options: PairsByCovisibilityOptions
+    num_images: int, observations: Sequence[tuple[int, int]], top_k: int, min_shared: int
 ) -> list[list[int]]:
     """``observations`` are points and images."""
     seen: list[set[int]] = [set() for _ in range(num_images)]
@@ -170,8 +162,8 @@ def by_sets(
     for image in range(num_images):
         shared = [(-len(seen[image] & seen[other]), other) for other in range(num_images)]
         shared.remove((-len(seen[image]), image))
-        for count, other in sorted(shared)[: options.top_k]:
-            if -count >= options.min_shared_points:
+        for count, other in sorted(shared)[:top_k]:
+            if -count >= min_shared:
                 found.add((min(image, other), max(image, other)))
     return [list(pair) for pair in sorted(found)]
 
@@ -193,17 +185,19 @@ def test_pairs_by_covisibility_equal_the_sets(
     """Observations in any order, some twice; images without any; ties."""
     observations = [(point, image) for point, image in observations if image < num_images]
     arrays = np.array(observations, dtype=np.int64).reshape(-1, 2)
-    options = PairsByCovisibilityOptions(top_k=top_k, min_shared_points=min_shared_points)
+    options = PairsByCovisibilityOptions(top_k=top_k)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "_IMAGES_AT_ONCE", chunk)
+        patch.setattr(module, "_MIN_SHARED_POINTS", min_shared_points)
         found = pairs_by_covisibility(num_images, arrays[:, 0], arrays[:, 1], options)
     assert found.dtype == np.int64 and found.shape[1] == 2
-    assert found.tolist() == by_sets(num_images, observations, options)
+    assert found.tolist() == by_sets(num_images, observations, top_k, min_shared_points)
 
 
-def test_a_point_that_every_image_sees_is_not_squared() -> None:
+def test_a_point_that_every_image_sees_is_not_squared(monkeypatch: pytest.MonkeyPatch) -> None:
     """The pairs of 20,000 images would be 200 million for each of its points."""
-    options = PairsByCovisibilityOptions(top_k=3, min_shared_points=2)
+    monkeypatch.setattr(module, "_MIN_SHARED_POINTS", 2)
+    options = PairsByCovisibilityOptions(top_k=3)
     images = np.tile(np.arange(20_000), 2)
     found = pairs_by_covisibility(20_000, np.repeat([0, 1], 20_000), images, options)
     # everybody shares as much: the first within reach
@@ -214,7 +208,8 @@ def test_a_point_that_every_image_sees_is_not_squared() -> None:
 
 def test_in_a_long_track_an_image_counts_those_near_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_TRACK_WINDOW", 3)
-    options = PairsByCovisibilityOptions(top_k=100, min_shared_points=1)
+    monkeypatch.setattr(module, "_MIN_SHARED_POINTS", 1)
+    options = PairsByCovisibilityOptions(top_k=100)
     # near in the track, not in the numbers of the images
     images = 10 * np.arange(9)
     found = pairs_by_covisibility(100, np.zeros(9, dtype=int), images, options)
@@ -261,48 +256,6 @@ CAMERAS = [
     Camera("OPENCV", 640, 480, (500.0, 510.0, 320.0, 240.0, -0.1, 0.03, 0.002, -0.003)),
     Camera("OPENCV_FISHEYE", 640, 640, (300.0, 300.0, 320.0, 320.0, 0.01, 0.0, 0.0, 0.0)),
 ]
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(1, 100))
-def test_equal_to_projecting_every_point(seed: int, chunk: int) -> None:
-    rng = np.random.default_rng(seed)
-    count = 7
-    cameras = [CAMERAS[k % 3] for k in range(count)]
-    turns = Rotation.from_rotvec(rng.uniform(-0.6, 0.6, (count, 3)))
-    poses = [RigidTransform.from_matrix(turn.as_matrix(), rng.uniform(-2, 2, 3)) for turn in turns]
-    xyz = rng.uniform((-6, -4, -2), (6, 4, 12), (80, 3))
-    # repeated observations count once, and the last image has none
-    points, images = rng.integers(0, 80, 150), rng.integers(0, count - 1, 150)
-    seen = [set(points[images == image].tolist()) for image in range(count)]
-    pairs = exhaustive_pairs(count)
-
-    def share(image: int, other: int) -> float:
-        pixels = project(cameras[other], poses[other], xyz[sorted(seen[image])])
-        size = cameras[other].width, cameras[other].height
-        with np.errstate(invalid="ignore"):
-            return float(((pixels >= 0) & (pixels < size)).all(axis=1).mean())
-
-    expected = [
-        max((share(i, j) for i, j in ((a, b), (b, a)) if seen[i]), default=np.nan)
-        for a, b in pairs.tolist()
-    ]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "_PAIRS_AT_ONCE", chunk)
-        found = frustum_overlap(pairs, cameras, poses, xyz, points, images)
-    np.testing.assert_array_equal(found, expected)
-
-
-def test_where_the_distortion_turns_back_nothing_is_seen() -> None:
-    """Barrel distortion brings what is far outside back into the image, by its formula."""
-    strong = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
-    xyz = np.array([[0.0, 0.0, 5.0], [8.5, 0.0, 5.0]])
-    level = RigidTransform.identity()
-    pixels = project(strong, level, xyz)
-    assert (pixels >= 0).all() and (pixels < (640, 480)).all()
-    found = frustum_overlap(
-        np.array([[0, 1]]), [strong] * 2, [level] * 2, xyz, np.array([0, 1]), np.array([0, 0])
-    )
-    assert found.tolist() == [0.5]
 
 
 @given(st.integers(0, 2**32 - 1))

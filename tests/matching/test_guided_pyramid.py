@@ -75,7 +75,6 @@ def test_no_variant_is_larger_than_the_bound(side: int, expected: list[float]) -
         ("rotations_deg", [(45,), ()]),
         ("mode", ["some"]),
         ("min_matches", [0]),
-        ("max_side_px", [0]),
     ],
 )
 def test_wrong_options_are_refused(name: str, values: list[Any]) -> None:

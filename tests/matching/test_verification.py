@@ -201,8 +201,7 @@ def test_too_few_good_matches_are_none() -> None:
     in_b[10:] += (0.0, 60.0)
     matches = (*seen(PINHOLE, in_a), *seen(PINHOLE, in_b))
     for min_matches, expected in ((10, 10), (11, 0)):
-        options = KnownPoseOptions(min_matches=min_matches)
-        good = verify_with_poses(*matches, B_FROM_A, options)
+        good = verify_with_poses(*matches, B_FROM_A, min_matches=min_matches)
         assert good.sum() == expected
     none = plain(np.zeros((0, 3)), 515.0)
     assert verify_with_poses(*none, *none, B_FROM_A).shape == (0,)
@@ -250,8 +249,8 @@ def test_two_views_keep_the_inliers_among_as_many_outliers(camera: Camera, seed:
     assert good[~outlier].mean() > 0.95
     # an outlier passes where it falls on its epipolar line: a band of 8 px in 480, with cheirality
     assert good[outlier].mean() < 0.06
-    options = TwoViewOptions(min_matches=30)  # nothing in common
-    assert not verify_two_view(in_a[:60], camera, in_b[60:120], PINHOLE, options).any()
+    # nothing in common
+    assert not verify_two_view(in_a[:60], camera, in_b[60:120], PINHOLE).any()
 
 
 def test_two_views_of_a_plane() -> None:
@@ -277,7 +276,7 @@ def test_two_views_leave_out_pixels_whose_distortion_cannot_be_undone() -> None:
 
 
 CAMERA = Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
-OPTIONS = TwoViewOptions(min_matches=5, max_iterations=5000)  # of matches in no order
+OPTIONS = TwoViewOptions(max_iterations=5000)  # of matches in no order
 
 
 def verified(first: Array, second: Array) -> tuple[Array, Camera, Array, Camera, int]:

@@ -18,7 +18,7 @@ from megloc_kapture.mvs.sweep import (
     refine,
     stereo_image,
 )
-from megloc_kapture.mvs.views import AgreementOptions, agreeing_views, confirmed, stereo_view
+from megloc_kapture.mvs.views import Agreement, agreeing_views, confirmed, stereo_view
 from megloc_kapture.plugins import DepthEstimate, DepthEstimator, StereoView
 
 POSES = [pose_at((x, 0.1 * (-1) ** i, 0.0), 0.5 * i, 0.0) for i, x in enumerate((0, -0.5, 0.5))]
@@ -74,7 +74,7 @@ def test_depth_sigma_and_normals_of_two_walls(estimates: list[DepthEstimate]) ->
 def test_other_views_confirm_what_is_right(estimates: list[DepthEstimate]) -> None:
     views = [view(number) for number in range(3)]
     others = [(views[n], estimates[n].depth_m) for n in (1, 2)]
-    kept = confirmed(views[0], estimates[0], others, AgreementOptions())
+    kept = confirmed(views[0], estimates[0], others, Agreement())
     exact = truth(0)
     known = kept.depth_m > 0
     assert known.mean() > 0.8
@@ -83,7 +83,7 @@ def test_other_views_confirm_what_is_right(estimates: list[DepthEstimate]) -> No
     # a surface that is not there, in one view only
     wrong = estimates[0].depth_m.copy()
     wrong[60:90, 60:90] *= 0.9
-    assert not agreeing_views(views[0], wrong, others, AgreementOptions())[62:88, 62:88].any()
+    assert not agreeing_views(views[0], wrong, others, Agreement())[62:88, 62:88].any()
 
 
 def test_textureless_and_masked_pixels_are_unknown() -> None:

@@ -29,6 +29,7 @@ from megloc_kapture.io.kapture import KaptureFolder, read_point_covariances, wri
 from megloc_kapture.io.tables import read_depth_rows
 from megloc_kapture.localization.map_index import TypedMatches
 from megloc_kapture.mapping.uncertainty import point_deviations
+from megloc_kapture.mvs.views import Agreement
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.densifying import DensifyOptions, densify_map, fitted_to_poses
 from megloc_kapture.stages.scene import depth_records, read_depth
@@ -38,7 +39,7 @@ from megloc_kapture.stages.work import Work
 from megloc_kapture.values import RigidTransform
 
 FAST = PluginChoice(name="sweep", options={"passes": 1, "max_planes": 64})
-OPTIONS = DensifyOptions(mode="points", max_size_px=200, num_sources=2, estimator=FAST)
+OPTIONS = DensifyOptions(mode="points", max_size_px=200, estimator=FAST)
 
 
 @pytest.fixture(scope="module")
@@ -103,8 +104,9 @@ def test_depth_is_as_sure_and_as_fine_as_the_poses(
     world: Any, densified: KaptureFolder, tmp_path: Path
 ) -> None:
     options = OPTIONS.model_copy(update={"mode": "depth", "max_size_px": 400})
-    fitted, error_px = fitted_to_poses(world.map(), options)
-    assert fitted == options and error_px < 0.2  # its poses are exact
+    exact = fitted_to_poses(world.map(), 400)
+    assert (exact.max_size_px, exact.num_sources, exact.agreement) == (400, 4, Agreement())
+    assert exact.error_px < 0.2
     doubtful = tmp_path / "doubtful"
     shutil.copytree(world.map().root, doubtful, symlinks=True)
     data = world.map().read()
@@ -117,7 +119,7 @@ def test_depth_is_as_sure_and_as_fine_as_the_poses(
         data.trajectories[key] = turned
     write_sensors(doubtful, data)
     source = KaptureFolder(doubtful, features_dirs=[world.features_dir])
-    fitted, error_px = fitted_to_poses(source, options)
+    fitted = fitted_to_poses(source, 400)
     # the median distance between observations and points that the turned cameras see elsewhere
     distances, seen = [], source.observations()["rootsift"]
     for row, image in enumerate(seen.image_names):
@@ -129,10 +131,9 @@ def test_depth_is_as_sure_and_as_fine_as_the_poses(
     median = np.median(np.concatenate(distances))
     assert median > 1
     assert fitted.max_size_px == pytest.approx(400 * 0.5 / np.sqrt(median**2 - 0.09), abs=2)
-    assert error_px == pytest.approx(0.5, abs=0.01)
-    assert fitted.num_sources == round(2 * 400 / fitted.max_size_px)
+    assert fitted.error_px == pytest.approx(0.5, abs=0.01)
+    assert fitted.num_sources == round(4 * 400 / fitted.max_size_px)
     assert fitted.agreement.max_error_px == pytest.approx(2.5, abs=0.05)
-    assert fitted_to_poses(source, fitted)[0] == fitted
     densify_map(source, tmp_path / "out", options)
     found = KaptureFolder(tmp_path / "out")
     for image, record in depth_records(found.read()).items():
@@ -171,7 +172,7 @@ def test_the_same_bytes_whatever_the_executor(
     assert folder_bytes(tmp_path / "again") == folder_bytes(densified.root)
     clouds = []
     for number, work in enumerate((Work(), Work(two_processes))):
-        count = fuse_depth(densified, tmp_path / f"{number}.ply", OPTIONS.agreement, work=work)
+        count = fuse_depth(densified, tmp_path / f"{number}.ply", Agreement(), work=work)
         clouds.append((tmp_path / f"{number}.ply").read_bytes())
         filled = sum(row.fill for row in read_depth_rows(densified.root / DEPTH_FILE)) * 200 * 150
         assert 0.2 * filled < count < 0.95 * filled  # surfaces seen twice are in it once
@@ -215,7 +216,7 @@ def test_what_cannot_be_densified_is_refused_with_its_name(
     with pytest.raises(DataError, match="records_data/mvs"):
         densify_map(densified, tmp_path / "b", OPTIONS)
     with pytest.raises(DataError, match="no densified map"):
-        fuse_depth(world.map(), tmp_path / "c.ply", OPTIONS.agreement)
+        fuse_depth(world.map(), tmp_path / "c.ply", Agreement())
 
 
 def test_an_image_without_a_file_has_a_reason(world: Any, tmp_path: Path) -> None:

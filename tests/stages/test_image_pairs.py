@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.poses import movement
 from megloc_kapture.io.dataset_tables import ImageGroup
 from megloc_kapture.io.kapture import (
@@ -26,6 +25,7 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.io.tables import PairCount, match_counts_path, write_match_counts
+from megloc_kapture.mapping import pairs as pairs_module
 from megloc_kapture.stages.candidates import QueryPairsOptions, Restrictions, Retrieval, vectors_of
 from megloc_kapture.stages.image_pairs import (
     MappingPairsOptions,
@@ -125,21 +125,24 @@ def shared_points(folder: KaptureFolder) -> dict[tuple[str, str], int]:
     return {(a, b): len(seen[a] & seen[b]) for a, b in combinations(sorted(seen), 2)}
 
 
-def test_map_pairs_by_covisibility(world: Any) -> None:
+def test_map_pairs_by_covisibility(world: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     shared = shared_points(world.map())
     least = sorted(shared.values())[5]
-    options = {"by": ("covisibility",), "covisibility": {"min_shared_points": least}}
+    monkeypatch.setattr(pairs_module, "_MIN_SHARED_POINTS", least)
+    options = {"by": ("covisibility",)}
     expected = sorted(pair for pair, count in shared.items() if count >= least)
     assert 0 < len(expected) < 10
     found = paired(world.map(), **options)
     assert names(found) == expected and {pair.score for pair in found} == {1.0}
     # images of one kapture, points of another
     assert paired(world.mapping(), world.map(), **options) == found
-    with pytest.raises(DataError, match="mapping: co-visibility and overlap need a map's points"):
+    with pytest.raises(DataError, match="mapping: co-visibility needs a map's points"):
         paired(world.mapping(), **options)
 
 
-def test_points_of_all_types_count(world: Any, tmp_path: Path) -> None:
+def test_points_of_all_types_count(
+    world: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Two images that share points of two types share the sum."""
     seen, points = world.map().observations()["rootsift"], world.map().points3d()
     again = replace(seen, keypoints_type="other", point_ids=seen.point_ids + len(points))
@@ -148,37 +151,14 @@ def test_points_of_all_types_count(world: Any, tmp_path: Path) -> None:
     write_observations(tmp_path, {"rootsift": seen, "other": again})
     shared = shared_points(world.map())
     most = max(shared.values())
-    covisibility = {"min_shared_points": 2 * most}
-    found = paired(KaptureFolder(tmp_path), by=("covisibility",), covisibility=covisibility)
+    monkeypatch.setattr(pairs_module, "_MIN_SHARED_POINTS", 2 * most)
+    found = paired(KaptureFolder(tmp_path), by=("covisibility",))
     assert names(found) == sorted(pair for pair, count in shared.items() if count == most)
     # a map of other images
     strangers = replace(seen, image_names=tuple(f"{k}.jpg" for k in range(5)))
     write_observations(tmp_path, {"rootsift": strangers})
     with pytest.raises(DataError, match="no image to be paired observes its points"):
         paired(world.mapping(), KaptureFolder(tmp_path), by=("covisibility",))
-
-
-def test_near_images_that_see_other_things_are_no_pairs(world: Any) -> None:
-    folder = world.map()
-    assert len(paired(folder, by=("poses",))) == 10
-    shares = {}
-    xyz = folder.points3d()[:, :3]
-    observations = folder.observations()["rootsift"]
-    for a, b in combinations(observations.image_names, 2):
-        of_pair = []
-        for image, other in ((a, b), (b, a)):
-            own = observations.image_ids == observations.image_names.index(image)
-            points = xyz[np.unique(observations.point_ids[own])]
-            pixels = project(folder.read().camera_of(other), world.map_poses[other], points)
-            of_pair.append(((pixels >= 0) & (pixels < (400, 300))).all(axis=1).mean())
-        shares[a, b] = max(of_pair)
-    least = sorted(shares.values())[4]
-    assert least > min(shares.values())
-    expected = sorted(pair for pair, share in shares.items() if share >= least)
-    by_overlap = {"by": ("poses",), "poses": {"min_overlap": least}}
-    assert names(paired(world.mapping(), KaptureFolder(folder.root), **by_overlap)) == expected
-    with pytest.raises(DataError, match="need a map's points"):
-        paired(world.mapping(), **by_overlap)
 
 
 def test_map_pairs_by_sequence_are_within_a_camera(world: Any, tmp_path: Path) -> None:
@@ -214,7 +194,7 @@ FRAMES = Restrictions(
 def test_frames_never_mix(world: Any, folders: Folders, by: Any) -> None:
     found = pair_map_images(
         folders[0],
-        MappingPairsOptions(by=by, covisibility={"top_k": 1, "min_shared_points": 1}),
+        MappingPairsOptions(by=by, covisibility={"top_k": 1}),
         retrieval=BY_TOY,
         restrictions=FRAMES,
         covisible=world.map(),

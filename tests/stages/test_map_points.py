@@ -15,7 +15,6 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.geometry.cameras import px_from_cam
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
-from megloc_kapture.mapping.depth import LiftingOptions
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.map_points import lift_map
 from megloc_kapture.stages.scene import depth_records, read_depth
@@ -34,7 +33,7 @@ def lifted(tmp_path_factory: pytest.TempPathFactory) -> tuple[KaptureFolder, Kap
     SyntheticKapture(options).write(root)
     mapping = KaptureFolder(root / "mapping", features_dirs=[root])
     extract_local_features([mapping], RootSift(RootSiftOptions(max_keypoints=300)), root)
-    counts = lift_map(mapping, ["rootsift"], root / "map", LiftingOptions())
+    counts = lift_map(mapping, ["rootsift"], root / "map")
     assert counts["images_with_depth"] == counts["images"] == 9
     return mapping, KaptureFolder(root / "map")
 
@@ -96,4 +95,4 @@ def test_depth_is_that_of_the_sensor_of_the_moment_on_the_rig(lifted: Any, besid
 def test_a_map_without_depth_is_refused(lifted: Any, tmp_path: Path) -> None:
     write_sensors(tmp_path, replace(lifted[0].read(), records_depth={}))
     with pytest.raises(DataError, match="no mapping image has a pose and a depth map"):
-        lift_map(KaptureFolder(tmp_path), ["rootsift"], tmp_path / "map", LiftingOptions())
+        lift_map(KaptureFolder(tmp_path), ["rootsift"], tmp_path / "map")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import os
-from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,7 +36,6 @@ from megloc_kapture.stages.preprocessing import (
     preprocess_images,
     read_report,
 )
-from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, RigidTransform
 
 Image = NDArray[np.uint8]
@@ -193,7 +191,7 @@ def test_how_images_are_stored(small_kapture: Any, tmp_path: Path) -> None:
     folder = small_kapture({"a.jpg": picture, "gray.jpg": grey, "b.png": grey, "gray.png": grey})
     # what the JPEG holds
     write_image(folder.image_path("b.png"), read_image_rgb(folder.image_path("a.jpg")))
-    cropped, _ = run(folder, tmp_path / "cropped", max_size_px=240, multiple_of=16)
+    cropped, _ = run(folder, tmp_path / "cropped", max_size_px=240)
     found, original = (read_image_rgb(where.image_path("b.png")) for where in (cropped, folder))
     np.testing.assert_array_equal(found, original[:176])
     new, _ = run(folder, tmp_path / "new", max_size_px=200)
@@ -331,23 +329,6 @@ def test_a_bonnet_is_found_with_the_maps_images(tmp_path: Path) -> None:
     assert report.images_masked == 0
     assert not (new.root / "sensors" / "masks").exists()
     assert len(report.remarks) == 1 and "nothing stays the same" in report.remarks[0]
-
-
-def test_what_lies_outside_the_original_is_masked_whoever_does_it(
-    street: KaptureFolder, tmp_path: Path, two_processes: Executor, folder_bytes: Any
-) -> None:
-    options: dict[str, Any] = {"max_size_px": 160, "undistort": True, "blank_pixels": 1.0}
-    new, report = run(street, tmp_path / "a", **options)
-    mask = mask_of(new, "side/0.jpg")
-    assert mask is not None and 0.5 < mask.mean() < 0.99
-    image = read_image_rgb(new.image_path("side/0.jpg"))
-    # JPEG rings beside an edge
-    away = cv2.erode((~mask).astype(np.uint8), np.ones((17, 17)), borderValue=1) == 1
-    assert (image[away] < 10).all()
-    assert report.masked["unseen"] == pytest.approx((1 - mask.mean()) / 2)
-    run(street, tmp_path / "b", **options, work=Work(two_processes))
-    first, second = folder_bytes(tmp_path / "a"), folder_bytes(tmp_path / "b")
-    assert first == second and "sensors/masks/side/2.jpg.png" in first
 
 
 def test_broken_inputs_are_named(street: KaptureFolder, tmp_path: Path) -> None:

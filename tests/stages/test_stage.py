@@ -12,7 +12,7 @@ from megloc_kapture.stages.stage import PipelineStage, StageWork
 
 class Declares(PipelineStage):
     name = "declares"
-    uses = ("local_features.name", "mask_margin_px", "triangulation.min_angle_deg")
+    uses = ("local_features.name", "mask_margin_px", "triangulation.two_view_tracks")
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         return {}
@@ -25,7 +25,7 @@ def test_settings_are_the_declared_options_and_no_more() -> None:
     assert Declares(options).settings() == {
         "local_features": [{"name": "rootsift"}, {"name": "sift"}],
         "mask_margin_px": 4.0,
-        "triangulation": {"min_angle_deg": options.triangulation.min_angle_deg},
+        "triangulation": {"two_view_tracks": False},
     }
 
 

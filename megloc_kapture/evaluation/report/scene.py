@@ -300,7 +300,7 @@ def _point_frames(
 def _dense_points(
     mapping: KaptureFolder | None, notes: list[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8], list[str]]:
-    from megloc_kapture.mvs.views import AgreementOptions  # loads more than others wait for
+    from megloc_kapture.mvs.views import Agreement  # loads more than others wait for
     from megloc_kapture.stages.stereo_depth import fused_cloud, stereo_images
 
     nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), list[str]()
@@ -315,7 +315,7 @@ def _dense_points(
     with contextlib.suppress(DataError):
         chosen = {name: images[name] for name in names}
         # most surfaces are seen by several images, some by none
-        cloud = fused_cloud(mapping, chosen, AgreementOptions(), max_points=8 * MAX_DENSE)
+        cloud = fused_cloud(mapping, chosen, Agreement(), max_points=8 * MAX_DENSE)
         kept = spread(len(cloud.xyz), MAX_DENSE) if len(cloud.xyz) else np.zeros(0, np.int64)
         colors = np.asarray(np.round(cloud.colours[kept]), np.uint8)
         return cloud.xyz[kept], colors, [names[int(row)] for row in cloud.image_ids[kept]]
