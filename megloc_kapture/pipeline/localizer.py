@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.localization.cluster_poses import Clock, interleave
-from megloc_kapture.localization.map_index import QueryView, TypedMatches
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
+from megloc_kapture.pipeline.live_source import LiveSource, MapMatching
 from megloc_kapture.pipeline.local_types import local_types_of
 from megloc_kapture.pipeline.map_retrieval import MapRetrieval
 from megloc_kapture.pipeline.presets import options_of_preset
@@ -32,12 +31,11 @@ from megloc_kapture.pipeline.queries import (
 )
 from megloc_kapture.pipeline.query_folders import KaptureQueries
 from megloc_kapture.stages.devices import Precision
-from megloc_kapture.stages.image_pairs import counted, rerank
 from megloc_kapture.stages.localized_folder import unreadable_image
-from megloc_kapture.stages.matches import FeatureCache, Features, VerifiedMatches
+from megloc_kapture.stages.matches import FeatureCache
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import MapRefiners
-from megloc_kapture.stages.query_poses import in_turn, localize_unit
+from megloc_kapture.stages.query_poses import localize_query
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import ordered_map
 from megloc_kapture.values import Camera, Device, Failure, Pose, RigidTransform
@@ -81,12 +79,10 @@ class Localizer:
             kapture_map.folder, kapture_map.restrictions, self.options.pose_refinement
         )
         self.types = local_types_of(kapture_map, self.options, FeatureCache())
-        names = [one.name for one in self.types]
-        # a foreign map may lack the types of the preset
-        self._counted = self.options.reranking.types_named(names) or names
         for local in self.types:
             local.prepare()
-        self._retrieval = MapRetrieval(kapture_map, self.options, self.types, self._preprocessor)
+        retrieval = MapRetrieval(kapture_map, self.options, self.types, self._preprocessor)
+        self.matching = MapMatching(kapture_map, self.options, self.types, retrieval)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _made_again, (self._key, *self.map.__reduce__(), self.options.model_dump_json())
@@ -185,10 +181,10 @@ class Localizer:
         with single_threaded():
             images = self._images(unit)
             scene = self._scene(images)
-            results, cameras = self._solve(unit, images, scene)
+            results, sources = self._solve(unit, images, scene)
             found = []
-            for (query, _), camera, result in zip(unit, cameras, results, strict=True):
-                image = camera.image
+            for (query, _), source, result in zip(unit, sources, results, strict=True):
+                image = source.image
                 if isinstance(result, Pose):
                     intrinsics = result.camera or image.camera
                     result = self.refiners.refine(image.query.name, intrinsics, result, scene)
@@ -197,8 +193,8 @@ class Localizer:
                     replace(
                         result,
                         name=query.name,
-                        remarks=(*result.remarks, *camera.left_out),
-                        seconds={**camera.clock.seconds, **result.seconds},
+                        remarks=(*result.remarks, *source.remarks),
+                        seconds={**source.clock.seconds, **result.seconds},
                     )
                 )
             return found
@@ -210,38 +206,22 @@ class Localizer:
         scene: KaptureScene,
         *,
         as_rig: bool = False,
-    ) -> tuple[list[Pose | Failure], list[_Matching]]:
-        """Match and localize all cameras; return a result per camera, and the matches.
-
-        Only reranking and guided pyramids need matches with unused candidates.
-        """
-        cameras = [self._begin(image, at) for image, (_, at) in zip(images, unit, strict=True)]
-        whole = self.options.reranking.reranks() or self.options.matches_again()
-
-        def localize(count: int) -> list[Pose | Failure]:
-            views = []
-            for camera in cameras:
-                if not whole:
-                    self._match(camera, count)
-                views.append(camera.view.among(camera.candidates[:count]))
-            candidates = interleave([camera.candidates[:count] for camera in cameras])
-            return localize_unit(
-                views,
-                candidates,
-                [self.map.restrictions.frame(name) for name in candidates],
-                self.options.localization,
-                centers=self._centers,
-                ranker=self._ranker,
-                scene=scene,
-                as_rig=as_rig,
-            )
-
-        if whole:
-            for camera in cameras:
-                self._match(camera, len(camera.ranked))
-        lists = [camera.candidates if whole else camera.ranked for camera in cameras]
-        longest = max(map(len, lists), default=0)
-        return in_turn(localize, longest, self.options.localization), cameras
+    ) -> tuple[list[Pose | Failure], list[LiveSource]]:
+        """Return a result per camera, and the sources of their matches."""
+        sources = [
+            LiveSource(self.matching, image, cam_from_rig)
+            for image, (_, cam_from_rig) in zip(images, unit, strict=True)
+        ]
+        results = localize_query(
+            sources,
+            self.options.localization,
+            frame_of=self.map.restrictions.frame,
+            centers=self._centers,
+            ranker=self._ranker,
+            scene=scene,
+            as_rig=as_rig,
+        )
+        return results, sources
 
     def _images(self, unit: Sequence[tuple[Query, RigidTransform]]) -> list[QueryImage]:
         """Return the images of a unit under unique names, by which their pixels are looked up."""
@@ -260,101 +240,15 @@ class Localizer:
     def _centers(self) -> dict[str, NDArray[np.float64]]:
         return {image: pose.center() for image, pose in self.map.poses.items()}
 
-    def _begin(self, image: QueryImage, cam_from_rig: RigidTransform) -> _Matching:
-        clock = Clock()
-        features = [local.of_query(image) for local in self.types]
-        clock.lap("extraction")
-        ranked = self._candidates(image, features)
-        clock.lap("retrieval")
-        return _Matching(image, cam_from_rig, features, ranked, [[] for _ in self.types], clock)
-
-    def _match(self, camera: _Matching, count: int) -> None:
-        camera.clock.start()
-        features, ranked = camera.features, camera.ranked[:count]
-        for local, own, found in zip(self.types, features, camera.of_types, strict=True):
-            found += local.match(own, ranked[len(found) :])
-        kept = self._kept(camera.of_types)
-        typed, left_out = [], []
-        for local, own, found in zip(self.types, features, camera.of_types, strict=True):
-            pairs = {ranked[at]: found[at] for at in kept}
-            keypoints_px, named, remark = local.match_again(own, pairs, camera.image)
-            left_out += [remark] if remark else []
-            typed.append(TypedMatches(local.points.index, keypoints_px, named))
-        image = camera.image
-        camera.view = QueryView(image.query.name, image.camera, tuple(typed), camera.cam_from_rig)
-        camera.candidates = [ranked[at] for at in kept]
-        camera.left_out = left_out
-        camera.clock.lap("matching")
-
-    def _kept(self, of_types: Sequence[Sequence[VerifiedMatches]]) -> list[int]:
-        how = self.options.reranking
-        of_named = zip(self.types, of_types, strict=True)
-        counted_types = [own for local, own in of_named if local.name in self._counted]
-        return rerank([[counted(one, how.by) for one in own] for own in counted_types], how)[0]
-
-    def _candidates(self, image: QueryImage, features: Sequence[Features]) -> list[str]:
-        query = image.query
-        if query.candidates is not None:
-            return self._usable(query, query.candidates)
-        permitted = self._permitted(query)
-        options = self.options.query_pairs
-        if options.by == "exhaustive" or not permitted:
-            return permitted
-        all_taken = len(permitted) <= options.top_k
-        in_order = self.options.localization.sure_confidence is not None
-        if all_taken and not in_order and not self._retrieval.is_at_hand(query.global_features):
-            return permitted
-        return self._retrieval.rank(image, features, permitted)
-
     def ranked(self, query: Query) -> list[str]:
         """Return the most similar map images of a query, best first, with reranking if enabled."""
-        image = self._preprocessor.of(query)
-        features = [local.of_query(image) for local in self.types]
-        found = self._retrieval.rank(image, features, self._permitted(query))
-        if self.options.reranking.reranks():
-            matched = [one.match(own, found) for one, own in zip(self.types, features, strict=True)]
-            found = [found[at] for at in self._kept(matched)]
-        return found
-
-    def _permitted(self, query: Query) -> list[str]:
-        if query.prior is None:
-            return self.map.images
-        return sorted(self._usable(query, query.prior))
-
-    def _usable(self, query: Query, images: Sequence[str]) -> list[str]:
-        unknown = set(images) - self._known_images
-        if unknown:
-            raise DataError(
-                f"query {query.name} is to be matched with {min(unknown)}, which is no image of "
-                "the map",
-                path=self.map.folder.root,
-            )
-        return [image for image in dict.fromkeys(images) if image in self.map.poses]
-
-    @cached_property
-    def _known_images(self) -> frozenset[str]:
-        return frozenset(self.map.folder.read().image_names())
+        return self.matching.ranked(self._preprocessor.of(query))
 
     def describe_retrieval(self, global_types: Collection[str]) -> str:
         options = self.options.query_pairs
         if options.by == "exhaustive" or len(self.map.images) <= options.top_k:
             return f"all {len(self.map.images)} map images"
-        return self._retrieval.describe(global_types)
-
-
-@dataclass(eq=False)
-class _Matching:
-    """State of one camera; ``of_types`` holds matches by type with the first of ``ranked``."""
-
-    image: QueryImage
-    cam_from_rig: RigidTransform
-    features: list[Features]
-    ranked: list[str]
-    of_types: list[list[VerifiedMatches]]
-    clock: Clock
-    view: QueryView = field(init=False)
-    candidates: list[str] = field(init=False)
-    left_out: list[str] = field(init=False)
+        return self.matching.retrieval.describe(global_types)
 
 
 def _query_of(image: Path | str | NDArray[np.uint8], camera: Camera) -> Query:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -174,12 +175,71 @@ def in_turn(
     return solve(num_candidates)
 
 
+class QuerySource(Protocol):
+    """A camera of a query, whose matches are computed live or read from kapture folders."""
+
+    @property
+    def candidates(self) -> Sequence[str]:
+        """Map images, best first."""
+        ...
+
+    def view(self, count: int) -> QueryView:
+        """Return the matches with the first ``count`` candidates."""
+        ...
+
+
+def localize_query(
+    sources: Sequence[QuerySource],
+    options: LocalizationOptions,
+    *,
+    frame_of: Callable[[str], str],
+    centers: Mapping[str, NDArray[np.float64]],
+    ranker: PoseRanker,
+    scene: RankingScene,
+    as_rig: bool = False,
+) -> list[Pose | Failure]:
+    """Localize a query, or the cameras of a rig; return a result per camera.
+
+    ``megloc eval``, ``megloc localize``, ``Localizer`` and the HTTP service all call this function.
+    ``frame_of`` names the coordinate frame of a map image; see :func:`localize_unit`.
+    """
+
+    def solve(count: int) -> list[Pose | Failure]:
+        views = [source.view(count) for source in sources]
+        candidates = interleave([source.candidates[:count] for source in sources])
+        return localize_unit(
+            views,
+            candidates,
+            [frame_of(image) for image in candidates],
+            options,
+            centers=centers,
+            ranker=ranker,
+            scene=scene,
+            as_rig=as_rig,
+        )
+
+    return in_turn(solve, max((len(source.candidates) for source in sources), default=0), options)
+
+
+@dataclass(frozen=True)
+class StoredSource:
+    """Matches that were read from kapture folders."""
+
+    stored: QueryView
+    candidates: Sequence[str]
+
+    def view(self, count: int) -> QueryView:
+        return self.stored.among(self.candidates[:count])
+
+
 # a unit, the candidates of each image, and their coordinate frames
 _Job = tuple[Unit, Sequence[Sequence[str]], Mapping[str, str]]
 
 
 @dataclass(frozen=True)
-class _Localizer:
+class _StoredQueries:
+    """Localizes units from stored matches, in any process."""
+
     map: FolderSpec
     query: FolderSpec
     matches: FolderSpec
@@ -188,46 +248,42 @@ class _Localizer:
     ranker: PoseRanker
 
     def __call__(self, job: _Job) -> list[tuple[str, Pose | Failure]]:
-        unit, of_images, frame_of = job
+        unit, candidate_lists, frame_of = job
         started = time.perf_counter()
-        views = [self._read(*one, own) for one, own in zip(unit, of_images, strict=True)]
-        reading = (time.perf_counter() - started) / len(views)
         mapping, query = self.map.open(), self.query.open()
         centers = {
             image: pose.center()
-            for image in interleave(of_images)
+            for image in interleave(candidate_lists)
             if (pose := mapping.read().cam_from_world(image)) is not None
         }
-        own_candidates = [[image for image in own if image in centers] for own in of_images]
-        scene = KaptureScene(mapping, query)
-
-        def localize(count: int) -> list[Pose | Failure]:
-            first = [own[:count] for own in own_candidates]
-            candidates = interleave(first)
-            return localize_unit(
-                [view.among(own) for view, own in zip(views, first, strict=True)],
-                candidates,
-                [frame_of[image] for image in candidates],
-                self.options,
-                centers=centers,
-                ranker=self.ranker,
-                scene=scene,
-            )
-
-        results = in_turn(localize, max(map(len, own_candidates), default=0), self.options)
+        sources = [
+            StoredSource(self._read(*camera, images), [name for name in images if name in centers])
+            for camera, images in zip(unit, candidate_lists, strict=True)
+        ]
+        reading_s = (time.perf_counter() - started) / len(sources)
+        results = localize_query(
+            sources,
+            self.options,
+            frame_of=frame_of.__getitem__,
+            centers=centers,
+            ranker=self.ranker,
+            scene=KaptureScene(mapping, query),
+        )
         return [
-            (image, _for_writing(result, reading))
+            (image, _for_writing(result, reading_s))
             for (image, _), result in zip(unit, results, strict=True)
         ]
 
-    def _read(self, image: str, cam_from_rig: RigidTransform, own: Sequence[str]) -> QueryView:
+    def _read(self, image: str, cam_from_rig: RigidTransform, images: Sequence[str]) -> QueryView:
         query, matches = self.query.open(), self.matches.open()
         typed = []
         for local_type, folder in self.indices.items():
             reader = matches.matches(local_type)
-            found = [(o, *reader.read(image, o)) for o in own if (image, o) in reader]
-            keypoints = query.keypoints(local_type).read(image)
-            typed.append(TypedMatches(_opened(folder), keypoints, found))
+            pairs = [
+                (name, *reader.read(image, name)) for name in images if (image, name) in reader
+            ]
+            keypoints_px = query.keypoints(local_type).read(image)
+            typed.append(TypedMatches(_opened(folder), keypoints_px, pairs))
         return QueryView(image, query.read().camera_of(image), tuple(typed), cam_from_rig)
 
 
@@ -269,7 +325,7 @@ def localize_from_matches(
         jobs.append((unit, own, {one: restrictions.frame(one) for one in chain(*own)}))
     specs = FolderSpec(map_folder), FolderSpec(query), FolderSpec(matches)
     with shared_index(measured, scratch) as indices:
-        localizer = _Localizer(*specs, indices, options, ranker)
+        localizer = _StoredQueries(*specs, indices, options, ranker)
         for results in work.map(localizer, jobs, "localizing"):
             yield from results
 
