@@ -13,7 +13,8 @@ and matches to descriptors: then every stage after them has something to do.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+import importlib
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,12 +25,15 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
+from megloc_kapture.features.aliked import AlikedNet
 from megloc_kapture.features.aslfeat import AslFeatNet
+from megloc_kapture.features.r2d2 import R2D2Network
 from megloc_kapture.features.superpoint import SuperPointNet
 from megloc_kapture.io.weights import UNVERIFIED, registry
 from megloc_kapture.nets.delg import DelgNet
 from megloc_kapture.nets.global_descriptors import ApGemNet, VggNetVlad
 from megloc_kapture.nets.lpips import Lpips
+from megloc_kapture.nets.megaloc import MegaLocNet
 from megloc_kapture.nets.superglue import SuperGlueNet
 from megloc_kapture.preprocessing.deeplab import DeepLabV3Plus
 
@@ -57,10 +61,20 @@ class Sizes:
 OFFICIAL = Sizes()
 
 
-def write_random_weights(folder: Path, seed: int = 0, sizes: Sizes = OFFICIAL) -> dict[str, Path]:
-    """Write one file per network, and return them by the networks' names in the registry."""
+def write_random_weights(
+    folder: Path,
+    seed: int = 0,
+    sizes: Sizes = OFFICIAL,
+    names: Collection[str] = (),
+) -> dict[str, Path]:
+    """Write one file per network, and return them by the networks' names in the registry.
+
+    ``names`` replaces the networks of the preset ``megloc``; it may have those of the free networks
+    (``FREE_NETWORKS``).
+    """
     found = {}
-    for name, write in _WRITERS.items():
+    for name in names or _WRITERS:
+        write = _WRITERS.get(name) or _FREE_WRITERS[name]
         path = folder / _official_name(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         with torch.random.fork_rng(devices=[]), torch.no_grad():
@@ -191,6 +205,60 @@ def _deeplab(path: Path, _: Sizes) -> None:
     state = {"model_state": net.state_dict(), "cur_itrs": 30_000, "best_score": np.float64(0.7)}
     torch.save(state, path)
 
+
+def _aliked(path: Path, _: Sizes) -> None:
+    torch.save(_spread(AlikedNet((16, 32, 64, 128), positions=16)).state_dict(), path)
+
+
+def _r2d2(path: Path, _: Sizes) -> None:
+    net = _spread(R2D2Network())
+    net.sal.bias.fill_(1.0)  # else few pixels are repeatable and reliable enough
+    net.clf.bias.copy_(torch.tensor([-1.0, 1.0]))
+    state = {f"module.{key}": value for key, value in net.state_dict().items()}
+    torch.save({"net": "Quad_L2Net_ConfCFS()", "state_dict": state}, path)
+
+
+def _xfeat(path: Path, _: Sizes) -> None:
+    torch.save(_spread(_kornia("XFeat").net).state_dict(), path)
+
+
+def _disk(path: Path, _: Sizes) -> None:
+    torch.save({"extractor": _kornia("DISK").state_dict()}, path)
+
+
+def _lightglue(path: Path, _: Sizes) -> None:
+    net = _kornia("LightGlue", None, flash=False)
+    for layer in net.transformers:  # so that descriptors are not drowned
+        for block in (layer.self_attn, layer.cross_attn):
+            block.ffn[-1].weight.mul_(0.1)
+    for head in net.log_assignment:
+        turned = nn.init.orthogonal_(torch.empty(256, 256))
+        head.final_proj.weight.copy_((_SHARPNESS**0.5 * 4) * turned)
+        head.final_proj.bias.zero_()
+        head.matchability.bias.fill_(3.0)
+    state = {key: value for key, value in net.state_dict().items() if key != "confidence_thresholds"}
+    torch.save(state, path)
+
+
+def _kornia(name: str, *arguments: Any, **named: Any) -> Any:
+    return getattr(importlib.import_module("kornia.feature"), name)(*arguments, **named)
+
+
+def _megaloc(path: Path, _: Sizes) -> None:
+    with torch.device("meta"):
+        shapes = MegaLocNet().state_dict()
+    save_file({key: 0.02 * torch.randn(value.shape) for key, value in shapes.items()}, path)
+
+
+_FREE_WRITERS: dict[str, Callable[[Path, Sizes], None]] = {
+    "aliked-n16": _aliked,
+    "r2d2_WASF_N16": _r2d2,
+    "xfeat": _xfeat,
+    "disk": _disk,
+    "superpoint_lightglue": _lightglue,
+    "megaloc": _megaloc,
+}
+FREE_NETWORKS = tuple(_FREE_WRITERS)
 
 _WRITERS: dict[str, Callable[[Path, Sizes], None]] = {
     "superpoint_v1": _superpoint,

@@ -18,6 +18,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 COPIES = {"aten::copy_", "aten::_to_copy"}
+PRODUCTS = {f"aten::{name}" for name in ("convolution", "mm", "bmm", "addmm", "baddbmm")}
 SOFTMAX = {"aten::_softmax", "aten::_log_softmax"}
 HALVES = (torch.float16, torch.bfloat16)
 
@@ -43,7 +44,6 @@ class DeviceTensor(torch.Tensor):
 
     __array__ = numpy
 
-    # torch's own indexing asks for the guard of a device that a build for CPUs has not
     def __getitem__(self, index: Any) -> Any:
         _check("indexing", self._tensors(self, index))
         return DeviceTensor(self.numbers[tree_map(_numbers, index)], self.device)
@@ -58,8 +58,32 @@ class DeviceTensor(torch.Tensor):
         return [torch.as_tensor(x) for x in leaves if isinstance(x, torch.Tensor | np.ndarray)]
 
     @classmethod
+    def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        with torch._C.DisableTorchFunctionSubclass():
+            return _GUARDED.get(func, func)(*args, **kwargs or {})
+
+    @classmethod
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         return _run(func, args, kwargs or {})
+
+
+# torch's own ask for the guard of a device, which builds for CPUs lack; so does indexing
+_GUARDED: dict[Any, Any] = {
+    torch.nonzero: lambda x, as_tuple=False: _nonzero(x, as_tuple),
+    torch.Tensor.nonzero: lambda x, as_tuple=False: _nonzero(x, as_tuple),
+    torch.Tensor.__invert__: torch.bitwise_not,
+    torch.Tensor.__float__: lambda x: float(x.item()),
+    torch.Tensor.__int__: lambda x: int(x.item()),
+    torch.Tensor.__bool__: lambda x: bool(x.item()),
+    torch.Tensor.contiguous: lambda x, memory_format=torch.contiguous_format: DeviceTensor(
+        x.numbers.contiguous(memory_format=memory_format), x.device
+    ),
+}
+
+
+def _nonzero(x: torch.Tensor, as_tuple: bool) -> Any:
+    found = torch.ops.aten.nonzero(x)
+    return found.unbind(1) if as_tuple else found
 
 
 class _Mode(TorchDispatchMode):
@@ -71,10 +95,11 @@ class _Mode(TorchDispatchMode):
 
 def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     name, schema = func._schema.name, func._schema
-    tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
+    leaves = tree_leaves((args, kwargs))
+    tensors = [leaf for leaf in leaves if isinstance(leaf, torch.Tensor)]
     devices = _devices(tensors)
-    wanted = kwargs.get("device")
-    if not devices and (wanted is None or torch.device(wanted).type == "cpu"):
+    wanted = next((leaf for leaf in leaves if isinstance(leaf, torch.device)), None)
+    if not devices and (wanted is None or wanted.type == "cpu"):
         return func(*args, **kwargs)
     if devices and name not in COPIES:
         _check(name, tensors)
@@ -88,7 +113,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     ]
     if written:
         return (written[0] if len(written) == 1 else tuple(written)) if schema.returns else None
-    where = next(iter(devices)) if wanted is None else torch.device(wanted)
+    where = wanted or next(iter(devices))
     if where.type == "cpu":
         return result
     where = torch.device("cuda", where.index or 0)
@@ -108,19 +133,19 @@ def _check(name: str, tensors: list[torch.Tensor]) -> None:
 
 
 def _computed(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-    if kwargs.get("device") is not None:
-        kwargs = kwargs | {"device": torch.device("cpu"), "pin_memory": False}
+    if "pin_memory" in kwargs:
+        kwargs = kwargs | {"pin_memory": False}
     if func._schema.name in SOFTMAX and args[2]:  # half to float, which only a GPU does in one
         args = (args[0].float(), args[1], False)
-    try:
-        return func(*args, **kwargs)
-    except RuntimeError as error:
-        if "not implemented for 'Half'" not in str(error):
-            raise
+    halves = any(_float(leaf) is not leaf for leaf in tree_leaves((args, kwargs)))
+    if halves and func._schema.name in PRODUCTS:  # with sums in float32, as GPUs do
         return tree_map(_half, func(*tree_map(_float, args), **tree_map(_float, kwargs)))
+    return func(*args, **kwargs)
 
 
 def _numbers(value: Any) -> Any:
+    if isinstance(value, torch.device):
+        return torch.device("cpu")
     return value.numbers if isinstance(value, DeviceTensor) else value
 
 

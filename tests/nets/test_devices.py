@@ -1,0 +1,181 @@
+"""Every network on an emulated GPU: one device, no index on the CPU, results of the CPU."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from emulated_device import emulated_devices
+from numpy.typing import NDArray
+
+from megloc_kapture.features import global_networks
+from megloc_kapture.features.aliked import Aliked
+from megloc_kapture.features.aslfeat import AslFeat
+from megloc_kapture.features.kornia_features import Disk, XFeat
+from megloc_kapture.features.r2d2 import R2D2
+from megloc_kapture.features.superpoint import SuperPoint
+from megloc_kapture.io.weights import UNVERIFIED
+from megloc_kapture.localization import lpips
+from megloc_kapture.matching.networks import LightGlue, SuperGlue
+from megloc_kapture.nets import runtime
+from megloc_kapture.preprocessing.deeplab import DeepLab
+from megloc_kapture.values import ImageFeatures
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+from whole_preset_weights import Sizes, write_random_weights  # noqa: E402
+
+DEVICE = "cuda:1"
+HEIGHT, WIDTH = 96, 128
+SLOW = pytest.mark.slow
+EXTRACTORS: dict[str, tuple[Any, dict[str, Any]]] = {
+    "superpoint_v1": (SuperPoint, {}),
+    "aslfeat": (AslFeat, {}),
+    "aliked-n16": (Aliked, {"threshold": 0.0}),
+    "r2d2_WASF_N16": (R2D2, {"min_size": 80, "max_size": 100}),
+    "xfeat": (XFeat, {}),
+    "disk": (Disk, {}),
+}
+GLOBAL: dict[str, tuple[Any, dict[str, Any]]] = {
+    "netvlad-pitts30k": (global_networks.NetVlad, {}),
+    "openibl": (global_networks.OpenIbl, {"max_size_px": 128}),
+    "apgem-resnet101-lm18": (global_networks.ApGem, {}),
+    "delg-r101-gldv2clean": (global_networks.Delg, {"scales": [1.0]}),
+    "megaloc": (global_networks.MegaLoc, {"size_px": 126}),
+}
+HEAVY = {"apgem-resnet101-lm18", "delg-r101-gldv2clean", "megaloc"}
+MATCHERS = {"superglue_outdoor": SuperGlue, "superpoint_lightglue": LightGlue}
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., None]]:
+    """Writes random weights where networks find them, each file once."""
+    folder = tmp_path_factory.mktemp("weights")
+
+    def write(*names: str) -> None:
+        for name in names:
+            if name not in written:
+                sizes = Sizes(clusters=4, whitened=32, hidden=8)
+                write_random_weights(folder / UNVERIFIED, sizes=sizes, names=[name])
+                written.add(name)
+
+    written: set[str] = set()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MEGLOC_WEIGHTS", str(folder))
+        yield write
+
+
+@pytest.fixture
+def image() -> NDArray[np.uint8]:
+    coarse = np.random.default_rng(0).integers(0, 256, (HEIGHT // 4, WIDTH // 4, 3), np.uint8)
+    return coarse.repeat(4, axis=0).repeat(4, axis=1)
+
+
+def forget() -> None:
+    for kept in (runtime.pick_device, runtime._made, lpips._network, lpips._features_kept):
+        kept.cache_clear()
+
+
+def on_both(
+    kind: Any, options: dict[str, Any], half: bool, run: Callable[[Any], Any]
+) -> tuple[Any, Any]:
+    """Return results of a plugin on the CPU, in full precision, and on the emulated device."""
+    on_cpu = run(kind(kind.Options.model_validate({**options, "device": "cpu"})))
+    forget()
+    torch.manual_seed(0)
+    try:
+        with emulated_devices():
+            wanted = {**options, "device": DEVICE, "half_precision": half}
+            return on_cpu, run(kind(kind.Options.model_validate(wanted)))
+    finally:
+        forget()
+
+
+both_precisions = pytest.mark.parametrize("half", [False, True], ids=["full", "half"])
+
+
+@both_precisions
+@pytest.mark.parametrize("name", EXTRACTORS)
+def test_local_features(
+    name: str, half: bool, weights: Callable[..., None], image: NDArray[np.uint8]
+) -> None:
+    weights(name)
+    kind, options = EXTRACTORS[name]
+    mask = np.ones((HEIGHT, WIDTH), bool)
+    mask[:, :20] = False
+    images, masks = [image, image[::-1].copy()], [mask, None]
+    cpu, found = on_both(
+        kind, options | {"max_keypoints": 200}, half, lambda p: p.extract_many(images, masks)
+    )
+    for one, other in zip(cpu, found, strict=True):
+        assert len(one.scores) > 20
+        apart = np.linalg.norm(one.keypoints_px[:, None, :2] - other.keypoints_px[:, :2], axis=2)
+        near = apart.min(axis=1) < (1.0 if half else 0.01)
+        cosine = (one.descriptors * other.descriptors[apart.argmin(axis=1)]).sum(axis=1)
+        print(name, half, len(one.scores), near.mean(), np.median(cosine[near]), cosine[near].min())
+        assert near.mean() > (0.5 if half else 0.99)
+        assert np.median(cosine[near]) > (0.95 if half else 0.9999)
+
+
+@both_precisions
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=SLOW if name in HEAVY else ()) for name in GLOBAL]
+)
+def test_global_features(
+    name: str, half: bool, weights: Callable[..., None], image: NDArray[np.uint8]
+) -> None:
+    weights(name)
+    kind, options = GLOBAL[name]
+    cpu, found = on_both(
+        kind, options, half, lambda p: p.describe_many([image, image[::-1].copy()])
+    )
+    cosine = (cpu * found).sum(axis=1)
+    print(name, half, cosine)
+    assert cosine.min() > (0.95 if half else 0.99999)
+
+
+@both_precisions
+@pytest.mark.parametrize("name", MATCHERS)
+def test_matches(name: str, half: bool, weights: Callable[..., None]) -> None:
+    weights(name)
+    rng = np.random.default_rng(0)
+
+    def features(number: int) -> ImageFeatures:
+        xy = rng.uniform(1, 90, (number, 2))
+        descriptors = rng.normal(size=(number, 256))
+        descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+        table = np.column_stack([xy, rng.uniform(0.1, 1, number)]).astype(np.float32)
+        return ImageFeatures(table, descriptors.astype(np.float32), WIDTH, HEIGHT)
+
+    a, less, none = features(60), features(1), features(0)
+    order = rng.permutation(60)[:40]
+    b = ImageFeatures(a.keypoints_px[order], a.descriptors[order], WIDTH, HEIGHT)
+    cpu, found = on_both(MATCHERS[name], {}, half, lambda p: p.match_many(a, [b, less, none]))
+    pairs = [set(map(tuple, matches.tolist())) for matches, _ in (cpu[0], found[0])]
+    print(name, half, len(pairs[0]), len(pairs[0] & pairs[1]))
+    assert len(pairs[0]) > 20
+    assert len(pairs[0] & pairs[1]) >= (0.9 if half else 1.0) * len(pairs[0] | pairs[1])
+    assert len(found[2][0]) == 0
+
+
+@SLOW
+@both_precisions
+def test_labels(half: bool, weights: Callable[..., None], image: NDArray[np.uint8]) -> None:
+    weights("deeplabv3plus-resnet101")
+    cpu, found = on_both(DeepLab, {}, half, lambda p: p.segment(image))
+    assert (cpu == found).mean() > (0.95 if half else 0.999)
+
+
+@both_precisions
+def test_image_distance(half: bool, weights: Callable[..., None], image: NDArray[np.uint8]) -> None:
+    weights("lpips-trunk-alex", "lpips-alex")
+    valid = np.ones((HEIGHT, WIDTH), bool)
+    valid[:, :30] = False
+    cpu, found = on_both(
+        lpips.LpipsDistance, {}, half, lambda p: p.distance(image, image[::-1].copy(), valid)
+    )
+    assert cpu > 0 and found == pytest.approx(cpu, rel=0.02 if half else 1e-5)
