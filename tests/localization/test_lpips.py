@@ -83,27 +83,7 @@ def masks() -> list[np.ndarray]:
     return list(found)
 
 
-def test_a_query_is_paid_for_once_per_mask(
-    files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[torch.Tensor] = []
-    described = Lpips.described
-
-    def counted(self: Lpips, image: torch.Tensor, valid: torch.Tensor) -> list[torch.Tensor]:
-        seen.append(image)
-        return described(self, image, valid)
-
-    monkeypatch.setattr(Lpips, "described", counted)
-    plugin = distance(files)
-    query, *views = pictures(4)
-    query[0] = 0  # another query than that of the other tests
-    for valid in masks():
-        for view in views:
-            plugin.distance(query.copy(), view, valid.copy())
-    assert len(seen) == 3 * (1 + 3)
-
-
-def test_what_is_kept_changes_nothing(files: tuple[Path, Path]) -> None:
+def test_the_distance_is_the_networks(files: tuple[Path, Path]) -> None:
     plugin = distance(files)
     query, *views = pictures(4)
     # the same array with other pixels is another image
