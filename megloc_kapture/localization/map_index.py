@@ -96,14 +96,15 @@ class MapIndex:
         """Count the points observed by both of two images, int64 (n, n); the diagonal has each
         one's own.
         """
-        points = [self.observed(image)[1] for image in images]
+        points = [np.unique(self.observed(image)[1]) for image in images]
         rows = np.repeat(np.arange(len(images)), [len(each) for each in points])
-        every, columns = np.unique(
-            np.concatenate([self.point_ids[:0], *points]), return_inverse=True
-        )
-        observes = np.zeros((len(images), len(every)), np.float32)
-        observes[rows, columns] = 1.0
-        return np.asarray(observes @ observes.T, np.int64)
+        every = np.concatenate([self.point_ids[:0], *points])
+        shared = np.zeros((len(images), len(images)), np.int64)
+        for row, own in enumerate(points):
+            seen = np.zeros(len(self.xyz), np.bool_)
+            seen[own] = True
+            shared[row] = np.bincount(rows[seen[every]], minlength=len(images))
+        return shared
 
 
 def _paired(high: Integers, low: Integers) -> NDArray[np.int64]:

@@ -1,10 +1,7 @@
 """Depth maps of map images: keypoints lifted to 3D points, and points verified by depth.
 
-An observation says that an image sees a point. Where the image has a depth map, the point must then
-lie on the surface that the sensor saw there. A surface is not known better than the sensor's noise,
-and near an edge not better than to some pixels; a triangulated point not better than its images
-determine it. So the point's depth is compared with the least and the greatest depth in a small
-window, widened by some standard deviations of both. Where the sensor has no depth, nothing is said.
+A point observed by an image with depth must lie on the surface seen by the sensor, within the noise
+of sensor and point and a small window for edges. Without depth nothing is rejected.
 """
 
 from __future__ import annotations
@@ -31,8 +28,6 @@ _STRUCTURED_LIGHT = (0.001504, -0.00152, 0.0019)
 
 
 class LiftingOptions(Options):
-    """Options of lifting."""
-
     max_jump: float = Field(
         default=0.1,
         gt=0,
@@ -49,21 +44,18 @@ def lift_keypoints(
     image_from_depth: RigidTransform,
     options: LiftingOptions | None = None,
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """3D points of an image's keypoints, through a depth map of the same moment.
+    """Lift an image's keypoints (N, 2 or more) by a depth map of the same moment.
 
-    Depth is interpolated between the four pixels around a keypoint; where some of them have none,
-    the nearest that has counts.
+    Depth is interpolated between four pixels; if some are unknown, the nearest known one counts.
 
     Parameters
     ----------
-    keypoints_px : (N, 2 or more), x and y first, in the image; COLMAP's pixel origin.
     depth_m : float32 (H, W), along the depth camera's axis, 0 or less where unknown.
     image_from_depth : from the depth camera's frame to the image camera's, metres.
 
     Returns
     -------
-    Points float64 (N, 3) in the image camera's frame, metres, NaN where there is no depth; and a
-        mask.
+    Points float64 (N, 3) in the image camera's frame, NaN without depth, and a mask (N,).
     """
     options = options or LiftingOptions()
     rays = bearing_rays(image_camera, np.asarray(keypoints_px, np.float64)[:, :2])
@@ -97,12 +89,11 @@ def lift_with_covariances(
     depth_camera: Camera,
     options: LiftingOptions,
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """:func:`lift_keypoints` through a depth map of the image's own centre, with covariances.
+    """Lift keypoints by a depth map of the image's own centre, with covariances (N, 3, 3).
 
-    Across the ray a keypoint is off by its own noise; along it by the deviation of depth,
-    ``sigma_m`` float32 (H, W), 0 where unknown, which is taken for that of keypoints with a noise
-    of a third of a pixel (``map_noise`` of the pose). The covariances are float64 (N, 3, 3) in the
-    camera's frame for a noise of 1 px, between the points and the mask.
+    ``sigma_m`` float32 (H, W) are the deviations of depth, 0 where unknown, taken as those for a
+    keypoint noise of a third of a pixel (the pose's ``map_noise``). Covariances are for a noise of
+    1 px, in the camera's frame.
     """
     same = RigidTransform.identity()
     points, valid = lift_keypoints(keypoints_px, depth_m, image_camera, depth_camera, same, options)
@@ -124,16 +115,10 @@ def lift_with_covariances(
 def sample_depth(
     depth_m: NDArray[np.float32], pixels: Floats, max_jump: float, *, whole: bool = False
 ) -> Floats:
-    """Depth (N,) at pixels of a depth map, interpolated as :func:`lift_keypoints` does.
+    """Return interpolated depths (N,) at pixels (N, 2), see :func:`lift_keypoints`.
 
-    NaN outside, where the depth is unknown, and where it jumps.
-
-    Parameters
-    ----------
-    depth_m : float32 (H, W), 0 or less where unknown.
-    pixels : float64 (N, 2) of the depth map, COLMAP's pixel origin; may be NaN.
-    max_jump : see :class:`LiftingOptions`.
-    whole : all four depths around a pixel must be known, else some of them.
+    NaN outside the map, where depth is unknown, and where it jumps; ``whole`` requires all four
+    pixels.
     """
     height, width = depth_m.shape
     result = np.full(len(pixels), np.nan)
@@ -161,12 +146,10 @@ def sample_depth(
 
 
 class DepthVerificationOptions(Options):
-    """Options of depth verification: the noise of the sensor, and the allowed distance from it.
+    """Options of depth verification: noise of the sensor and largest distance.
 
-    The default noise is that of a structured-light sensor (Kinect): 0.0012 + 0.0019 (z - 0.4)^2,
-    Nguyen, Izadi and Lovell, Modeling Kinect Sensor Noise for Improved 3D Reconstruction and
-    Tracking, 3DIMPVT 2012, eq. 4; Khoshelham and Elberink, Sensors 12(2), 2012, find 0.0014 z^2. A
-    laser scan has about ``[0.003, 0, 0]``.
+    The default noise is a structured-light sensor's: 0.0012 + 0.0019 (z - 0.4)^2 (Nguyen et al.,
+    3DIMPVT 2012, eq. 4). A laser scan has about ``[0.003, 0, 0]``.
     """
 
     max_sigmas: float | None = Field(
@@ -204,7 +187,7 @@ class DepthVerificationOptions(Options):
 
 
 def depth_noise(depth: Floats, noise: tuple[float, float, float]) -> Floats:
-    """Standard deviation of a sensor's depth (...), in its unit, by a + b z + c z^2."""
+    """Return the standard deviation of a sensor's depth, a + b z + c z^2."""
     a, b, c = noise
     return a + depth * (b + depth * c)
 
@@ -218,20 +201,10 @@ def contradicted_by_depth(
     *,
     deviations: Floats | None = None,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Find the points that do not lie on the surface of a depth map.
+    """Find the points (N, 3), in the image camera's frame, that are off the surface of a depth map.
 
-    Parameters
-    ----------
-    points_in_image : float64 (N, 3) in the image camera's frame, metres.
-    depth_m : float32 (H, W) along the depth camera's axis, 0 or less or not finite where unknown.
-    image_from_depth : from the depth camera's frame to the image camera's, metres.
-    deviations : float64 (N,), standard deviations of the points along the depth camera's axis for a
-        noise of 1 px; NaN where unknown, which counts as none.
-
-    Returns
-    -------
-    Masks (N,): contradicted, never where there is no depth; and where there is depth to compare
-        with.
+    ``deviations`` (N,) are the points' along the depth camera's axis for a noise of 1 px, NaN if
+    unknown. Returns masks (N,) of contradicted points and of points with depth to compare with.
     """
     own = 0.0 if deviations is None else np.nan_to_num(deviations) * options.keypoint_noise_px
     before, behind, checked = compare_with_depth(
@@ -248,16 +221,9 @@ def compare_with_depth(
     options: DepthVerificationOptions,
     sigmas: Floats | float,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Compare points with the surface of a depth map; see :func:`contradicted_by_depth`.
+    """Compare points, with standard deviations ``sigmas``, with the surface of a depth map.
 
-    Parameters
-    ----------
-    sigmas : float64 (N,) or one for all, standard deviations of the points, metres.
-
-    Returns
-    -------
-    Masks (N,): clearly before the surface, which the camera then sees through the point; clearly
-        behind it, hidden; and where there is depth to compare with.
+    Returns masks (N,): before the surface, behind it, and with depth to compare with.
     """
     points = image_from_depth.inverse().apply(np.asarray(points_in_image, np.float64))
     before, behind, checked = np.zeros((3, len(points)), bool)

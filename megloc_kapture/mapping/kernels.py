@@ -1,7 +1,4 @@
-"""Compiled loops over a map's observations: arrays in, arrays out.
-
-Imported where they are called, not where their module is: numba costs half a second to import.
-"""
+"""Compiled loops over a map's observations; import only where called: numba loads slowly."""
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
 
@@ -24,7 +21,7 @@ _SMALL = 2.3e-16
 
 
 def in_chunks(count: int, size: int, work: Callable[[int, int], object]) -> None:
-    """Call ``work(first, last)`` for parts of ``range(count)``, which must not mind the order."""
+    """Call ``work(first, last)`` for independent parts of ``range(count)``, in threads."""
     chunks = [(first, min(first + size, count)) for first in range(0, count, size)]
     if len(chunks) < 2:
         for first, last in chunks:
@@ -39,11 +36,12 @@ def in_chunks(count: int, size: int, work: Callable[[int, int], object]) -> None
 def most_shared(
     first, last, starts, of_image, images, track, track_starts, window, min_shared, best
 ):
-    """Images that share most points with each of ``first`` to ``last``, rows of ``best`` (I, K).
+    """Find the images that share most points with images ``first`` to ``last``: rows of ``best``
+    (I, K).
 
-    Observations of image i are ``of_image[starts[i]:starts[i + 1]]``; they are sorted by track,
-    then image, and those of track t run from ``track_starts[t]`` to ``track_starts[t + 1]``. An
-    image looks no farther in a track than ``window`` before and after itself.
+    Image i has observations ``of_image[starts[i]:starts[i + 1]]``; observations are sorted by
+    track, then image, and track t has ``track_starts[t]`` to ``track_starts[t + 1]``. At most
+    ``window`` observations before and after are visited.
     """
     shared = np.zeros(len(best), np.int64)
     touched = np.empty(len(best), np.int64)
@@ -76,9 +74,8 @@ def most_shared(
 def shares_seen(
     first, last, pairs, starts, points, xyz, rotations, translations, models, params, sizes, shares
 ):
-    """Share of one image's points in the other's frustum, the larger of the two; ``shares`` (P,).
-
-    NaN where neither image has points.
+    """Compute shares (P,) of one image's points in the other's frustum, the larger one; NaN without
+    points.
     """
     out = np.empty(8)
     for pair in range(first, last):
@@ -119,7 +116,7 @@ def mean_depths(starts, image_ids, xyz, rotations, translations, out):
 def covariances_of_points(
     first, last, starts, image_ids, xyz, rotations, translations, models, params, out
 ):
-    """Covariances of the points ``first`` to ``last``, rows of ``out`` (N, 6)."""
+    """Compute covariances of the points ``first`` to ``last``, rows of ``out`` (N, 6)."""
     for i in range(first, last):
         xx = xy = xz = yy = yz = zz = 0.0
         px, py, pz = xyz[i, 0], xyz[i, 1], xyz[i, 2]

@@ -1,13 +1,8 @@
-"""A foreign map's conventions: its pixel origin, and whether it agrees with itself.
+"""Checks of a prebuilt map: its pixel origin, and its consistency.
 
-COLMAP has (0, 0) at the corner of the first pixel, many networks and simulators at its centre.
-Keypoints and intrinsics of one map need not agree. What can be measured is their offset: half a
-pixel too much or too little shows in the reprojection error of the map's own points. Where the
-two agree, the principal points tell which origin they share: a camera whose principal point is
-((w - 1) / 2, (h - 1) / 2) exactly was described with the origin at the centre.
-
-A map whose observations do not fit is named with the mistake that explains it best: what files of
-other tools get wrong is mostly one of a few conventions, and each can be tried.
+COLMAP's pixel origin is the corner of the first pixel, that of many networks and simulators its
+centre. An offset between keypoints and intrinsics shows in the reprojection error. Otherwise
+principal points at exactly ((w - 1) / 2, (h - 1) / 2) indicate the centre.
 """
 
 from __future__ import annotations
@@ -49,9 +44,8 @@ _UNITS = {1000.0: "millimetres", 100.0: "centimetres", 1 / 1000: "kilometres", 1
 
 @dataclass(frozen=True, eq=False)
 class ObservedKeypoints:
-    """A map image with its keypoints (K, 2) and its observations.
-
-    ``rows`` and ``points`` int (M,) are rows of its keypoints and of the map's points.
+    """A map image with keypoints (K, 2), and its observations as rows of keypoints and of points
+    (M,).
     """
 
     name: str
@@ -62,8 +56,9 @@ class ObservedKeypoints:
     points: NDArray[np.integer]
 
     def errors_px(self, xyz: Floats, shift_px: float = 0.0) -> Floats:
-        """Distances (M,) of the points (N, 3), seen by the camera, from the keypoints moved by
-        ``shift_px``; NaN for a point behind it."""
+        """Return reprojection errors (M,) of points (N, 3), keypoints shifted; NaN behind the
+        camera.
+        """
         with np.errstate(invalid="ignore"):
             seen = project(self.camera, self.cam_from_world, xyz[self.points])
             return np.linalg.norm(seen - (self.keypoints_px[self.rows] + shift_px), axis=1)
@@ -71,10 +66,10 @@ class ObservedKeypoints:
 
 @dataclass(frozen=True)
 class PixelOrigin:
-    """Pixel origins of a map's intrinsics and keypoints as stored, and the evidence in words.
+    """Pixel origins of a map as stored, and the reason.
 
-    ``error_px`` is the median reprojection error with the intrinsics' origin taken as corner or
-    centre, the keypoints' origin as found; NaN without observations.
+    ``error_px`` is the median reprojection error by the intrinsics' origin; NaN without
+    observations.
     """
 
     intrinsics: Origin
@@ -84,12 +79,12 @@ class PixelOrigin:
 
     @property
     def intrinsics_shift_px(self) -> float:
-        """To be added to principal points to have COLMAP's."""
+        """Return the shift of principal points to COLMAP's origin."""
         return _HALF if self.intrinsics == "centre" else 0.0
 
     @property
     def keypoints_shift_px(self) -> float:
-        """To be added to keypoints to have COLMAP's."""
+        """Return the shift of keypoints to COLMAP's origin."""
         return _HALF if self.keypoints == "centre" else 0.0
 
 
@@ -100,10 +95,9 @@ def find_pixel_origin(
     cameras: Sequence[Camera],
     keypoints_at: Origin | None = None,
 ) -> PixelOrigin:
-    """Find the pixel origin of intrinsics and keypoints.
+    """Find the pixel origin of intrinsics and keypoints from a sample of map images.
 
-    Of a sample of the map's images, keypoints as stored, all points (N, 3) and all cameras;
-    ``keypoints_at`` is the keypoints' origin where it is known.
+    ``keypoints_at`` is the keypoints' origin if known.
     """
     observed = [image for image in images if len(image.rows)]
     errors = {
@@ -152,9 +146,9 @@ _Reading = Callable[[ObservedKeypoints], _View]
 
 
 def map_fault(images: Sequence[ObservedKeypoints], xyz: Floats) -> str | None:
-    """Say why a map contradicts itself; None where it does not.
+    """Return why a map contradicts itself; None if it is consistent.
 
-    Of a sample of its images, by name, and all its points, float64 (N, 3).
+    ``images`` is a sample sorted by name; ``xyz`` are all points, float64 (N, 3).
     """
     if not np.isfinite(xyz).all():
         count = int((~np.isfinite(xyz).all(axis=1)).sum())
@@ -189,7 +183,7 @@ def map_fault(images: Sequence[ObservedKeypoints], xyz: Floats) -> str | None:
 
 
 def camera_fault(camera: Camera) -> str | None:
-    """Say why no camera has these intrinsics; None where one may have."""
+    """Return why intrinsics are impossible; None if they are possible."""
     size = max(camera.width, camera.height)
     cx, cy = principal_point_px(camera)
     if not (-size <= cx <= 2 * size and -size <= cy <= 2 * size):
@@ -218,7 +212,7 @@ def _as_it_is(image: ObservedKeypoints, xyz: Floats) -> _View:
 
 
 def _errors_px(images: Iterable[ObservedKeypoints], read: _Reading) -> Floats:
-    """Median reprojection error of each image, infinite where most points are not in front."""
+    """Return each image's median reprojection error, infinite if most points are behind it."""
     medians = []
     for image in images:
         camera, pose, pixels, points = read(image)
@@ -229,7 +223,7 @@ def _errors_px(images: Iterable[ObservedKeypoints], read: _Reading) -> Floats:
 
 
 def _likely_mistake(images: Sequence[ObservedKeypoints], xyz: Floats) -> tuple[str, float]:
-    """The reading of the map that fits best, and the median error of its images."""
+    """Return the reading of the map with the smallest error, and its median error."""
     found = ("", np.inf)
     for name, read in _readings(images, xyz):
         error = float(np.median(_errors_px(images, read)))
@@ -240,7 +234,7 @@ def _likely_mistake(images: Sequence[ObservedKeypoints], xyz: Floats) -> tuple[s
 
 
 def _readings(images: Sequence[ObservedKeypoints], xyz: Floats) -> Iterator[tuple[str, _Reading]]:
-    """Other readings of a map: what is done to it, in words, and the views that come of it."""
+    """Yield other readings of a map."""
 
     def changed(
         pixels: Callable[[NDArray[np.floating], NDArray[np.integer]], NDArray[np.floating]]
@@ -298,7 +292,7 @@ def _readings(images: Sequence[ObservedKeypoints], xyz: Floats) -> Iterator[tupl
 
 
 def _moved(images: Sequence[ObservedKeypoints], xyz: Floats, by: int) -> _Reading:
-    """Each image with the pose of a neighbour in the sample, which must be of neighbours."""
+    """Give each image the pose of its neighbour in the sample."""
     poses = {
         image.name: images[(at + by) % len(images)].cam_from_world
         for at, image in enumerate(images)
@@ -307,7 +301,7 @@ def _moved(images: Sequence[ObservedKeypoints], xyz: Floats, by: int) -> _Readin
 
 
 def _factors(images: Sequence[ObservedKeypoints], xyz: Floats) -> dict[str, float]:
-    """By how much keypoints, or the focal length, would have to be scaled to fit."""
+    """Return the scale factors of keypoints and focal length that would fit."""
     of_keypoints, of_focal = [], []
     for image in images:
         camera, pose, pixels, points = _as_it_is(image, xyz)

@@ -26,12 +26,12 @@ _DEPTHS = 2.0 ** np.arange(-2, 8, 0.5)
 
 
 def exhaustive_pairs(count: int) -> NDArray[np.int64]:
-    """All pairs i < j of ``count`` images, int64 (P, 2), sorted; for small maps."""
+    """Return all pairs i < j of ``count`` images, int64 (P, 2), sorted."""
     return np.stack(np.triu_indices(count, 1), axis=1).astype(np.int64)
 
 
 def unique_pairs(pairs: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Pairs (P, 2) with i < j, sorted, each once, none with itself."""
+    """Return distinct pairs (P, 2) with i < j, sorted."""
     low, high = pairs.min(axis=1), pairs.max(axis=1)
     # a pair in one number: sorted much faster than rows are
     base = int(high.max(initial=0)) + 1
@@ -40,13 +40,13 @@ def unique_pairs(pairs: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def each_once(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The keys (K,) sorted, each once; what np.unique does, which takes ten times as long."""
+    """Return distinct keys (K,), sorted; ten times as fast as np.unique."""
     ascending = np.sort(keys)
     return ascending[np.append(True, ascending[1:] != ascending[:-1])[: len(keys)]]
 
 
 class PairsByPosesOptions(Options):
-    """Options of pairs by poses; the distance is per image, so it needs no metric scale."""
+    """Options of pairs by poses; neighbours are counted, so no metric scale is needed."""
 
     num_neighbours: int = Field(default=20, gt=0, description="nearest centres taken per image")
     max_distance: float | None = Field(
@@ -65,10 +65,9 @@ class PairsByPosesOptions(Options):
 def pairs_by_poses(
     cams_from_world: list[RigidTransform], options: PairsByPosesOptions | None = None
 ) -> NDArray[np.int64]:
-    """Pairs (P, 2) of images that stand close and look the same way, i < j, sorted, each once.
+    """Return pairs (P, 2) of nearby images with similar viewing directions, i < j, sorted.
 
-    Candidates come from a k-d tree in growing neighbourhoods, block by block. An image looks at no
-    more than the 1024 nearest centres, so that time and memory grow with the number of images.
+    Searches growing neighbourhoods of a k-d tree, at most the 1024 nearest centres.
     """
     options = options or PairsByPosesOptions()
     count = len(cams_from_world)
@@ -109,8 +108,6 @@ def pairs_by_poses(
 
 
 class PairsByCovisibilityOptions(Options):
-    """Options of pairs by co-visibility."""
-
     top_k: int = Field(default=20, gt=0, description="images taken that share most points")
     min_shared_points: int = Field(default=15, gt=0, description="points both images observe")
 
@@ -121,13 +118,10 @@ def pairs_by_covisibility(
     image_ids: NDArray[np.integer[Any]],
     options: PairsByCovisibilityOptions | None = None,
 ) -> NDArray[np.int64]:
-    """Pairs of each image with those that share most points with it; of equals the first.
+    """Pair each image with those that share most points; int64 (P, 2), i < j, sorted.
 
-    Of observations (O,), in any order, repeated ones count once; int64 (P, 2), indices i < j,
-    sorted, each pair once. It is the sparse product of the observations with themselves, row by
-    row, of which only the best of each row are kept. Its time is the number of observations times
-    the length of a track, which is bounded: of a point that very many images see, an image counts
-    as seeing it only the 512 before and the 512 after it in the order of the images.
+    Observations (O,) are in any order. In longer tracks, only the 512 images before and after
+    count.
     """
     from megloc_kapture.mapping import kernels
 
@@ -153,8 +147,6 @@ def pairs_by_covisibility(
 
 
 class PairsBySequenceOptions(Options):
-    """Options of pairs by temporal sequence."""
-
     window: int = Field(default=5, gt=0, description="images that each is paired with after it")
     loop: bool = Field(default=False, description="the first image follows the last one")
 
@@ -162,11 +154,7 @@ class PairsBySequenceOptions(Options):
 def pairs_by_sequence(
     cameras: Sequence[str], timestamps: Sequence[int], options: PairsBySequenceOptions
 ) -> NDArray[np.int64]:
-    """Pairs (P, 2) of each image with the next ones of its camera, i < j, sorted, each once.
-
-    Of N images it is given which camera took each and when; images of one camera at the same time
-    follow each other as they are given.
-    """
+    """Pair each image with the next ones of its camera; (P, 2), i < j, sorted."""
     sequences: dict[str, list[int]] = {}
     for image in sorted(range(len(cameras)), key=lambda image: timestamps[image]):
         sequences.setdefault(cameras[image], []).append(image)
@@ -186,10 +174,9 @@ def views_can_overlap(
     second: Camera,
     second_from_world: RigidTransform,
 ) -> bool:
-    """True if some point in the view of one camera is in that of the other, whatever is seen.
+    """Return True if a point in one camera's view may be in the other's.
 
-    Looked for along the rays of a grid of pixels, from a quarter of the distance between the
-    cameras to infinity.
+    Tested along rays of a pixel grid, from a quarter of the cameras' distance to infinity.
     """
     between = second_from_world @ first_from_world.inverse()
     return _reaches(first, second, between) or _reaches(second, first, between.inverse())
@@ -219,20 +206,11 @@ def frustum_overlap(
     point_ids: NDArray[np.integer[Any]],
     image_ids: NDArray[np.integer[Any]],
 ) -> NDArray[np.float64]:
-    """Share of the points an image observes that fall into the other's image, for pairs of images.
+    """Return the share of an image's points in the other's frustum, the larger of a pair's two;
+    (P,).
 
-    The larger of a pair's two shares: a near view and a far one overlap though the far one sees
-    much besides. Nothing is known of what hides a point.
-
-    Parameters
-    ----------
-    pairs : int64 (P, 2), rows of ``cameras`` and ``cams_from_world``.
-    xyz : float64 (N, 3) in the world.
-    point_ids, image_ids : (O,), the observations, rows of ``xyz`` and of ``cameras``; in any order.
-
-    Returns
-    -------
-    float64 (P,) from 0 to 1, NaN where neither image observes a point.
+    ``pairs`` (P, 2) are rows of ``cameras``; ``point_ids`` and ``image_ids`` (O,) are the
+    observations. Occlusion is ignored. NaN if neither image observes a point.
     """
     from megloc_kapture.geometry.projection import packed_views
     from megloc_kapture.mapping import kernels

@@ -1,17 +1,12 @@
 """Geometric verification of matches: with known poses, or by a two-view model.
 
-Known poses (mapping pairs): the essential matrix is given, so verification is one vectorised
-Sampson distance and a test that the rays meet in front of both cameras; no sampling. The distance
-is in pixels of the images as they were taken: how far both measurements together have to move, to
-first order, until their rays meet. Unknown pose (query pairs): LO-RANSAC of the relative pose by
-poselib, whose samples are of the best matches first (Chum and Matas, "Matching with PROSAC", CVPR
-2005), and of all matches alike by the last iteration: then scores that say nothing do no harm.
+With known poses (mapping pairs): Sampson distance in pixels of the original images, and rays that
+meet in front of both cameras. Without (query pairs): LO-RANSAC of the relative pose by poselib with
+progressive sampling (Chum and Matas, CVPR 2005).
 
-With rays r = (x, y, 1), the epipolar constraint is C = r_b . E r_a. Its derivatives with respect to
-the four measured coordinates follow from those of C with respect to x and y and from the inverse of
-d px / d (x, y), which is the derivative of the camera's own projection; the distance is |C| over
-their norm (Hartley and Zisserman, Multiple View Geometry, eq. 4.13; for one focal length and no
-distortion it is their eq. 11.9 times the focal length).
+With rays r = (x, y, 1) the epipolar constraint is C = r_b . E r_a. The distance is |C| over the
+norm of its derivatives by the four pixel coordinates, which use the derivative of the camera's
+projection (Hartley and Zisserman, Multiple View Geometry, eq. 4.13).
 """
 
 from __future__ import annotations
@@ -47,14 +42,14 @@ _MAX_WRONG_PAIRS = 20_000
 
 
 class KnownPoseOptions(Options):
-    """Options of verification with the known poses."""
+    """Options of verification with known poses."""
 
     max_error_px: float = Field(default=4.0, gt=0, description="Sampson distance in the images")
     min_matches: int = Field(default=15, ge=0, description="a pair with fewer left has none")
 
 
 class TwoViewOptions(Options):
-    """Options of two-view verification; calibrated, so a plane is no degenerate case."""
+    """Options of two-view verification; cameras are calibrated, so planes are not degenerate."""
 
     max_error_px: float = Field(
         default=4.0, gt=0, description="distance from the epipolar line of an inlier"
@@ -69,16 +64,15 @@ class TwoViewOptions(Options):
 
 
 def essential_matrix(b_from_a: RigidTransform) -> Floats:
-    """E (3, 3) with ``ray_b . E ray_a = 0``."""
+    """Return E (3, 3) with ``ray_b . E ray_a = 0``."""
     return cross_matrix(np.array(b_from_a.translation)) @ b_from_a.rotation_matrix()
 
 
 def ray_slopes(camera: Camera, keypoints_px: NDArray[np.floating[Any]], rays: Floats) -> Floats:
-    """Derivatives d (x, y) / d px (N, 2, 2) of rays by their pixels, under the camera's own model.
+    """Return derivatives d (x, y) / d px (N, 2, 2) of rays (N, 3) by their pixels (N, 2).
 
-    Of pixels (N, 2) and their homogeneous rays float64 (N, 3), last component 1. NaN where a ray is
-    not that of its pixel: the distortion cannot be undone there, or the pixel looks sideways or
-    back, as pixels of a fisheye may.
+    NaN where the ray does not project to its pixel: distortion without inverse, or sideways rays of
+    a fisheye.
     """
     from megloc_kapture.geometry.projection import project_with_jacobian
 
@@ -96,10 +90,9 @@ def ray_slopes(camera: Camera, keypoints_px: NDArray[np.floating[Any]], rays: Fl
 def sampson_error_px(
     rays_a: Floats, slopes_a: Floats, rays_b: Floats, slopes_b: Floats, b_from_a: RigidTransform
 ) -> Floats:
-    """Sampson distance in pixels (N,) of matched rays (N, 3), last component 1, see above.
+    """Return Sampson distances (N,) in pixels of matched rays (N, 3) with slopes (N, 2, 2).
 
-    Of slopes (N, 2, 2), see :func:`ray_slopes`. Infinite where there is no epipolar line, NaN where
-    a slope is.
+    Infinite without an epipolar line, NaN if a slope is.
     """
     essential = essential_matrix(b_from_a)
     line_b = rays_a @ essential.T
@@ -114,10 +107,7 @@ def sampson_error_px(
 
 
 def in_front_of_both(rays_a: Floats, rays_b: Floats, b_from_a: RigidTransform) -> NDArray[np.bool_]:
-    """Mask (N,): the midpoint of two rays' common perpendicular is in front of both cameras.
-
-    Rays so close to parallel that the point is at infinity pass: they do no harm.
-    """
+    """Return a mask (N,) of rays whose midpoint is in front of both cameras, or at infinity."""
     rotation = b_from_a.rotation_matrix()
     a = rays_a / np.linalg.norm(rays_a, axis=1, keepdims=True)
     b = (rays_b / np.linalg.norm(rays_b, axis=1, keepdims=True)) @ rotation
@@ -140,10 +130,10 @@ def verify_with_poses(
     b_from_a: RigidTransform,
     options: KnownPoseOptions | None = None,
 ) -> NDArray[np.bool_]:
-    """Mask (N,) of the matches that agree with a known relative pose.
+    """Return a mask (N,) of the matched rays (N, 3) that agree with a relative pose.
 
-    Of matched homogeneous rays float64 (N, 3), last component 1, and their :func:`ray_slopes`; a
-    match with NaN is refused. All False when fewer than ``min_matches`` agree.
+    ``slopes`` see :func:`ray_slopes`, NaN is rejected. All False if fewer than ``min_matches``
+    agree.
     """
     options = options or KnownPoseOptions()
     if len(rays_a) == 0:
@@ -162,12 +152,10 @@ def verify_two_view(
     camera_b: Camera,
     options: TwoViewOptions | None = None,
 ) -> NDArray[np.bool_]:
-    """Mask (N,) of the matches that agree with one relative pose of two calibrated cameras.
+    """Return a mask (N,) of the matches that agree with one relative pose of calibrated cameras.
 
-    Of matched keypoints (N, 2), the best matches first, see
-    :func:`~.guided_pyramid.verify_best_first`; in any other order it takes more iterations. All
-    False when no model has ``min_matches`` inliers; False where a camera's distortion cannot be
-    undone.
+    Keypoints (N, 2) are best first, see :func:`~.guided_pyramid.verify_best_first`. All False if no
+    model has ``min_matches`` inliers.
     """
     options = options or TwoViewOptions()
     none = np.zeros(len(keypoints_a_px), dtype=bool)
@@ -197,10 +185,10 @@ def two_view_of_variants(
     base_matches: NDArray[np.int64],
     options: TwoViewOptions,
 ) -> PairVerifier:
-    """Verification by a two-view model; the richest's decides which variants agree.
+    """Return a two-view verifier; variants must agree with the model of the richest.
 
-    Of a camera, the image that the variants are of, with its own keypoints (N, 2 or more), the
-    other image's (M, 2 or more), and the verified matches int64 (K, 2) of the two as they are.
+    Keypoints are (N, 2 or more) and (M, 2 or more); ``base_matches`` int64 (K, 2) are the verified
+    matches of the images themselves.
     """
     focal, other_focal = focal_px(camera), focal_px(other_camera)
     pairs = image_px[base_matches[:, 0], :2], other_px[base_matches[:, 1], :2]
@@ -256,10 +244,8 @@ def known_pose_of_variants(
     other_from_image: RigidTransform,
     options: KnownPoseOptions,
 ) -> PairVerifier:
-    """Verification with the known poses.
-
-    Of the camera of the image that the variants are of, and of the other image's keypoints the rays
-    float64 (M, 3) and slopes (M, 2, 2).
+    """Return a verifier by a known pose; the other image's rays (M, 3) and slopes (M, 2, 2) are
+    given.
     """
 
     def verify(found: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -276,10 +262,9 @@ def known_pose_of_variants(
 def relative_pose(
     rays: Floats, other_rays: Floats, focal: float, options: TwoViewOptions
 ) -> RigidTransform | None:
-    """Estimate ``other_from_image`` of matched rays, with a translation of length 1, by RANSAC.
+    """Estimate ``other_from_image`` of matched rays (N, 3) by RANSAC, with a unit translation.
 
-    Of homogeneous rays (N, 3), last component 1, at a focal length in pixels, at which an error
-    counts. None where no model has ``min_matches`` inliers.
+    ``focal`` in pixels scales errors. None if no model has ``min_matches`` inliers.
     """
     if len(rays) < options.min_matches:
         return None
@@ -297,8 +282,7 @@ def _ransac(
     sampling: dict[str, Any],
     refinement: dict[str, Any],
 ) -> tuple[Any, dict[str, Any]]:
-    """poselib's relative pose, of normalised coordinates at a focal length: so it needs to know no
-    camera model, and ours knows them all."""
+    """Estimate poselib's relative pose of normalised coordinates, which need no camera model."""
     import poselib
 
     pinhole = {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0.0, 0.0]}
@@ -314,7 +298,7 @@ def _ransac(
 
 
 def _precision(variant: ImageVariant) -> float:
-    """Pixels of the image that a keypoint was found in, for one of the original; 1 at most."""
+    """Return pixels of a variant per pixel of the original, at most 1."""
     return min(1.0, variant.scale)
 
 
@@ -326,16 +310,13 @@ def agree_by_chance(
     num_matches: int,
     options: TwoViewOptions,
 ) -> bool:
-    """True if wrong matches of two images may agree with a relative pose as well as these do.
+    """Return True if wrong matches may agree with a relative pose as well as these do.
 
-    These are the matches (N, 2) that two-view verification kept of ``num_matches``. Of matches that
-    are all wrong some lie near the epipolar lines of any model, and RANSAC finds the model with
-    most of them. The number of false alarms (Moisan and Stival, A probabilistic criterion to detect
-    rigid point matches between two images, IJCV 2004) is how many models as good as this one are
-    expected among wrong matches. There a wrong match falls anywhere in the image; but keypoints
-    stand where the texture is, and wrong matches are of things that look alike. How often one is
-    near its line is therefore counted, on the keypoints themselves: each with the others' partners.
-    Few keypoints tell little of that, so it is never taken to be less than anywhere.
+    Keypoints (N, 2) are the verified ones of ``num_matches``. RANSAC finds a model even for wrong
+    matches. The number of false alarms (Moisan and Stival, IJCV 2004) is the expected number of
+    models as good among wrong matches. Keypoints cluster on texture, so the probability of a wrong
+    match near its epipolar line is measured on mismatched pairs of the keypoints, and is at least
+    that of uniform positions.
     """
     from scipy.special import gammaln
     from scipy.stats import binom

@@ -1,8 +1,4 @@
-"""Exact nearest neighbours among global descriptors, as blocked matrix products.
-
-Databases are read block by block, and no more than one block of similarities per feature is kept:
-what the search needs does not grow with the database.
-"""
+"""Exact nearest neighbours among global descriptors, as blocked matrix products."""
 
 from __future__ import annotations
 
@@ -33,27 +29,17 @@ Found = tuple[NDArray[np.int64], Float32]
 
 
 class VectorBlocks(Protocol):
-    """Global descriptors of a database, of which no more than a block has to be in memory.
-
-    Rows are finite and of unit length, so that the inner product is the cosine; a zero row, of an
-    image without features, is similar to nothing.
+    """Global descriptors of a database, read in blocks: unit rows, zero for images without
+    features.
     """
 
-    def __len__(self) -> int:
-        """Number of rows."""
-        ...
+    def __len__(self) -> int: ...
 
     @property
-    def dimension(self) -> int:
-        """Length D of a row."""
-        ...
+    def dimension(self) -> int: ...
 
     def read(self, start: int, stop: int, out: Float32 | None = None) -> Float32:
-        """The rows from ``start`` to ``stop``, float32 (stop - start, D); they are not written to.
-
-        They may be in ``out``, a C-contiguous array of that shape: memory that is used again and
-        again is much faster than new memory.
-        """
+        """Return rows float32 (stop - start, D), maybe in the C-contiguous array ``out``."""
         ...
 
 
@@ -61,8 +47,6 @@ VectorSource = VectorBlocks | NDArray[np.floating[Any]]
 
 
 class ArrayBlocks:
-    """An array (N, D) of unit or zero rows as a source of blocks."""
-
     def __init__(self, rows: NDArray[np.floating[Any]]) -> None:
         if rows.ndim != 2:
             raise DataError(f"global descriptors {rows.shape} are of different dimensions")
@@ -81,12 +65,11 @@ class ArrayBlocks:
 
 
 def as_blocks(source: VectorSource) -> VectorBlocks:
-    """The source itself, or the array as one."""
     return ArrayBlocks(source) if isinstance(source, np.ndarray) else source
 
 
 def common_length(sources: Sequence[VectorBlocks]) -> int:
-    """Number of rows that all sources have; DataError where they differ."""
+    """Return the number of rows of all sources; DataError if they differ."""
     lengths = {len(source) for source in sources}
     if len(lengths) != 1:
         raise DataError(f"features of one set of images have {sorted(lengths)} rows")
@@ -95,10 +78,7 @@ def common_length(sources: Sequence[VectorBlocks]) -> int:
 
 @dataclass(frozen=True)
 class FusedSearch:
-    """The ``top_k`` best database rows of queries by several features, part by part of a database.
-
-    One feature alone is not fused. The weights are positive, one per feature; all equal by default.
-    """
+    """Search of the ``top_k`` best database rows by several features, part by part."""
 
     top_k: int
     fusion: FusionOptions
@@ -107,18 +87,11 @@ class FusedSearch:
     def lists(
         self, queries: Sequence[NDArray[np.floating[Any]]], database: Sequence[VectorSource]
     ) -> list[Found]:
-        """Rank the rows of a part: one ranking, or of methods that fuse ranks one per feature.
+        """Rank the rows of a part: one ranking, or one per feature for fusion of ranks.
 
-        Parameters
-        ----------
-        queries : per feature float (Q, D_i), rows of unit length for cosine similarity. A zero row,
-            of an image without features, has similarity 0 with everything.
-        database : per feature float (M, D_i), or a source of blocks of them.
-
-        Returns
-        -------
-        Of each ranking indices, int64 (Q, min(K, M)), best first, where equal scores keep the
-        database's order, and scores float32; K is ``top_k``, or more of rankings that are fused.
+        ``queries`` and ``database`` have (Q, D_i) and (M, D_i) per feature. A ranking has indices
+        int64 (Q, min(K, M)), best first, ties in the database's order, and scores float32; K is
+        ``top_k``, or more for fusion of ranks.
         """
         if len(queries) == 0 or len(queries) != len(database):
             raise OptionError(
@@ -134,10 +107,7 @@ class FusedSearch:
         return _search(queries, database, self.top_k, fused)
 
     def ranking(self, parts: Sequence[Sequence[Found]]) -> Found:
-        """Rank the whole from the lists of its parts, whose rows are the whole's.
-
-        Indices and scores are (Q, min(top_k, M)).
-        """
+        """Merge the lists of all parts: indices and scores (Q, min(top_k, M))."""
         lists = [_merged(found, self._list_length()) for found in zip(*parts, strict=True)]
         if len(lists) == 1:
             indices, scores = lists[0]
@@ -150,7 +120,6 @@ class FusedSearch:
 
 
 def _merged(parts: Sequence[Found], length: int) -> Found:
-    """The best of the parts' rankings (Q, K), best first; of equal ones the earlier part's."""
     if len(parts) == 1:
         return parts[0]
     indices, scores = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
@@ -164,7 +133,7 @@ def _search(
     length: int,
     combine: Callable[[Matrices], Matrices],
 ) -> list[Found]:
-    """A ranking of at most ``length`` rows per matrix of scores that ``combine`` returns."""
+    """Rank at most ``length`` rows by each matrix of scores that ``combine`` returns."""
     sources = [as_blocks(source) for source in database]
     vectors = [_checked(rows, source) for rows, source in zip(queries, sources, strict=True)]
     num_queries, num_rows = len(vectors[0]), common_length(sources)
@@ -209,20 +178,14 @@ def _checked(queries: NDArray[np.floating[Any]], source: VectorBlocks) -> Float3
 
 
 class _BestRows:
-    """For each query the ``top_k`` best database rows so far, best first; of equal ones the first.
-
-    ``rows`` int64 (Q, top_k), -1 where fewer came, and ``scores`` float32, -inf there.
-    """
+    """Best ``top_k`` rows so far of each query: ``rows`` int64, -1 if fewer, ``scores`` float32."""
 
     def __init__(self, num_queries: int, top_k: int) -> None:
         self.rows = np.full((num_queries, top_k), -1, dtype=np.int64)
         self.scores = np.full((num_queries, top_k), -np.inf, dtype=np.float32)
 
     def add(self, first_query: int, first_row: int, scores: NDArray[np.floating[Any]]) -> None:
-        """Take finite scores (q, b) of queries and database rows from these on.
-
-        Blocks of rows come in the order of the database.
-        """
+        """Add scores (q, b) of queries and database rows; blocks come in the database's order."""
         known = slice(first_query, first_query + len(scores))
         top_k = self.rows.shape[1]
         found, columns = _first_best(np.asarray(scores, np.float32), top_k)
@@ -235,7 +198,7 @@ class _BestRows:
 
 
 def _first_best(scores: Float32, count: int) -> tuple[Float32, NDArray[np.int64]]:
-    """The ``count`` best of each row (q, b) and their columns, ascending; of equal the first."""
+    """Return the ``count`` best of each row (q, b) and their columns; ties to the first."""
     height, width = scores.shape
     if width <= count:
         return scores, np.broadcast_to(np.arange(width), scores.shape)

@@ -35,8 +35,6 @@ TASKS: dict[str, type[TrainingOptions]] = {
 
 @dataclass(frozen=True)
 class TrainingData:
-    """The data of a training."""
-
     kaptures: Sequence[KaptureFolder] = ()  # with poses and depth
     photographs: Sequence[Path] = ()  # folders of images, trained on under homographies
     # kaptures that are only evaluated on; no folder of ``kaptures`` may be one
@@ -64,16 +62,11 @@ def train(
 ) -> dict[str, float]:
     """Train a matcher, or descriptors with :class:`DescriptorOptions`, to the last step.
 
-    Written at each evaluation, beside each other: ``output``, of descriptors that are trained
-    through SuperGlue also ``X-superglue.safetensors``, the manifest ``X.json``, the curves
-    ``X.csv`` and ``X.state.pt``, from which the same call goes on; before, ``X.overlaps``. Returns
-    the last row of the curves by column.
-
-    Parameters
-    ----------
-    output : the file to write, ``X.safetensors``.
-    force : begin again where another training's files stand.
-    threads : that prepare pairs.
+    Each evaluation writes ``output`` (``X.safetensors``), for descriptors trained through SuperGlue
+    also ``X-superglue.safetensors``, the manifest ``X.json``, the curves ``X.csv`` and
+    ``X.state.pt``, from which the same call resumes; ``X.overlaps`` is written before. ``force``
+    replaces another training's files; ``threads`` prepare pairs. Returns the last row of the
+    curves.
     """
     if output.suffix != ".safetensors":
         raise OptionError(f"{output}: the file to write must end in .safetensors")
@@ -105,8 +98,6 @@ def train(
 
 
 class _Files:
-    """The files of one training; ``overlaps`` is a folder, of measured overlaps of pairs."""
-
     def __init__(self, output: Path) -> None:
         self.output = output
         self.state, self.manifest = output.with_suffix(".state.pt"), output.with_suffix(".json")

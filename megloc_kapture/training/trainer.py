@@ -1,7 +1,6 @@
-"""The training loop: seeded, and resumed from its last evaluation.
+"""Training loop: seeded, and resumed from its last evaluation.
 
-The pairs of a step and all that is random in them depend on the seed and the step alone, so the
-state is the networks, the optimizer and the number of the step.
+A step's pairs depend on seed and step only, so the state is networks, optimizer and step.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ _MAX_GRADIENT = 1.0  # norm; a single pair may have one that is far off
 
 
 class TrainingOptions(NetworkOptions):
-    """Options of training SuperGlue on the features of a frozen extractor."""
+    """Options of training SuperGlue on a frozen extractor's features."""
 
     half_precision: bool = Field(
         default=False, description="bfloat16 but for keypoints, transport and loss"
@@ -79,7 +78,7 @@ class TrainingOptions(NetworkOptions):
 
 
 class DescriptorOptions(TrainingOptions):
-    """Options of training the descriptors of a frozen detector's keypoints."""
+    """Options of training descriptors of a frozen detector's keypoints."""
 
     through: Literal["superglue", "products"] = Field(
         default="superglue",
@@ -96,7 +95,6 @@ class TrainingState:
     def resume(
         cls, path: Path, model: PairModel, optimizer: torch.optim.Optimizer
     ) -> TrainingState:
-        """Load where a training was left; the beginning without a file."""
         if not path.is_file():
             return cls(0, [])
         content = load_state(read_content(path), path, model, optimizer)
@@ -104,7 +102,6 @@ class TrainingState:
 
 
 def model_of(options: TrainingOptions, extractor: LocalFeatureExtractor) -> PairModel:
-    """Build the networks as training begins."""
     # plugins need not say it
     noise = np.random.default_rng(0).integers(0, 256, (128, 128, 3), np.uint8)
     size = extractor.extract(noise).descriptors.shape[1]
@@ -151,10 +148,7 @@ class Trainer:
         *,
         threads: int = 1,
     ) -> Iterator[TrainingState]:
-        """Train to the last step on pairs drawn from each source alike; yield at evaluations.
-
-        With one thread the pairs of a step are prepared when it comes.
-        """
+        """Train on pairs drawn evenly from the sources; yield at evaluations."""
         options, losses = self.options, []
         steps = range(state.step, options.steps)
         with ThreadPoolExecutor(threads) if threads > 1 else nullcontext() as pool:
@@ -172,7 +166,7 @@ class Trainer:
                 yield state
 
     def hold_out(self, sources: Mapping[str, PairSource]) -> None:
-        """Draw the pairs that are evaluated on, by the names of their sources."""
+        """Draw the evaluation pairs of each source."""
         self._held_out = {
             name: [
                 self._frozen.prepare(source.draw(np.random.default_rng([0, number])))
