@@ -96,14 +96,18 @@ class MapIndex:
         """Count the points observed by both of two images, int64 (n, n); the diagonal has each
         one's own.
         """
-        points = [np.unique(self.observed(image)[1]) for image in images]
-        rows = np.repeat(np.arange(len(images)), [len(each) for each in points])
-        every = np.concatenate([self.point_ids[:0], *points])
-        shared = np.zeros((len(images), len(images)), np.int64)
-        for row, own in enumerate(points):
-            seen = np.zeros(len(self.xyz), np.bool_)
-            seen[own] = True
-            shared[row] = np.bincount(rows[seen[every]], minlength=len(images))
+        count, seen_by = len(images), [self.observed(image)[1] for image in images]
+        rows = np.repeat(np.arange(count), [len(points) for points in seen_by])
+        keys = np.unique(_paired(np.concatenate([self.point_ids[:0], *seen_by]), rows))
+        points, rows = keys >> 32, keys & 0xFFFFFFFF
+        shared = np.diag(np.bincount(rows, minlength=count))
+        for step in range(1, count):
+            same = points[step:] == points[:-step]
+            if not same.any():
+                break
+            pairs = rows[:-step][same] * count + rows[step:][same]
+            each = np.bincount(pairs, minlength=count**2).reshape(count, count)
+            shared = shared + each + each.T
         return shared
 
 
