@@ -14,10 +14,8 @@ from numba import get_num_threads
 from megloc_kapture.compiling import compiled_loop
 from megloc_kapture.geometry.projection import PINHOLES, distorted, moved, project_point
 
-# information whose pivots are this far apart does not determine its point
+# least ratio of the information's pivots that determine a point
 _MIN_RATIO = 1e-13
-_MAX_SWEEPS = 16
-_SMALL = 2.3e-16
 
 
 def in_chunks(count: int, size: int, work: Callable[[int, int], object]) -> None:
@@ -99,20 +97,6 @@ def shares_seen(
 
 
 @compiled_loop
-def mean_depths(starts, image_ids, xyz, rotations, translations, out):
-    """Mean depths (N,) of points in their images; NaN where no image observes one."""
-    for i in range(len(xyz)):
-        total = 0.0
-        for o in range(starts[i], starts[i + 1]):
-            k = image_ids[o]
-            r = rotations[k]
-            total += r[2, 0] * xyz[i, 0] + r[2, 1] * xyz[i, 1] + r[2, 2] * xyz[i, 2]
-            total += translations[k, 2]
-        count = starts[i + 1] - starts[i]
-        out[i] = total / count if count > 0 else math.nan
-
-
-@compiled_loop
 def covariances_of_points(
     first, last, starts, image_ids, xyz, rotations, translations, models, params, out
 ):
@@ -169,44 +153,3 @@ def covariances_of_points(
         cxy = -l10 * cyy - l20 * cyz
         out[i, 0] = 1.0 / xx - l10 * cxy - l20 * cxz
         out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = cxy, cxz, cyy, cyz, czz
-
-
-@compiled_loop
-def _rotated(a, b, ab, ac, bc):
-    """One Jacobi rotation of axes a and b, c the third: the new entries, the new ``ab`` is zero."""
-    if ab == 0.0:
-        return a, b, ab, ac, bc
-    theta = (b - a) / (2.0 * ab)
-    t = 1.0 / (abs(theta) + math.sqrt(theta * theta + 1.0))
-    if theta < 0.0:
-        t = -t
-    cosine = 1.0 / math.sqrt(t * t + 1.0)
-    sine = t * cosine
-    return a - t * ab, b + t * ab, 0.0, cosine * ac - sine * bc, sine * ac + cosine * bc
-
-
-@compiled_loop
-def deviations_of_points(first, last, covariances, out):
-    """Square roots of the eigenvalues of covariances (N, 6), ascending, rows of ``out`` (N, 3).
-
-    Cyclic Jacobi: slower than the closed formula, and accurate in the small eigenvalues too, where
-    that is not (Golub and van Loan, Matrix Computations, section 8.5).
-    """
-    for i in range(first, last):
-        a, b, c = covariances[i, 0], covariances[i, 3], covariances[i, 5]
-        ab, ac, bc = covariances[i, 1], covariances[i, 2], covariances[i, 4]
-        for _ in range(_MAX_SWEEPS):
-            # each off-diagonal entry against its own diagonal: a small eigenvalue counts as much
-            if (
-                ab * ab <= _SMALL * _SMALL * a * b
-                and ac * ac <= _SMALL * _SMALL * a * c
-                and bc * bc <= _SMALL * _SMALL * b * c
-            ):
-                break
-            a, b, ab, ac, bc = _rotated(a, b, ab, ac, bc)
-            a, c, ac, ab, bc = _rotated(a, c, ac, ab, bc)
-            b, c, bc, ab, ac = _rotated(b, c, bc, ab, ac)
-        low, high = min(a, b), max(a, b)
-        out[i, 0] = math.sqrt(min(low, c))
-        out[i, 1] = math.sqrt(max(low, min(high, c)))
-        out[i, 2] = math.sqrt(max(high, c))

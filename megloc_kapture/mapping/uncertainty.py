@@ -40,8 +40,6 @@ def point_covariances(
     from megloc_kapture.geometry.projection import packed_views
     from megloc_kapture.mapping import kernels
 
-    if len(cameras) != len(cams_from_world):
-        raise DataError(f"{len(cameras)} cameras and {len(cams_from_world)} poses, not as many")
     out = np.full((len(xyz), 6), np.nan)
     starts, image_ids = _by_point(point_ids, image_ids, len(xyz), len(cameras))
     if len(image_ids) == 0:
@@ -60,26 +58,19 @@ def point_covariances(
 
 
 def point_deviations(covariances: Floats) -> Floats:
-    """Return ascending deviations (N, 3) along the principal axes of covariances (N, 6); NaN if
-    unknown.
-    """
-    from megloc_kapture.mapping import kernels
-
-    out = np.full((len(covariances), 3), np.nan)
-    known = np.ascontiguousarray(covariances, dtype=np.float64)
-    kernels.in_chunks(
-        len(covariances), _CHUNK, lambda a, b: kernels.deviations_of_points(a, b, known, out)
-    )
-    return out
+    """Return deviations (N, 3) along the principal axes, ascending; NaN if unknown."""
+    deviations = np.full((len(covariances), 3), np.nan)
+    known = np.isfinite(covariances).all(axis=1)
+    matrices = covariances[known][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    # rounding may turn the smallest eigenvalue negative
+    deviations[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(matrices), 0.0))
+    return deviations
 
 
 def _by_point(
     point_ids: NDArray[np.integer], image_ids: NDArray[np.integer], num_points: int, num_images: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """Return the first observation of each point (N + 1,), and the images (O,) in that order."""
-    point_ids, image_ids = np.asarray(point_ids), np.asarray(image_ids)
-    if point_ids.shape != image_ids.shape or point_ids.ndim != 1:
-        raise DataError(f"ids of points {point_ids.shape} and of images {image_ids.shape} differ")
     for name, ids, count in (("point", point_ids, num_points), ("image", image_ids, num_images)):
         if len(ids) and not (ids.min() >= 0 and ids.max() < count):
             raise DataError(
@@ -142,13 +133,14 @@ class ObservedPoints:
 
 def mean_depths(observed: ObservedPoints) -> Floats:
     """Return mean depths (N,) of the points in their images; NaN without observations."""
-    from megloc_kapture.geometry.projection import packed_views
-    from megloc_kapture.mapping import kernels
-
-    depths = np.empty(len(observed.xyz))
-    poses = packed_views(observed.cameras, observed.cams_from_world)[:2]
-    kernels.mean_depths(observed.starts(), observed.image_ids, observed.xyz, *poses, depths)
-    return depths
+    poses = observed.cams_from_world
+    axes = np.array([pose.rotation_matrix()[2] for pose in poses]).reshape(-1, 3)
+    offsets = np.array([pose.translation[2] for pose in poses])
+    points, images = observed.xyz[observed.point_ids], observed.image_ids
+    depths = np.einsum("oi,oi->o", axes[images], points) + offsets[images]
+    with np.errstate(invalid="ignore"):
+        sums = np.bincount(observed.point_ids, depths, minlength=len(observed.xyz))
+        return np.asarray(sums / track_lengths(observed))
 
 
 def track_lengths(observed: ObservedPoints) -> NDArray[np.int64]:
