@@ -22,7 +22,6 @@ from megloc_kapture.geometry.warping import WarpedView, WarpSource, warp_to_view
 from megloc_kapture.plugin_loading import load_plugin, weights_of
 from megloc_kapture.plugins import (
     IMAGE_DISTANCES,
-    HypothesisView,
     ImageDistance,
     PluginChoice,
     PoseHypothesis,
@@ -104,10 +103,10 @@ def _explains(this: PoseHypothesis, other: PoseHypothesis) -> bool:
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_ANOTHER_VIEW = 0.2  # of references, how unlike; radians: with equal centres, 11 degrees
+_ANOTHER_VIEW = 0.2  # least difference of references, radians
 
 
-class AlignedViewOptions(Options):
+class PerceptualOptions(Options):
     references: int = Field(
         default=5,
         ge=1,
@@ -117,9 +116,6 @@ class AlignedViewOptions(Options):
     long_side: int = Field(
         default=320, ge=16, description="of the views compared, pixels; never enlarged"
     )
-
-
-class PerceptualOptions(AlignedViewOptions):
     distance: PluginChoice = Field(
         default=PluginChoice(name="structure"),
         description="how different two aligned images look: structure, lpips, or another's",
@@ -179,9 +175,9 @@ class PerceptualRanker:
         otherwise = DistinctiveInliers().score(hypotheses, scene)
         inliers = [sum(int(v.inliers.sum()) for v in each.views) for each in hypotheses]
         enough = self.options.min_inlier_share * max(inliers)
-        shown = _Shown(scene, self.options)
+        read = cache(scene.query_image), cache(partial(warp_source, scene=scene))
         compared = [
-            shown.views(each) if count >= enough else None
+            self._views(each, scene, *read) if count >= enough else None
             for each, count in zip(hypotheses, inliers, strict=True)
         ]
         own = np.array(
@@ -204,6 +200,25 @@ class PerceptualRanker:
         untold = ~np.isfinite(own)
         scores[untold] = scores[told].min() - 1.0 - 1.0 / (1.0 + otherwise[untold])
         return scores
+
+    def _views(
+        self,
+        hypothesis: PoseHypothesis,
+        scene: RankingScene,
+        query_image: Callable[[str], NDArray[np.uint8]],
+        source_of: Callable[[str], WarpSource | None],
+    ) -> list[_Compared]:
+        views, options, images = [], self.options, hypothesis.images
+        for view in hypothesis.views:
+            place = view.camera, view.cam_from_world
+            warped = aligned_view(*place, images, scene, options, source_of=source_of)
+            height, width = warped.valid.shape
+            mask, valid = scene.query_mask(view.name), warped.valid
+            if mask is not None:
+                valid = valid & _mask_at_size(mask, width, height)
+            query = query_at_size(query_image(view.name), width, height)
+            views.append(_Compared(query, warped.image, valid))
+        return views
 
     def _against_each_other(
         self, finalists: Sequence[Sequence[_Compared] | None], own: Floats, at: NDArray[np.int64]
@@ -237,36 +252,6 @@ class PerceptualRanker:
         return float(np.average(np.array(distances)[known], weights=counts[known]))
 
 
-class _Shown:
-    def __init__(self, scene: RankingScene, options: AlignedViewOptions) -> None:
-        self._scene, self._options = scene, options
-        self._queries: dict[str, tuple[NDArray[np.uint8], Mask | None]] = {}
-        self._source = cache(partial(warp_source, scene=scene))
-
-    def views(self, hypothesis: PoseHypothesis) -> list[_Compared]:
-        return [self._view(view, hypothesis.images) for view in hypothesis.views]
-
-    def _view(self, view: HypothesisView, images: Sequence[str]) -> _Compared:
-        warped = aligned_view(
-            view.camera,
-            view.cam_from_world,
-            images,
-            self._scene,
-            self._options,
-            source_of=self._source,
-        )
-        height, width = warped.valid.shape
-        if view.name not in self._queries:
-            image, mask = self._scene.query_image(view.name), self._scene.query_mask(view.name)
-            self._queries[view.name] = (
-                query_at_size(image, width, height),
-                None if mask is None else _mask_at_size(mask, width, height),
-            )
-        query, usable = self._queries[view.name]
-        valid = warped.valid if usable is None else warped.valid & usable
-        return _Compared(query, warped.image, valid)
-
-
 def warp_source(name: str, scene: RankingScene) -> WarpSource | None:
     depth = scene.map_depth(name)
     if depth is None:
@@ -287,12 +272,12 @@ def aligned_view(
     cam_from_world: RigidTransform,
     images: Sequence[str],
     scene: RankingScene,
-    options: AlignedViewOptions | None = None,
+    options: PerceptualOptions | None = None,
     *,
     source_of: Callable[[str], WarpSource | None] | None = None,
 ) -> WarpedView:
     """Warp the map images with depth that are nearest to a pose into its view, at reduced size."""
-    options = options or AlignedViewOptions()
+    options = options or PerceptualOptions()
     read = source_of or (lambda name: warp_source(name, scene))
     sources: list[WarpSource] = []
     for name in _nearest_first(images, cam_from_world, scene):

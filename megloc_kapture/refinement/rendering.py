@@ -37,11 +37,10 @@ from megloc_kapture.refinement.pyramid import (
 )
 from megloc_kapture.refinement.references import (
     Displacement,
-    PyramidKind,
     ReferenceImages,
     RenderingQuery,
     RenderingReference,
-    prepared,
+    lifted,
     pyramid_of,
     reference_of,
     refine_held_out,
@@ -135,12 +134,9 @@ class _Refining:
         self.options, self.least_overlap = options, max(options.min_overlap, 1e-9)
         self.camera = query.camera
         self.threads = threads
-        kind = PyramidKind(options.levels, options.max_side_px, options.appearance)
-        ours = threads.submit(pyramid_of, query, kind)
-        theirs = list(threads.map(lambda each: prepared(each, kind), references))
-        self.query_levels = ours.result()
-        self.levels = [each.pyramid for each in theirs]
-        self.points = [each.points for each in theirs]
+        pyramids = threads.map(partial(pyramid_of, options=options), [query, *references])
+        self.points = list(threads.map(lifted, references))
+        self.query_levels, *self.levels = pyramids
 
     def refine(self, start: RigidTransform) -> PoseRefinement:
         sight, overlap = self._visibility(start)
