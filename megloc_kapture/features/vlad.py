@@ -69,12 +69,7 @@ class VladOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class PcaWhitening:
-    """PCA whitening of global descriptors: ``y = projection (x - mean)``, then unit length.
-
-    Jegou and Chum, "Negative evidences and co-occurrences in image retrieval", ECCV 2012: whitening
-    compensates for co-occurrences and for redundant vocabularies. ``mean`` is float32 (D,),
-    ``projection`` float32 (d, D), rows of scaled principal components, the strongest first.
-    """
+    """``y = projection (x - mean)``, then unit length (Jegou and Chum, ECCV 2012)."""
 
     mean: Float32
     projection: Float32
@@ -91,10 +86,8 @@ class PcaWhitening:
 def learn_whitening(vectors: Float32, dimensions: int, power: float = 1.0) -> PcaWhitening:
     """Learn whitening from vectors (N, D), float32, which are overwritten.
 
-    With fewer images than dimensions the last components are noise, and full whitening would make
-    all vectors equally dissimilar. So the deviations are raised to ``power`` below one (Revaud et
-    al., ICCV 2019: the variance to the power 0.25, which is 0.5 here). The rank, less than N,
-    limits the number of dimensions.
+    With few images the last components are noise, so deviations are raised to ``power`` below one
+    (Revaud et al., ICCV 2019). The rank, less than N, limits the number of dimensions.
     """
     mean = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)
     vectors -= mean
@@ -153,11 +146,7 @@ def train_vlad(
 ) -> Vocabulary:
     """Train vocabularies, and optionally their whitening, on the images of a map.
 
-    Parameters
-    ----------
-    length, read : functions for the number of an image's descriptors, and for the descriptors (N,
-        D).
-    each : parallel map for the vectors that whitening is learnt from.
+    ``length`` and ``read`` return an image's number of descriptors and its descriptors (N, D).
     """
     options = options or VladOptions()
     rows = sample_rows(map(length, images), options.training_descriptors, options.seed)
@@ -280,11 +269,7 @@ def sample_rows(counts: Iterable[int], total: int, seed: int) -> list[NDArray[np
 def aggregate(
     descriptors: NDArray[Any], vocabulary: Vocabulary, options: VladOptions | None = None
 ) -> Float32:
-    """Compute the VLAD of descriptors (N, D): float32 (``vocabulary.size``,), unit length.
-
-    Without whitening the order is vocabulary, cluster, dimension. An image without descriptors gets
-    the zero vector.
-    """
+    """Compute the VLAD of descriptors (N, D): float32, unit length; zero without descriptors."""
     options = options or VladOptions()
     data = np.ascontiguousarray(descriptors, dtype=np.float32)
     if len(data) and data.shape[1] != vocabulary.centres.shape[2]:

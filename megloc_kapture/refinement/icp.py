@@ -140,10 +140,8 @@ def refine_by_icp(
 ) -> PoseRefinement:
     """Fit a query's cloud, float64 (N, 3) in the camera's frame, to the map's (M, 3), in metres.
 
-    The measures are ``residual_before_m`` and ``residual_after_m`` (median distance from the map's
-    planes within the coarsest distance), ``overlap_before`` and ``overlap_after`` (share of points
-    within the finest distance), ``moved_m``, ``moved_deg`` and ``condition``. The covariance is
-    that of :func:`~megloc_kapture.refinement.icp_surface.fit_covariance`.
+    Residuals are median distances from the map's planes within the coarsest distance, overlaps the
+    shares of points within the finest one.
     """
     options = options or IcpOptions()
     # coordinates are small near the camera, whatever the world's origin
@@ -288,11 +286,10 @@ def map_cloud(
     scene: RankingScene,
     options: IcpOptions,
 ) -> Floats:
-    """Return the map's points around a query under its estimated pose, float64 (M, 3), world.
+    """Return the map's points (M, 3) around a query under its estimated pose.
 
     They come from the depth maps of the references with most overlap, one per view within 0.2 m and
-    10 deg, or from the references' sparse points without depth. ``query_points``: float64 (N, 3) in
-    the query camera's frame; ``references``: map images, best first.
+    10 deg, or from the references' sparse points without depth.
     """
     margin_m = options.max_distances_m[0]
     low, high = query_points.min(axis=0) - margin_m, query_points.max(axis=0) + margin_m
@@ -326,7 +323,6 @@ def _overlaps(
     scene: RankingScene,
     options: IcpOptions,
 ) -> list[tuple[str, float]]:
-    """Return references with depth and the share that agrees with the query's; most first."""
     found = []
     depth_from_world = query_depth.image_from_depth.inverse() @ cam_from_world
     for name in references:

@@ -65,12 +65,7 @@ class ReferenceImages:
     ) -> list[str]:
         """Return images with a similar viewing direction, nearest first, half from ``first``.
 
-        Parameters
-        ----------
-        first : images that the pose comes from, which are known to match.
-        only_first : use no other images.
-        max_angle_deg : largest angle between viewing directions.
-        min_distance_m : least distance of the centres, unit of the map.
+        ``first`` are images that match; ``only_first`` uses no others.
         """
         forward = cam_from_world.rotation_matrix()[2]
         facing = self._directions @ forward >= np.cos(np.deg2rad(max_angle_deg))
@@ -88,8 +83,6 @@ class ReferenceImages:
 
 @dataclass(frozen=True, eq=False)
 class RenderingQuery:
-    """An image to refine: RGB uint8 (H, W, 3), mask True = use."""
-
     image: NDArray[np.uint8]
     camera: Camera
     mask: NDArray[np.bool_] | None = None
@@ -149,7 +142,6 @@ class Displacement:
 
     @property
     def contradicts(self) -> bool:
-        """True if it exceeds the claimed uncertainty and the resolution of alignment."""
         return self.squared_distance > CHI2_OF_CHANCE and self.moved_px > _RESOLVED_PX
 
 
@@ -169,7 +161,6 @@ class Consistency:
 
     @property
     def consistent(self) -> bool:
-        """True unless the tests contradict the claimed accuracy."""
         return not self.reason
 
 
@@ -234,13 +225,7 @@ def refine_held_out(
 ) -> Displacement | None:
     """Refine a map image against others from its given pose and return the displacement.
 
-    None without depth, or where the others do not determine the pose.
-
-    Parameters
-    ----------
-    images : of the map, in one coordinate frame.
-    scene : source of pixels, cameras, poses and depth; no query data is read.
-    max_references : the references with most overlap and another viewing angle.
+    None without depth, or if the others do not determine the pose. No query data is read.
     """
     view = reference_of(image, scene)
     if view is None:

@@ -62,15 +62,10 @@ def refine_by_rendering(
     cam_from_world: RigidTransform,
     options: RenderingOptions | None = None,
 ) -> PoseRefinement:
-    """Refine the pose of an image by references lifted by their depth.
+    """Refine the pose of an image, in metres, by references lifted by their depth.
 
     ``measures`` of the result: cost (robust loss, 0 to 0.5), correlation and overlap before and
     after, decrease of the cost in standard errors, motion in m and deg, points and references.
-
-    Parameters
-    ----------
-    references : all are used.
-    cam_from_world : of the query, in the frame of the references' poses, metres.
     """
     options = options or RenderingOptions()
     # independent work on two threads; results keep the order of the work
@@ -89,8 +84,7 @@ def judge_by_rendering(
 ) -> PoseRefinement:
     """Judge a pose found by other means, after alignment at the finest level.
 
-    ``start`` and ``found``: old and new ``cam_from_world``; ``judged``: bool (H, W), pixels of the
-    query for acceptance, all by default.
+    ``judged``: bool (H, W), pixels of the query for acceptance, all by default.
     """
     with ThreadPoolExecutor(2) as threads:
         return _Refining(query, references, options, threads).judge(start, found, judged)
@@ -255,7 +249,6 @@ class Rendering:
         references: Sequence[str],
         scene: RankingScene,
     ) -> PoseRefinement:
-        """Refine the pose of a query by its best references with depth."""
         used: list[RenderingReference] = []
         for name in references:
             if len(used) == self.options.max_references:
