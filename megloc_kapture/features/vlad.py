@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,6 @@ from pydantic import Field
 from megloc_kapture.errors import DataError
 from megloc_kapture.values import Options
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 Float32 = NDArray[np.float32]
 
 _CHUNK = 16384  # descriptors per block: bounds memory at 16384 x clusters floats
@@ -130,10 +128,8 @@ class Vocabulary:
         return self.centres.size if self.whitening is None else len(self.whitening.projection)
 
 
-class Each(Protocol):
-    def __call__(
-        self, function: Callable[[Item], Result], items: Iterable[Item], /
-    ) -> Iterable[Result]: ...
+Each = Callable[[Callable[[str], Float32], Iterable[str]], Iterable[Float32]]
+"""A parallel map."""
 
 
 def train_vlad(

@@ -24,7 +24,7 @@ _SETTLED = 0.01
 _PIXELS_OF_SIGMA = 3.0
 _SAME_CENTRE_M = 1e-9  # an offset that is left over from composing transforms
 # coefficients of z^0, z^1, z^2 of 0.0012 + 0.0019 (z - 0.4)^2
-_STRUCTURED_LIGHT = (0.001504, -0.00152, 0.0019)
+STRUCTURED_LIGHT = (0.001504, -0.00152, 0.0019)
 
 
 class LiftingOptions(Options):
@@ -159,7 +159,7 @@ class DepthVerificationOptions(Options):
         "observation is dropped; none: depth maps are not looked at",
     )
     noise: tuple[float, float, float] = Field(
-        default=_STRUCTURED_LIGHT,
+        default=STRUCTURED_LIGHT,
         description="a, b, c of the noise a + b z + c z^2 at depth z, in the map's unit",
     )
     keypoint_noise_px: float = Field(

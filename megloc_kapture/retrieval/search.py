@@ -18,28 +18,24 @@ from megloc_kapture.retrieval.fusion import (
     normalized_weights,
 )
 
-# products of large blocks are faster: the matrix library's threads wait for each other less often
 _BLOCK_ELEMENTS = 1 << 24  # similarities held at once, per feature: 64 MiB of float32
 _VECTOR_ELEMENTS = 1 << 25  # of a block of database rows, per feature: 128 MiB of float32
 _MOST_ROWS = 1 << 14  # of a block, however short they are
-_CACHED_ELEMENTS = 1 << 18  # of similarities ranked at once: 1 MiB, which a cache holds
 Float32 = NDArray[np.float32]
 Matrices = Sequence[NDArray[np.floating[Any]]]
 Found = tuple[NDArray[np.int64], Float32]
 
 
 class VectorBlocks(Protocol):
-    """Global descriptors of a database, read in blocks: unit rows, zero for images without
-    features.
-    """
+    """Unit rows of a database, read in blocks; zero for images without features."""
 
     def __len__(self) -> int: ...
 
     @property
     def dimension(self) -> int: ...
 
-    def read(self, start: int, stop: int, out: Float32 | None = None) -> Float32:
-        """Return rows float32 (stop - start, D), maybe in the C-contiguous array ``out``."""
+    def read(self, start: int, stop: int) -> Float32:
+        """Return rows float32 (stop - start, D)."""
         ...
 
 
@@ -59,8 +55,7 @@ class ArrayBlocks:
     def dimension(self) -> int:
         return self._rows.shape[1]
 
-    def read(self, start: int, stop: int, out: Float32 | None = None) -> Float32:
-        # a view where the array is float32 already
+    def read(self, start: int, stop: int) -> Float32:
         return np.ascontiguousarray(self._rows[start:stop], dtype=np.float32)
 
 
@@ -141,29 +136,17 @@ def _search(
         raise DataError(f"features of {', '.join(str(len(rows)) for rows in vectors)} queries")
     step = _VECTOR_ELEMENTS // max(1, *(source.dimension for source in sources))
     step = max(1, min(step, _MOST_ROWS, _BLOCK_ELEMENTS))
-    height = min(step, num_rows)
     at_once = min(max(1, _BLOCK_ELEMENTS // step), num_queries)
-    buffers = [np.empty((height, source.dimension), dtype=np.float32) for source in sources]
-    products = [np.empty(at_once * height, dtype=np.float32) for _ in sources]
     num_rankings = len(combine([np.zeros((0, 0), np.float32)] * len(sources)))
     best = [_BestRows(num_queries, min(length, num_rows)) for _ in range(num_rankings)]
     for left in range(0, num_rows, step) if num_queries else ():
         right = min(left + step, num_rows)
-        blocks = [
-            source.read(left, right, out=buffer[: right - left])
-            for source, buffer in zip(sources, buffers, strict=True)
-        ]
+        blocks = [source.read(left, right) for source in sources]
         for first in range(0, num_queries, at_once):
-            matrices = []
-            for rows, block, out in zip(vectors, blocks, products, strict=True):
-                some = rows[first : first + at_once]
-                product = out[: len(some) * len(block)].reshape(len(some), len(block))
-                matrices.append(np.matmul(some, block.T, out=product))
-            few = max(1, _CACHED_ELEMENTS // (right - left))
-            for start in range(0, len(matrices[0]), few):
-                fused = combine([matrix[start : start + few] for matrix in matrices])
-                for scores, ranking in zip(fused, best, strict=True):
-                    ranking.add(first + start, left, scores)
+            some = slice(first, first + at_once)
+            products = [rows[some] @ block.T for rows, block in zip(vectors, blocks, strict=True)]
+            for scores, ranking in zip(combine(products), best, strict=True):
+                ranking.add(first, left, scores)
     return [(ranking.rows, ranking.scores) for ranking in best]
 
 
