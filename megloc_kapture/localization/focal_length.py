@@ -81,14 +81,10 @@ class _Fit:
     """
 
     change: Floats
-    deviations: Floats
+    deviation: float  # relative, of the focal length
     rig_from_world: RigidTransform
     pose_covariance: Floats
     depth: float
-
-    @property
-    def deviation(self) -> float:
-        return float(self.deviations[0])
 
 
 def is_uncertain(problem: PoseProblem) -> bool:
@@ -361,7 +357,7 @@ def _fit(
     of_camera, between = covariance[6:, 6:], covariance[:6, 6:]
     return _Fit(
         change=change,
-        deviations=np.sqrt(np.diagonal(of_camera)),
+        deviation=math.sqrt(of_camera[0, 0]),
         rig_from_world=view.cam_from_rig.inverse() @ moved @ start,
         pose_covariance=between @ np.linalg.solve(of_camera, between.T),
         depth=depth,

@@ -16,13 +16,13 @@ from megloc_kapture.geometry.cameras import bearing_rays, focal_px, px_from_cam
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
-# a depth sensor beside the camera sees each point at a pixel that depends on its depth; a few
-# rounds find it, and what has not settled to a hundredth of its depth lies behind an edge
+# a point's pixel in a depth sensor beside the camera depends on its depth, so it is iterated;
+# points that do not converge are behind an edge
 _ROUNDS = 6
 _SETTLED = 0.01
-# one over the noise, in pixels, that a deviation of estimated depth is due to
+# one over the keypoint noise, in pixels, of the deviations of estimated depth
 _PIXELS_OF_SIGMA = 3.0
-_SAME_CENTRE_M = 1e-9  # an offset that is left over from composing transforms
+_SAME_CENTRE_M = 1e-9  # offset by rounding of composed transforms
 # coefficients of z^0, z^1, z^2 of 0.0012 + 0.0019 (z - 0.4)^2
 STRUCTURED_LIGHT = (0.001504, -0.00152, 0.0019)
 
@@ -64,7 +64,7 @@ def lift_keypoints(
     if not len(rays) or not (depth_m > 0).any():
         return points, np.zeros(len(rays), bool)
     same_centre = bool(np.linalg.norm(image_from_depth.translation) < _SAME_CENTRE_M)
-    # of one centre, all points of a ray are seen at one pixel
+    # with one centre, all points of a ray are at one pixel
     z = np.full(len(rays), 1.0 if same_centre else float(np.median(depth_m[depth_m > 0])))
     settled = np.zeros(len(rays), bool)
     for _ in range(1 if same_centre else _ROUNDS):
@@ -179,7 +179,7 @@ class DepthVerificationOptions(Options):
     @classmethod
     def _positive(cls, noise: tuple[float, float, float]) -> tuple[float, float, float]:
         a, b, c = noise
-        # least where z = -b / 2c, if that lies before the sensor, else at the sensor itself
+        # minimum at z = -b / 2c, if positive, else at 0
         lowest = a - b * b / (4.0 * c) if c > 0 and b < 0 else a
         if not np.isfinite(noise).all() or lowest <= 0 or c < 0 or (c == 0 and b < 0):
             raise ValueError("noise is not positive at every depth")
@@ -234,14 +234,13 @@ def compare_with_depth(
     with np.errstate(invalid="ignore"):
         inside = (pixels >= 0).all(axis=1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
     rows = np.flatnonzero(inside)
-    # the centre of the first pixel is (0.5, 0.5): the whole part is the pixel
     column, line = np.floor(pixels[rows]).astype(np.int64).T
     reach = np.arange(-options.window_px, options.window_px + 1)
     columns = np.clip(column[:, None, None] + reach[None, None, :], 0, width - 1)
     lines = np.clip(line[:, None, None] + reach[None, :, None], 0, height - 1)
     window = depth_m[lines, columns].reshape(len(rows), len(reach) ** 2).astype(np.float64)
     known = np.isfinite(window) & (window > 0)
-    # beside a hole the surface may be the one that the sensor has not seen
+    # next to a hole, the surface may be invisible to the sensor
     whole = known.all(axis=1)
     rows, window = rows[whole], window[whole]
     z, low, high = points[rows, 2], window.min(axis=1), window.max(axis=1)

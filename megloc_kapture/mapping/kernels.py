@@ -59,7 +59,7 @@ def most_shared(
         for k in range(count):
             other = touched[k]
             if other != image and shared[other] >= min_shared:
-                # most shared first, then the first image, as one number that ascends
+                # sort key: most shared first, then the image
                 touched[enough] = (-shared[other] << 32) | other
                 enough += 1
             shared[other] = 0
@@ -113,11 +113,11 @@ def covariances_of_points(
             y = r10 * px + r11 * py + r12 * pz + translations[k, 1]
             z = r20 * px + r21 * py + r22 * pz + translations[k, 2]
             if not z > 0.0:
-                continue  # behind the camera: such an observation says nothing
+                continue  # behind the camera
             inverse = 1.0 / z
             u, v = x * inverse, y * inverse
             au, av, bu, bv = 1.0, 0.0, 0.0, 1.0
-            if models[k] > PINHOLES:  # to ask a pinhole too makes its loop twice as slow
+            if models[k] > PINHOLES:  # twice as fast for pinholes
                 _, _, au, av, bu, bv = distorted(models[k], params[k], u, v)
             fx, fy = params[k, 0] * inverse, params[k, 1] * inverse
             # z times the derivatives of u and v by the point in the world

@@ -13,14 +13,13 @@ from scipy.spatial import cKDTree
 from megloc_kapture.geometry.cameras import bearing_rays, px_from_cam
 from megloc_kapture.values import Camera, Options, RigidTransform
 
-_BLOCK_ELEMENTS = 1 << 20  # distances held at once; each takes about 80 bytes on the way
-# where hardly any two images look the same way, an image searches no further than this
+_BLOCK_ELEMENTS = 1 << 20  # distances held at once, about 80 bytes each
+# most neighbours searched for similar viewing directions
 _MAX_SEARCHED = 1024
-# of a point that more images than this see, an image counts only those that near it
+# images before and after in a track that count as sharing its point
 _TRACK_WINDOW = 512
-# each is worked out by itself, so that chunks change nothing
 _IMAGES_AT_ONCE, _PAIRS_AT_ONCE = 256, 1024
-# pixels looked at, across and down; depths, in distances of the two centres
+# pixels across and down; depths in distances of the two centres
 _GRID = (9, 7)
 _DEPTHS = 2.0 ** np.arange(-2, 8, 0.5)
 
@@ -33,7 +32,7 @@ def exhaustive_pairs(count: int) -> NDArray[np.int64]:
 def unique_pairs(pairs: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return distinct pairs (P, 2) with i < j, sorted."""
     low, high = pairs.min(axis=1), pairs.max(axis=1)
-    # a pair in one number: sorted much faster than rows are
+    # a pair as one number sorts faster
     base = int(high.max(initial=0)) + 1
     keys = each_once((low * base + high)[low != high])
     return np.stack(np.divmod(keys, base), axis=1)
@@ -95,7 +94,7 @@ def pairs_by_poses(
             cosine = np.einsum("nd,nkd->nk", axes[part], axes[other])
             good = valid & (cosine >= min_cosine - 1e-12)
             rank = np.cumsum(good, axis=1)
-            # an image whose neighbours look elsewhere searches further
+            # search further without enough neighbours in similar directions
             done = (rank[:, -1] >= options.num_neighbours) | ~np.isfinite(distance[:, -1])
             done |= size >= largest
             take = good & (rank <= options.num_neighbours) & done[:, None]
@@ -128,7 +127,7 @@ def pairs_by_covisibility(
     options = options or PairsByCovisibilityOptions()
     if len(point_ids) == 0:
         return np.zeros((0, 2), dtype=np.int64)
-    # an observation in one number, sorted by point, then image
+    # observations as numbers, sorted by point, then image
     keys = each_once(np.asarray(point_ids, dtype=np.int64) * num_images + image_ids)
     points, images = np.divmod(keys, num_images)
     track_ends = np.flatnonzero(np.append(points[1:] != points[:-1], True)) + 1
@@ -190,7 +189,7 @@ def _reaches(first: Camera, second: Camera, second_from_first: RigidTransform) -
     turned = rays @ second_from_first.rotation_matrix().T
     offset = np.asarray(second_from_first.translation)
     depths = _DEPTHS * np.linalg.norm(offset)
-    # without a distance between them, and at infinity, only the turn counts
+    # at infinity only the rotation counts
     points = [turned, *(turned * depth + offset for depth in depths[depths > 0])]
     with np.errstate(invalid="ignore"):
         seen = px_from_cam(second, np.concatenate(points))

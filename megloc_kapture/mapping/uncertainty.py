@@ -23,7 +23,7 @@ from megloc_kapture.values import Camera, Options, RigidTransform
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_CHUNK = 1 << 14  # points; each is worked out by itself, so that chunks change nothing
+_CHUNK = 1 << 14  # points
 
 
 def point_covariances(
@@ -150,7 +150,7 @@ def track_lengths(observed: ObservedPoints) -> NDArray[np.int64]:
 
 def too_uncertain(deviations: Floats, depths: Floats, max_robust_sigmas: float) -> Mask:
     """Return a mask (N,) of points to reject by their largest deviation and mean depth (N,)."""
-    with np.errstate(invalid="ignore"):  # comparisons with NaN are false, as they should be
+    with np.errstate(invalid="ignore"):  # comparisons with NaN are false
         relative = deviations / depths
         usual = relative[np.isfinite(relative) & (relative > 0)]
         if len(usual) == 0:

@@ -60,7 +60,7 @@ def match_nearest(
         clear = to_best <= options.max_ratio**2 * to_second
         rows, to_best, to_second = rows[clear], to_best[clear], to_second[clear]
     if options.mutual:
-        # two rows with exactly the best value of one column: the first one has it
+        # of rows with the same best column and value, keep the first
         first = np.sort(np.unique(best[rows], return_index=True)[1])
         rows, to_best, to_second = rows[first], to_best[first], to_second[first]
     ratio = np.divide(to_best, to_second, out=np.ones(len(rows)), where=to_second > 0)

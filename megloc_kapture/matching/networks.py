@@ -109,7 +109,8 @@ def network_input(
             f"{where} takes descriptors of {descriptor_size} dimensions, one "
             f"for each of {len(table)} keypoints; these have the shape {descriptors.shape}"
         )
-    xy = torch.from_numpy(table[:, :2] - np.float32(0.5)).to(device)  # its first pixel is (0, 0)
+    # the network's first pixel centre is (0, 0)
+    xy = torch.from_numpy(table[:, :2] - np.float32(0.5)).to(device)
     return ImageKeypoints(
         normalise_keypoints(xy, image.width, image.height),
         torch.from_numpy(scores.copy()).to(device),
@@ -134,7 +135,7 @@ KindOptions = TypeVar("KindOptions", bound=LightGlueKindOptions)
 class _LightGlueKind(PairNetwork[KindOptions]):
     """Matcher by kornia's LightGlue, one pair at a time without padding."""
 
-    _load: Any  # of a checkpoint's tensors, the file's name and the options
+    _load: Any  # loader of a checkpoint
 
     def __init__(self, options: KindOptions | None = None) -> None:
         require_kornia("LightGlue")

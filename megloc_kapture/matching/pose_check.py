@@ -13,11 +13,11 @@ from megloc_kapture.geometry.conventions import CONVENTIONS, better_conventions
 from megloc_kapture.matching.verification import Floats, KnownPoseOptions, verify_with_poses
 from megloc_kapture.values import RigidTransform
 
-# share of the larger side, more than a degree: poses of depth sensors are off by nearly as much
+# share of the larger side, more than a degree: poses of depth sensors have such errors
 _MAX_ERROR_SHARE = 0.02
-_AGREEING = 0.5  # share of a pair's matches that have to fit its poses
+_AGREEING = 0.5  # least share of a pair's matches that fit its poses
 _MOST = 0.5
-_FEW = 3  # compared images, too few to refuse a map for
+_FEW = 3  # least compared images to reject a map
 
 
 @dataclass(frozen=True)

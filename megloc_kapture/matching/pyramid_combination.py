@@ -65,7 +65,7 @@ def combine(
             alone.take(best, tried[best])
             if len(alone.matches) > len(base_matches):
                 return alone.result(best)
-            # several of its keypoints are the same one
+            # identical keypoints have reduced its matches
             for union, length in zip(keypoints, lengths, strict=True):
                 if union is not None:
                     union.truncate(length)
@@ -102,7 +102,7 @@ class _Combination:
             if other in used_other:
                 continue
             row = int(known[k])
-            if row < 0:  # it may have been appended since
+            if row < 0:  # may have been appended in this loop
                 row = union.find_added(found.keypoints_px[k])
             if row < 0:
                 row = union.append(found.keypoints_px[k])

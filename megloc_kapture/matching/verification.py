@@ -29,14 +29,11 @@ from megloc_kapture.matching.guided_pyramid import (
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
-# a ray that is seen this far from its pixel is none of this pixel
-_MAX_RAY_ERROR_PX = 0.1
-# of a variant's matches, whose own model is another one where fewer agree
-_MIN_AGREEING = 0.5
-_SAMPLE = 5  # matches that a relative pose of calibrated cameras is made of
-# shares of the threshold: the most telling one counts, as in the paper of false alarms
-_THRESHOLDS = (1.0, 0.5, 0.25)
-# matches of one thing in two images are not independent of each other, so few must be expected
+_MAX_RAY_ERROR_PX = 0.1  # round trip of a pixel
+_MIN_AGREEING = 0.5  # share of a variant's matches
+_SAMPLE = 5  # matches that determine a relative pose
+_THRESHOLDS = (1.0, 0.5, 0.25)  # shares of the error threshold, of which the best counts
+# strict, since matches on one object are not independent
 _MAX_FALSE_ALARMS = 1e-10
 _MAX_WRONG_PAIRS = 20_000
 
@@ -80,7 +77,7 @@ def ray_slopes(camera: Camera, keypoints_px: NDArray[np.floating[Any]], rays: Fl
     a, b, c, d = (jacobian[:, row, column] for row in (0, 1) for column in (0, 1))
     determinant = a * d - b * c
     error = np.abs(px - keypoints_px).max(axis=1)
-    # beyond the radius where a distortion turns back, it is mirrored
+    # a distortion polynomial that turns back mirrors
     good = (error <= _MAX_RAY_ERROR_PX) & (determinant > 0)
     slopes = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2)
     slopes /= np.where(good, determinant, np.nan)[:, None, None]
@@ -166,7 +163,7 @@ def verify_two_view(
         return none
     focal = 0.5 * (focal_px(camera_a) + focal_px(camera_b))
     best_first = {"progressive_sampling": True, "max_prosac_iterations": options.max_iterations}
-    # the pose is not asked for, and the inliers are known before it is refined
+    # only the inliers are needed, which refinement does not change
     unrefined = {"max_iterations": 0}
     _, info = _ransac(rays_a[usable], rays_b[usable], focal, options, best_first, unrefined)
     inliers = np.asarray(info["inliers"], dtype=bool)
@@ -194,7 +191,7 @@ def two_view_of_variants(
     pairs = image_px[base_matches[:, 0], :2], other_px[base_matches[:, 1], :2]
 
     def verify(found: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
-        # an error counts at the mean focal length of both cameras, and a variant's has its scale
+        # poselib's errors are at the mean focal length; a variant's are larger by its scale
         coarser = (focal + other_focal) / (_precision(found.variant) * focal + other_focal)
         return verify_two_view(
             found.keypoints_px[matches[:, 0], :2],
@@ -208,7 +205,7 @@ def two_view_of_variants(
         if not found:
             return found
         sets = [pairs, *((one.keypoints_px, other_px[one.other_rows]) for one in found)]
-        richest = max(range(len(sets)), key=lambda at: len(sets[at][0]))  # of equals the first
+        richest = max(range(len(sets)), key=lambda at: len(sets[at][0]))
         other_from_image = relative_pose(
             bearing_rays(camera, sets[richest][0][:, :2]),
             bearing_rays(other_camera, sets[richest][1][:, :2]),
@@ -224,7 +221,7 @@ def two_view_of_variants(
         for one in found:
             px = one.keypoints_px[:, :2]
             rays = bearing_rays(camera, px)
-            # a ray turns so much more with a pixel of the smaller image
+            # pixels of a smaller image are larger angles
             slopes = ray_slopes(camera, px, rays) / _precision(one.variant)
             others = one.other_rows
             good = verify_with_poses(
@@ -344,7 +341,7 @@ def agree_by_chance(
     samples = gammaln(num_matches + 1) - gammaln(num_matches - _SAMPLE + 1) - gammaln(_SAMPLE + 1)
     for share in _THRESHOLDS:
         threshold_px = share * options.max_error_px
-        # a wrong match that falls anywhere in the image; a Sampson error is of both together
+        # probability for uniform positions; a Sampson error is of both images together
         anywhere = max(
             2 * math.sqrt(2) * threshold_px * math.hypot(c.width, c.height) / (c.width * c.height)
             for c in (camera_a, camera_b)

@@ -8,7 +8,6 @@ from a few pixels, so it begins at a coarse level, from several perturbed poses.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 
@@ -68,9 +67,7 @@ def refine_by_rendering(
     after, decrease of the cost in standard errors, motion in m and deg, points and references.
     """
     options = options or RenderingOptions()
-    # independent work on two threads; results keep the order of the work
-    with ThreadPoolExecutor(2) as threads:
-        return _Refining(query, references, options, threads).refine(cam_from_world)
+    return _Refining(query, references, options).refine(cam_from_world)
 
 
 def judge_by_rendering(
@@ -86,8 +83,7 @@ def judge_by_rendering(
 
     ``judged``: bool (H, W), pixels of the query for acceptance, all by default.
     """
-    with ThreadPoolExecutor(2) as threads:
-        return _Refining(query, references, options, threads).judge(start, found, judged)
+    return _Refining(query, references, options).judge(start, found, judged)
 
 
 def displacement_by_rendering(
@@ -102,11 +98,10 @@ def displacement_by_rendering(
     too small, or the minimum is out of bounds.
     """
     options = options or RenderingOptions()
-    with ThreadPoolExecutor(2) as threads:
-        refining = _Refining(query, references, options, threads)
-        refined = refining.refine(cam_from_world)
-        if not refined.accepted:
-            refined = refining.judge(cam_from_world, cam_from_world, None)
+    refining = _Refining(query, references, options)
+    refined = refining.refine(cam_from_world)
+    if not refined.accepted:
+        refined = refining.judge(cam_from_world, cam_from_world, None)
     found = refined.measures
     if "squared_distance" not in found or (
         found["moved_m"] > options.max_translation_m
@@ -123,14 +118,12 @@ class _Refining:
         query: RenderingQuery,
         references: Sequence[RenderingReference],
         options: RenderingOptions,
-        threads: Executor,
     ) -> None:
         self.options, self.least_overlap = options, max(options.min_overlap, 1e-9)
         self.camera = query.camera
-        self.threads = threads
-        pyramids = threads.map(partial(pyramid_of, options=options), [query, *references])
-        self.points = list(threads.map(lifted, references))
-        self.query_levels, *self.levels = pyramids
+        self.query_levels = pyramid_of(query, options)
+        self.levels = [pyramid_of(each, options) for each in references]
+        self.points = [lifted(each) for each in references]
 
     def refine(self, start: RigidTransform) -> PoseRefinement:
         sight, overlap = self._visibility(start)
@@ -203,8 +196,7 @@ class _Refining:
         fewer = problem.thinned(_START_POINTS)
         here = minimise(fewer, fewer.nuisance_at(pose), last_step_px=_COARSE_STEP_PX)
         starts = [here, *perturbed_starts(fewer, here)[:_MAX_STARTS]]
-        align = partial(minimise, fewer, last_step_px=_COARSE_STEP_PX, rounds=1)
-        tried = list(self.threads.map(align, starts))
+        tried = [minimise(fewer, each, last_step_px=_COARSE_STEP_PX, rounds=1) for each in starts]
         return max(tried, key=partial(correlation, fewer)).cam_from_world
 
     def _decide(

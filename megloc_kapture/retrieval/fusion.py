@@ -23,16 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import OptionError
 from megloc_kapture.values import Options
 
 FusionMethod = Literal["ghm", "mean", "early", "reciprocal_rank"]
-# added to each similarity by the generalized harmonic mean; kapture-localization's default
-_GAMMA = 0.5
-# added to each rank; the constant of Cormack et al.
-_RANK_CONSTANT = 60
-# images of each feature's ranking that count in reciprocal rank fusion
-RANKED_IMAGES = 200
+_GAMMA = 0.5  # kapture-localization's default
+_RANK_CONSTANT = 60  # of Cormack et al.
+RANKED_IMAGES = 200  # per feature in reciprocal rank fusion
 Similarities = NDArray[np.floating[Any]]
 Ranking = tuple[NDArray[np.int64], NDArray[np.float32]]
 
@@ -57,9 +54,6 @@ def fuse(
 ) -> Similarities:
     """Fuse the similarities (Q, M) of several features; weights are equal by default."""
     shares = normalized_weights(weights, len(similarities)).tolist()
-    if len({matrix.shape for matrix in similarities}) != 1:
-        shapes = ", ".join(str(matrix.shape) for matrix in similarities)
-        raise DataError(f"similarities of different shapes: {shapes}")
     total = np.zeros_like(similarities[0])
     if options.method in ("mean", "early"):
         for matrix, share in zip(similarities, shares, strict=True):
@@ -67,7 +61,7 @@ def fuse(
         return total
     with np.errstate(divide="ignore", over="ignore"):
         for matrix, share in zip(similarities, shares, strict=True):
-            # 1 / 0 is infinite, and makes the mean zero
+            # 1 / 0 is infinite and makes the mean zero
             total += (1 / len(similarities)) / np.maximum(_GAMMA + share * matrix, 0)
         fused: Similarities = 1 / total
     fused -= _GAMMA

@@ -92,7 +92,7 @@ class FusedSearch:
             raise OptionError(
                 f"{len(queries)} global features of the queries, {len(database)} of the map"
             )
-        normalized_weights(self.weights, len(queries))  # refused before anything is read
+        normalized_weights(self.weights, len(queries))  # check before reading
         if len(queries) == 1 or self.fusion.fuses_ranks():
             return _search(queries, database, self._list_length(), lambda matrices: matrices)
 
@@ -174,7 +174,7 @@ class _BestRows:
         found, columns = _first_best(np.asarray(scores, np.float32), top_k)
         both = np.concatenate([self.scores[known], found], axis=1)
         rows = np.concatenate([self.rows[known], first_row + columns], axis=1)
-        # what was known comes first, so that of equal scores the earlier rows stay
+        # known rows come first, so that they win ties
         order = np.argsort(-both, axis=1, kind="stable")[:, :top_k]
         self.scores[known] = np.take_along_axis(both, order, axis=1)
         self.rows[known] = np.take_along_axis(rows, order, axis=1)
@@ -188,7 +188,7 @@ def _first_best(scores: Float32, count: int) -> tuple[Float32, NDArray[np.int64]
     bound = np.partition(scores, width - count, axis=1)[:, width - count, None]
     chosen = scores >= bound
     surplus = np.count_nonzero(chosen, axis=1) - count
-    for row in np.flatnonzero(surplus):  # several are equal to the last one
+    for row in np.flatnonzero(surplus):  # ties with the last one
         equal = np.flatnonzero(scores[row] == bound[row])
         chosen[row, equal[len(equal) - surplus[row] :]] = False
     columns = np.nonzero(chosen)[1].reshape(height, count)

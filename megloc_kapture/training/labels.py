@@ -21,7 +21,7 @@ from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 UNMATCHED, IGNORED = -1, -2
-# pixels across and down that overlap is measured at
+# grid of pixels to measure overlap
 _GRID = (24, 18)
 _LIFTING = LiftingOptions()
 

@@ -42,9 +42,9 @@ from megloc_kapture.training.pairs import TrainingPair
 from megloc_kapture.values import ImageFeatures, RigidTransform
 
 _FEATURES_KEPT = 1024  # images
-_FIRST_SCALE = 10.0  # of products of descriptors; SuperGlue's final projection learns its own
-_FIRST_DUSTBIN = 0.7  # cosine at which a product is as good as nothing
-_CONFIDENT = 0.2  # the matcher's own threshold
+_FIRST_SCALE = 10.0  # initial scale of descriptor products
+_FIRST_DUSTBIN = 0.7  # initial cosine of the dustbin
+_CONFIDENT = 0.2  # the matcher's threshold
 
 Image = NDArray[np.uint8]
 AUC_DEG = (5, 10, 20)
@@ -254,7 +254,6 @@ def transport_loss(log_assignment: torch.Tensor, labels: Labels) -> torch.Tensor
     lost_b = torch.from_numpy(labels.partner_b == UNMATCHED).to(device)
     matched = log_assignment[rows, columns]
     unmatched = torch.cat([log_assignment[:-1, -1][lost_a], log_assignment[-1, :-1][lost_b]])
-    # a mean of nothing is not a number
     return -sum(0.5 * part.sum() / max(len(part), 1) for part in (matched, unmatched))  # type: ignore[return-value]
 
 
@@ -262,9 +261,9 @@ def transport_loss(log_assignment: torch.Tensor, labels: Labels) -> torch.Tensor
 class HeldOutResult:
     pairs: int
     loss: float  # mean over the pairs
-    precision: float  # share of right ones among all matches whose keypoints are labelled
-    recall: float  # share of the labelled matches that are found
-    # area under the curve of the relative pose's error up to 5, 10 and 20 degrees, in [0, 1]
+    precision: float  # share of right matches of labelled keypoints
+    recall: float  # share of the labelled matches
+    # area under the curve of the relative pose error up to 5, 10 and 20 degrees, in [0, 1]
     auc: tuple[float, ...]
 
 
@@ -300,7 +299,7 @@ def pose_error_deg(pair: PreparedPair, matches: NDArray[np.int64]) -> float:
     of one centre.
     """
     views, truth = pair.pair.views, pair.pair.b_from_a
-    assert views is not None and truth is not None  # who calls has asked
+    assert views is not None and truth is not None
     rays = [
         bearing_rays(view.camera, features.keypoints_px[matches[:, side], :2])
         for side, (view, features) in enumerate(zip(views, pair.features, strict=True))

@@ -37,7 +37,7 @@ from megloc_kapture.training.labels import (
 )
 from megloc_kapture.values import Options, RigidTransform
 
-# near images that look anything like the same way; their overlap is then measured
+# candidates, whose overlap is then measured
 _CANDIDATES = PairsByPosesOptions(num_neighbours=40, max_angle_deg=90)
 _VIEWS_KEPT = 64
 
@@ -80,9 +80,9 @@ class PairOptions(Options):
 @dataclass(frozen=True, eq=False)
 class TrainingPair:
     images: tuple[Image, Image]  # uint8 (H, W, 3), RGB
-    keys: tuple[str, str] | None  # of images that come again as they are; None of those that do not
+    keys: tuple[str, str] | None  # cache keys; None for images that do not recur
     label: Labelling  # labels of keypoints (N, 2) and (M, 2) of the images
-    # cameras, poses and depth of a pair of posed images; None under a homography
+    # None under a homography
     views: tuple[PosedView, PosedView] | None = None
 
     @property
@@ -112,7 +112,6 @@ class PosedPairs:
         poses, records = data.poses(), depth_records(data)
         self._poses, self._records = poses, records
         self._names = [name for name in sorted(poses) if name in records]
-        # bound to this object, so that it goes with it
         self._view = lru_cache(maxsize=_VIEWS_KEPT)(self._read_view)
         if measured is not None and measured.is_file():
             near, overlaps = self._read_overlaps(measured)
@@ -236,7 +235,7 @@ def random_view(
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     corners = (moved - rectangle.mean(axis=0)) @ turn.T
     extent = np.ptp(corners, axis=0)
-    # as large a part of the photograph as fits, times the scale
+    # the largest part of the photograph that fits, times the scale
     corners *= rng.uniform(options.min_scale, 1.0) * (sides / extent).min()
     corners -= corners.min(axis=0)
     corners += rng.uniform(0, 1, 2) * (sides - corners.max(axis=0))
@@ -259,7 +258,7 @@ def relit(image: Image, rng: np.random.Generator, strength: float = 1.0) -> Imag
     cast = np.exp2(rng.normal(0, 0.12 * strength, 3))
     noise, blur = rng.uniform(0, 0.04 * strength), rng.uniform(0, 1.2 * strength)
     level = (image.astype(np.float32) / 255) ** np.float32(gamma)
-    # what is brighter than white is lost, so exposure mostly takes light away
+    # values above white are lost, so exposure is mostly reduced
     level *= (min(exposure, 1.3) * cast).astype(np.float32)
     if blur > 0.3:
         level = np.asarray(cv2.GaussianBlur(level, (0, 0), float(blur)), np.float32)

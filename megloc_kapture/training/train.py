@@ -47,7 +47,7 @@ COLUMNS = (
     *(f"auc_{bound}" for bound in AUC_DEG),
 )
 _LAST_RATE = 0.01  # of the first
-_MAX_GRADIENT = 1.0  # norm; a single pair may have one that is far off
+_MAX_GRADIENT = 1.0  # norm
 
 
 class TrainingOptions(NetworkOptions):
@@ -106,7 +106,7 @@ class TrainingState:
 
 
 def model_of(options: TrainingOptions, extractor: LocalFeatureExtractor) -> PairModel:
-    # plugins need not say it
+    # plugins may not have descriptor_size
     noise = np.random.default_rng(0).integers(0, 256, (128, 128, 3), np.uint8)
     size = extractor.extract(noise).descriptors.shape[1]
     with torch.random.fork_rng(devices=[]):
@@ -141,7 +141,7 @@ class Trainer:
         trained = [p for p in self.model.parameters() if p.requires_grad]
         self.optimizer = torch.optim.Adam(trained, lr=options.learning_rate)
         self._held_out: dict[str, list[PreparedPair]] = {}
-        # of the last evaluation, by the name of the held-out source
+        # last evaluation by held-out source
         self.results: dict[str, HeldOutResult] = {}
 
     def train(
@@ -232,8 +232,8 @@ TASKS: dict[str, type[TrainingOptions]] = {
 @dataclass(frozen=True)
 class TrainingData:
     kaptures: Sequence[KaptureFolder] = ()  # with poses and depth
-    photographs: Sequence[Path] = ()  # folders of images, trained on under homographies
-    # kaptures that are only evaluated on; no folder of ``kaptures`` may be one
+    photographs: Sequence[Path] = ()  # folders of images, for homographies
+    # for evaluation only, disjoint from ``kaptures``
     held_out: Sequence[KaptureFolder] = ()
 
     def check(self) -> None:
