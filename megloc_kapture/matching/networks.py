@@ -118,8 +118,13 @@ def network_input(
     )
 
 
-class LightGlueKindOptions(NetworkOptions):
-    weights: str
+class LightGlueOptions(NetworkOptions):
+    """Options of LightGlue."""
+
+    weights: str = Field(
+        default="superpoint_lightglue",
+        description="superpoint_lightglue, aliked_lightglue, disk_lightglue, or a file",
+    )
     threshold: float = Field(default=0.1, ge=0, lt=1, description="probability of a match")
     depth_confidence: float = Field(
         default=-1.0, ge=-1, le=1, description="stop early at this confidence; -1: all layers"
@@ -129,15 +134,13 @@ class LightGlueKindOptions(NetworkOptions):
     )
 
 
-KindOptions = TypeVar("KindOptions", bound=LightGlueKindOptions)
+class LightGlue(PairNetwork[LightGlueOptions]):
+    """Matcher ``lightglue`` by kornia, for the features of its weights, without padding."""
 
+    Options = LightGlueOptions
+    _load: Any = staticmethod(load_lightglue)
 
-class _LightGlueKind(PairNetwork[KindOptions]):
-    """Matcher by kornia's LightGlue, one pair at a time without padding."""
-
-    _load: Any  # loader of a checkpoint
-
-    def __init__(self, options: KindOptions | None = None) -> None:
+    def __init__(self, options: LightGlueOptions | None = None) -> None:
         require_kornia("LightGlue")
         super().__init__(options)
 
@@ -183,26 +186,14 @@ def _kornia_input(image: ImageFeatures, device: torch.device) -> dict[str, torch
     return {name: torch.from_numpy(array)[None].to(device) for name, array in values.items()}
 
 
-class LightGlueOptions(LightGlueKindOptions):
-    weights: str = Field(
-        default="superpoint_lightglue",
-        description="superpoint_lightglue, aliked_lightglue, disk_lightglue, or a file",
-    )
+class LighterGlueOptions(LightGlueOptions):
+    """Options of LighterGlue."""
 
-
-class LightGlue(_LightGlueKind[LightGlueOptions]):
-    """Matcher ``lightglue`` for the features of its weights; needs kornia."""
-
-    Options = LightGlueOptions
-    _load = staticmethod(load_lightglue)
-
-
-class LighterGlueOptions(LightGlueKindOptions):
     weights: str = Field(default="xfeat-lighterglue", description="name in the registry, or a file")
 
 
-class LighterGlue(_LightGlueKind[LighterGlueOptions]):
-    """Matcher ``lighterglue`` for features of type ``xfeat``; needs kornia."""
+class LighterGlue(LightGlue):
+    """Matcher ``lighterglue`` for features of type ``xfeat``."""
 
     Options = LighterGlueOptions
-    _load = staticmethod(load_lighterglue)
+    _load: Any = staticmethod(load_lighterglue)

@@ -75,26 +75,6 @@ def test_it_is_the_networks_distance(files: tuple[Path, Path]) -> None:
     assert half == pytest.approx(plugin.distance(a, b, FULL), rel=0.1)
 
 
-def masks() -> list[np.ndarray]:
-    """A full one, one without the left, one without a patch."""
-    found = np.ones((3, 80, 96), bool)
-    found[1, :, :40] = False
-    found[2, 20:50, 30:70] = False
-    return list(found)
-
-
-def test_the_distance_is_the_networks(files: tuple[Path, Path]) -> None:
-    plugin = distance(files)
-    query, *views = pictures(4)
-    # the same array with other pixels is another image
-    for shade in (0, 90):
-        query[:40] = shade
-        for valid in masks():
-            for view in views:
-                expected = by_network(files, query, view, valid)
-                assert plugin.distance(query, view, valid) == pytest.approx(expected, abs=1e-6)
-
-
 def test_where_nothing_can_be_told_it_is_infinite(files: tuple[Path, Path]) -> None:
     assert distance(files).distance(*pictures(), ~FULL) == np.inf
     assert distance(files).distance(*pictures(height=40), FULL[:40]) == np.inf
