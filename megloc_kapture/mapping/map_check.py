@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -220,12 +221,7 @@ def _readings(
         lambda image: replace(image, keypoints_px=image.keypoints_px[:, ::-1]),
     )
     for name, convention in CONVENTIONS.items():
-        yield (
-            name,
-            lambda image, read=convention: replace(
-                image, cam_from_world=read(image.cam_from_world)
-            ),
-        )
+        yield name, partial(_with_convention, convention)
     factors = _factors(images, xyz)
     if (scale := factors.get("keypoints")) is not None:
         yield (
@@ -239,6 +235,12 @@ def _readings(
             f"a focal length {longer:.3g} times as long",
             lambda image: replace(image, camera=scale_focal(image.camera, longer)),
         )
+
+
+def _with_convention(
+    convention: Callable[[RigidTransform], RigidTransform], image: ObservedKeypoints
+) -> ObservedKeypoints:
+    return replace(image, cam_from_world=convention(image.cam_from_world))
 
 
 def _factors(images: Sequence[ObservedKeypoints], xyz: Floats) -> dict[str, float]:
