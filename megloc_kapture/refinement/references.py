@@ -8,7 +8,7 @@ not detected.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -145,12 +145,6 @@ class Displacement:
         return self.squared_distance > CHI2_OF_CHANCE and self.moved_px > _RESOLVED_PX
 
 
-Displace = Callable[
-    [RenderingQuery, Sequence[RenderingReference], RigidTransform], Displacement | None
-]
-"""Refines a pose that should be right; None where the references do not determine it."""
-
-
 @dataclass(frozen=True)
 class Consistency:
     images: int
@@ -186,7 +180,7 @@ def spread_names(names: Sequence[str]) -> list[str]:
 
 
 def judge_consistency(displacements: Iterable[Displacement | None]) -> Consistency:
-    """Judge a map by at most ``MAX_TESTED`` displacements of :func:`refine_held_out`."""
+    """Judge a map by at most ``MAX_TESTED`` displacements of held-out images."""
     known: list[Displacement] = []
     for each in displacements:
         if each is not None:
@@ -215,31 +209,11 @@ def judge_consistency(displacements: Iterable[Displacement | None]) -> Consisten
     return Consistency(len(known), contradicting, median, reason)
 
 
-def refine_held_out(
-    image: str,
-    images: ReferenceImages,
-    scene: RankingScene,
-    displace: Displace,
-    *,
-    max_references: int,
-) -> Displacement | None:
-    """Refine a map image against others from its given pose and return the displacement.
-
-    None without depth, or if the others do not determine the pose. No query data is read.
-    """
-    view = reference_of(image, scene)
-    if view is None:
-        return None
-    references = _references_elsewhere(view, lifted(view), images, scene)[:max_references]
-    if not references:
-        return None
-    query = RenderingQuery(view.image, view.camera, view.mask)
-    return displace(query, references, view.cam_from_world)
-
-
-def _references_elsewhere(
-    view: RenderingReference, own: DepthPoints, images: ReferenceImages, scene: RankingScene
+def references_elsewhere(
+    view: RenderingReference, images: ReferenceImages, scene: RankingScene
 ) -> list[RenderingReference]:
+    """Return images of the map with another viewing angle, those with most overlap first."""
+    own = lifted(view)
     points = own.points[:: max(1, len(own.points) // _ASKED_POINTS)]
     if len(points) == 0:
         return []

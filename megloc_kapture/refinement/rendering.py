@@ -42,7 +42,7 @@ from megloc_kapture.refinement.references import (
     lifted,
     pyramid_of,
     reference_of,
-    refine_held_out,
+    references_elsewhere,
 )
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -227,11 +227,15 @@ class Rendering:
     def hold_out(
         self, image: str, images: ReferenceImages, scene: RankingScene
     ) -> Displacement | None:
+        view = reference_of(image, scene)
+        if view is None:
+            return None
+        references = references_elsewhere(view, images, scene)[: self.options.max_references]
+        if not references:
+            return None
+        query = RenderingQuery(view.image, view.camera, view.mask)
         options = self.options.model_copy(update={"accept_always": False})
-        displace = partial(displacement_by_rendering, options=options)
-        return refine_held_out(
-            image, images, scene, displace, max_references=self.options.max_references
-        )
+        return displacement_by_rendering(query, references, view.cam_from_world, options)
 
     def refine(
         self,
