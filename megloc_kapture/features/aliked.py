@@ -94,11 +94,7 @@ class Aliked(LocalNetwork[AlikedOptions]):
 
 
 class AlikedNet(nn.Module):
-    """Network from image to score map and features; the keys are those of ``aliked-*.pth``.
-
-    ``channels``: of the four blocks; the last is the descriptor size; ``positions``: number of
-    sampling positions of a descriptor.
-    """
+    """Network from image to score map and features; the keys are those of ``aliked-*.pth``."""
 
     def __init__(self, channels: tuple[int, int, int, int], positions: int) -> None:
         super().__init__()

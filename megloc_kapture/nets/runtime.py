@@ -61,11 +61,13 @@ def inference(device: torch.device, half_precision: bool = False) -> Iterator[No
 def _without_tf32() -> Iterator[None]:
     """TF32 is a setting of the process, so only one thread computes at a time."""
     with _computing:
-        products, convolutions = torch.backends.cuda.matmul, torch.backends.cudnn
+        products: Any = torch.backends.cuda.matmul
+        convolutions: Any = torch.backends.cudnn
+        name: str = "allow_tf32"
+        exact: Any = False
         if hasattr(products, "fp32_precision"):  # torch 2.9 refuses a mix with the older settings
-            settings, name, exact = (products, convolutions.conv), "fp32_precision", "ieee"
-        else:
-            settings, name, exact = (products, convolutions), "allow_tf32", False
+            convolutions, name, exact = convolutions.conv, "fp32_precision", "ieee"
+        settings = products, convolutions
         before = [getattr(setting, name) for setting in settings]
         for setting in settings:
             setattr(setting, name, exact)
