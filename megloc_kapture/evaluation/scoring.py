@@ -1,19 +1,17 @@
-"""One result against true poses: errors, outcomes, recall; and by MLAD's metric of pairs.
+"""Errors, outcomes and recall of one result, by absolute poses or by MLAD's pairs.
 
-The MLAD challenges hand out pairs of a reference and a query and score ``|t - t_true|`` of
-``query_from_reference``, without the rotation. That length mixes the error of the camera's centre
-with the error of its rotation times the distance of the two cameras, so the distance of the
-centres is reported beside it.
+The MLAD challenges score ``|t - t_true|`` of ``query_from_reference`` for pairs of images. That
+length mixes the error of the camera centre with the error of the rotation times the distance of the
+two cameras, so the error of the centre is reported too.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +38,6 @@ from megloc_kapture.values import RigidTransform
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from megloc_kapture.evaluation.report.reports import AnyReported
     from megloc_kapture.evaluation.statistics import Comparison
 
 _CHI2_95 = 12.592  # quantile of six degrees of freedom
@@ -56,19 +53,10 @@ _COLUMNS = {
 
 @dataclass(frozen=True, slots=True)
 class QueryResult:
-    """The outcome of one query.
+    """Outcome of one query: ``localized``, ``fallback`` (the pose is a guess) or ``missing``.
 
-    Parameters
-    ----------
-    image, condition : the query and what it is reported under (``""``: nothing).
-    outcome : ``localized``, ``fallback`` (its pose is a guess) or ``missing`` (no pose).
-    reason : why it was not localized; empty for a localized query.
-    position_m, angle_deg : errors in metres and degrees, infinite without a pose; NaN where the
-        truth is not known.
-    num_matches, num_inliers : from the status table; None without one.
-    fallback : what kind of guess a fallback pose is.
-    candidates : map images the pose comes from, best first; from the status table.
-    confidence : probability that the pose is right, as the result says; None where it does not.
+    Errors are infinite without a pose and NaN without a true pose. ``reason`` is empty for a
+    localized query. Counts are None without a status table, ``confidence`` where it is not known.
     """
 
     image: str
@@ -84,32 +72,36 @@ class QueryResult:
     confidence: float | None = None
 
 
-class Reported(ABC):
+class Reported:
+    """Base of everything that has a report."""
+
     __slots__ = ()
 
-    @abstractmethod
+    if TYPE_CHECKING:
+
+        @property
+        def evaluations(self) -> tuple[Evaluation, ...]: ...
+
     def per_query(self) -> dict[str, list[Any]]:
-        """Column -> one value per query, as in ``per_query.csv``."""
+        """Return the columns of ``per_query.csv``, one value per query."""
+        raise NotImplementedError
 
     def __str__(self) -> str:
         from megloc_kapture.evaluation.report.reports import report_text
 
-        # the three subclasses are what reports know
-        return report_text(cast("AnyReported", self)).removesuffix("\n")
+        return report_text(self).removesuffix("\n")
 
     def html(self, path: Path | str) -> None:
         from megloc_kapture.evaluation.report.reports import render_report
 
-        write_bytes(path, render_report(cast("AnyReported", self)).encode("utf-8"))
+        write_bytes(path, render_report(self).encode("utf-8"))
 
     def to_pandas(self) -> DataFrame:
-        """One row per query, by image, with the columns of ``per_query.csv``.
+        """Return the columns of ``per_query.csv``, indexed by image.
 
-        Errors are in metres and degrees, and infinite where a query has no pose: they lie beyond
-        every threshold, and raise a median instead of leaving it. Counts that may be unknown are
-        pandas' nullable integers.
+        Errors are in metres and degrees; those of queries without a pose are infinite.
         """
-        import pandas as pd  # only those who ask for it wait for it
+        import pandas as pd  # slow import
 
         columns = {
             name: pd.array(values, dtype="Int64") if "num_" in name else values
@@ -120,35 +112,28 @@ class Reported(ABC):
 
 @dataclass(frozen=True, slots=True)
 class CovarianceCheck:
+    """Number of poses with a covariance, and of errors within its 95 % region."""
+
     num_poses: int
     num_within: int
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Evaluation(Reported):
-    """Everything known about one result.
+    """One result; without true poses ``truth`` and ``thresholds`` are empty.
 
-    Parameters
+    Attributes
     ----------
-    label : what the result is called in tables.
-    thresholds : of the recall rows, in their order.
-    rows : recall per condition, pools, and ``"all"``, which is the last.
-    members : row name -> bool (N,), the queries it counts.
-    queries : every counted query, sorted by name.
-    errors : the same queries' errors as arrays.
-    truth, estimated : ``cam_from_world`` of the counted queries (estimated: those that have one).
-    without_truth : images that were estimated (or asked to be scored) but have no true pose;
-        sorted. They are reported, never counted.
-    not_scored : images with a true pose that the benchmark does not count; sorted.
-    truth_known_by : who knows the true poses that are not published; empty: said nowhere.
-    pairs : of MLAD's challenges, what a query is called in ``queries`` -> its pair; else empty.
-    covariance : how many poses come with a covariance, and of how many the error lies within the
-        region that it claims to hold 95 % of the errors; None where none has one.
-    nowhere : queries that show nothing of the map, sorted by name; they are right without a pose,
-        and stand in no row.
-    by_center : of MLAD's pairs, the same queries' evaluation by the distance of the camera centres;
-        None where that is the position error anyway.
-    alignment : how the poses were aligned with the truth, or that they could be.
+    rows : recall per condition, per pool, and of ``"all"``, which is the last.
+    members : row name -> mask (N,) of its queries.
+    queries, errors : N counted queries, sorted by name, and their errors.
+    truth, estimated : ``cam_from_world`` of counted queries.
+    without_truth, not_scored : images that are reported but not counted, sorted.
+    truth_known_by : owner of true poses that are not published.
+    pairs : name of a query -> its pair, for the MLAD challenges.
+    nowhere : queries that show nothing of the map; right without a pose, and in no row.
+    by_center : of MLAD's pairs, the evaluation by the distance of camera centres.
+    alignment : note on how the poses were, or could be, aligned with the truth.
     """
 
     label: str
@@ -170,12 +155,18 @@ class Evaluation(Reported):
     alignment: str = ""
 
     @property
+    def evaluations(self) -> tuple[Evaluation, ...]:
+        return (self,)
+
+    @property
     def confidence(self) -> Confidence | None:
         return confidence_of(self.queries, self.thresholds[-1], self.nowhere)
 
     def rows_above(self, min_confidence: float) -> tuple[RecallRow, ...]:
-        """The recall rows when each pose below a confidence counts as a miss; empty where no pose
-        has a confidence."""
+        """Return recall rows that count poses below a confidence as misses.
+
+        Empty if no pose has a confidence.
+        """
         if all(query.confidence is None for query in self.queries):
             return ()
         doubtful = [
@@ -185,18 +176,15 @@ class Evaluation(Reported):
         position_m = np.where(doubtful, np.inf, self.errors.position_m)
         angle_deg = np.where(doubtful, np.inf, self.errors.angle_deg)
         errors = PoseErrors(self.errors.names, position_m, angle_deg)
-        return _rows(self.queries, errors, self.thresholds, self.members)
+        return recall_rows(self.queries, errors, self.thresholds, self.members)
 
     def compare(self, *others: Evaluation) -> Comparison:
-        """Test the differences from results on the same queries, which need other labels; see
-        :func:`megloc_kapture.evaluation.statistics.compare`."""
+        """Test the differences from other results on the same queries."""
         from megloc_kapture.evaluation.statistics import compare
 
         return compare([self, *others])
 
     def per_query(self) -> dict[str, list[Any]]:
-        """Column -> one value per query; of MLAD's pairs the position error is the translation's
-        relative to the reference."""
         columns = query_columns(self.queries)
         if self.by_center is not None:
             columns["reference"] = [self.pairs[query.image].reference for query in self.queries]
@@ -214,11 +202,13 @@ class Evaluation(Reported):
 
 
 def query_columns(queries: Sequence[QueryResult]) -> dict[str, list[Any]]:
-    """Column -> one value per query, as tables of queries have them."""
-    shown = dict(_COLUMNS)
-    if all(query.confidence is None for query in queries):
-        del shown["confidence"]
-    return {name: [getattr(query, own) for query in queries] for name, own in shown.items()}
+    columns = {
+        name: [getattr(query, attribute) for query in queries]
+        for name, attribute in _COLUMNS.items()
+    }
+    if all(confidence is None for confidence in columns["confidence"]):
+        del columns["confidence"]
+    return columns
 
 
 def evaluate_poses(
@@ -236,22 +226,14 @@ def evaluate_poses(
     confidences: Mapping[str, float] | None = None,
     covariances: Mapping[str, NDArray[np.float64]] | None = None,
 ) -> Evaluation:
-    """Errors, recall and outcomes of ``estimated``.
+    """Return errors, outcomes and recall of ``estimated``.
 
-    The queries are the images of ``truth``, those of them that are in ``scored`` where it is
-    given. Every one of them stands in the denominator of recall, with or without a pose.
-
-    Parameters
-    ----------
-    estimated, truth : ``cam_from_world`` by image name, in one frame, metres.
-    conditions : image -> condition; images may be absent from it.
-    scored : the images the benchmark counts; None counts all of ``truth``.
-    statuses : rows of ``status.csv``: reasons, inliers, and which poses are fallbacks.
-    condition_order, pools : see :func:`megloc_kapture.evaluation.metrics.row_members`.
-    label : what to call this result.
-    nowhere : images that are known to show nothing of the map.
-    confidences : of poses, where ``statuses`` do not say them.
-    covariances : of poses, float64 (6, 6) as of ``Pose``.
+    Every image of ``truth`` that is ``scored`` (None: all) counts in the denominator of recall,
+    with or without a pose. Poses are ``cam_from_world`` in one frame, in metres. ``statuses`` have
+    reasons, inliers, fallbacks and confidences; ``confidences`` are for poses without a status.
+    ``nowhere`` are images that show nothing of the map, ``covariances`` (6, 6) as of ``Pose``;
+    ``condition_order`` and ``pools`` as in
+    :func:`megloc_kapture.evaluation.metrics.row_members`.
     """
     if not thresholds:
         raise OptionError("at least one recall threshold is needed")
@@ -274,15 +256,14 @@ def evaluate_poses(
             confidence=(confidences or {}).get(name),
         )
 
-    found = zip(counted, errors.position_m.tolist(), errors.angle_deg.tolist(), strict=True)
-    queries = tuple(result(*one) for one in found)
+    queries = tuple(map(result, counted, errors.position_m.tolist(), errors.angle_deg.tolist()))
     members = row_members(
         [query.condition for query in queries], order=condition_order, pools=pools
     )
     return Evaluation(
         label=label,
         thresholds=tuple(thresholds),
-        rows=_rows(queries, errors, thresholds, members),
+        rows=recall_rows(queries, errors, thresholds, members),
         members=members,
         queries=queries,
         errors=errors,
@@ -309,7 +290,7 @@ def _check_covariances(
     return CovarianceCheck(len(names), within) if names else None
 
 
-def _rows(
+def recall_rows(
     queries: Sequence[QueryResult],
     errors: PoseErrors,
     thresholds: Sequence[Threshold],
@@ -331,7 +312,6 @@ def query_result(
     errors: tuple[float, float],
     confidence: float | None = None,
 ) -> QueryResult:
-    """Return the outcome of a query; errors are in metres and degrees."""
     if status is None:
         outcome: Outcome = "localized" if has_pose else "missing"
         reason = "" if has_pose else "no pose in the result"
@@ -362,17 +342,14 @@ def relative_translation_errors(
     truth: tuple[NDArray[np.float64], NDArray[np.float64]],
     references: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """``|t - t_true|`` (N,) of ``query_from_reference``, in metres.
+    """Return ``|t - t_true|`` (N,) of ``query_from_reference``.
 
-    Parameters
-    ----------
-    estimated, truth, references : ``cam_from_world`` of the queries, and of the reference each is
-        paired with, in one frame: quaternions (N, 4), w first, and translations (N, 3).
+    Arguments are quaternions (N, 4) and translations (N, 3) of ``cam_from_world`` in one frame.
     """
     world_from_reference = invert(*references)
-    _, found = compose(*estimated, *world_from_reference)
-    _, true = compose(*truth, *world_from_reference)
-    return np.asarray(np.linalg.norm(found - true, axis=1), dtype=np.float64)
+    _, translations = compose(*estimated, *world_from_reference)
+    _, true_translations = compose(*truth, *world_from_reference)
+    return np.asarray(np.linalg.norm(translations - true_translations, axis=1), dtype=np.float64)
 
 
 def evaluate_pairs(
@@ -387,18 +364,9 @@ def evaluate_pairs(
 ) -> Evaluation:
     """Evaluate by MLAD's metric: every pair counts once, and each file is a condition.
 
-    A pair is called by its query; where that stands in several, with reference and file as well.
-
-    Parameters
-    ----------
-    estimated : ``cam_from_world`` of a pair's query; pairs may be absent.
-    truth, references : ``cam_from_world`` of queries and references, in the same frame, metres.
-    statuses : rows of ``status.csv`` by image.
-
-    Returns
-    -------
-    The errors' position is the relative translation's; ``by_center`` has the distances of the
-    centres. Pairs whose query has no true pose are named in ``without_truth``.
+    A pair is named like its query; if that is in several pairs, with reference and file as well.
+    Poses are ``cam_from_world`` in one frame, in metres. Position errors are those of the relative
+    translation; ``by_center`` has the distances of the camera centres.
     """
     absent = next((pair for pair in pairs if pair.reference not in references), None)
     if absent is not None:
@@ -424,10 +392,10 @@ def evaluate_pairs(
         label=label,
     )
     names = by_center.errors.names
-    found = by_center.errors.has_pose
-    posed = [name for name, has in zip(names, found, strict=True) if has]
+    has_pose = by_center.errors.has_pose
+    posed = [name for name, has in zip(names, has_pose, strict=True) if has]
     position_m = np.full(len(names), np.inf)
-    position_m[found] = relative_translation_errors(
+    position_m[has_pose] = relative_translation_errors(
         stack_poses(estimated[named[name]] for name in posed),
         stack_poses(truth[named[name].query] for name in posed),
         stack_poses(references[named[name].reference] for name in posed),
@@ -441,7 +409,7 @@ def evaluate_pairs(
         by_center,
         errors=errors,
         queries=queries,
-        rows=_rows(queries, errors, thresholds, by_center.members),
+        rows=recall_rows(queries, errors, thresholds, by_center.members),
         pairs={name: named[name] for name in names},
         by_center=by_center,
     )

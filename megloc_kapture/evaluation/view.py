@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.evaluation.evaluate import (
@@ -16,15 +15,11 @@ from megloc_kapture.evaluation.evaluate import (
 )
 from megloc_kapture.evaluation.results import Poses, ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation
-from megloc_kapture.evaluation.without_truth import ResultWithoutTruth
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import Camera
 
-if TYPE_CHECKING:
-    pass
-
-# what a view has near its beginning
+# a view has this within its first bytes
 _OURS, _HEAD_BYTES = b'content="megloc view"', 1000
 
 
@@ -37,21 +32,11 @@ def write_view(
     cameras: Mapping[str, Camera] | None = None,
     force: bool = False,
 ) -> str:
-    """Write a page that shows a map in 3D, and the queries of a result in it.
+    """Write a self-contained 3D page of a map and of the queries of a result.
 
-    The page holds everything itself and needs no network. Click or tap a query to fly to it.
-
-    Parameters
-    ----------
-    path : of the file; another view is overwritten, anything else only with ``force``.
-    mapping : kapture folder with points, or with the poses of images alone.
-    result, truth : as in :func:`megloc_kapture.evaluation.evaluate.evaluate`; queries are coloured
-        by their error where the truth is known, else by their confidence.
-    cameras : of the queries of a result in memory, where they are known.
-
-    Returns
-    -------
-    What is left out of the page, in words; empty where nothing is.
+    Another view at ``path`` is overwritten, other files only with ``force``. ``result`` and
+    ``truth`` are as in :func:`megloc_kapture.evaluation.evaluate.evaluate`: queries are coloured by
+    their error, or by their confidence without truth. Returns sentences on what is left out.
     """
     from megloc_kapture.evaluation.report.queries import StoredInliers, shown_queries
     from megloc_kapture.evaluation.report.scene import render_view, scene_of
@@ -62,11 +47,11 @@ def write_view(
     title = folder.root.resolve().name
     context, queries = ResultContext(mapping=folder), []
     if result is not None:
-        found = _judged(result, truth, folder)
-        context, queries = found.context, shown_queries(found)
-        # those that were estimated with the poses come first
+        evaluation = _evaluate(result, truth, folder)
+        context, queries = evaluation.context, shown_queries(evaluation)
+        # cameras that were estimated with the poses come first
         context = replace(context, cameras={**(cameras or {}), **context.cameras})
-        title = found.label or title
+        title = evaluation.label or title
     elif truth is not None:
         raise OptionError("a truth needs a result to be compared with")
     scene = scene_of(title, StoredInliers(context), queries)
@@ -76,14 +61,14 @@ def write_view(
     return " ".join(scene.notes)
 
 
-def _judged(
+def _evaluate(
     result: Localized, truth: Path | str | Poses | None, folder: KaptureFolder
-) -> Evaluation | ResultWithoutTruth:
+) -> Evaluation:
     benchmark = benchmark_beside([truth, result])
     labels = [""] if isinstance(result, Mapping) else None
     if truth is None:
-        judged = results_without_truth([result], benchmark, mapping=folder.root, labels=labels)
-        return judged.results[0]
+        reported = results_without_truth([result], benchmark, mapping=folder.root, labels=labels)
+        return reported.evaluations[0]
     return evaluate_results([result], truth, benchmark, mapping=folder.root, labels=labels)[0]
 
 
@@ -92,10 +77,7 @@ def _check_output(path: Path, *, force: bool) -> None:
         raise OutputError(f"{path}: is a folder; give the name of a file, such as view.html")
     if force or not path.exists():
         return
-    try:
-        with open(path, "rb") as file:
-            ours = _OURS in file.read(_HEAD_BYTES)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
-    if not ours:
+    with open(path, "rb") as file:
+        is_view = _OURS in file.read(_HEAD_BYTES)
+    if not is_view:
         raise OutputError(f"{path}: exists and is no view; -f overwrites it")

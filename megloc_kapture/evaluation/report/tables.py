@@ -1,11 +1,11 @@
-"""The tables of reports as data frames, and their text form."""
+"""Tables of reports as data frames, and their text."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,13 +18,11 @@ from megloc_kapture.evaluation.report.wording import (
     format_movement,
     format_percent,
 )
-from megloc_kapture.evaluation.results import Poses
 from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.evaluation.without_truth import (
     AgreementRow,
-    ResultWithoutTruth,
-    RowWithoutTruth,
     WithoutTruth,
+    inliers_quartiles,
 )
 from megloc_kapture.values import MIN_CONFIDENCE
 
@@ -38,50 +36,45 @@ _REASONS_SHOWN = 3
 _NUMBER = re.compile(r"-?\d+(\.\d+)?")
 
 
-class _Named(Protocol):
-    @property
-    def name(self) -> str: ...
-    @property
-    def num_queries(self) -> int: ...
-
-
 def recall_table(evaluations: Sequence[Evaluation]) -> DataFrame:
-    """Recall and medians of one result, or of several below each other in each condition."""
-    rows = []
-    for group in zip(*(evaluation.rows for evaluation in evaluations), strict=True):
-        for evaluation, row in zip(evaluations, group, strict=True):
-            label = {"result": _shortened(evaluation.label)} if evaluations[1:] else {}
-            medians = row.median_localized_position_m, row.median_localized_angle_deg
-            rows.append(
-                {
-                    **_condition(row),
-                    **label,
-                    "queries": row.num_queries,
-                    "localized": _localized(row),
-                    "recall (%)": _joined(row.recall),
-                    "median (m, deg)": format_median(row.median_position_m, row.median_angle_deg),
-                    "median of localized": format_median(*medians) if row.num_localized else "-",
-                }
+    """Return recall and medians; several results are below each other in each condition."""
+    return _frame(
+        {
+            **label,
+            "queries": row.num_queries,
+            "localized": _localized(row),
+            "recall (%)": _joined(row.recall),
+            "median (m, deg)": format_median(row.median_position_m, row.median_angle_deg),
+            "median of localized": format_median(
+                row.median_localized_position_m, row.median_localized_angle_deg
             )
-    return _frame(rows)
+            if row.num_localized
+            else "-",
+        }
+        for label, row in _rows(evaluations)
+    )
 
 
 def interval_table(evaluations: Sequence[Evaluation]) -> DataFrame:
-    """The confidence intervals of recall, one column per threshold."""
-    rows = []
+    """Return the confidence intervals of recall, one column per threshold."""
+    return _frame(
+        {**label, **{str(at.threshold): format_interval(at) for at in row.recall}}
+        for label, row in _rows(evaluations)
+    )
+
+
+def _rows(evaluations: Sequence[Evaluation]) -> Iterator[tuple[dict[str, str], RecallRow]]:
     for group in zip(*(evaluation.rows for evaluation in evaluations), strict=True):
         for evaluation, row in zip(evaluations, group, strict=True):
-            label = {"result": _shortened(evaluation.label)} if evaluations[1:] else {}
-            intervals = {str(at.threshold): format_interval(at) for at in row.recall}
-            rows.append({**_condition(row), **label, **intervals})
-    return _frame(rows)
+            result = {"result": _shortened(evaluation.label)} if evaluations[1:] else {}
+            yield {**_condition(row.name), **result}, row
 
 
 def confident_table(evaluation: Evaluation) -> DataFrame | None:
-    """Recall when poses below the usual confidence count as misses; None without confidences."""
+    """Return recall that counts doubtful poses as misses; None without confidences."""
     rows = [
         {
-            **_condition(row),
+            **_condition(row.name),
             "queries": row.num_queries,
             "accepted": row.num_localized,
             "recall (%)": _joined(row.recall),
@@ -91,31 +84,32 @@ def confident_table(evaluation: Evaluation) -> DataFrame | None:
     return _frame(rows) if rows else None
 
 
-def result_table(result: ResultWithoutTruth) -> DataFrame:
-    """Localized share and inliers of a result without truth."""
+def result_table(evaluation: Evaluation) -> DataFrame:
+    """Return localized share and inliers of a result without truth."""
 
-    def inliers(row: RowWithoutTruth) -> str:
-        return " / ".join(f"{value:.0f}" for value in row.inliers_quartiles or ()) or "-"
+    def inliers(name: str) -> str:
+        quartiles = inliers_quartiles(evaluation, name)
+        return " / ".join(f"{value:.0f}" for value in quartiles or ()) or "-"
 
     return _frame(
         {
-            **_condition(row),
+            **_condition(row.name),
             "queries": row.num_queries,
             "localized": _localized(row),
             "%": format_percent(row.num_localized / max(row.num_queries, 1)),
-            "inliers, quartiles": inliers(row),
+            "inliers, quartiles": inliers(row.name),
         }
-        for row in result.rows
+        for row in evaluation.rows
     )
 
 
 def agreement_table(found: WithoutTruth, rows: Iterable[AgreementRow]) -> DataFrame:
-    """Share of queries whose poses in two results agree, by condition."""
+    """Return the share of queries whose poses in two results agree."""
     return _frame(
         {
-            "first": _shortened(found.results[row.first].label),
-            "second": _shortened(found.results[row.second].label),
-            **_condition(row),
+            "first": _shortened(found.evaluations[row.first].label),
+            "second": _shortened(found.evaluations[row.second].label),
+            **_condition(row.name),
             "queries": row.num_queries,
             "both have a pose": row.num_both,
             "agree (%)": _joined(row.within),
@@ -126,7 +120,7 @@ def agreement_table(found: WithoutTruth, rows: Iterable[AgreementRow]) -> DataFr
 
 
 def query_table(evaluation: Evaluation, queries: Sequence[ShownQuery]) -> DataFrame:
-    """Queries one by one, in their order."""
+    """Return one row per query, without columns that are empty."""
     centers = evaluation.by_center
     of_center = {} if centers is None else {q.image: q.position_m for q in centers.queries}
 
@@ -153,24 +147,23 @@ def query_table(evaluation: Evaluation, queries: Sequence[ShownQuery]) -> DataFr
     return frame.loc[:, (frame != "").any()]
 
 
-def refinement_table(result: Evaluation | ResultWithoutTruth) -> DataFrame | None:
-    """The steps of refining poses over all queries; None where nothing was refined."""
-    estimated: Poses = result.estimated if isinstance(result, Evaluation) else result.poses
-    truth: Poses = result.truth if isinstance(result, Evaluation) else {}
+def refinement_table(evaluation: Evaluation) -> DataFrame | None:
+    """Return the steps of pose refinement over all queries; None if nothing was refined."""
+    estimated, truth = evaluation.estimated, evaluation.truth
     steps: dict[str, list[tuple[Any, Any]]] = {}
-    for image, rows in sorted(result.context.refinements.items()):
+    for image, rows in sorted(evaluation.context.refinements.items()):
         if image in estimated:
             # each step ends with the pose that the next begins with
             ends = [*(row.before for row in rows[1:]), estimated[image]]
             for row, after in zip(rows, ends, strict=True):
                 steps.setdefault(row.method, []).append((row, after))
     table = []
-    for method, own in steps.items():
-        accepted = [(row, after) for row, after in own if row.accepted]
-        reasons = Counter(_NUMBER.sub("…", row.reason) for row, _ in own if not row.accepted)
-        told = (f"{count} x {reason}" for reason, count in reasons.most_common(_REASONS_SHOWN))
+    for method, refined in steps.items():
+        accepted = [(row, after) for row, after in refined if row.accepted]
+        reasons = Counter(_NUMBER.sub("…", row.reason) for row, _ in refined if not row.accepted)
+        listed = (f"{count} x {reason}" for reason, count in reasons.most_common(_REASONS_SHOWN))
         moved = [(row.moved_m, row.turned_deg) for row, _ in accepted]
-        line: dict[str, Any] = {"step": method, "queries": len(own), "accepted": len(accepted)}
+        line: dict[str, Any] = {"step": method, "queries": len(refined), "accepted": len(accepted)}
         line |= {"moved by (median)": _medians(moved)}
         if truth:
             names = [row.image for row, _ in accepted if row.image in truth]
@@ -178,12 +171,12 @@ def refinement_table(result: Evaluation | ResultWithoutTruth) -> DataFrame | Non
             for heading, poses in (("error before", old), ("error after", new)):
                 errors = pose_errors(poses, truth, names)
                 line[heading] = _medians(zip(errors.position_m, errors.angle_deg, strict=True))
-        table.append({**line, "why other poses stay": "; ".join(told)})
+        table.append({**line, "why other poses stay": "; ".join(listed)})
     return _frame(table) if table else None
 
 
 def as_text(frame: DataFrame) -> str:
-    """A table as lines, its columns to the left and two blanks apart."""
+    """Format a table with left-aligned columns, two blanks apart."""
     cells = frame.astype(str)
     form: dict[Any, Any] = {
         name: f"{{:<{max([len(str(name)), *column.str.len()]) + 1}}}".format
@@ -194,19 +187,18 @@ def as_text(frame: DataFrame) -> str:
 
 
 def _frame(rows: Iterable[dict[str, Any]]) -> DataFrame:
-    import pandas as pd  # only a report waits for it
+    import pandas as pd  # slow import
 
     return pd.DataFrame(list(rows))
 
 
-def _condition(row: _Named) -> dict[str, str]:
-    return {"condition": _shortened(row.name or "(no condition)")}
+def _condition(name: str) -> dict[str, str]:
+    return {"condition": _shortened(name or "(no condition)")}
 
 
-def _localized(row: RecallRow | RowWithoutTruth) -> str:
-    return (
-        f"{row.num_localized} (+{row.num_fallback})" if row.num_fallback else f"{row.num_localized}"
-    )
+def _localized(row: RecallRow) -> str:
+    guessed = f" (+{row.num_fallback})" if row.num_fallback else ""
+    return f"{row.num_localized}{guessed}"
 
 
 def _joined(recall: Sequence[RecallAt]) -> str:

@@ -1,7 +1,4 @@
-"""Figures as words, and the notes and sentences of reports.
-
-Recall is printed in the style of papers: ``89.8 / 96.1 / 99.4``.
-"""
+"""Numbers, notes and sentences of reports; recall as in papers: ``89.8 / 96.1 / 99.4``."""
 
 from __future__ import annotations
 
@@ -24,7 +21,7 @@ from megloc_kapture.values import MIN_CONFIDENCE
 
 INTERVALS = "95 % confidence intervals of recall, queries taken as independent (%)"
 CONFIDENT = f"Recall if poses with a confidence below {MIN_CONFIDENCE:g} are misses (%)"
-# fewer are an example, not a measurement
+# fewer queries are an example, not a measurement
 FEW = 10
 _NAMES_SHOWN = 5
 _FALLBACK_POSES = {
@@ -34,44 +31,37 @@ _FALLBACK_POSES = {
 
 
 def format_percent(share: float) -> str:
-    """A share as papers print it: percent with one decimal."""
     return f"{100.0 * share:.1f}"
 
 
 def format_metres(position_m: float) -> str:
-    """Metres down to a tenth of a millimetre below 1, to a centimetre above."""
     return f"{position_m:.4f}" if position_m < 1 else f"{position_m:.2f}"
 
 
 def format_degrees(angle_deg: float) -> str:
-    """Degrees to a thousandth below 1, to a hundredth above."""
     return f"{angle_deg:.3f}" if angle_deg < 1 else f"{angle_deg:.2f}"
 
 
 def format_median(position_m: float, angle_deg: float) -> str:
-    """Two medians in one cell; ``inf`` where most queries have no pose."""
     if not math.isfinite(position_m):
         return "inf"
     return f"{format_metres(position_m)}, {format_degrees(angle_deg)}"
 
 
 def format_interval(at: RecallAt) -> str:
-    """The confidence interval of a recall in percent: ``87.5-91.8``."""
     return f"{format_percent(at.low)}-{format_percent(at.high)}"
 
 
 def counted(number: int, one: str, many: str = "") -> str:
-    """A number and the right form of its noun."""
     return f"{number} {one if number == 1 else many or f'{one}s'}"
 
 
 def bounds(thresholds: Sequence[Threshold]) -> str:
-    """All thresholds, as a heading has them."""
     return " / ".join(str(threshold) for threshold in thresholds)
 
 
 def criterion(evaluation: Evaluation) -> str:
-    """The rule by which recall is counted, in one sentence."""
+    """Return the rule by which recall is counted."""
     with_angles = any(threshold.angle_deg is not None for threshold in evaluation.thresholds)
     errors = "Both errors" if with_angles else "Position error"
     if evaluation.by_center is not None:
@@ -80,47 +70,45 @@ def criterion(evaluation: Evaluation) -> str:
 
 
 def notes(evaluation: Evaluation) -> list[str]:
-    """Sentences a reader needs beside the table: fallbacks, images without truth, no overlap."""
     row = evaluation.row()
-    found = [evaluation.alignment] if evaluation.alignment else []
+    sentences = [evaluation.alignment] if evaluation.alignment else []
     if row.num_queries < FEW:
-        found.append(
+        sentences.append(
             f"too few queries ({row.num_queries}) to compare recall by: the intervals are wide"
         )
     kinds = {query.fallback for query in evaluation.queries} - {"none"}
     if row.num_fallback:
         whose = " or the one ".join(_FALLBACK_POSES[kind] for kind in sorted(kinds))
         without = counted(row.num_fallback, "query", "queries")
-        found.append(
+        sentences.append(
             f"{without} could not be localized and got the pose {whose} instead; recall and the "
             "median of all count it like any pose"
         )
     if row.num_missing == row.num_queries:
-        found.append("no query has a pose")
+        sentences.append("no query has a pose")
     missing = evaluation.without_truth
     if missing:
         shown = ", ".join(missing[:_NAMES_SHOWN]) + (", ..." if missing[_NAMES_SHOWN:] else "")
         lack = counted(
             len(missing), "image has no true pose and is", "images have no true pose and are"
         )
-        found.append(f"{lack} not counted: {shown}")
+        sentences.append(f"{lack} not counted: {shown}")
         if evaluation.truth_known_by:
-            found.append(evaluation.truth_known_by.rstrip("."))
+            sentences.append(evaluation.truth_known_by.rstrip("."))
         if not evaluation.estimated and row.num_missing == row.num_queries:
-            found.append("no estimated image is in the ground truth; the names may not agree")
+            sentences.append("no estimated image is in the ground truth; the names may not agree")
     if number := len(evaluation.not_scored):
         ignored = counted(number, "image with a true pose is", "images with a true pose are")
-        found.append(f"{ignored} not scored by this benchmark")
-    return found
+        sentences.append(f"{ignored} not scored by this benchmark")
+    return sentences
 
 
 def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[str]:
-    """What the confidences of a result are worth, without a full stop."""
-    found = []
+    sentences = []
     if confidence.num_poses:
         share = format_percent(confidence.num_wrong / confidence.num_poses)
         interval = f"{100 * confidence.wrong_low:.1f}-{100 * confidence.wrong_high:.1f}"
-        found.append(
+        sentences.append(
             f"of {counted(confidence.num_poses, 'pose')} with a confidence "
             f"{counted(confidence.num_wrong, 'is', 'are')} wrong (beyond {coarsest}): {share} % "
             f"({interval})"
@@ -128,21 +116,20 @@ def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[st
     if confidence.num_wrong:
         by_inliers = confidence.area_by_inliers
         than = "" if by_inliers is None else f", by the number of inliers {by_inliers:.4f}"
-        found.append(
+        sentences.append(
             f"calibration error {confidence.calibration_error:.3f}; area under risk against "
             f"coverage {confidence.area:.4f}{than}, at best {confidence.least_area:.4f}"
         )
     if confidence.num_nowhere:
-        found.append(
+        sentences.append(
             f"{counted(confidence.num_nowhere, 'query shows', 'queries show')} nothing of the map: "
             f"{confidence.num_nowhere_refused} refused, "
             f"{confidence.num_nowhere - confidence.num_nowhere_refused} given a pose"
         )
-    return found
+    return sentences
 
 
 def covariance_sentence(check: CovarianceCheck) -> str:
-    """How many errors are as small as the covariances claim, without a full stop."""
     return (
         f"{check.num_within} of {counted(check.num_poses, 'error lies', 'errors lie')} within the "
         "claimed 95 % region"
@@ -150,7 +137,6 @@ def covariance_sentence(check: CovarianceCheck) -> str:
 
 
 def consistency_sentence(row: ConsistencyRow) -> str:
-    """The verdict of a map's own images on a refiner, and how far they move."""
     frame = f" in {row.frame}" if row.frame else ""
     if row.reason:
         return f"{row.method}{frame} is not used: {row.reason}"
@@ -162,15 +148,13 @@ def consistency_sentence(row: ConsistencyRow) -> str:
 
 
 def format_movement(metres: float, degrees: float) -> str:
-    """``0.0042 m, 0.150 deg``."""
     return f"{format_metres(metres)} m, {format_degrees(degrees)} deg"
 
 
 def agreement_sentence(row: AgreementRow, found: WithoutTruth) -> str:
-    """Numbers of queries with a pose in one of two results only."""
     if not row.num_only_first and not row.num_only_second:
         return "The same queries have a pose in both."
-    first, second = found.results[row.first].label, found.results[row.second].label
+    first, second = found.evaluations[row.first].label, found.evaluations[row.second].label
     return (
         f"Only {first} has a pose for {counted(row.num_only_first, 'query', 'queries')}, "
         f"only {second} for {row.num_only_second}."
@@ -178,7 +162,6 @@ def agreement_sentence(row: AgreementRow, found: WithoutTruth) -> str:
 
 
 def threshold_sentence(test: PairedTest, labels: Sequence[str]) -> str:
-    """Queries that one of two results finds and the other misses, and whether that is chance."""
     first, second = labels[test.first], labels[test.second]
     where = f"At {test.threshold}"
     only_first, only_second = len(test.only_first), len(test.only_second)
@@ -193,7 +176,6 @@ def threshold_sentence(test: PairedTest, labels: Sequence[str]) -> str:
 
 
 def median_sentence(difference: MedianDifference, labels: Sequence[str]) -> str:
-    """The medians of two results, and whether they differ by more than chance."""
     pair = (labels[difference.first], labels[difference.second])
     medians = (difference.first_m, difference.second_m)
     lost = [label for label, value in zip(pair, medians, strict=True) if math.isinf(value)]
@@ -211,7 +193,7 @@ def median_sentence(difference: MedianDifference, labels: Sequence[str]) -> str:
 
 
 def comparison_sentences(comparison: Comparison) -> list[tuple[str, bool]]:
-    """Each test and each median as a sentence, with whether the difference is real."""
+    """Return a sentence for each test and median, and whether its difference is real."""
     labels = [evaluation.label for evaluation in comparison.evaluations]
     tests = [(threshold_sentence(test, labels), test.is_real) for test in comparison.tests]
     medians = [(median_sentence(median, labels), median.is_real) for median in comparison.medians]
@@ -219,7 +201,6 @@ def comparison_sentences(comparison: Comparison) -> list[tuple[str, bool]]:
 
 
 def method_sentence(comparison: Comparison) -> str:
-    """The method of the tests."""
     number = len(comparison.tests)
     holm = f", after Holm's correction for {number} tests" if number > 1 else ""
     return (
@@ -233,7 +214,7 @@ def _verdict(test: PairedTest) -> str:
     p = "p < 0.001" if test.p_adjusted < 0.001 else f"p = {test.p_adjusted:.2g}"
     if test.is_real:
         return f"the difference is real ({p})"
-    # the most uneven split of so few would not do either
+    # even the most uneven split of so few queries would not be significant
     if 2.0 * 0.5 ** (len(test.only_first) + len(test.only_second)) > SIGNIFICANCE:
         return f"too few queries differ to tell it from chance ({p})"
     return f"the difference could be chance ({p})"
