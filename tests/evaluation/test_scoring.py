@@ -16,8 +16,8 @@ from megloc_kapture.evaluation.metrics import thresholds_from_pairs
 from megloc_kapture.evaluation.pose_files import RelativePose, format_mlad_file, relative_pose
 from megloc_kapture.evaluation.protocols import benchmark_of, protocol_of
 from megloc_kapture.evaluation.report.reports import (
-    render_report,
     plain,
+    render_report,
     report_data,
     report_text,
     write_report,

@@ -1,8 +1,7 @@
-"""The 3D view of a map and of queries in it: one self-contained HTML file, drawn by WebGL2.
+"""The 3D view of a map and of queries in it: one self-contained HTML page, drawn by WebGL2.
 
-Everything that is drawn stands in the page as little-endian arrays; coordinates are float32,
-relative to an origin that is given in full, so that a frame far from zero loses nothing. What would
-make the page large is drawn in part, and the page says so.
+Coordinates are float32 relative to an origin in full precision. A page that would be large shows a
+part of the data and says so.
 """
 
 from __future__ import annotations
@@ -36,43 +35,38 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import Camera, RigidTransform
 
 MAX_POINTS, MAX_CAMERAS, MAX_QUERIES = 60_000, 4_000, 2_000
-# points of depth by stereo, and map images that they are read of: 0.2 s each
+# points of depth by stereo, and map images that they come from, 0.2 s each
 MAX_DENSE, _MAX_DENSE_IMAGES = 40_000, 40
-# points that inliers lead to: of all queries, and of one of them
+# inliers of all queries, and of one
 _MAX_INLIERS, _MAX_INLIERS_OF_ONE = 40_000, 300
-# to find a query's inliers takes 20 ms, of many keypoints more
+# reading the inliers of a query takes 20 ms or more
 _MAX_QUERIES_WITH_INLIERS = 300
 _MAX_FRAMES = 255
 _MAX_COLOR_IMAGES = 150
 _SEED = 0
-# rays further from the axis than this (80 degrees) make a frustum that hides everything
+# tan(80 degrees): wider frusta hide everything
 _WIDEST = 5.7
-# the share of points and cameras that the first look takes in
+# quantiles of points and cameras that are seen first
 _SEEN_AT_FIRST = 0.02, 0.98
-_ANY_CAMERA = Camera.pinhole(4, 3, 4)  # stands in for intrinsics that are not known
+_ANY_CAMERA = Camera.pinhole(4, 3, 4)  # for unknown intrinsics
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What a view shows.
+    """Content of a view.
 
     Attributes
     ----------
-    title : of the page.
-    origin : float64 (3,), which the coordinates are relative to.
-    up : float64 (3,), unit vector.
-    points : float32 (P, 3), and ``colors`` uint8 (P, 3); the last ``num_dense`` are not the map's
-        own but of depth by stereo.
-    cameras : names of map images, and ``camera_frusta`` float32 (C, 5, 3): the centre, then the
-        rays through the image's corners (upper left, upper right, lower right, lower left) at
-        depth 1, as vectors of the world.
-    queries : in the order of the list, worst first.
-    frusta, true_frusta : float32 (Q, 5, 3), of estimates and truths, NaN where there is none.
-    inliers : float32 (K, 3), points of the queries' inliers one query after another, and
-        ``num_inliers`` (Q,) how many each has here.
-    radius : of what there is to see around the origin, unit of the map.
-    frames : names of the map's coordinate frames, which share no world and are shown one at a time;
-        ``point_frames``, ``camera_frames``, ``query_frames`` uint8 (P,), (C,), (Q,) say which.
+    origin : float64 (3,), subtracted from all coordinates.
+    points, colors : (P, 3); the last ``num_dense`` are depth by stereo, the others the map's.
+    camera_frusta, frusta, true_frusta : float32 (N, 5, 3) of map cameras, estimates and truths: the
+        centre, then rays at depth 1 through the upper left, upper right, lower right and lower left
+        corner of the image; NaN without a pose.
+    queries : worst first.
+    inliers : float32 (K, 3), ``num_inliers`` of each query in turn.
+    radius : of the visible content around the origin.
+    frames : names of coordinate frames, shown one at a time; ``point_frames``, ``camera_frames``
+        and ``query_frames`` are indices into them.
     notes : sentences on what is left out.
     """
 
@@ -98,14 +92,7 @@ class Scene:
 
 
 def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = ()) -> Scene | None:
-    """The scene of a map and of queries in it; None where no camera has a pose.
-
-    Parameters
-    ----------
-    stored : the inliers of the queries; its context says where the map and the queries' cameras
-        are, each of which may be absent.
-    queries : worst first; what is left out of many are the better ones.
-    """
+    """Return the scene of a map and of queries, worst first; None if no camera has a pose."""
     context, notes = stored.context, list[str]()
     rng = np.random.default_rng(_SEED)
     mapping = context.mapping
@@ -136,12 +123,10 @@ def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = 
     quats, translations = stack_poses(spanning)
     centers = camera_centers(quats, translations)
     view = top_view(quats, centers)
-    # each by itself: of a thousand points and ten cameras the cameras count too
-    ends = [
-        np.quantile(own, _SEEN_AT_FIRST, axis=0) for own in (centers, points[:, :3]) if len(own)
-    ]
+    # separately, so that ten cameras count beside a thousand points
+    ends = [np.quantile(a, _SEEN_AT_FIRST, axis=0) for a in (centers, points[:, :3]) if len(a)]
     low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
-    # of few digits, so that the text of the page says exactly what was subtracted
+    # few digits, so that JSON has exactly what was subtracted
     origin = np.round((low + high) / 2, 3)
     rays = _rays(context.queries, [query.image for query in queries], context.cameras)
     with_inliers = min(max(len(queries), 1), _MAX_QUERIES_WITH_INLIERS)
@@ -153,9 +138,9 @@ def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = 
         for query in queries[:_MAX_QUERIES_WITH_INLIERS]
     ]
     inliers += [np.zeros((0, 3))] * (len(queries) - len(inliers))
-    if any(len(own) > most for own in inliers):
+    if any(len(xyz) > most for xyz in inliers):
         notes.append(f"Of a query's inliers at most {most} are drawn.")
-    inliers = [own[spread(len(own), most)] for own in inliers]
+    inliers = [xyz[spread(len(xyz), most)] for xyz in inliers]
     up = np.cross(view.right, view.up)
     colors = _colors(points, up, mapping, kept)
     dense, dense_colors, dense_images = _dense_points(mapping, notes)
@@ -173,7 +158,7 @@ def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = 
         frusta=_frusta([query.estimated for query in queries], rays, origin),
         true_frusta=_frusta([query.truth for query in queries], rays, origin),
         inliers=(np.concatenate([np.zeros((0, 3)), *inliers]) - origin).astype(np.float32),
-        num_inliers=tuple(len(own) for own in inliers),
+        num_inliers=tuple(map(len, inliers)),
         radius=max(float(np.linalg.norm(high - low)) / 2, 1e-3),
         frames=tuple(frames),
         point_frames=np.concatenate([point_frames, dense_frames]),
@@ -184,7 +169,7 @@ def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = 
 
 
 def render_view(scene: Scene) -> str:
-    """The page of a scene; the same scene gives the same text. It loads nothing."""
+    """Render the page; it is self-contained and deterministic."""
     failed = [query for query in scene.queries if query.estimated is None]
     data = {
         "origin": scene.origin.tolist(),
@@ -235,9 +220,10 @@ def render_view(scene: Scene) -> str:
 
 
 def corner_rays(camera: Camera) -> NDArray[np.float64]:
-    """Rays (4, 3) at depth 1 through the corners of an image: upper left, upper right, lower right,
-    lower left. Where the lens' model says nothing of a corner, or nothing narrower than 80 degrees,
-    they are those of the nearest pixels towards the middle that it does."""
+    """Return rays (4, 3) at depth 1 through the corners of an image, clockwise from upper left.
+
+    Corners beyond 80 degrees or the range of the lens model are moved towards the middle.
+    """
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
     middle = np.array([camera.width, camera.height]) / 2
     for share in np.linspace(1.0, 0.1, 10):
@@ -250,28 +236,28 @@ def corner_rays(camera: Camera) -> NDArray[np.float64]:
 def _rays(
     folder: KaptureFolder | None, images: Sequence[str], cameras: Mapping[str, Camera]
 ) -> NDArray[np.float64]:
-    known: dict[Camera, NDArray[np.float64]] = {}
-    found = []
+    rays_of: dict[Camera, NDArray[np.float64]] = {}
+    rays = []
     for image in images:
         camera = cameras.get(image, _ANY_CAMERA)
         with contextlib.suppress(DataError):
             if folder is not None and image not in cameras:
                 camera = folder.read().camera_of(image)
-        if camera not in known:
-            known[camera] = corner_rays(camera)
-        found.append(known[camera])
-    return np.array(found).reshape(-1, 4, 3)
+        if camera not in rays_of:
+            rays_of[camera] = corner_rays(camera)
+        rays.append(rays_of[camera])
+    return np.array(rays).reshape(-1, 4, 3)
 
 
 def _frusta(
     poses: Sequence[RigidTransform | None], rays: NDArray[np.float64], origin: NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    found = np.full((len(poses), 5, 3), np.nan, np.float32)
-    for own, pose, of_camera in zip(found, poses, rays, strict=True):
+    frusta = np.full((len(poses), 5, 3), np.nan, np.float32)
+    for frustum, pose, of_camera in zip(frusta, poses, rays, strict=True):
         if pose is not None:
-            own[0] = pose.center() - origin
-            own[1:] = of_camera @ pose.rotation_matrix()  # R^T x of rows
-    return found
+            frustum[0] = pose.center() - origin
+            frustum[1:] = of_camera @ pose.rotation_matrix()  # R^T x of rows
+    return frusta
 
 
 def _frame_of(query: ShownQuery, context: ResultContext, frame_of: Mapping[str, str]) -> str:
@@ -289,18 +275,18 @@ def _positions(frames: Sequence[str], known: Sequence[str]) -> NDArray[np.uint8]
 def _point_frames(
     mapping: KaptureFolder | None, frame_of: Mapping[str, str], frames: Sequence[str], number: int
 ) -> NDArray[np.uint8]:
-    found = np.zeros(number, np.uint8)
+    of_point = np.zeros(number, np.uint8)
     if mapping is not None and number and len(frames) > 1:
         for seen in mapping.observations().values():
             of_image = _positions([frame_of.get(name, "") for name in seen.image_names], frames)
-            found[seen.point_ids] = of_image[seen.image_ids]
-    return found
+            of_point[seen.point_ids] = of_image[seen.image_ids]
+    return of_point
 
 
 def _dense_points(
     mapping: KaptureFolder | None, notes: list[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8], list[str]]:
-    from megloc_kapture.mvs.views import AgreementOptions  # loads more than others wait for
+    from megloc_kapture.mvs.views import AgreementOptions  # slow imports
     from megloc_kapture.stages.stereo_depth import fused_cloud, stereo_images
 
     nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), list[str]()
@@ -314,7 +300,6 @@ def _dense_points(
     # a view without depth is better than none
     with contextlib.suppress(DataError):
         chosen = {name: images[name] for name in names}
-        # most surfaces are seen by several images, some by none
         cloud = fused_cloud(mapping, chosen, AgreementOptions(), max_points=8 * MAX_DENSE)
         kept = spread(len(cloud.xyz), MAX_DENSE) if len(cloud.xyz) else np.zeros(0, np.int64)
         colors = np.asarray(np.round(cloud.colours[kept]), np.uint8)
@@ -328,8 +313,10 @@ def _colors(
     mapping: KaptureFolder | None,
     rows: NDArray[np.int64],
 ) -> NDArray[np.uint8]:
-    """The points' own colours (P, 3); of a map without any those of its images, and where no image
-    says one, greys that grow lighter upwards. ``rows`` are the points' in the map."""
+    """Return colours (P, 3) of the map, of its images, or greys that grow lighter upwards.
+
+    ``rows`` are the indices of the points in the map.
+    """
     if points[:, 3:].any():
         return np.asarray(np.clip(np.round(points[:, 3:]), 0, 255), np.uint8)
     heights = points[:, :3] @ up
@@ -340,7 +327,6 @@ def _colors(
     if mapping is not None and len(points):
         position = np.full(int(rows.max()) + 1, -1)
         position[rows] = np.arange(len(rows))
-        # without images, or keypoints, the greys are as good
         with contextlib.suppress(DataError):
             _color_from_images(colors, position, mapping)
     return colors
@@ -373,6 +359,6 @@ def _encoded(array: NDArray[np.float32] | NDArray[np.uint8]) -> str:
 
 
 def _script_data(data: Mapping[str, Any]) -> Markup:
-    """JSON that can stand in a script element whatever names it holds."""
+    """Return JSON that is safe in a script element, whatever names it contains."""
     text = json.dumps(plain(data), ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
