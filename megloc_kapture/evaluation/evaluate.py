@@ -137,61 +137,23 @@ def evaluate_results(
             f"the {len(benchmark.pairs)} pairs to relocalize need the poses of their references, "
             "which are the map's: give it with --map"
         )
-    limits = thresholds or benchmark.thresholds()
     read = _read(results, benchmark, contexts, labels, true_poses, references)
     if not isinstance(truth, Mapping) and side_tables_near(truth) is None:
         true_poses = _in_local_frame(true_poses, read, benchmark.world, truth)
     if relative:
-        evaluations = [
-            evaluate_pairs(
-                result.poses_of_pairs(benchmark.pairs),
-                true_poses,
-                benchmark.pairs,
-                references,
-                thresholds=limits,
-                statuses=result.statuses,
-                label=result.label,
-            )
+        return [
+            evaluate_pairs(result, true_poses, benchmark, references, thresholds=thresholds)
             for result in read
         ]
-    else:
-        true_poses = _by_names_of_results(true_poses, read, {*nowhere, *benchmark.names})
-        evaluations = [
-            _evaluate_absolute(
-                *_aligned(result, true_poses, align), true_poses, benchmark, limits, nowhere
-            )
-            for result in read
-        ]
-    return [
-        replace(evaluation, truth_known_by=benchmark.protocol.truth, context=result.context)
-        for evaluation, result in zip(evaluations, read, strict=True)
-    ]
-
-
-def _evaluate_absolute(
-    result: Result,
-    alignment: str,
-    true_poses: Poses,
-    benchmark: Benchmark,
-    thresholds: Sequence[Threshold],
-    nowhere: Collection[str],
-) -> Evaluation:
-    images = {*true_poses, *result.poses, *nowhere}
-    evaluation = evaluate_poses(
-        result.poses,
-        true_poses,
-        conditions=benchmark.conditions(images),
-        thresholds=thresholds,
-        scored=benchmark.scored(images),
-        statuses=result.statuses,
-        condition_order=benchmark.protocol.conditions,
-        pools=benchmark.protocol.pools,
-        label=result.label,
-        nowhere=nowhere,
-        confidences=result.confidences,
-        covariances=result.covariances,
-    )
-    return replace(evaluation, alignment=alignment)
+    true_poses = _by_names_of_results(true_poses, read, {*nowhere, *benchmark.names})
+    evaluations = []
+    for result in read:
+        aligned, note = _aligned(result, true_poses, align)
+        evaluation = evaluate_poses(
+            aligned, true_poses, benchmark, thresholds=thresholds, nowhere=nowhere
+        )
+        evaluations.append(replace(evaluation, alignment=note))
+    return evaluations
 
 
 def results_without_truth(
@@ -216,15 +178,7 @@ def results_without_truth(
     if not queries:
         of_results = {image for result in read for image in result.images}
         queries = benchmark.scored(known | of_results)
-    return evaluate_without_truth(
-        read,
-        queries=sorted(queries),
-        conditions=benchmark.conditions(queries),
-        thresholds=thresholds or benchmark.thresholds(),
-        condition_order=benchmark.protocol.conditions,
-        pools=benchmark.protocol.pools,
-        statement=benchmark.protocol.truth,
-    )
+    return evaluate_without_truth(read, benchmark, queries=queries, thresholds=thresholds)
 
 
 def _read(

@@ -54,9 +54,6 @@ def thresholds_from_pairs(pairs: Iterable[tuple[float, float | None]]) -> tuple[
     return tuple(Threshold(position_m=p, angle_deg=a) for p, a in pairs)
 
 
-DEFAULT_THRESHOLDS = thresholds_from_pairs(Protocol().thresholds)
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class PoseErrors:
     """Distances of camera centres (N,) and rotation angles (N,) of the queries ``names``.
@@ -201,25 +198,21 @@ def recall_row(
     )
 
 
-def row_members(
-    conditions: Sequence[str],
-    *,
-    order: Sequence[str] = (),
-    pools: Mapping[str, Sequence[str]] | None = None,
-) -> dict[str, NDArray[np.bool_]]:
+def row_members(conditions: Sequence[str], protocol: Protocol) -> dict[str, NDArray[np.bool_]]:
     """Return a mask (N,) of queries for each row of a recall table.
 
-    One row per condition (first those in ``order``; queries without a condition last), then one
-    per pool that has queries, then ``"all"``. A pool counts the queries of its conditions together;
-    it is not the mean of their recalls.
+    One row per condition (in the protocol's order, queries without a condition last), then one per
+    pool that has queries, then ``"all"``. A pool counts the queries of its conditions together; it
+    is not the mean of their recalls.
     """
+    order, pools = protocol.conditions, protocol.pools
     of_query = np.array(list(conditions), str)
     present = set(of_query.tolist())
     named = [c for c in order if c in present] + sorted(present - {""} - set(order))
     if named and "" in present:
         named.append("")
     rows = [(c, of_query == c) for c in named]
-    pooled = ((pool, np.isin(of_query, list(parts))) for pool, parts in (pools or {}).items())
+    pooled = ((pool, np.isin(of_query, list(parts))) for pool, parts in pools.items())
     rows += [(pool, members) for pool, members in pooled if members.any()]
     rows.append((ALL, np.ones(len(of_query), bool)))
     for name, number in Counter(name for name, _ in rows).items():

@@ -173,7 +173,7 @@ class Result:
     label: str
     poses: Poses
     images: tuple[str, ...]
-    statuses: Mapping[str, QueryStatus] | None = None
+    statuses: Mapping[str, QueryStatus] = field(default_factory=dict)
     confidences: Mapping[str, float] = field(default_factory=dict)
     covariances: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     by_pair: Mapping[RelocalizationPair, RigidTransform] | None = None
@@ -212,7 +212,7 @@ def read_result(
             label,
             _in_frame_of(benchmark.world, data.poses(), path),
             tuple(sorted(data.image_names())),
-            _if_there(read_status, path / STATUS_FILE),
+            _if_there(read_status, path / STATUS_FILE) or {},
             covariances=_if_there(read_covariances, path / COVARIANCE_FILE) or {},
         )
     poses = poses_by_image(read_poses(path), images, benchmark.names)
@@ -255,7 +255,7 @@ def result_in_memory(
             if pose.covariance is not None:
                 covariances[image] = pose.covariance
     images = tuple(sorted(estimated))
-    return Result(label, poses, images, statuses or None, covariances=covariances)
+    return Result(label, poses, images, statuses, covariances=covariances)
 
 
 def distinct_labels(sources: Sequence[Path]) -> list[str]:

@@ -8,7 +8,7 @@ two cameras, so the error of the centre is reported too.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal
@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.confidence import Confidence, confidence_of
 from megloc_kapture.evaluation.metrics import (
-    DEFAULT_THRESHOLDS,
     PoseErrors,
     RecallRow,
     Threshold,
@@ -27,13 +26,13 @@ from megloc_kapture.evaluation.metrics import (
     recall_row,
     row_members,
 )
-from megloc_kapture.evaluation.results import Poses, ResultContext
+from megloc_kapture.evaluation.protocols import Benchmark
+from megloc_kapture.evaluation.results import Poses, Result, ResultContext
 from megloc_kapture.geometry.poses import compose, invert, stack_poses
-from megloc_kapture.io.dataset_tables import RelocalizationPair
+from megloc_kapture.io.dataset_tables import ImageGroup, RelocalizationPair
 from megloc_kapture.io.files import write_bytes
-from megloc_kapture.io.tables import Fallback, QueryStatus
+from megloc_kapture.io.tables import Fallback
 from megloc_kapture.refinement.acceptance import squared_distance
-from megloc_kapture.values import RigidTransform
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -212,79 +211,61 @@ def query_columns(queries: Sequence[QueryResult]) -> dict[str, list[Any]]:
 
 
 def evaluate_poses(
-    estimated: Poses,
+    result: Result,
     truth: Poses,
+    benchmark: Benchmark = Benchmark(),  # noqa: B008
     *,
-    conditions: Mapping[str, str] | None = None,
-    thresholds: Sequence[Threshold] = DEFAULT_THRESHOLDS,
-    scored: Collection[str] | None = None,
-    statuses: Mapping[str, QueryStatus] | None = None,
-    condition_order: Sequence[str] = (),
-    pools: Mapping[str, Sequence[str]] | None = None,
-    label: str = "",
+    thresholds: Sequence[Threshold] | None = None,
     nowhere: Collection[str] = (),
-    confidences: Mapping[str, float] | None = None,
-    covariances: Mapping[str, NDArray[np.float64]] | None = None,
 ) -> Evaluation:
-    """Return errors, outcomes and recall of ``estimated``.
+    """Return errors, outcomes and recall of a result.
 
-    Every image of ``truth`` that is ``scored`` (None: all) counts in the denominator of recall,
-    with or without a pose. Poses are ``cam_from_world`` in one frame, in metres. ``statuses`` have
-    reasons, inliers, fallbacks and confidences; ``confidences`` are for poses without a status.
-    ``nowhere`` are images that show nothing of the map, ``covariances`` (6, 6) as of ``Pose``;
-    ``condition_order`` and ``pools`` as in
-    :func:`megloc_kapture.evaluation.metrics.row_members`.
+    Every image of ``truth`` that the benchmark scores counts in the denominator of recall, with or
+    without a pose. ``nowhere`` are images that show nothing of the map.
     """
-    if not thresholds:
-        raise OptionError("at least one recall threshold is needed")
-    counted = tuple(sorted(n for n in truth if scored is None or n in scored))
     if both := set(nowhere).intersection(truth):
         raise DataError(f"{min(both)!r} is said to show nothing of the map, and has a true pose")
+    counted = tuple(sorted(benchmark.scored(truth)))
     if not counted:
         raise DataError("no query with a true pose to count: is this the right ground truth?")
-    wanted = set(estimated) if scored is None else set(estimated) | set(scored)
-    errors = pose_errors(estimated, truth, counted)
-
-    def result(name: str, position_m: float, angle_deg: float) -> QueryResult:
-        status = (statuses or {}).get(name)
-        return query_result(
-            name,
-            (conditions or {}).get(name, ""),
-            status,
-            has_pose=name in estimated,
-            errors=(position_m, angle_deg),
-            confidence=(confidences or {}).get(name),
+    thresholds = tuple(thresholds or benchmark.thresholds())
+    conditions = benchmark.conditions({*counted, *nowhere})
+    errors = pose_errors(result.poses, truth, counted)
+    queries = tuple(
+        query_result(result, name, conditions, (position_m, angle_deg))
+        for name, position_m, angle_deg in zip(
+            counted, errors.position_m.tolist(), errors.angle_deg.tolist(), strict=True
         )
-
-    queries = tuple(map(result, counted, errors.position_m.tolist(), errors.angle_deg.tolist()))
-    members = row_members(
-        [query.condition for query in queries], order=condition_order, pools=pools
     )
+    members = row_members([query.condition for query in queries], benchmark.protocol)
+    estimated = {name: result.poses[name] for name in counted if name in result.poses}
     return Evaluation(
-        label=label,
-        thresholds=tuple(thresholds),
+        label=result.label,
+        thresholds=thresholds,
         rows=recall_rows(queries, errors, thresholds, members),
         members=members,
         queries=queries,
         errors=errors,
         truth={name: truth[name] for name in counted},
-        estimated={name: estimated[name] for name in counted if name in estimated},
-        covariance=_check_covariances(queries, estimated, truth, covariances or {}),
-        nowhere=tuple(result(name, np.inf, np.inf) for name in sorted(nowhere)),
-        without_truth=tuple(sorted(wanted - set(truth) - set(nowhere))),
-        not_scored=tuple(sorted(set(truth) - set(counted))),
+        estimated=estimated,
+        covariance=_check_covariances(queries, result, truth),
+        nowhere=tuple(
+            query_result(result, name, conditions, (np.inf, np.inf)) for name in sorted(nowhere)
+        ),
+        without_truth=tuple(sorted(result.poses.keys() - truth.keys() - set(nowhere))),
+        not_scored=tuple(sorted(truth.keys() - set(counted))),
+        truth_known_by=benchmark.protocol.truth,
+        context=result.context,
     )
 
 
 def _check_covariances(
-    queries: Sequence[QueryResult],
-    estimated: Poses,
-    truth: Poses,
-    covariances: Mapping[str, NDArray[np.float64]],
+    queries: Sequence[QueryResult], result: Result, truth: Poses
 ) -> CovarianceCheck | None:
+    covariances = result.covariances
     names = [q.image for q in queries if q.outcome == "localized" and q.image in covariances]
     within = sum(
-        squared_distance(truth[name], estimated[name], covariances[name]) <= _CHI2_95
+        squared_distance(truth[name], result.poses[name], covariances[name]) <= _CHI2_95
         for name in names
     )
     return CovarianceCheck(len(names), within) if names else None
@@ -304,17 +285,15 @@ def recall_rows(
 
 
 def query_result(
-    image: str,
-    condition: str,
-    status: QueryStatus | None,
-    *,
-    has_pose: bool,
-    errors: tuple[float, float],
-    confidence: float | None = None,
+    result: Result, image: str, conditions: Mapping[str, str], errors: tuple[float, float]
 ) -> QueryResult:
+    """Return the outcome of a query with errors in metres and degrees."""
+    has_pose, condition = image in result.poses, conditions.get(image, "")
+    status = result.statuses.get(image)
     if status is None:
         outcome: Outcome = "localized" if has_pose else "missing"
         reason = "" if has_pose else "no pose in the result"
+        confidence = result.confidences.get(image)
         return QueryResult(image, condition, outcome, reason, *errors, confidence=confidence)
     outcome, reason = "missing", status.reason
     if has_pose and status.fallback == "none":
@@ -353,14 +332,12 @@ def relative_translation_errors(
 
 
 def evaluate_pairs(
-    estimated: Mapping[RelocalizationPair, RigidTransform],
+    result: Result,
     truth: Poses,
-    pairs: Sequence[RelocalizationPair],
+    benchmark: Benchmark,
     references: Poses,
     *,
-    thresholds: Sequence[Threshold],
-    statuses: Mapping[str, QueryStatus] | None = None,
-    label: str = "",
+    thresholds: Sequence[Threshold] | None = None,
 ) -> Evaluation:
     """Evaluate by MLAD's metric: every pair counts once, and each file is a condition.
 
@@ -368,6 +345,7 @@ def evaluate_pairs(
     Poses are ``cam_from_world`` in one frame, in metres. Position errors are those of the relative
     translation; ``by_center`` has the distances of the camera centres.
     """
+    pairs, estimated = benchmark.pairs, result.poses_of_pairs(benchmark.pairs)
     absent = next((pair for pair in pairs if pair.reference not in references), None)
     if absent is not None:
         raise DataError(f"reference {absent.reference!r} of {absent.file!r} has no pose in the map")
@@ -378,18 +356,22 @@ def evaluate_pairs(
     }
     if len(named) != len(pairs):
         raise DataError("a pair of reference and query is listed twice in one file")
-    called = _conditions(dict.fromkeys(pair.file for pair in pairs))
-    statuses = statuses or {}
-    of_pairs = {n: statuses[p.query] for n, p in named.items() if p.query in statuses}
+    called = _conditions({pair.file for pair in pairs})
+    conditions = tuple(filter(None, dict.fromkeys(called[pair.file] for pair in pairs)))
     by_center = evaluate_poses(
-        {n: estimated[p] for n, p in named.items() if p in estimated},
+        replace(
+            result,
+            poses={n: estimated[p] for n, p in named.items() if p in estimated},
+            statuses={
+                n: result.statuses[p.query] for n, p in named.items() if p.query in result.statuses
+            },
+        ),
         {n: truth[p.query] for n, p in named.items() if p.query in truth},
-        conditions={n: called[p.file] for n, p in named.items()} if len(called) > 1 else None,
-        thresholds=thresholds,
-        scored=named.keys(),
-        statuses=of_pairs,
-        condition_order=list(called.values()),
-        label=label,
+        Benchmark(
+            protocol=benchmark.protocol.model_copy(update={"conditions": conditions, "pools": {}}),
+            groups={n: ImageGroup(condition=called[p.file]) for n, p in named.items()},
+        ),
+        thresholds=thresholds or benchmark.thresholds(),
     )
     names = by_center.errors.names
     has_pose = by_center.errors.has_pose
@@ -409,13 +391,16 @@ def evaluate_pairs(
         by_center,
         errors=errors,
         queries=queries,
-        rows=recall_rows(queries, errors, thresholds, by_center.members),
+        rows=recall_rows(queries, errors, by_center.thresholds, by_center.members),
+        without_truth=tuple(sorted(n for n, p in named.items() if p.query not in truth)),
         pairs={name: named[name] for name in names},
         by_center=by_center,
     )
 
 
-def _conditions(files: Iterable[str]) -> dict[str, str]:
+def _conditions(files: Collection[str]) -> dict[str, str]:
+    if len(files) == 1:
+        return dict.fromkeys(files, "")
     whole = {file: PurePosixPath(file).stem for file in files}
     short = {}
     for file, stem in whole.items():

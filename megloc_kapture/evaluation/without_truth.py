@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, compress
 from typing import Any
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.metrics import (
-    DEFAULT_THRESHOLDS,
     PoseErrors,
     RecallAt,
     Threshold,
@@ -21,6 +20,7 @@ from megloc_kapture.evaluation.metrics import (
     recall_row,
     row_members,
 )
+from megloc_kapture.evaluation.protocols import Benchmark
 from megloc_kapture.evaluation.results import Result
 from megloc_kapture.evaluation.scoring import (
     Evaluation,
@@ -88,18 +88,15 @@ class WithoutTruth(Reported):
 
 def evaluate_without_truth(
     results: Sequence[Result],
+    benchmark: Benchmark = Benchmark(),  # noqa: B008
     *,
-    queries: Sequence[str] | None = None,
-    conditions: Mapping[str, str] | None = None,
-    thresholds: Sequence[Threshold] = DEFAULT_THRESHOLDS,
-    condition_order: Sequence[str] = (),
-    pools: Mapping[str, Sequence[str]] | None = None,
-    statement: str = "",
+    queries: Collection[str] | None = None,
+    thresholds: Sequence[Threshold] | None = None,
 ) -> WithoutTruth:
     """Count localized queries, and compare results in one frame with each other.
 
     ``queries`` are by default all that any result names; ``thresholds`` limit the differences of
-    two results. See :func:`megloc_kapture.evaluation.scoring.evaluate_poses` for the rest.
+    two results.
     """
     labels = [result.label for result in results]
     if not results or len(set(labels)) != len(labels):
@@ -107,10 +104,9 @@ def evaluate_without_truth(
     images = sorted({i for r in results for i in r.images} if queries is None else set(queries))
     if not images:
         raise DataError("no query: the results name no image")
-    of_image = conditions or {}
-    members = row_members(
-        [of_image.get(image, "") for image in images], order=condition_order, pools=pools
-    )
+    conditions = benchmark.conditions(images)
+    members = row_members([conditions.get(image, "") for image in images], benchmark.protocol)
+    thresholds = tuple(thresholds or benchmark.thresholds())
     agreement, apart = list[AgreementRow](), []
     for i, j in combinations(range(len(results)), 2):
         first, second = results[i].poses, results[j].poses
@@ -135,31 +131,21 @@ def evaluate_without_truth(
                 )
             )
     return WithoutTruth(
-        statement=statement or "No true poses were given.",
-        thresholds=tuple(thresholds),
-        evaluations=tuple(_result(result, images, of_image, members) for result in results),
+        statement=benchmark.protocol.truth or "No true poses were given.",
+        thresholds=thresholds,
+        evaluations=tuple(_counted(result, images, conditions, members) for result in results),
         agreement=tuple(agreement),
         apart=tuple(apart),
     )
 
 
-def _result(
+def _counted(
     result: Result,
     images: Sequence[str],
     conditions: Mapping[str, str],
     members: Mapping[str, NDArray[np.bool_]],
 ) -> Evaluation:
-    queries = tuple(
-        query_result(
-            image,
-            conditions.get(image, ""),
-            (result.statuses or {}).get(image),
-            has_pose=image in result.poses,
-            errors=(math.nan, math.nan),
-            confidence=result.confidences.get(image),
-        )
-        for image in images
-    )
+    queries = tuple(query_result(result, i, conditions, (math.nan, math.nan)) for i in images)
     # rows count poses; without thresholds nothing depends on the errors
     errors = pose_errors(result.poses, result.poses, images)
     return Evaluation(

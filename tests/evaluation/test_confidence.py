@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scored import evaluate_poses
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.confidence import calibration_error, reliability, risk_by_score
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.evaluation.pose_files import write_pose_file, write_provenance
 from megloc_kapture.evaluation.report.reports import report_text, write_report
-from megloc_kapture.evaluation.scoring import evaluate_poses
 from megloc_kapture.io.dataset_tables import read_nowhere, write_nowhere
 from megloc_kapture.io.tables import QueryStatus
 from megloc_kapture.values import Failure, Pose, RigidTransform

@@ -21,6 +21,7 @@ from megloc_kapture.evaluation.metrics import (
     row_members,
     within,
 )
+from megloc_kapture.io.dataset_tables import Protocol
 from megloc_kapture.values import RigidTransform
 
 
@@ -142,14 +143,14 @@ def test_rows_by_condition_pool_and_all() -> None:
     errors = errors_of((0.1, 1), (0.1, 1), (0.1, 1), (9, 1), (9, 1), (INF, INF))
     conditions = ["noon", "noon", "noon", "dawn", "night", ""]
     pools = {"day": ("dawn", "noon"), "wet": ("rain",)}
-    members = row_members(conditions, order=("noon", "rain"), pools=pools)
+    members = row_members(conditions, Protocol(conditions=("noon", "rain"), pools=pools))
     rows = [recall_row(n, errors, [QUARTER], members=own) for n, own in members.items()]
     assert [row.name for row in rows] == ["noon", "dawn", "night", "", "day", "all"]
     recall = {row.name: row.recall[0].recall for row in rows}
     # pooled: 3 of 4 queries, not the mean 0.5 of the two recalls
     assert (recall["day"], recall["all"]) == (0.75, 0.5)
     assert sum(row.num_queries for row in rows[:4]) == rows[-1].num_queries == 6
-    assert list(row_members([""])) == list(row_members([])) == ["all"]
+    assert list(row_members([""], Protocol())) == list(row_members([], Protocol())) == ["all"]
     for condition, pools in (("all", {}), ("day", {"day": ("day",)}), ("x", {"all": ("x",)})):
         with pytest.raises(OptionError, match="rename one"):
-            row_members([condition], pools=pools)
+            row_members([condition], Protocol(pools=pools))

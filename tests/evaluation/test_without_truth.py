@@ -24,7 +24,13 @@ from megloc_kapture.evaluation.without_truth import (
     evaluate_without_truth,
     inliers_quartiles,
 )
-from megloc_kapture.io.dataset_tables import ImageGroup, write_groups, write_names, write_protocol
+from megloc_kapture.io.dataset_tables import (
+    ImageGroup,
+    Protocol,
+    write_groups,
+    write_names,
+    write_protocol,
+)
 from megloc_kapture.io.tables import QueryStatus, write_status
 from megloc_kapture.values import RigidTransform
 
@@ -68,8 +74,9 @@ def second() -> Result:
 
 @pytest.fixture
 def found(first: Result, second: Result) -> WithoutTruth:
-    options = {"conditions": CONDITIONS, "thresholds": THRESHOLDS}
-    return evaluate_without_truth([first, second], **options, statement="Nobody tells.")
+    groups = {image: ImageGroup(condition=name) for image, name in CONDITIONS.items()}
+    benchmark = Benchmark(protocol=Protocol(truth="Nobody tells."), groups=groups)
+    return evaluate_without_truth([first, second], benchmark, thresholds=THRESHOLDS)
 
 
 def test_counts_and_inliers(found: WithoutTruth) -> None:

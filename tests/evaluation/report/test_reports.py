@@ -12,6 +12,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 import pytest
+from scored import evaluate_poses
 
 from megloc_kapture.errors import OutputError
 from megloc_kapture.evaluation.metrics import Threshold
@@ -26,7 +27,7 @@ from megloc_kapture.evaluation.report.wording import (
     threshold_sentence,
 )
 from megloc_kapture.evaluation.results import ResultContext
-from megloc_kapture.evaluation.scoring import Evaluation, evaluate_poses
+from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.evaluation.statistics import MedianDifference, compare
 from megloc_kapture.io.tables import QueryStatus
 from megloc_kapture.values import RefinementRow, RigidTransform
