@@ -47,7 +47,6 @@ _SAMPLE = 500
 # a pose is near the map within this multiple of the median distance of the best convention, or
 # within this share of the map's extent, below which directions hardly differ
 _NEAR, _LEAST = 2.0, 0.02
-_DUMMY = RigidTransform.identity()
 
 
 @dataclass(frozen=True, slots=True)

@@ -432,7 +432,7 @@ def _confidence(evaluation: Evaluation, whose: str) -> Section:
 
 
 def _view(reported: Reported) -> str | None:
-    from megloc_kapture.evaluation.report.scene import render_view, scene_of
+    from megloc_kapture.evaluation.view import render_view, scene_of
 
     if len(reported.evaluations) > 1:
         return None
