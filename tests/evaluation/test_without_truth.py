@@ -133,7 +133,7 @@ def test_said_in_every_file(
     assert rows[3]["A to B: position_m"] == ""
     html = paths["report.html"].read_text()
     page = page_of(html)
-    assert "No recall: Nobody tells." in page.text and "Do they agree?" in page.text
+    assert "No recall: Nobody tells." in page.text and "only B for 1." in page.text
     again = render_report(found, map_poses=MAP, provenance={"preset": "classic"})
     assert again == html
 
@@ -145,7 +145,7 @@ def test_one_pose_file_alone_and_no_pose_at_all(
     text = report_text(found)
     assert "No true poses were given." in text
     assert "agree (%)" not in text
-    assert "Do they agree" not in page_of(render_report(found)).text
+    assert "both have a pose" not in page_of(render_report(found)).text
     found = evaluate_without_truth([Result("x", {}, ("a.jpg",))])
     assert found.evaluations[0].rows[0].num_missing == 1
     assert "From above" not in page_of(render_report(found)).text

@@ -84,54 +84,61 @@ def write_report(
 
 
 def report_text(reported: Reported) -> str:
-    parts = _text_without_truth(reported) if isinstance(reported, WithoutTruth) else _text(reported)
+    has_label = isinstance(reported, Evaluation) and reported.label
+    parts = [reported.evaluations[0].label] if has_label else []
+    for text, table in _facts(reported):
+        lines = [_wrapped(line) for line in text.splitlines()]
+        parts.append("\n".join(lines if table is None else [*lines, tables.as_text(table)]))
     return "\n\n".join(parts) + "\n"
 
 
-def _text(reported: Reported) -> list[str]:
+# text and table of a report, either may be empty; the page adds figures and pictures
+_Fact = tuple[str, "DataFrame | None"]
+
+
+def _facts(reported: Reported) -> list[_Fact]:
+    if isinstance(reported, WithoutTruth):
+        return _facts_without_truth(reported)
     evaluations, several = reported.evaluations, isinstance(reported, Comparison)
-    parts = [] if several or not evaluations[0].label else [evaluations[0].label]
-    thresholds = wording.bounds(evaluations[0].thresholds)
-    parts.append(f"recall (%) at {thresholds}\n{_wrapped(wording.criterion(evaluations[0]))}")
-    parts.append(tables.as_text(tables.recall_table(evaluations)))
+    facts: list[_Fact] = []
+    thresholds, criterion = evaluations[0].thresholds, wording.criterion(evaluations[0])
+    facts.append((f"recall (%) at {wording.bounds(thresholds)}\n{criterion}", None))
+    facts.append(("", tables.recall_table(evaluations)))
     if by_center := [e.by_center for e in evaluations if e.by_center is not None]:
-        table = tables.as_text(tables.recall_table(by_center))
-        parts.append(f"the same by the distance of the camera centres\n{table}")
-    parts.append(f"{wording.INTERVALS}\n{tables.as_text(tables.interval_table(evaluations))}")
+        text = "the same by the distance of the camera centres"
+        facts.append((text, tables.recall_table(by_center)))
+    facts.append((wording.INTERVALS, tables.interval_table(evaluations)))
     for evaluation in evaluations:
         whose = f" of {evaluation.label}" if several else ""
         if (confident := tables.confident_table(evaluation)) is not None:
-            parts.append(f"{wording.CONFIDENT}{whose}\n{tables.as_text(confident)}")
+            facts.append((f"{wording.CONFIDENT}{whose}", confident))
         if (confidence := evaluation.confidence) is not None:
-            sentences = wording.confidence_sentences(confidence, evaluation.thresholds[-1])
-            parts.append(_wrapped(f"Confidence{whose}: {'; '.join(sentences)}."))
+            sentences = wording.confidence_sentences(confidence, thresholds[-1])
+            facts.append((f"Confidence{whose}: {'; '.join(sentences)}.", None))
         if evaluation.covariance is not None:
             sentence = wording.covariance_sentence(evaluation.covariance)
-            parts.append(_wrapped(f"Covariance{whose}: {sentence}."))
+            facts.append((f"Covariance{whose}: {sentence}.", None))
     if isinstance(reported, Comparison):
         sentences = [text for text, _ in wording.comparison_sentences(reported)]
-        parts.append("\n".join(map(_wrapped, sentences)))
-        parts.append(_wrapped(wording.method_sentence(reported)))
+        facts += [("\n".join(sentences), None), (wording.method_sentence(reported), None)]
     for evaluation in evaluations:
         on = f" on {evaluation.label}" if several else ""
-        parts += [_wrapped(f"Note{on}: {note}.") for note in wording.notes(evaluation)]
-    return parts
+        facts += [(f"Note{on}: {note}.", None) for note in wording.notes(evaluation)]
+    return facts
 
 
-def _text_without_truth(reported: WithoutTruth) -> list[str]:
-    parts = [f"{_wrapped(f'No recall: {reported.statement}')}\n{_wrapped(CAUTION)}"]
-    for evaluation in reported.evaluations:
-        parts.append(f"{evaluation.label}\n{tables.as_text(tables.result_table(evaluation))}")
+def _facts_without_truth(reported: WithoutTruth) -> list[_Fact]:
+    facts: list[_Fact] = [(f"No recall: {reported.statement}\n{CAUTION}", None)]
+    facts += [(e.label, tables.result_table(e)) for e in reported.evaluations]
     for _, group in groupby(reported.agreement, key=lambda row: (row.first, row.second)):
         rows = list(group)
         heading = (
             "% of all queries where both have a pose and the two are at most "
             f"{wording.bounds(reported.thresholds)} apart"
         )
-        table = tables.as_text(tables.agreement_table(reported, rows))
-        sentence = wording.agreement_sentence(rows[-1], reported)
-        parts.append(f"{_wrapped(heading)}\n{table}\n{sentence}")
-    return parts
+        facts.append((heading, tables.agreement_table(reported, rows)))
+        facts.append((wording.agreement_sentence(rows[-1], reported), None))
+    return facts
 
 
 def _wrapped(text: str) -> str:
@@ -250,10 +257,9 @@ def render_report(
     evaluations = reported.evaluations
     if map_poses is None:
         map_poses = first_map_poses(evaluation.context for evaluation in evaluations)
-    if isinstance(reported, WithoutTruth):
-        sections = _sections_without_truth(reported)
-    else:
-        sections = _sections(reported)
+    sections = [_summary(reported)]
+    if not isinstance(reported, WithoutTruth):
+        sections.append(_error_curves(evaluations))
     for evaluation in evaluations:
         sections += _sections_of(evaluation, map_poses, several=len(evaluations) > 1)
     # slow import
@@ -310,59 +316,25 @@ def _numbers(evaluation: Evaluation) -> list[tuple[str, str, str]]:
     return [*numbers, (metres, "median", degrees)]
 
 
-def _sections(reported: Reported) -> list[Section]:
+def _summary(reported: Reported) -> Section:
+    section = Section("Summary" if isinstance(reported, WithoutTruth) else "Recall")
+    for text, table in _facts(reported):
+        for line in text.splitlines():
+            section.text(line)
+        section.table(table)
+    return section
+
+
+def _error_curves(evaluations: Sequence[Evaluation]) -> Section:
     from megloc_kapture.evaluation.report import figures  # loads matplotlib
 
-    evaluations = reported.evaluations
-    head = f"{evaluations[0].row().num_queries} queries. {wording.criterion(evaluations[0])}"
-    sections = [Section("", [head])]
-    if isinstance(reported, Comparison):
-        item = Markup('<li class="{}">{}</li>')
-        items = [
-            item.format("real" if real else "", text)
-            for text, real in wording.comparison_sentences(reported)
-        ]
-        listed = Markup('<ul class="said">{}</ul>').format(Markup("").join(items))
-        method = wording.method_sentence(reported)
-        sections.append(Section("Is the difference real?", [method], [listed]))
-    recall = Section("Recall", [f"At {wording.bounds(evaluations[0].thresholds)}."])
-    recall.table(tables.recall_table(evaluations))
-    if by_center := [e.by_center for e in evaluations if e.by_center is not None]:
-        recall.text("The same by the distance of the camera centres:")
-        recall.table(tables.recall_table(by_center))
-    recall.text(f"{wording.INTERVALS}:")
-    recall.table(tables.interval_table(evaluations))
-    for evaluation in evaluations:
-        on = f"{evaluation.label}: " if isinstance(reported, Comparison) else ""
-        note = Markup('<p class="note">{}</p>')
-        recall.body += [note.format(_sentence(on + text)) for text in wording.notes(evaluation)]
-    curves = (
+    explanation = (
         "Share of all queries at or below an error, each error by itself; queries without a pose "
         "keep the curves below 100 %. Dotted: the thresholds."
     )
-    errors = Section("How large the errors are", [curves])
-    errors.figure(figures.error_curves(evaluations))
-    return [*sections, recall, errors]
-
-
-def _sections_without_truth(reported: WithoutTruth) -> list[Section]:
-    sections = [Section("", [f"No recall: {reported.statement} {CAUTION}"])]
-    for evaluation in reported.evaluations:
-        sections.append(Section(evaluation.label))
-        sections[-1].table(tables.result_table(evaluation))
-    if reported.agreement:
-        explanation = (
-            "Share of all queries where both results have a pose and the two are at most "
-            f"{wording.bounds(reported.thresholds)} apart."
-        )
-        sentences = [
-            wording.agreement_sentence(row, reported)
-            for row in reported.agreement
-            if row.name == "all"
-        ]
-        sections.append(Section("Do they agree?", [explanation, *sentences]))
-        sections[-1].table(tables.agreement_table(reported, reported.agreement))
-    return sections
+    section = Section("How large the errors are", [explanation])
+    section.figure(figures.error_curves(evaluations))
+    return section
 
 
 def _sections_of(evaluation: Evaluation, map_poses: Poses, *, several: bool) -> list[Section]:
@@ -413,20 +385,12 @@ def _query_list(evaluation: Evaluation, queries: Sequence[ShownQuery]) -> Sectio
 def _confidence(evaluation: Evaluation, whose: str) -> Section:
     from megloc_kapture.evaluation.report import figures
 
-    section, confidence = Section(f"{whose}Confidence"), evaluation.confidence
-    if confidence is not None:
-        sentences = wording.confidence_sentences(confidence, evaluation.thresholds[-1])
-        section.paragraphs += map(_sentence, sentences)
-    if evaluation.covariance is not None:
-        section.paragraphs.append(_sentence(wording.covariance_sentence(evaluation.covariance)))
-    if (confident := tables.confident_table(evaluation)) is not None:
-        section.text(f"{wording.CONFIDENT}:")
-        section.table(confident)
+    explanation = (
+        "Left: where confidences can be trusted, the dots are on the dotted line. Right: poses are "
+        "accepted from the most confident on."
+    )
+    section, confidence = Section(f"{whose}Confidence", [explanation]), evaluation.confidence
     if confidence is not None and confidence.num_poses >= wording.FEW:
-        section.text(
-            "Left: where confidences can be trusted, the dots are on the dotted line. Right: poses "
-            "are accepted from the most confident on."
-        )
         section.figure(figures.confidence_curves(confidence))
     return section
 
