@@ -373,10 +373,6 @@ def _sha256(path: Path) -> str:
 
 class _Beside(BaseModel):
     files: dict[str, str] = {}
-    confidence: Any = None
-
-
-class _Scores(BaseModel):
     confidence: dict[str, Annotated[float, Field(ge=0, le=1)]] = {}
 
 
@@ -391,10 +387,8 @@ def read_confidences(target: Path | str) -> dict[str, float]:
         beside = read_json_model(path, _Beside) if path.is_file() else _Beside()
     except DataError:
         return {}
-    if beside.confidence is None:
-        return {}
     known = beside.files.get(target.name)
-    if known is not None and known != _sha256(target):
+    if beside.confidence and known is not None and known != _sha256(target):
         _log.warning("%s is of another pose file; its confidences are left out", path)
         return {}
-    return read_json_model(path, _Scores).confidence
+    return beside.confidence

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.metrics import Threshold
-from megloc_kapture.evaluation.report.wording import format_degrees, format_metres
+from megloc_kapture.evaluation.report.content import format_degrees, format_metres
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
 from megloc_kapture.geometry.cameras import project

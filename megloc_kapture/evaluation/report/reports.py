@@ -18,7 +18,7 @@ from pydantic import BaseModel
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.pose_files import package_versions
-from megloc_kapture.evaluation.report import tables, wording
+from megloc_kapture.evaluation.report import content
 from megloc_kapture.evaluation.report.queries import (
     ShownQuery,
     StoredInliers,
@@ -88,7 +88,7 @@ def report_text(reported: Reported) -> str:
     parts = [reported.evaluations[0].label] if has_label else []
     for text, table in _facts(reported):
         lines = [_wrapped(line) for line in text.splitlines()]
-        parts.append("\n".join(lines if table is None else [*lines, tables.as_text(table)]))
+        parts.append("\n".join(lines if table is None else [*lines, content.as_text(table)]))
     return "\n\n".join(parts) + "\n"
 
 
@@ -101,43 +101,43 @@ def _facts(reported: Reported) -> list[_Fact]:
         return _facts_without_truth(reported)
     evaluations, several = reported.evaluations, isinstance(reported, Comparison)
     facts: list[_Fact] = []
-    thresholds, criterion = evaluations[0].thresholds, wording.criterion(evaluations[0])
-    facts.append((f"recall (%) at {wording.bounds(thresholds)}\n{criterion}", None))
-    facts.append(("", tables.recall_table(evaluations)))
+    thresholds, criterion = evaluations[0].thresholds, content.criterion(evaluations[0])
+    facts.append((f"recall (%) at {content.bounds(thresholds)}\n{criterion}", None))
+    facts.append(("", content.recall_table(evaluations)))
     if by_center := [e.by_center for e in evaluations if e.by_center is not None]:
         text = "the same by the distance of the camera centres"
-        facts.append((text, tables.recall_table(by_center)))
-    facts.append((wording.INTERVALS, tables.interval_table(evaluations)))
+        facts.append((text, content.recall_table(by_center)))
+    facts.append((content.INTERVALS, content.interval_table(evaluations)))
     for evaluation in evaluations:
         whose = f" of {evaluation.label}" if several else ""
-        if (confident := tables.confident_table(evaluation)) is not None:
-            facts.append((f"{wording.CONFIDENT}{whose}", confident))
+        if (confident := content.confident_table(evaluation)) is not None:
+            facts.append((f"{content.CONFIDENT}{whose}", confident))
         if (confidence := evaluation.confidence) is not None:
-            sentences = wording.confidence_sentences(confidence, thresholds[-1])
+            sentences = content.confidence_sentences(confidence, thresholds[-1])
             facts.append((f"Confidence{whose}: {'; '.join(sentences)}.", None))
         if evaluation.covariance is not None:
-            sentence = wording.covariance_sentence(evaluation.covariance)
+            sentence = content.covariance_sentence(evaluation.covariance)
             facts.append((f"Covariance{whose}: {sentence}.", None))
     if isinstance(reported, Comparison):
-        sentences = [text for text, _ in wording.comparison_sentences(reported)]
-        facts += [("\n".join(sentences), None), (wording.method_sentence(reported), None)]
+        sentences = content.comparison_sentences(reported)
+        facts += [("\n".join(sentences), None), (content.method_sentence(reported), None)]
     for evaluation in evaluations:
         on = f" on {evaluation.label}" if several else ""
-        facts += [(f"Note{on}: {note}.", None) for note in wording.notes(evaluation)]
+        facts += [(f"Note{on}: {note}.", None) for note in content.notes(evaluation)]
     return facts
 
 
 def _facts_without_truth(reported: WithoutTruth) -> list[_Fact]:
     facts: list[_Fact] = [(f"No recall: {reported.statement}\n{CAUTION}", None)]
-    facts += [(e.label, tables.result_table(e)) for e in reported.evaluations]
+    facts += [(e.label, content.result_table(e)) for e in reported.evaluations]
     for _, group in groupby(reported.agreement, key=lambda row: (row.first, row.second)):
         rows = list(group)
         heading = (
             "% of all queries where both have a pose and the two are at most "
-            f"{wording.bounds(reported.thresholds)} apart"
+            f"{content.bounds(reported.thresholds)} apart"
         )
-        facts.append((heading, tables.agreement_table(reported, rows)))
-        facts.append((wording.agreement_sentence(rows[-1], reported), None))
+        facts.append((heading, content.agreement_table(reported, rows)))
+        facts.append((content.agreement_sentence(rows[-1], reported), None))
     return facts
 
 
@@ -167,8 +167,8 @@ def report_data(reported: Reported) -> dict[str, Any]:
     return {
         "results": [_recall_data(evaluation) for evaluation in reported.evaluations],
         "comparison": {
-            "method": wording.method_sentence(reported),
-            "sentences": [text for text, _ in wording.comparison_sentences(reported)],
+            "method": content.method_sentence(reported),
+            "sentences": content.comparison_sentences(reported),
             "tests": [{**named(test), "real": test.is_real} for test in reported.tests],
             "medians": [{**named(median), "real": median.is_real} for median in reported.medians],
         },
@@ -194,10 +194,10 @@ def _recall_data(evaluation: Evaluation) -> dict[str, Any]:
     by_center = evaluation.by_center
     return {
         "label": evaluation.label,
-        "criterion": wording.criterion(evaluation),
+        "criterion": content.criterion(evaluation),
         "thresholds": evaluation.thresholds,
         "rows": evaluation.rows,
-        "notes": wording.notes(evaluation),
+        "notes": content.notes(evaluation),
         **({} if confidence is None else {"confidence": confidence}),
         "rows_above_min_confidence": evaluation.rows_above(MIN_CONFIDENCE),
         **({} if covariance is None else {"covariance": covariance}),
@@ -303,16 +303,16 @@ def _numbers(evaluation: Evaluation) -> list[tuple[str, str, str]]:
     overall = evaluation.row()
     numbers = [
         (
-            f"{wording.format_percent(at.recall)} %",
+            f"{content.format_percent(at.recall)} %",
             f"within {at.threshold}",
-            f"95 % interval {wording.format_interval(at)}",
+            f"95 % interval {content.format_interval(at)}",
         )
         for at in overall.recall
     ]
     if not np.isfinite(overall.median_position_m):
         return [*numbers, ("none", "median", "most queries lack a pose")]
-    degrees = f"{wording.format_degrees(overall.median_angle_deg)} deg"
-    metres = f"{wording.format_metres(overall.median_position_m)} m"
+    degrees = f"{content.format_degrees(overall.median_angle_deg)} deg"
+    metres = f"{content.format_metres(overall.median_position_m)} m"
     return [*numbers, (metres, "median", degrees)]
 
 
@@ -359,9 +359,9 @@ def _sections_of(evaluation: Evaluation, map_poses: Poses, *, several: bool) -> 
         sections += [inliers, _confidence(evaluation, whose)]
     refined = Section(f"{whose}What refinement changed", ["Of accepted poses; medians."])
     refined.paragraphs += [
-        _sentence(wording.consistency_sentence(row)) for row in context.consistency
+        _sentence(content.consistency_sentence(row)) for row in context.consistency
     ]
-    refined.table(tables.refinement_table(evaluation))
+    refined.table(content.refinement_table(evaluation))
     which = "true" if evaluation.truth else "estimated"
     lines = (
         f"Left the query, right the candidate with most matches. Green matches agree with the "
@@ -378,7 +378,7 @@ def _query_list(evaluation: Evaluation, queries: Sequence[ShownQuery]) -> Sectio
     section = Section("Queries, the worst first")
     if len(queries) > _MAX_ROWS:
         section.paragraphs.append(f"The worst {_MAX_ROWS} of {len(queries)}.")
-    section.table(tables.query_table(evaluation, queries[:_MAX_ROWS]))
+    section.table(content.query_table(evaluation, queries[:_MAX_ROWS]))
     return section
 
 
@@ -390,7 +390,7 @@ def _confidence(evaluation: Evaluation, whose: str) -> Section:
         "accepted from the most confident on."
     )
     section, confidence = Section(f"{whose}Confidence", [explanation]), evaluation.confidence
-    if confidence is not None and confidence.num_poses >= wording.FEW:
+    if confidence is not None and confidence.num_poses >= content.FEW:
         section.figure(figures.confidence_curves(confidence))
     return section
 
