@@ -373,7 +373,11 @@ def _sha256(path: Path) -> str:
 
 class _Beside(BaseModel):
     files: dict[str, str] = {}
-    confidence: dict[str, Annotated[float, Field(ge=0, le=1)]] = {}
+    confidence: Any = None
+
+
+class _Confidences(BaseModel):
+    confidence: dict[str, Annotated[float, Field(ge=0, le=1)]]
 
 
 def read_confidences(target: Path | str) -> dict[str, float]:
@@ -387,8 +391,9 @@ def read_confidences(target: Path | str) -> dict[str, float]:
         beside = read_json_model(path, _Beside) if path.is_file() else _Beside()
     except DataError:
         return {}
-    known = beside.files.get(target.name)
-    if beside.confidence and known is not None and known != _sha256(target):
+    if beside.confidence is None:
+        return {}
+    if beside.files.get(target.name) not in (None, _sha256(target)):
         _log.warning("%s is of another pose file; its confidences are left out", path)
         return {}
-    return beside.confidence
+    return read_json_model(path, _Confidences).confidence

@@ -82,8 +82,14 @@ class Reported:
         def evaluations(self) -> tuple[Evaluation, ...]: ...
 
     def per_query(self) -> dict[str, list[Any]]:
-        """Return the columns of ``per_query.csv``, one value per query."""
-        raise NotImplementedError
+        """Return the columns of ``per_query.csv``, with one value per query."""
+        columns: dict[str, list[Any]] = {}
+        for evaluation in self.evaluations:
+            label = f"{evaluation.label}: " if self.evaluations[1:] else ""
+            for name, values in _query_columns(evaluation).items():
+                shared = name in ("image", "condition")
+                columns.setdefault(name if shared else label + name, values)
+        return columns
 
     def __str__(self) -> str:
         from megloc_kapture.evaluation.report.reports import report_text
@@ -183,13 +189,6 @@ class Evaluation(Reported):
 
         return compare([self, *others])
 
-    def per_query(self) -> dict[str, list[Any]]:
-        columns = query_columns(self.queries)
-        if self.by_center is not None:
-            columns["reference"] = [self.pairs[query.image].reference for query in self.queries]
-            columns["center_error_m"] = [query.position_m for query in self.by_center.queries]
-        return columns
-
     def row(self, name: str = "all") -> RecallRow:
         for row in self.rows:
             if row.name == name:
@@ -200,13 +199,18 @@ class Evaluation(Reported):
         return self.pairs[query].query if query in self.pairs else query
 
 
-def query_columns(queries: Sequence[QueryResult]) -> dict[str, list[Any]]:
+def _query_columns(evaluation: Evaluation) -> dict[str, list[Any]]:
     columns = {
-        name: [getattr(query, attribute) for query in queries]
+        name: [getattr(query, attribute) for query in evaluation.queries]
         for name, attribute in _COLUMNS.items()
+        if evaluation.truth or "error" not in name
     }
     if all(confidence is None for confidence in columns["confidence"]):
         del columns["confidence"]
+    if evaluation.by_center is not None:
+        pairs, centers = evaluation.pairs, evaluation.by_center.queries
+        columns["reference"] = [pairs[query.image].reference for query in evaluation.queries]
+        columns["center_error_m"] = [query.position_m for query in centers]
     return columns
 
 

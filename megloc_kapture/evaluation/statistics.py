@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.metrics import LEVEL, Threshold, within
-from megloc_kapture.evaluation.scoring import Evaluation, Reported, query_columns
+from megloc_kapture.evaluation.scoring import Evaluation, Reported
 
 SIGNIFICANCE = 0.05
 NUM_RESAMPLES, _CHUNK = 2000, 250
@@ -72,14 +71,6 @@ class Comparison(Reported):
     tests: tuple[PairedTest, ...]
     medians: tuple[MedianDifference, ...]
 
-    def per_query(self) -> dict[str, list[Any]]:
-        columns: dict[str, list[Any]] = {}
-        for evaluation in self.evaluations:
-            for name, values in query_columns(evaluation.queries).items():
-                shared = name in ("image", "condition")
-                columns.setdefault(name if shared else f"{evaluation.label}: {name}", values)
-        return columns
-
 
 def compare(evaluations: Sequence[Evaluation]) -> Comparison:
     """Compare at least two results on the same queries, thresholds and conditions."""
@@ -124,12 +115,17 @@ def _check_comparable(evaluations: Sequence[Evaluation]) -> None:
     if len(set(labels)) != len(labels):
         raise OptionError(f"two results are called {max(labels, key=labels.count)!r}")
     for other in evaluations[1:]:
-        if other.thresholds != first.thresholds:
-            raise OptionError(f"{first.label} and {other.label} have different thresholds")
-        if other.errors.names != first.errors.names:
-            raise OptionError(f"{first.label} and {other.label} count different queries")
-        if [q.condition for q in other.queries] != [q.condition for q in first.queries]:
-            raise OptionError(f"{first.label} and {other.label} have different conditions")
+        for kind, ours, theirs in (
+            ("thresholds", first.thresholds, other.thresholds),
+            ("queries", first.errors.names, other.errors.names),
+            (
+                "conditions",
+                [query.condition for query in first.queries],
+                [query.condition for query in other.queries],
+            ),
+        ):
+            if ours != theirs:
+                raise OptionError(f"{first.label} and {other.label} have different {kind}")
 
 
 def mcnemar(only_first: int, only_second: int) -> float:

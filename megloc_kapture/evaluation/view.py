@@ -30,6 +30,7 @@ from megloc_kapture.evaluation.report.map_view import top_view
 from megloc_kapture.evaluation.report.queries import (
     ShownQuery,
     StoredInliers,
+    frame_of_query,
     legend,
     query_facts,
     shown_queries,
@@ -233,7 +234,7 @@ def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = 
         frames=tuple(frames),
         point_frames=np.concatenate([point_frames, dense_frames]),
         camera_frames=_positions([frame_of[name] for name in names], frames),
-        query_frames=_positions([_frame_of(q, context, frame_of) for q in queries], frames),
+        query_frames=_positions([frame_of_query(q, context.frames) for q in queries], frames),
         notes=tuple(notes),
     )
 
@@ -325,13 +326,6 @@ def _frusta(
             frustum[0] = pose.center() - origin
             frustum[1:] = of_camera @ pose.rotation_matrix()  # R^T x of rows
     return frusta
-
-
-def _frame_of(query: ShownQuery, context: ResultContext, frame_of: Mapping[str, str]) -> str:
-    if query.image in context.frames:
-        return context.frames[query.image]
-    known = (frame_of[image] for image in query.candidates if image in frame_of)
-    return next(known, query.condition)
 
 
 def _positions(frames: Sequence[str], known: Sequence[str]) -> NDArray[np.uint8]:

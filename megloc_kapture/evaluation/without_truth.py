@@ -25,7 +25,6 @@ from megloc_kapture.evaluation.results import Result
 from megloc_kapture.evaluation.scoring import (
     Evaluation,
     Reported,
-    query_columns,
     query_result,
     recall_rows,
 )
@@ -71,14 +70,7 @@ class WithoutTruth(Reported):
     apart: tuple[PoseErrors, ...]
 
     def per_query(self) -> dict[str, list[Any]]:
-        columns: dict[str, list[Any]] = {}
-        for result in self.evaluations:
-            before = f"{result.label}: " if self.evaluations[1:] else ""
-            for name, values in query_columns(result.queries).items():
-                if name in ("image", "condition"):
-                    columns[name] = values
-                elif "error" not in name:
-                    columns[before + name] = values
+        columns = Reported.per_query(self)
         labels = [result.label for result in self.evaluations]
         for (first, second), apart in zip(combinations(labels, 2), self.apart, strict=True):
             columns[f"{first} to {second}: position_m"] = apart.position_m.tolist()

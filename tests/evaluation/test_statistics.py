@@ -146,7 +146,7 @@ def test_median_of_resamples_is_numpys() -> None:
             [("B", [0.1, 0.3], {"thresholds": [Threshold(position_m=2.0)]})],
             "A and B have different thresholds",
         ),
-        ([("B", [0.1, 0.3, 0.2], {})], "A and B count different queries"),
+        ([("B", [0.1, 0.3, 0.2], {})], "A and B have different queries"),
         (
             [("B", [0.1, 0.3], {"conditions": {"0000.jpg": "night"}})],
             "A and B have different conditions",

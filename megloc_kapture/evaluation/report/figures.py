@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.evaluation.confidence import Confidence
 from megloc_kapture.evaluation.report.map_view import top_view
-from megloc_kapture.evaluation.report.queries import ShownQuery
+from megloc_kapture.evaluation.report.queries import ShownQuery, frame_of_query
 from megloc_kapture.evaluation.results import Poses
 from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.geometry.poses import camera_centers, stack_poses
@@ -184,15 +184,13 @@ def views_from_above(
     ``frames`` maps images to frames, if the dataset has several.
     """
 
-    def frame_of(query: ShownQuery) -> str:
-        known = (frames[image] for image in (query.image, *query.candidates) if image in frames)
-        return next(known, query.condition)
-
     figures = {}
     mapped = {name: frames.get(name, "") for name in map_poses}
     names = sorted(set(mapped.values())) or [""]
+    of_query = [frame_of_query(query, frames) for query in queries]
+    of_query = [frame if frame in names else names[0] for frame in of_query]
     for name in names:
-        here = [q for q in queries if (f if (f := frame_of(q)) in names else names[0]) == name]
+        here = [query for query, frame in zip(queries, of_query, strict=True) if frame == name]
         poses = [map_poses[image] for image, frame in mapped.items() if frame == name]
         if any(query.estimated or query.truth for query in here):
             figures[name] = _from_above(here, poses, unit)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 
@@ -105,6 +105,12 @@ def _color(query: QueryResult, thresholds: Sequence[Threshold]) -> tuple[str, st
         if query.confidence >= least:
             return color, f"confidence {least:g} or more"
     return _SCALE[-1], f"confidence below {_CONFIDENCES[-1]:g}"
+
+
+def frame_of_query(query: ShownQuery, frames: Mapping[str, str]) -> str:
+    """Return the frame of a query or of its best candidate with one, else its condition."""
+    known = (frames[image] for image in (query.image, *query.candidates) if image in frames)
+    return next(known, query.condition)
 
 
 def legend(queries: Sequence[ShownQuery]) -> list[tuple[str, str]]:
