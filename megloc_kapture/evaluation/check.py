@@ -309,7 +309,7 @@ def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -
         only_endings = all(n.rpartition(".")[0] == r.rpartition(".")[0] for n, r in wrong.items())
         severity: Severity = "error"
         if only_endings and dataset == _ANY_ENDING:
-            severity, message = "warning", f"{message} (the server is said to take either)"
+            severity, message = "warning", f"{message} (the server takes either)"
         elif len(wrong) == len(lines):
             message += "; the server finds none of them, and every figure is zero"
         findings.append(Finding(severity, "name", message, names=tuple(wrong)))

@@ -257,10 +257,11 @@ def relative_pose(
     query_from_world: RigidTransform, reference_from_world: RigidTransform, *, scale: float = 1.0
 ) -> RigidTransform:
     """Return ``query_from_reference``; ``scale`` is metres per unit of the (local) world."""
-    pose = query_from_world @ reference_from_world.inverse()
-    if scale == 1.0:
-        return pose
-    x, y, z = (float(v) for v in scale * np.array(pose.translation))
+    return scaled_pose(query_from_world @ reference_from_world.inverse(), scale)
+
+
+def scaled_pose(pose: RigidTransform, scale: float) -> RigidTransform:
+    x, y, z = (scale * np.array(pose.translation)).tolist()
     return RigidTransform(pose.quat_wxyz, (x, y, z))
 
 

@@ -19,6 +19,7 @@ from megloc_kapture.evaluation.pose_files import (
     read_confidences,
     read_mlad_file,
     read_pose_file,
+    scaled_pose,
     timestamp_of,
 )
 from megloc_kapture.evaluation.protocols import Benchmark
@@ -312,17 +313,10 @@ def _read_mlad(
             elif asked_pair.reference not in references:
                 problem = f"reference {asked_pair.reference!r} has no pose in the map"
             else:
-                pose = _in_local_units(row.query_from_reference, world.official_from_local.scale)
+                pose = scaled_pose(row.query_from_reference, 1 / world.official_from_local.scale)
                 # the identity fills in for a missing pose: the file must have every row
                 if row.query_from_reference != RigidTransform.identity():
                     poses[asked_pair] = pose @ references[asked_pair.reference]
                 continue
             raise DataError(problem, path=pose_file)
     return poses
-
-
-def _in_local_units(pose: RigidTransform, metres_per_unit: float) -> RigidTransform:
-    if metres_per_unit == 1.0:
-        return pose
-    x, y, z = (np.array(pose.translation) / metres_per_unit).tolist()
-    return RigidTransform(pose.quat_wxyz, (x, y, z))

@@ -228,7 +228,9 @@ def evaluate_poses(
     without a pose. ``nowhere`` are images that show nothing of the map.
     """
     if both := set(nowhere).intersection(truth):
-        raise DataError(f"{min(both)!r} is said to show nothing of the map, and has a true pose")
+        raise DataError(
+            f"{min(both)!r} has a true pose, but is listed as showing nothing of the map"
+        )
     counted = tuple(sorted(benchmark.scored(truth)))
     if not counted:
         raise DataError("no query with a true pose to count: is this the right ground truth?")

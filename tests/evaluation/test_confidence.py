@@ -86,7 +86,7 @@ def test_of_a_result() -> None:
     evaluation = evaluate_poses({"a": at(0.0)}, {"a": at(0.0)}, statuses={"a": status("a", None)})
     assert evaluation.confidence is None and "onfidence:" not in report_text(evaluation)
     assert "confidence" not in evaluation.to_pandas().columns
-    with pytest.raises(DataError, match="'a' is said to show nothing of the map, and has"):
+    with pytest.raises(DataError, match="'a' has a true pose, but is listed"):
         evaluate_poses({}, {"a": at(0.0)}, nowhere=["a"])
 
 

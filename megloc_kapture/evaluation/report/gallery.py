@@ -164,7 +164,7 @@ def mask_pictures(folders: Sequence[KaptureFolder]) -> list[Picture]:
             with contextlib.suppress(DataError):
                 small, _ = _read(folder, names[at], _SMALL_BOX)
                 mask = read_image_rgb(masks / f"{names[at]}.png")[:, :, 0]
-                shares = np.where(_sampled(mask, small.shape)[..., None] > 0, 0.0, 0.62)
+                shares = np.where(_nearest(mask, small)[..., None] > 0, 0.0, 0.62)
                 shaded = np.round(small + shares * (_SHADE - small)).astype(np.uint8)
                 facts = f"{100 * float(np.mean(mask == 0)):.1f} % masked"
                 pictures.append(Picture(names[at], facts, image_tag(shaded, names[at])))
@@ -185,7 +185,7 @@ def depth_pictures(mapping: KaptureFolder | None) -> list[Picture]:
             assert mapping is not None
             record = depth_records(mapping.read())[names[at]]
             small, _ = _read(mapping, names[at], _SMALL_BOX)
-            depth = _sampled(read_depth(mapping, record), small.shape)
+            depth = _nearest(read_depth(mapping, record), small)
             known = depth > 0
             # inverse depth keeps the shades of near surfaces
             near = np.where(known, 1 / np.where(known, depth, 1), 0)
@@ -237,13 +237,11 @@ def _read(folder: KaptureFolder, image: str, box: tuple[int, int]) -> tuple[Pixe
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8), scale
 
 
-def _sampled(values: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Resize (H, W) by nearest neighbour, because depths must not be interpolated."""
-    rows, columns = (
-        ((np.arange(size) + 0.5) * old / size).astype(np.int64)
-        for size, old in zip(shape, values.shape, strict=False)
-    )
-    return values[np.ix_(rows, columns)]
+def _nearest(values: NDArray[Any], pixels: Pixels) -> NDArray[Any]:
+    import cv2
+
+    size = pixels.shape[1], pixels.shape[0]
+    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT))
 
 
 def _jpeg(pixels: Pixels) -> str:

@@ -36,11 +36,14 @@ def top_view(quats_wxyz: NDArray[np.float64], centers: NDArray[np.float64]) -> T
     down = rotate(invert_quats(quats_wxyz), np.array([0.0, 1.0, 0.0])).mean(axis=0)
     length = float(np.linalg.norm(down))
     spread = centers - centers.mean(axis=0)
-    axes = np.linalg.svd(spread, full_matrices=True)[2] if len(centers) <= 3 else _axes(spread)
+    axes = np.linalg.eigh(spread.T @ spread)[1].T[::-1]
     upward = -down / length if length >= _MIN_AGREEMENT else _signed(axes[2])
     nearest = int(np.argmax(np.abs(upward)))
     if abs(upward[nearest]) >= _AXIS_COSINE:
-        return _along_axes(nearest, positive=bool(upward[nearest] > 0))
+        first, second = (nearest + 1) % 3, (nearest + 2) % 3
+        if upward[nearest] < 0:  # swapped, so that the page is not mirrored
+            first, second = second, first
+        return TopView(np.eye(3)[first], np.eye(3)[second], ("xyz"[first], "xyz"[second]))
     right = axes[0] - (axes[0] @ upward) * upward
     if np.linalg.norm(right) < 1e-6:  # the cameras stand on one vertical line
         right = np.eye(3)[int(np.argmin(np.abs(upward)))]
@@ -49,18 +52,5 @@ def top_view(quats_wxyz: NDArray[np.float64], centers: NDArray[np.float64]) -> T
     return TopView(right, np.cross(upward, right), ("along the map", "across the map"))
 
 
-def _axes(spread: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.linalg.eigh(spread.T @ spread)[1].T[::-1], dtype=np.float64)
-
-
 def _signed(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     return direction if direction[int(np.argmax(np.abs(direction)))] > 0 else -direction
-
-
-def _along_axes(vertical: int, *, positive: bool) -> TopView:
-    first, second = ((1, 2), (2, 0), (0, 1))[vertical]
-    names = "xyz"
-    if not positive:  # seen from the other side: swap to keep the page right-handed
-        first, second = second, first
-    world = np.eye(3)
-    return TopView(world[first], world[second], (names[first], names[second]))

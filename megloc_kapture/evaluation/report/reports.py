@@ -265,7 +265,7 @@ def render_report(
     # slow import
     from megloc_kapture.evaluation.report.gallery import depth_pictures, mask_pictures
 
-    context, shaded = evaluations[0].context, "What masks hide is shaded."
+    context, shaded = evaluations[0].context, "Masked regions are shaded."
     sections += [
         Section("Masks", [shaded], pictures=mask_pictures(context.masked)),
         Section(
@@ -357,7 +357,7 @@ def _sections_of(evaluation: Evaluation, map_poses: Poses, *, several: bool) -> 
         )
         inliers.figure(figures.errors_against_inliers(evaluation))
         sections += [inliers, _confidence(evaluation, whose)]
-    refined = Section(f"{whose}What refinement changed", ["Of accepted poses; medians."])
+    refined = Section(f"{whose}Changes by refinement", ["Of accepted poses; medians."])
     refined.paragraphs += [
         _sentence(content.consistency_sentence(row)) for row in context.consistency
     ]

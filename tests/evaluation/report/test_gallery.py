@@ -135,4 +135,4 @@ def test_masked_images_are_shaded(run: Run) -> None:
     found = context_of(run.workspace / "localized")
     evaluation = evaluate_poses({}, {QUERY: POSES[QUERY]})
     page = render_report(replace(evaluation, context=found))
-    assert "What masks hide is shaded." in page and "25.0 % masked" in page
+    assert "Masked regions are shaded." in page and "25.0 % masked" in page
