@@ -13,16 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.pose_files import (
-    checked_pose,
-    poses_by_image,
-    read_confidences,
-    read_mlad_file,
-    read_pose_file,
-    scaled_pose,
-    timestamp_of,
-)
+from megloc_kapture.evaluation import pose_files
 from megloc_kapture.evaluation.protocols import Benchmark
+from megloc_kapture.io import tables
 from megloc_kapture.io.colmap import read_model_poses
 from megloc_kapture.io.dataset_tables import (
     METRES,
@@ -35,18 +28,7 @@ from megloc_kapture.io.dataset_tables import (
     unit_of,
 )
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.io.tables import (
-    CONSISTENCY_FILE,
-    COVARIANCE_FILE,
-    REFINEMENT_FILE,
-    STATUS_FILE,
-    ConsistencyRow,
-    QueryStatus,
-    read_consistency,
-    read_covariances,
-    read_refinement,
-    read_status,
-)
+from megloc_kapture.io.tables import ConsistencyRow, QueryStatus
 from megloc_kapture.stages.localized_folder import query_status
 from megloc_kapture.values import Camera, Failure, Pose, RefinementRow, RigidTransform
 
@@ -132,14 +114,14 @@ def context_of(result: Path | str, *, mapping: Path | str | None = None) -> Resu
     if mapping is not None:
         map_path = Path(mapping)
     refinements: dict[str, list[RefinementRow]] = {}
-    for row in _if_there(read_refinement, folder / REFINEMENT_FILE) or ():
+    for row in _if_there(tables.read_refinement, folder / tables.REFINEMENT_FILE) or ():
         refinements.setdefault(row.image, []).append(row)
     return ResultContext(
         queries=None if queries is None else KaptureFolder(queries, features_dirs=features),
         mapping=None if map_path is None else KaptureFolder(map_path, features_dirs=features),
         side_tables=None if workspace is None else workspace / SIDE_TABLES,
         refinements=refinements,
-        consistency=_if_there(read_consistency, folder / CONSISTENCY_FILE) or (),
+        consistency=_if_there(tables.read_consistency, folder / tables.CONSISTENCY_FILE) or (),
         unit=unit_of(result),
         masked=[] if workspace is None else _masked(workspace),
     )
@@ -213,13 +195,13 @@ def read_result(
             label,
             _in_frame_of(benchmark.world, data.poses(), path),
             tuple(sorted(data.image_names())),
-            _if_there(read_status, path / STATUS_FILE) or {},
-            covariances=_if_there(read_covariances, path / COVARIANCE_FILE) or {},
+            _if_there(tables.read_status, path / tables.STATUS_FILE) or {},
+            covariances=_if_there(tables.read_covariances, path / tables.COVARIANCE_FILE) or {},
         )
-    poses = poses_by_image(read_poses(path), images, benchmark.names)
+    poses = pose_files.poses_by_image(read_poses(path), images, benchmark.names)
     if benchmark.world != World():
         poses = {image: benchmark.world.pose_in_local(pose) for image, pose in poses.items()}
-    return Result(label, poses, tuple(sorted(poses)), confidences=read_confidences(path))
+    return Result(label, poses, tuple(sorted(poses)), confidences=pose_files.read_confidences(path))
 
 
 def read_poses(source: Path) -> dict[str, RigidTransform]:
@@ -228,8 +210,14 @@ def read_poses(source: Path) -> dict[str, RigidTransform]:
         raise DataError("no such file or folder", path=source)
     if (model := model_of(source)) is not None:
         images = model / "images.txt"
-        return read_model_poses(model) if not images.is_file() else read_pose_file(images)
-    return KaptureFolder(source).read().poses() if source.is_dir() else read_pose_file(source)
+        return (
+            read_model_poses(model) if not images.is_file() else pose_files.read_pose_file(images)
+        )
+    return (
+        KaptureFolder(source).read().poses()
+        if source.is_dir()
+        else pose_files.read_pose_file(source)
+    )
 
 
 def model_of(folder: Path) -> Path | None:
@@ -248,7 +236,7 @@ def result_in_memory(
     covariances = {}
     for image, pose in estimated.items():
         if isinstance(pose, RigidTransform):
-            poses[image] = checked_pose(pose.quat_wxyz, pose.translation, repr(image))
+            poses[image] = pose_files.checked_pose(pose.quat_wxyz, pose.translation, repr(image))
             continue
         statuses[image] = query_status(image, pose)
         if isinstance(pose, Pose):
@@ -272,8 +260,8 @@ def distinct_labels(sources: Sequence[Path]) -> list[str]:
 
 def _in_frame_of(world: World, poses: dict[str, RigidTransform], result: Path) -> Poses:
     """Bring poses of a workspace with another local frame to the truth's frame."""
-    tables = side_tables_near(result)
-    result_world = world if tables is None else read_world(tables)
+    side_tables = side_tables_near(result)
+    result_world = world if side_tables is None else read_world(side_tables)
     if result_world.official_from_local == world.official_from_local:
         return poses
     return {i: world.pose_in_local(result_world.pose_in_official(p)) for i, p in poses.items()}
@@ -287,12 +275,12 @@ def _read_mlad(
         raise DataError(reason, path=path)
     asked: dict[str, dict[tuple[int, int], RelocalizationPair]] = {}
     for pair in pairs:
-        stamps = timestamp_of(pair.reference), timestamp_of(pair.query)
+        stamps = pose_files.timestamp_of(pair.reference), pose_files.timestamp_of(pair.query)
         asked.setdefault(pair.file, {})[stamps] = pair
-    pose_files = {path.name if path.name in asked else min(asked): path}
+    paths = {path.name if path.name in asked else min(asked): path}
     if path.is_dir():
-        pose_files = {file: path / file for file in sorted(asked) if (path / file).is_file()}
-        if not pose_files:
+        paths = {file: path / file for file in sorted(asked) if (path / file).is_file()}
+        if not paths:
             raise DataError(
                 f"neither a kapture folder nor one with pose files ({min(asked)})", path=path
             )
@@ -303,8 +291,8 @@ def _read_mlad(
             path=path,
         )
     poses: dict[RelocalizationPair, RigidTransform] = {}
-    for file, pose_file in pose_files.items():
-        for row in read_mlad_file(pose_file):
+    for file, pose_file in paths.items():
+        for row in pose_files.read_mlad_file(pose_file):
             asked_pair = asked[file].get((row.reference, row.query))
             if asked_pair is None:
                 problem = f"pair {row.reference} {row.query} is not asked for"
@@ -313,7 +301,9 @@ def _read_mlad(
             elif asked_pair.reference not in references:
                 problem = f"reference {asked_pair.reference!r} has no pose in the map"
             else:
-                pose = scaled_pose(row.query_from_reference, 1 / world.official_from_local.scale)
+                pose = pose_files.scaled_pose(
+                    row.query_from_reference, 1 / world.official_from_local.scale
+                )
                 # the identity fills in for a missing pose: the file must have every row
                 if row.query_from_reference != RigidTransform.identity():
                     poses[asked_pair] = pose @ references[asked_pair.reference]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import cached_property
 
 import numpy as np
@@ -136,9 +136,6 @@ class StoredInliers:
     """
 
     context: ResultContext
-    _inliers: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = field(
-        init=False, default_factory=dict
-    )
 
     @cached_property
     def _sources(self) -> list[tuple[FeatureReader, MatchesReader, MapIndex]]:
@@ -165,11 +162,6 @@ class StoredInliers:
 
     def of(self, query: ShownQuery) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return pixels (K, 2) and world points (K, 3) of the inliers of a query's pose."""
-        if query.image not in self._inliers:
-            self._inliers[query.image] = self._read(query)
-        return self._inliers[query.image]
-
-    def _read(self, query: ShownQuery) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         pose, queries = self.context.localized.get(query.image), self.context.queries
         if pose is not None and pose.inlier_points_world is not None:
             px, xyz = pose.inlier_points_px, pose.inlier_points_world
