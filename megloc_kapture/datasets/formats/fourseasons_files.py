@@ -12,9 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from megloc_kapture.datasets.formats.text_lines import (
     MAX_DISTANCE_M,
     Line,
@@ -95,11 +92,6 @@ class GnssPose:
     fusion_quality: float | None
 
 
-def read_times(path: Path) -> list[int]:
-    """Read ``times.txt``: timestamps (ns) of all frames of a recording."""
-    return list(_by_timestamp(path, lambda line: None))
-
-
 def read_gnss_poses(path: Path) -> dict[int, GnssPose]:
     """Read ``GNSSPoses.txt`` by timestamp (ns).
 
@@ -127,11 +119,6 @@ def read_gnss_poses(path: Path) -> dict[int, GnssPose]:
 def read_poses(path: Path) -> dict[int, RigidTransform]:
     """Read ``poses.txt`` (ECCV 2020 challenge): ``world_from_cam`` by timestamp (ns), metres."""
     return _by_timestamp(path, lambda line: _transform(line, line.comma_fields[1:]))
-
-
-def read_keyframe_accuracy(path: Path) -> set[int]:
-    """Read ``keyframe_accuracy.txt``: timestamps (ns) of keyframes known to better than 0.05 m."""
-    return {_timestamp(line, line.comma_fields[0]) for line in read_lines(path, comments=True)}
 
 
 def timestamp_of_name(stem: str) -> int | None:
@@ -208,64 +195,6 @@ def read_transformations(path: Path) -> Transformations:
         scale = _scale(row, row.text)
     s_from_as, w_from_gpsw, e_from_gpsw = transforms
     return Transformations(s_from_as, w_from_gpsw, e_from_gpsw, scale)
-
-
-@dataclass(frozen=True, eq=False)
-class Keyframe:
-    """A keyframe's file, written by the odometry, with the undistorted left camera.
-
-    ``world_from_cam`` is in the odometry's world and unit, not that of ``GNSSPoses.txt``; relative
-    motions are equal. ``points`` is float64 (P, 3): u and v in pixels, inverse depth.
-    """
-
-    timestamp: int
-    camera: Camera
-    world_from_cam: RigidTransform
-    points: NDArray[np.float64]
-
-
-def read_keyframe(path: Path) -> Keyframe:
-    """Read ``KeyFrame_<timestamp>.txt``; comment lines name its parts."""
-    lines = read_lines(path, blank=True)
-    timestamp_line = _part(lines, "timestamp", path)[0]
-    line = _part(lines, "fx", path)[0]
-    line.expect(line.comma_fields, 7, "fx, fy, cx, cy, width, height, npoints")
-    params = line.numbers_of(line.comma_fields[:4], "camera parameter")
-    width, height, num_points = (line.count_of(text, "size") for text in line.comma_fields[4:])
-    with line.named():
-        camera = Camera("PINHOLE", width, height, tuple(params))
-    # each point has a line of numbers and a line of colours
-    rows = _part(lines, "Point Cloud", path, may_be_empty=num_points == 0)[::2]
-    if len(rows) != num_points:
-        raise DataError(f"{len(rows)} points, {num_points} are announced", path=path)
-    points = []
-    for row in rows:
-        form = "u,v,idepth_scaled,idepth_hessian,maxRelBaseline,numGoodRes,status"
-        row.expect(row.comma_fields, 7, form)
-        points.append(row.numbers_of(row.comma_fields[:3], "u, v or depth"))
-    timestamp = _timestamp(timestamp_line, timestamp_line.text)
-    pose_line = _part(lines, "camToWorld", path)[0]
-    pose = _transform(pose_line, pose_line.comma_fields)
-    return Keyframe(timestamp, camera, pose, np.array(points, np.float64).reshape(-1, 3))
-
-
-def _part(
-    lines: Sequence[Line], title: str, path: Path, *, may_be_empty: bool = False
-) -> list[Line]:
-    part: list[Line] = []
-    begun = False
-    for line in lines:
-        if line.text.startswith("#"):
-            if part:
-                break
-            begun = begun or line.text[1:].lstrip().startswith(title)
-        elif begun and line.text:
-            part.append(line)
-        elif part:
-            break
-    if not part and not (begun and may_be_empty):
-        raise DataError(f"there is no '# {title}' with its values below", path=path)
-    return part
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,6 @@ a nearby keyframe to each query.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,15 +14,11 @@ from pydantic import Field
 
 from megloc_kapture.datasets.formats.fourseasons_files import (
     StereoCalibration,
-    read_keyframe_accuracy,
-    read_times,
 )
 from megloc_kapture.datasets.fourseasons import (
-    ACCURACY,
     CAMERAS,
     GNSS_POSES,
     POSES,
-    TIMES,
     TRANSFORMATIONS,
     Recording,
     RelocalizationFile,
@@ -37,7 +32,6 @@ from megloc_kapture.datasets.fourseasons.images import (
     LocalFrame,
     challenge_tables,
     read_keyframe_poses,
-    write_depth_maps,
 )
 from megloc_kapture.datasets.official import (
     Count,
@@ -78,9 +72,6 @@ class FourSeasonsOptions(Options):
         "recording the keyframes that relocalization files ask for, or all where nothing tells",
     )
     stereo: bool = Field(default=True, description="take the right camera too")
-    depth: bool = Field(
-        default=False, description="the map keyframes' point clouds as sparse depth maps"
-    )
     min_fusion_quality: int = Field(
         default=1,
         ge=0,
@@ -101,7 +92,7 @@ class FourSeasons:
         "calibration.zip once",
         folders=("4Seasons",),
         layout="ROOT/calibration/ and ROOT/<recording>/{undistorted_images/,GNSSPoses.txt,"
-        "Transformations.txt,times.txt} of two recordings or more; relocalization files of a "
+        "Transformations.txt} of two recordings or more; relocalization files of a "
         "challenge in ROOT or the reference recording's folder",
     )
 
@@ -120,17 +111,12 @@ class FourSeasons:
         recordings = (*chosen.references, *chosen.queries)
         yield from dict.fromkeys(f for r in recordings for f in r.calibration_files(root))
         for recording in recordings:
-            for name in (GNSS_POSES, TRANSFORMATIONS, POSES, ACCURACY, TIMES):
+            for name in (GNSS_POSES, TRANSFORMATIONS, POSES):
                 if (recording.folder / name).is_file():
                     yield recording.folder / name
         for data in (dataset.mapping, dataset.query):
             for image in data.image_names():
                 yield chosen.recordings[image.partition("/")[0]].file_of(image)
-        if self.options.depth:
-            taken = {timestamp for timestamp, _ in dataset.mapping.records_depth}
-            for recording in chosen.references:
-                files = (recording.keyframe_file(timestamp) for timestamp in sorted(taken))
-                yield from (file for file in files if file.is_file())
         yield from ground_truth_files(root)
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
@@ -142,7 +128,7 @@ class FourSeasons:
         local = {name: frame.cams_from_local(of) for name, of in poses.items()}
         mapping = ImageRecords(suffixes, missing, self.options.stereo)
         for recording in chosen.references:
-            self._add_map(mapping, recording, root, poses[recording.name], local[recording.name])
+            self._add_map(mapping, recording, root, local[recording.name])
         query = ImageRecords(suffixes, missing, self.options.stereo)
         truth: dict[tuple[int, str], RigidTransform] = {}
         cars: dict[str, str] = {}
@@ -178,9 +164,6 @@ class FourSeasons:
             summary=_summary(chosen, poses, mapping.data, query.data, query_gt),
             remarks=_remarks(poses, frame, tables, self.options.min_fusion_quality),
             missing=missing,
-            write_more=partial(write_depth_maps, mapping.depth_jobs)
-            if self.options.depth
-            else None,
         )
 
     def _select(self, root: Path, missing: Missing) -> Selection:
@@ -215,7 +198,6 @@ class FourSeasons:
         mapping: ImageRecords,
         recording: Recording,
         root: Path,
-        poses: KeyframePoses,
         cams_from_local: Mapping[int, RigidTransform],
     ) -> None:
         times: Iterable[int] = sorted(cams_from_local)
@@ -227,14 +209,6 @@ class FourSeasons:
         for timestamp, pose in cams_from_local.items():
             if timestamp in taken:
                 mapping.data.trajectories[timestamp, car] = pose
-        if self.options.depth:
-            scales = {t: s for t, s in poses.scales.items() if t in cams_from_local}
-            if not scales:
-                raise DataError(
-                    f"depth needs the scale of the keyframes, which is in {GNSS_POSES}",
-                    path=recording.folder,
-                )
-            mapping.add_depth(recording, calibration, scales)
 
     def _query_times(
         self,
@@ -305,14 +279,6 @@ def _summary(
                 good = poses[recording.name]
                 rows = len(good.scene_from_cam) + len(good.dropped)
                 counts.append(Count("  keyframes with a pose", len(good.scene_from_cam), rows))
-            if (recording.folder / TIMES).is_file():
-                listed = len(read_times(recording.folder / TIMES))
-                counts.append(Count(f"  frames in {TIMES}", listed))
-                on_disk = len(recording.times_on_disk(CAMERAS[0]))
-                counts.append(Count("  frames with a left image", on_disk))
-            if (recording.folder / ACCURACY).is_file():
-                accurate = read_keyframe_accuracy(recording.folder / ACCURACY)
-                counts.append(Count("  keyframes known to 0.05 m", len(accurate)))
     counts += [file.count() for file in chosen.files]
     counts.append(Count("images with a pose in the map", len(mapping.poses())))
     counts.append(Count("queries", len(query.records_camera)))
