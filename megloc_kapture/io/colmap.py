@@ -394,27 +394,6 @@ def write_model(
         raise OutputError(f"{output}: COLMAP cannot write its model: {error}") from error
 
 
-def read_model_poses(model: Path) -> dict[str, RigidTransform]:
-    """Read ``cam_from_world`` by image name from a binary model; its points may be missing."""
-    with tempfile.TemporaryDirectory(prefix=f".{owned_name()}") as folder:
-        for file in model.glob("*.bin"):
-            if file.name != "points3D.bin":
-                (Path(folder) / file.name).symlink_to(file.resolve())
-        (Path(folder) / "points3D.bin").write_bytes(bytes(8))  # no points
-        try:
-            images = load_pycolmap().Reconstruction(folder).images.values()
-        except (OSError, RuntimeError, ValueError, IndexError) as error:
-            raise DataError(f"COLMAP cannot read the model: {error}", path=model) from error
-    poses = {}
-    for image in images:
-        if image.has_pose:
-            pose = image.cam_from_world()
-            x, y, z, w = pose.rotation.quat.tolist()
-            tx, ty, tz = pose.translation.tolist()
-            poses[image.name] = RigidTransform((w, x, y, z), (tx, ty, tz))
-    return poses
-
-
 def undistort_model(model: Path, images: Path, output: Path) -> None:
     """Undistort a model with its keypoints into ``sparse/0`` and its images into ``images/``."""
     pycolmap = load_pycolmap()

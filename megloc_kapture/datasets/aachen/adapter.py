@@ -42,7 +42,6 @@ _NUM_DAY, _NUM_NIGHT = 824, {"1.0": 98, "1.1": 191}
 _NUM_CAMERAS = 5234
 # visuallocalization.net recognises versions by these file names
 _POSE_FILE_STEMS = {"1.0": "Aachen", "1.1": "Aachen_v1_1"}
-_WRONG_IMAGE = "db/1228.jpg"
 
 
 class AachenOptions(Options):
@@ -141,12 +140,6 @@ class Aachen:
         **more: Any,
     ) -> OfficialDataset:
         truth, _ = read_ground_truth(missing.root, images.query, World())  # names tell conditions
-        if _WRONG_IMAGE in images.mapping.records_camera.values():
-            wrong = (
-                f"{_WRONG_IMAGE} has a wrong pose in the published model; its maintainer says that "
-                "it may be dropped. It is imported as published."
-            )
-            remarks = [wrong, *remarks]
         conditions = images.conditions.items()
         return OfficialDataset(
             mapping=images.mapping,

@@ -19,7 +19,6 @@ from megloc_kapture.datasets.formats.text_lines import Line, read_lines
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import has_control_characters, named
-from megloc_kapture.io.mat_file import read_mat_array
 from megloc_kapture.values import RigidTransform
 
 FLOORS = ("DUC1", "DUC2")
@@ -120,7 +119,12 @@ def read_wrong_scans(path: Path | str) -> frozenset[str]:
 
 def read_cutout_points(path: Path | str, width: int, height: int) -> NDArray[np.float64]:
     """Read the scanned points float64 (height, width, 3), metres in the scan's frame, or NaN."""
-    points = read_mat_array(path, POINTS)
+    from scipy.io import loadmat
+
+    try:
+        points = np.asarray(loadmat(path, variable_names=[POINTS])[POINTS], np.float64)
+    except Exception as error:  # SciPy raises many kinds on broken files
+        raise DataError(f"not a MAT file with {POINTS}: {error}", path=path) from error
     if points.shape != (height, width, 3):
         found = "x".join(map(str, points.shape))
         raise DataError(f"{POINTS} is {found}, expected {height}x{width}x3", path=path)

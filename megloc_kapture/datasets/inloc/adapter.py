@@ -51,7 +51,6 @@ _CUTOUT_FOCAL_SHARE = 3**0.5 / 2
 # the 277 scans of the paper's 9,972 cutouts, with the floors published by the authors
 _PUBLISHED_SCANS = {"DUC1": 50, "DUC2": 80, "CSE3": 7, "CSE4": 75, "CSE5": 65}
 _PUBLISHED_QUERIES = 356
-_EXIF_ORIENTATION = 0x0112
 _MANY_GIGABYTES = 5
 # points of a wrong image are off by a large part of its width
 _MAX_OFFSET = 0.03
@@ -123,7 +122,7 @@ class InLoc:
                 path=layout.cutouts,
             )
         names = [f"{QUERIES}/{name}" for name in layout.queries()]
-        query, turned = _queries(names, layout.query)
+        query = _queries(names, layout.query)
         truth, true_groups = read_ground_truth(root, query, World())
         groups = {image: true_groups.get(image, ImageGroup()) for image in names}
         records = Path("mapping") / "sensors" / "records_data"
@@ -136,7 +135,7 @@ class InLoc:
             names={image: last_part(image) for image in names},
             protocol=protocol_of(DATASET),
             summary=self._summary(map_, groups),
-            remarks=self._remarks(map_, groups, left_out, turned),
+            remarks=self._remarks(map_, groups, left_out),
             missing=missing,
             write_more=lambda output: write_depth_maps(
                 map_.depth_jobs, self.options.depth_step, output / records
@@ -161,7 +160,7 @@ class InLoc:
         return counts
 
     def _remarks(
-        self, map_: _Map, groups: Mapping[str, ImageGroup], left_out: list[str], turned: int
+        self, map_: _Map, groups: Mapping[str, ImageGroup], left_out: list[str]
     ) -> list[str]:
         remarks = [
             "Each floor is a coordinate frame of its own (frame in groups.csv): a pose that rests "
@@ -184,11 +183,6 @@ class InLoc:
             remarks.append(
                 f"Left out, as the dataset's authors list them as wrongly placed: scans "
                 f"{', '.join(left_out)}."
-            )
-        if turned:
-            remarks.append(
-                f"{turned} queries have an EXIF orientation, which is ignored: cameras and poses "
-                "refer to the pixels as they are stored."
             )
         return remarks
 
@@ -263,26 +257,14 @@ def _timestamp(scan: Scan, cutout: Cutout) -> int:
     )
 
 
-def _queries(names: list[str], folder: Path) -> tuple[KaptureData, int]:
-    data, turned = KaptureData(), 0
+def _queries(names: list[str], folder: Path) -> KaptureData:
+    data = KaptureData()
     for timestamp, name in enumerate(names):
-        path = folder / last_part(name)
-        camera = _camera(path, _FOCAL_SHARE, longer=True)
+        camera = _camera(folder / last_part(name), _FOCAL_SHARE, longer=True)
         sensor = f"iphone7_{camera.width}x{camera.height}"
         data.sensors[sensor] = Sensor.from_camera(camera, name=sensor)
         data.records_camera[timestamp, sensor] = name
-        turned += _is_turned(path)
-    return data, turned
-
-
-def _is_turned(path: Path) -> bool:
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            return image.getexif().get(_EXIF_ORIENTATION, 1) != 1
-    except Exception:  # pillow raises many types on broken metadata, which is optional
-        return False
+    return data
 
 
 # ----------------------------------------------------------------------------------- depth
