@@ -22,8 +22,7 @@ from megloc_kapture.io.kapture.features import (
 )
 from megloc_kapture.io.kapture.format import KaptureData
 from megloc_kapture.io.kapture.matches import MatchesReader
-from megloc_kapture.io.kapture.observations import Observations, read_observations
-from megloc_kapture.io.kapture.points import read_points3d
+from megloc_kapture.io.kapture.points import Observations, read_observations, read_points3d
 from megloc_kapture.io.kapture.sensors import read_kapture_data
 
 _ARRAY_KINDS: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_features")

@@ -10,16 +10,15 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture import observations, write_ply
-from megloc_kapture.io.kapture.observations import (
-    Observations,
-    read_observations,
-    write_observations,
-)
+from megloc_kapture.io.kapture import points as observations
+from megloc_kapture.io.kapture import write_ply
 from megloc_kapture.io.kapture.points import (
     COVARIANCES_FILE,
+    Observations,
+    read_observations,
     read_point_covariances,
     read_points3d,
+    write_observations,
     write_point_covariances,
     write_points3d,
 )
