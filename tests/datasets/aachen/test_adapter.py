@@ -234,7 +234,7 @@ def test_missing_lists(root: Path, tmp_path: Path) -> None:
     ("change", "where", "match"),
     [
         (edit(LIST, "db/7.jpg", "db/8.jpg"), LIST, "no line for 'db/7.jpg'"),
-        (edit(LIST, " 10.5 ", " nan "), f"{LIST}:2", "'nan' is not a finite number"),
+        (edit(LIST, " 10.5 ", " nan "), f"{LIST}:2", "parameters must be finite"),
         (edit(MODEL, "\n2\n", "\n3\n"), MODEL, "ends before its last point"),
         (edit(DAY_LIST, DAY[2], DAY[0]), f"{DAY_LIST}:3", "is listed twice"),
         (edit(NIGHT_LIST, NIGHT[0], DAY[1]), NIGHT_LIST, "is also in day_time_queries"),

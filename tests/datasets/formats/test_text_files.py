@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 from megloc_kapture.datasets import robotcar
-from megloc_kapture.datasets.aachen import read_query_list
 from megloc_kapture.datasets.formats import fourseasons_files
 from megloc_kapture.datasets.formats.text_lines import read_rigid_matrix
 from megloc_kapture.datasets.inloc import read_transformation, read_wrong_scans
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.camera_list import read_camera_rows
 
 TIME = 1602074877390449152
 POSE = "-0.06,0.05,-0.15,0,0.6,0,0.8"
@@ -31,7 +31,7 @@ TEXTS: dict[Callable[[Path], Any], str] = {
     robotcar.read_query_location: "dawn/left/1418721355075498.jpg\ndawn/rear/14.jpg\n",
     robotcar.read_test_list: "rear/1418721355075498.png\nrear/1418721354984638.png\n",
     robotcar.read_train_poses: "dawn/rear/1.png 1 0 0 10.0 0 1 0 0.0 0 0 1 -2.0 0 0 0 1\n",
-    read_query_list: "query/day/a.jpg SIMPLE_RADIAL 1600 1200 1469.2 800 600 -0.0353\r\n"
+    read_camera_rows: "query/day/a.jpg SIMPLE_RADIAL 1600 1200 1469.2 800 600 -0.0353\r\n"
     "query/b.jpg PINHOLE 768 1024 971.838 384 512 -0.00177789",
     read_transformation: f"Before general icp:\n{MATRIX}\nAfter general icp:\n{MATRIX}",
     read_wrong_scans: "known wrong:\n\n008\nDUC_scan_12.ptx 31\r\n2017\n",
