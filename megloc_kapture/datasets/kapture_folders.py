@@ -25,7 +25,6 @@ from megloc_kapture.io.dataset_tables import (
     read_groups,
     read_nowhere,
     read_side_tables,
-    table_path,
     write_nowhere,
     write_side_tables,
 )
@@ -72,11 +71,11 @@ def input_files(root: Path) -> Iterator[Path]:
             files = files_of(folder, images=part != QUERY_GT)
             # queries without image fail later, see stages/localized_folder.py
             yield from (path for path in files if part != QUERY or path.is_file())
-    if (nowhere := table_path(root / QUERY_GT, NOWHERE_FILE)).is_file():
+    if (nowhere := root / QUERY_GT / NOWHERE_FILE).is_file():
         yield nowhere
     own = (GROUPS_FILE, PRIORS_FILE, PROTOCOL_FILE, WORLD_FILE, NAMES_FILE, RELOCALIZATION_FILE)
     for name in own:
-        if (table := table_path(root / SIDE_TABLES, name)).is_file():
+        if (table := root / SIDE_TABLES / name).is_file():
             yield table
 
 
@@ -179,7 +178,7 @@ def import_mapping(mapping: KaptureFolder, output: Path) -> dict[str, float]:
 
 def mapping_files(mapping: KaptureFolder) -> Iterator[Path]:
     yield from files_of(mapping)
-    if (groups := table_path(_tables_beside(mapping), GROUPS_FILE)).is_file():
+    if (groups := _tables_beside(mapping) / GROUPS_FILE).is_file():
         yield groups
 
 

@@ -198,12 +198,8 @@ def triangulate(
     if not images:
         return TriangulatedPoints(np.zeros((0, 3)), np.zeros(0), empty, empty, empty)
     for (i, j), pairs in matches.items():
-        if i == j or (j, i) in matches:
-            raise DataError(
-                f"images {images[i].name} and {images[j].name} are matched twice or are the same"
-            )
         both = np.array([len(images[i].keypoints_px), len(images[j].keypoints_px)])
-        if len(pairs) and ((np.asarray(pairs) >= both).any() or (np.asarray(pairs) < 0).any()):
+        if (np.asarray(pairs).reshape(-1, 2) >= both).any():
             raise DataError(
                 f"matches between {images[i].name} and {images[j].name} refer to keypoints "
                 f"that the images do not have ({both[0]} and {both[1]})"

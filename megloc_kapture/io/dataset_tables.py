@@ -255,10 +255,6 @@ def write_side_tables(folder: Path, tables: SideTables) -> None:
         write_relocalization(folder, tables.relocalization)
 
 
-def table_path(folder: Path | str, name: str) -> Path:
-    return Path(folder) / name
-
-
 def read_groups(folder: Path | str) -> dict[str, ImageGroup]:
     names = tuple(ImageGroup.model_fields)
     return {
@@ -281,10 +277,6 @@ def read_priors(folder: Path | str) -> dict[str, tuple[str, ...]]:
 
 
 def write_priors(folder: Path | str, priors: Mapping[str, Sequence[str]]) -> None:
-    """Write ``priors.csv``, sorted; every query needs a permitted name."""
-    for query, groups in priors.items():
-        if not groups or not all(groups):
-            raise DataError(f"the prior of {query!r} permits nothing")
     rows = sorted({_PriorRow(query, group) for query in priors for group in priors[query]})
     _PRIORS.write(Path(folder) / PRIORS_FILE, rows)
 

@@ -7,12 +7,12 @@ orientation. Focal lengths from EXIF are uncertain because of zoom, stabilisatio
 from __future__ import annotations
 
 import math
-import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -350,20 +350,9 @@ def _tried(read: Callable[[], T]) -> T | None:
 
 
 def _numbers(value: Any) -> list[float]:
-    """Return the numbers in an EXIF tag of any type, up to the first that is not finite."""
-    if isinstance(value, bytes):
-        text = value.decode("latin-1")
-        value = text if re.search(r"\d", text) else list(value)
-    if isinstance(value, str):
-        value = re.findall(r"[-+]?\d+(?:\.\d+)?", value)
-    elif not isinstance(value, tuple | list):
-        value = () if value is None else (value,)
-    found = []
-    for number in map(float, value):
-        if not math.isfinite(number):
-            break
-        found.append(number)
-    return found
+    """Return the numbers of an EXIF tag; unknown parts, such as seconds 0/0, end the list."""
+    values = value if isinstance(value, tuple) else (value,)
+    return list(takewhile(math.isfinite, map(float, values)))
 
 
 def _number(value: Any) -> float | None:
@@ -371,12 +360,9 @@ def _number(value: Any) -> float | None:
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, bytes):
-        value = value.decode("latin-1")
     if not isinstance(value, str):
         return ""
-    printable = "".join(c if c.isprintable() else " " for c in value.strip("\0").partition("\0")[0])
-    return " ".join(printable.split())
+    return " ".join("".join(c if c.isprintable() else " " for c in value).split())
 
 
 def turned_upright(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
@@ -398,13 +384,11 @@ def _centred(width: int, height: int, focal: float, deviation: float) -> Camera:
 def _position(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
     """Return latitude, longitude and height from EXIF's GPS table (EXIF 2.3, table 15)."""
     found = []
-    for reference, tag, sides, limit in ((1, 2, "NS", 90), (3, 4, "EW", 180)):
+    for reference, tag, sides in ((1, 2, "NS"), (3, 4, "EW")):
         side, parts = _text(gps.get(reference))[:1].upper(), _numbers(gps.get(tag))
         if side not in sides or not side or not parts:
             return None
         value = sum(part / 60**at for at, part in enumerate(parts[:3]))
-        if abs(value) > limit:
-            return None
         found.append(-value if side == sides[1] else value)
     below = gps.get(5) in (1, b"\x01")
     height = (_number(gps.get(6)) or 0.0) * (-1 if below else 1)

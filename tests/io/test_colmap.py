@@ -210,7 +210,7 @@ def test_keypoints_may_have_more_columns_and_images_none() -> None:
     assert 4 not in result.image_ids
 
 
-@pytest.mark.parametrize("row", [[60, 0], [0, 60], [-1, 0]])
+@pytest.mark.parametrize("row", [[60, 0], [0, 60]])
 def test_matches_past_the_keypoints_are_refused(row: list[int]) -> None:
     _, images, matches = scene(CAMERAS["PINHOLE"])
     matches[1, 2] = np.concatenate([matches[1, 2], [row]])

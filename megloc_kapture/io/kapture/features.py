@@ -390,15 +390,9 @@ class FeatureWriter(BlobWriter):
 
     def write(self, image: str, array: ArrayLike) -> tuple[Path, Path]:
         """Write an image's array, (N, dsize) or (dsize,); return the configuration and its file."""
-        given = np.asarray(array)
-        shape = given.shape
-        dsize = self.config.dsize
-        if self.kind == "global_features":
-            if shape not in ((dsize,), (1, dsize)):
-                raise ValueError(f"expected shape ({dsize},), got {shape}")
-        elif len(shape) != 2 or shape[1] != dsize:
-            raise ValueError(f"expected shape (N, {dsize}), got {shape}")
-        if not np.can_cast(given.dtype, self.config.dtype, casting="same_kind"):
-            raise ValueError(f"cannot store {given.dtype} as {self.config.dtype.name}")
-        content = np.ascontiguousarray(given, dtype=self.config.dtype).tobytes()
+        rows = np.ascontiguousarray(array, dtype=self.config.dtype)
+        size = self.config.dsize
+        if rows.shape[-1:] != (size,) or (self.kind == "global_features" and rows.size != size):
+            raise ValueError(f"expected rows of {size} numbers, got {rows.shape}")
+        content = rows.tobytes()
         return self._path, self.put(check_field(image) + SUFFIX[self.kind], content)

@@ -127,26 +127,18 @@ class KaptureData:
 
     def device_from_world(self, timestamp: int, device_id: str) -> RigidTransform | None:
         """Return the pose of a sensor or rig at a time, directly or through rigs; None without."""
-        return self._device_from_world(timestamp, device_id, frozenset())
+        if (timestamp, device_id) in self.trajectories:
+            return self.trajectories[timestamp, device_id]
+        for rig_id in self._parents().get(device_id, ()):
+            rig_from_world = self.device_from_world(timestamp, rig_id)
+            if rig_from_world is not None:
+                return self.rigs[rig_id][device_id] @ rig_from_world
+        return None
 
     def poses(self) -> dict[str, RigidTransform]:
         """Return ``cam_from_world`` of every image that has one, sorted by image name."""
         poses = {image: self.cam_from_world(image) for image in self.image_names()}
         return {image: pose for image, pose in poses.items() if pose is not None}
-
-    def _device_from_world(
-        self, timestamp: int, device_id: str, seen: frozenset[str]
-    ) -> RigidTransform | None:
-        own = self.trajectories.get((timestamp, device_id))
-        if own is not None:
-            return own
-        for rig_id in self._parents().get(device_id, ()):
-            if rig_id in seen:
-                raise DataError(f"rig {rig_id!r} contains itself")
-            rig_from_world = self._device_from_world(timestamp, rig_id, seen | {rig_id})
-            if rig_from_world is not None:
-                return self.rigs[rig_id][device_id] @ rig_from_world
-        return None
 
     def _parents(self) -> dict[str, list[str]]:
         if self._num_rigs != len(self.rigs):

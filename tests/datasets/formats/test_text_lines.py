@@ -60,9 +60,8 @@ def test_a_rigid_matrix(path: Path, separator: str) -> None:
     [
         (" 5\n", " 5 0\n", "expected four lines of four numbers"),
         ("\n0 0 0 1", "", "expected four lines of four numbers"),
-        ("0 0 0 1", "0 0 0.1 1", "last row of the matrix is 0 0 0.1 1"),
+        ("0 0 0 1", "0 0 0.1 1", "last row of the matrix is not"),
         ("0 0 1 -1", "0 0 -1 -1", "not a rotation matrix"),
-        ("-1\n", "-3e99\n", "not on earth"),
         ("-1\n", "inf\n", "'inf' is not a finite number"),
     ],
 )

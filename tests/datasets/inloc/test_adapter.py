@@ -252,20 +252,12 @@ def test_broken_points_name_their_file(root: Path, tmp_path: Path) -> None:
     imported(root, tmp_path / "d")
 
 
-@pytest.mark.parametrize(
-    ("name", "match"),
-    [
-        ("DUC_cutout_024_0.jpg", "is not named <BUILDING>_cutout"),
-        ("DUC_cutout_025_0_0.jpg", "scan 025, but lies in DUC1, scan 024"),
-        ("cse_cutout_024_0_0.jpg", "cutout of cse, scan 024, but lies"),
-    ],
-)
-def test_images_that_lie_elsewhere_are_refused(root: Path, name: str, match: str) -> None:
+def test_images_of_other_names_are_refused(root: Path) -> None:
+    name = "DUC_cutout_024_0.jpg"
     folder = root / "database/cutouts/DUC1/024"
     (folder / "DUC_cutout_024_0_0.jpg").rename(folder / name)
-    with pytest.raises(DataError, match=match) as caught:
+    with pytest.raises(DataError, match=rf"{name}: .*is not named <BUILDING>_cutout"):
         read(root)
-    assert str(caught.value).startswith(str(folder / name))
 
 
 def test_broken_files_are_refused(root: Path) -> None:
@@ -278,9 +270,6 @@ def test_broken_files_are_refused(root: Path) -> None:
     query = root / "query" / "iphone7" / "IMG_0804.JPG"
     query.write_bytes(b"\xff\xd8 no image")
     with pytest.raises(DataError, match=r"IMG_0804\.JPG: not an image"):
-        read(root)
-    query.rename(query.with_name("IMG 0804.JPG"))
-    with pytest.raises(DataError, match="no blanks, commas"):
         read(root)
 
 
