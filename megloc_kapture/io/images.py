@@ -161,9 +161,7 @@ def image_as_read_back(
     import cv2
 
     content = np.frombuffer(_encoded(Path(name), image, jpeg_quality), np.uint8)
-    decoded = cv2.imdecode(content, cv2.IMREAD_COLOR)
-    if decoded is None:
-        raise ValueError(f"{name}: cannot decode what was encoded")
+    decoded = np.asarray(cv2.imdecode(content, cv2.IMREAD_COLOR))
     return np.ascontiguousarray(decoded[:, :, ::-1], np.uint8)
 
 
@@ -178,13 +176,7 @@ def _encoded(path: Path, image: NDArray[np.uint8], jpeg_quality: int) -> bytes:
     import cv2
 
     suffix = _format_suffix(path.name)
-    pixels = np.asarray(image)
-    if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or 0 in pixels.shape:
-        raise ValueError(f"expected uint8 (H, W, 3) or (H, W), got {pixels.dtype} {pixels.shape}")
-    if pixels.ndim == 3:
-        if pixels.shape[2] != 3:
-            raise ValueError(f"expected 3 channels, got {pixels.shape[2]}")
-        pixels = pixels[:, :, ::-1]
+    pixels = image if image.ndim == 2 else image[:, :, ::-1]
     options = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if suffix in _JPEG else []
     done, encoded = cv2.imencode(suffix, np.ascontiguousarray(pixels), options)
     if not done:
@@ -236,10 +228,7 @@ def read_depth_map(path: Path | str, *, width: int, height: int) -> NDArray[np.f
 
 
 def write_depth_map(path: Path | str, depth_m: ArrayLike) -> None:
-    pixels = np.asarray(depth_m, dtype="<f4")
-    if pixels.ndim != 2:
-        raise ValueError(f"expected a depth map of shape (H, W), got {pixels.shape}")
-    write_bytes(path, np.ascontiguousarray(pixels).tobytes())
+    write_bytes(path, np.ascontiguousarray(depth_m, dtype="<f4").tobytes())
 
 
 def extract_frames(video: Path, folder: Path, every: int) -> Iterator[str]:

@@ -154,18 +154,10 @@ def test_things_that_are_no_images_are_refused(tmp_path: Path) -> None:
                 read(path)
 
 
-def test_bad_arrays_and_places_are_refused(tmp_path: Path) -> None:
+def test_places_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    for name, image, match in (
-        ("a.png", PIXELS.astype(np.float32), "uint8"),
-        ("a.png", PIXELS[:, :, :2], "channels"),
-    ):
-        with pytest.raises(ValueError, match=match):
-            write_image(tmp_path / name, image)
     with pytest.raises(OutputError, match="file/a.png"):
         write_image(tmp_path / "file" / "a.png", PIXELS)
-    with pytest.raises(ValueError, match="shape"):
-        write_depth_map(tmp_path / "x.depth", np.ones(3))
     with pytest.raises(OutputError, match="file/x.depth"):
         write_depth_map(tmp_path / "file" / "x.depth", np.ones((2, 3)))
 

@@ -314,15 +314,26 @@ class Aachen:
             return self._dataset(images, lambda _: form.root, missing, remarks, image_files=files)
         layout = Layout(root)
         images, left_out = layout.read(layout.version(self.options.version), missing)
-        reference = None
+        remarks, reference = [], None
+        if images.version == "1.0" and not layout.database_intrinsics.is_file():
+            remarks.append(
+                f"Without {layout.database_intrinsics.name} the map images' principal points are "
+                "taken to be in the middle, and their sizes from the image files."
+            )
+        if left_out:
+            remarks.append(
+                f"{left_out} night queries of v1.1 ({ADDITIONAL_NIGHT}) are left out of v1.0."
+            )
         if self.options.reference_model:
+            database = layout.feature_database if images.version == "1.0" else None
             points = partial(layout.read_points, images.version)
-            reference = ReferenceModel(points, _descriptors(layout, images.version))
+            reference = ReferenceModel(points, database)
+            remarks += reference.remarks()
         return self._dataset(
             images,
             layout.query_list,
             missing,
-            self._remarks(layout, images.version, left_out),
+            remarks,
             links={"": layout.images},
             reference=reference,
         )
@@ -352,37 +363,9 @@ class Aachen:
             **more,
         )
 
-    def _remarks(self, layout: Layout, version: Version, left_out: int) -> list[str]:
-        remarks = []
-        if version == "1.0" and not layout.database_intrinsics.is_file():
-            remarks.append(
-                f"Without {layout.database_intrinsics.name} the map images' principal points are "
-                "taken to be in the middle, and their sizes from the image files."
-            )
-        if left_out:
-            remarks.append(
-                f"{left_out} night queries of v1.1 ({ADDITIONAL_NIGHT}) are left out of v1.0."
-            )
-        if self.options.reference_model and _descriptors(layout, version) is None:
-            where = (
-                f"those of v1.0 are in {layout.feature_database.name}, which is not there"
-                if version == "1.0"
-                else "v1.1 publishes none"
-            )
-            remarks.append(
-                f"The reference model comes without descriptors: {where}. "
-                "With map = given they are extracted again from the images."
-            )
-        return remarks
-
 
 def _kapture_form(root: Path) -> KaptureForm | None:
     return KaptureForm.find(root) if Layout(root).absent() else None
-
-
-def _descriptors(layout: Layout, version: Version) -> Path | None:
-    there = version == "1.0" and layout.feature_database.is_file()
-    return layout.feature_database if there else None
 
 
 def _pose_file_names(images: AachenImages, lists: Callable[[str], Path]) -> dict[str, str]:

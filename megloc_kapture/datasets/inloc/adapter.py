@@ -51,7 +51,6 @@ _CUTOUT_FOCAL_SHARE = 3**0.5 / 2
 # the 277 scans of the paper's 9,972 cutouts, with the floors published by the authors
 _PUBLISHED_SCANS = {"DUC1": 50, "DUC2": 80, "CSE3": 7, "CSE4": 75, "CSE5": 65}
 _PUBLISHED_QUERIES = 356
-_MANY_GIGABYTES = 5
 # points of a wrong image are off by a large part of its width
 _MAX_OFFSET = 0.03
 _CHECKED_EVERY = 8  # rows and columns
@@ -135,7 +134,7 @@ class InLoc:
             names={image: last_part(image) for image in names},
             protocol=protocol_of(DATASET),
             summary=self._summary(map_, groups),
-            remarks=self._remarks(map_, groups, left_out),
+            remarks=[f"Omitted, wrongly placed: scans {', '.join(left_out)}."] if left_out else [],
             missing=missing,
             write_more=lambda output: write_depth_maps(
                 map_.depth_jobs, self.options.depth_step, output / records
@@ -154,37 +153,7 @@ class InLoc:
         for floor in self.floors:
             scans = {g.location for g in map_.groups.values() if g.frame == floor}
             counts.append(Count(f"scans of {floor}", len(scans), _PUBLISHED_SCANS[floor]))
-        for condition in sorted({g.condition for g in groups.values()} - {""}):
-            taken = sum(g.condition == condition for g in groups.values())
-            counts.append(Count(f"queries taken on {condition}", taken))
         return counts
-
-    def _remarks(
-        self, map_: _Map, groups: Mapping[str, ImageGroup], left_out: list[str]
-    ) -> list[str]:
-        remarks = [
-            "Each floor is a coordinate frame of its own (frame in groups.csv): a pose that rests "
-            "on images of two floors means nothing.",
-        ]
-        if not any(group.condition for group in groups.values()):
-            remarks.append(
-                "The layout does not say on which floor a query was taken; the server reports "
-                "DUC1 and DUC2 apart, here all queries stand together."
-            )
-        step = self.options.depth_step
-        cameras = [depth_camera(job.camera, step) for job in map_.depth_jobs]
-        gigabytes = sum(4 * camera.width * camera.height for camera in cameras) / 1e9
-        if gigabytes > _MANY_GIGABYTES:
-            remarks.append(
-                f"The depth maps take {gigabytes:.0f} GB; with depth_step = {4 * step} it would "
-                "be a sixteenth."
-            )
-        if left_out:
-            remarks.append(
-                f"Left out, as the dataset's authors list them as wrongly placed: scans "
-                f"{', '.join(left_out)}."
-            )
-        return remarks
 
 
 def _camera(path: Path, focal_share: float, *, longer: bool) -> Camera:

@@ -75,10 +75,6 @@ def _line_of_another_length(path: Path) -> int | None:
 def write_points3d(root: Path, points: ArrayLike) -> None:
     """Write ``reconstruction/points3d.txt``, (N, 3) or (N, 6) with colours, without loss."""
     rows = np.asarray(points, dtype=np.float64)
-    if rows.ndim != 2 or rows.shape[1] not in POINTS_HEADERS:
-        raise ValueError(f"expected points of shape (N, 3) or (N, 6), got {rows.shape}")
-    if not np.isfinite(rows).all():
-        raise ValueError("points are not finite")
     pattern = ",".join(["%r"] * rows.shape[1]) + "\n"
     with atomic_write(Path(root) / "reconstruction" / "points3d.txt") as file:
         file.write(f"{FORMAT_LINE}\n{POINTS_HEADERS[rows.shape[1]]}\n".encode())
@@ -320,8 +316,6 @@ def write_ply(
         *zip(("red", "green", "blue"), colours.T, ["|u1"] * 3, strict=True),
         *((name, np.asarray(values), "<f4") for name, values in properties.items()),
     ]
-    if {len(values) for _, values, _ in columns} != {len(xyz)}:
-        raise ValueError("coordinates, colours and properties differ in length")
     rows = np.empty(len(xyz), dtype=[(name, kind) for name, _, kind in columns])
     for name, values, _ in columns:
         rows[name] = values

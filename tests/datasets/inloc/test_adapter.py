@@ -304,10 +304,3 @@ def test_input_files_are_all_that_is_read(root: Path) -> None:
     for path in more:
         path.write_text("image, condition, frame, location, scored\n")
     assert set(InLoc().input_files(root)) == {*read_so, *more}
-
-
-def test_large_depth_maps_are_announced(downloaded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert not any("depth maps take" in remark for remark in read(downloaded).remarks)
-    monkeypatch.setattr("megloc_kapture.datasets.inloc.adapter._MANY_GIGABYTES", 1e-9)
-    assert any("depth_step = 8" in remark for remark in read(downloaded, depth_step=2).remarks)
-    assert not any("depth maps take" in remark for remark in read(downloaded, depth=False).remarks)
