@@ -92,7 +92,7 @@ def check_relative(text: str) -> str:
         raise DataError(f"backslash or control character in path {text!r}")
     components = text.split("/")
     if text.startswith("/") or ".." in components:
-        raise DataError(f"path {text!r} leads out of its folder; it must be relative to it")
+        raise DataError(f"path {text!r} leads out of its folder: it begins with '/' or has '..'")
     if "" in components or "." in components:
         raise DataError(f"path {text!r} has an empty or '.' component")
     return text

@@ -43,9 +43,7 @@ class Sensor:
     def camera(self) -> Camera:
         if self.sensor_type not in CAMERA_SENSOR_TYPES:
             raise DataError(f"a sensor of type {self.sensor_type!r} has no camera model")
-        if not self.params:
-            raise DataError("camera without a model")
-        model = self.params[0]
+        model = self.params[0] if self.params else ""
         if model == UNKNOWN_CAMERA:
             raise DataError("camera is not calibrated (UNKNOWN_CAMERA); give it intrinsics first")
         if model not in CAMERA_MODEL_NUM_PARAMS:

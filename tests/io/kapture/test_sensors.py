@@ -92,7 +92,7 @@ REFUSED = {
         "x, ": "at least 3 columns",
         ", n, camera, PINHOLE, 640, 480, 500, 500, 320, 240": "is empty or listed twice",
         "cam, n, gnss": "'cam' is empty or listed twice",
-        "x, n, camera": "without a model",
+        "x, n, camera": "unknown camera model ''",
         "x, n, camera, PINHOLLOW, 640, 480, 1, 1, 1, 1": "unknown camera model 'PINHOLLOW'",
         "x, n, camera, PINHOLE, 640, 480, 500, 320, 240": "takes 6 parameters .* got 5",
         "x, n, camera, PINHOLE, 640, 480, nan, 500, 320, 240": "'nan' is not finite",
