@@ -238,12 +238,12 @@ def _other_cameras(reconstruction: Any, doubtful: Collection[str]) -> dict[str, 
     after = _errors_px(apart)
     found: dict[str, str] = {}
     for camera_id in sorted(camera_id for camera_id, number in sharing.items() if number > 1):
-        own = [image for image in images if image.camera_id == camera_id]
-        focal = np.array([apart.cameras[image.image_id].mean_focal_length() for image in own])
+        members = [image for image in images if image.camera_id == camera_id]
+        focal = np.array([apart.cameras[image.image_id].mean_focal_length() for image in members])
         zooms = np.log(focal / np.median(focal)).tolist()
         others = sorted(
             (zoom, image.name)
-            for zoom, image in zip(zooms, own, strict=True)
+            for zoom, image in zip(zooms, members, strict=True)
             if abs(zoom) > _OTHER_ZOOM
             and image.name in doubtful
             and after[image.image_id] < _SMALLER_ERROR * before[image.image_id]
@@ -324,7 +324,7 @@ def _why_none(seen: Sequence[tuple[Any, float]]) -> str:
             "how far anything is; walk sideways between photographs"
         )
     return (
-        f"{len(seen)} pairs of photographs match, but no {MIN_IMAGES} of them hang together; take "
+        f"{len(seen)} pairs of photographs match, but no {MIN_IMAGES} of them are connected; take "
         "more, with more overlap and from more places"
     )
 

@@ -142,11 +142,11 @@ class FourSeasons:
         tables = challenge_tables(chosen.files, chosen.recordings, local, mapping.data, query.data)
         truth |= {(time, cars[name]): pose for (name, time), pose in tables.truth.items()}
         groups = _image_groups(chosen, mapping.data, query.data)
-        beside, beside_groups = read_ground_truth(root, query.data, frame.world())
-        for image in groups.keys() & beside_groups.keys():
-            condition = beside_groups[image].condition or groups[image].condition
+        truth_folder, truth_groups = read_ground_truth(root, query.data, frame.world())
+        for image in groups.keys() & truth_groups.keys():
+            condition = truth_groups[image].condition or groups[image].condition
             groups[image] = groups[image].model_copy(update={"condition": condition})
-        query_gt = _known_poses(query.data, truth, beside)
+        query_gt = _known_poses(query.data, truth, truth_folder)
         used = (*chosen.references, *chosen.queries)
         rules: dict[str, Any] = {"conditions": tuple(one.name for one in chosen.queries)}
         if not chosen.files:  # no challenge: write absolute poses in ECEF
@@ -229,14 +229,14 @@ class FourSeasons:
 def _known_poses(
     query: KaptureData,
     published: Mapping[tuple[int, str], RigidTransform],
-    beside: KaptureData | None,
+    truth_folder: KaptureData | None,
 ) -> KaptureData | None:
     """Return the queries with published poses, else with poses of ``ground_truth/``."""
     times = {timestamp for timestamp, _ in query.records_camera}
     poses = {key: pose for key, pose in published.items() if key[0] in times}
     known = with_poses(query, poses)
-    if beside is not None:
-        for (timestamp, device), pose in beside.trajectories.items():
+    if truth_folder is not None:
+        for (timestamp, device), pose in truth_folder.trajectories.items():
             if known.device_from_world(timestamp, device) is None:
                 poses[timestamp, device] = pose
     return with_poses(query, poses) if poses else None
@@ -293,21 +293,21 @@ def _remarks(
     tables: ChallengeTables,
     min_fusion_quality: int,
 ) -> list[str]:
-    told = []
+    remarks = []
     for name, of in poses.items():
         if of.dropped:
-            told.append(
+            remarks.append(
                 f"{name}: {len(of.dropped)} keyframes are left out, their fusion quality is below "
                 f"{min_fusion_quality} (min_fusion_quality)."
             )
     if frame.earth_from_scene is None:
-        told.append(
-            f"The map's poses are those of {POSES}, whose frame is its own: of the queries only "
-            "poses in relocalization files are known."
+        remarks.append(
+            f"The map's poses are those of {POSES}, in a separate frame: only the query poses in "
+            "relocalization files are known."
         )
     if tables.lost:
-        told.append(
+        remarks.append(
             f"{tables.lost} pairs of relocalization files are left out: their reference has no "
             "pose or image, or their query no image. A challenge expects every pair."
         )
-    return told
+    return remarks

@@ -116,7 +116,7 @@ class InLoc:
                     map_.add(scan, missing)
         if self.options.depth and map_.groups and not (map_.depth_jobs or allow_missing):
             raise DataError(
-                f"no cutout has its points beside it (.jpg{POINTS_SUFFIX}); the download without "
+                f"no cutout has its points (.jpg{POINTS_SUFFIX}); the download without "
                 "them is imported with the option depth = false",
                 path=layout.cutouts,
             )

@@ -228,7 +228,7 @@ class RobotCar:
     ) -> OfficialDataset:
         car = car.with_rig_of(selection.reference)
         mapping, query = mapping_data(selection, car), car.data(selection.query_images)
-        beside, _ = read_ground_truth(missing.root, query, World())  # names tell conditions
+        published, _ = read_ground_truth(missing.root, query, World())  # names tell conditions
         groups = _image_groups(selection)
         others = "test images" if selection.version == 2 else "other queries"
         truth = (
@@ -239,7 +239,7 @@ class RobotCar:
         return OfficialDataset(
             mapping=mapping,
             query=query,
-            query_gt=query_truth(selection, query, beside),
+            query_gt=query_truth(selection, query, published),
             groups=groups,
             priors=_query_priors(selection, groups) if self.options.location_prior else {},
             names=_pose_file_names(selection),
@@ -294,8 +294,10 @@ def _query_priors(
     known = {groups[path].location for path in map_paths}
     priors = {}
     for image, path in selection.query_images.items():
-        own = tuple(_location(image.camera, p) for p in selection.queries.locations[image])
-        priors[path] = tuple(name for name in (*own, image.camera) if name in known) or own
+        locations = tuple(_location(image.camera, p) for p in selection.queries.locations[image])
+        priors[path] = (
+            tuple(name for name in (*locations, image.camera) if name in known) or locations
+        )
     return priors
 
 

@@ -109,7 +109,7 @@ def test_pairs_with_poses_in_the_frame_of_poses_txt(root: Path) -> None:
     # x_query = R (x_world - (100.5, 7, 3)) + (1, 2, 3)
     at = np.array([[101.0, 8.0, 5.0]])
     np.testing.assert_allclose(known.apply(at)[0], turn @ [0.5, 1, 2] + [1, 2, 3], atol=1e-12)
-    assert "poses.txt, whose frame is its own" in dataset.remarks[0]
+    assert "poses.txt, in a separate frame" in dataset.remarks[0]
 
 
 def test_truth_of_a_pair_counts_before_the_recordings_own(root: Path) -> None:
