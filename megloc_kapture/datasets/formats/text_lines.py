@@ -82,15 +82,13 @@ class Line:
         return RigidTransform.from_matrix(rotation, position)
 
 
-def read_lines(path: Path, *, blank: bool = False, comments: bool = False) -> list[Line]:
-    """Read stripped lines; ``blank`` keeps blank lines, ``comments`` drops # lines."""
-    texts = [text.strip() for text in read_text(path).split("\n")]
-    if not texts[-1]:
-        texts.pop()
+def read_lines(path: Path, *, comments: bool = False) -> list[Line]:
+    """Read stripped lines that are not blank; ``comments`` drops # lines."""
+    texts = (text.strip() for text in read_text(path).split("\n"))
     return [
         Line(path, number, text)
         for number, text in enumerate(texts, start=1)
-        if (text or blank) and not (comments and text.startswith("#"))
+        if text and not (comments and text.startswith("#"))
     ]
 
 

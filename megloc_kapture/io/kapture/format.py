@@ -24,7 +24,6 @@ UNKNOWN_CAMERA = "UNKNOWN_CAMERA"
 FORMAT_VERSION = "1.1"
 FORMAT_LINE = f"# kapture format: {FORMAT_VERSION}"
 _READ_VERSIONS = ("1.0", FORMAT_VERSION)  # the tables are the same in both
-BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 
 # stricter than float(), which takes "1_0", "nan" and digits of other scripts
 FLOAT_PATTERN = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")

@@ -23,7 +23,6 @@ def test_lines_keep_their_numbers(path: Path) -> None:
         (4, "x\ty\x0bz"),
     ]
     assert [line.number for line in read_lines(path)] == [1, 3, 4]
-    assert [line.number for line in read_lines(path, blank=True)] == [1, 2, 3, 4]
     first, second = read_lines(path, comments=True)
     assert first.comma_fields == ["1", "2", "3"]
     assert second.comma_fields == second.fields == ["x", "y", "z"]
