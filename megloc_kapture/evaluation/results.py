@@ -16,7 +16,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation import pose_files
 from megloc_kapture.evaluation.protocols import Benchmark
 from megloc_kapture.io import tables
-from megloc_kapture.io.colmap import read_model_poses
+from megloc_kapture.io.colmap_model import read_colmap_model
 from megloc_kapture.io.dataset_tables import (
     METRES,
     PROTOCOL_FILE,
@@ -209,10 +209,10 @@ def read_poses(source: Path) -> dict[str, RigidTransform]:
     if not source.exists():
         raise DataError("no such file or folder", path=source)
     if (model := model_of(source)) is not None:
-        images = model / "images.txt"
-        return (
-            read_model_poses(model) if not images.is_file() else pose_files.read_pose_file(images)
-        )
+        if (model / "images.txt").is_file():
+            return pose_files.read_pose_file(model / "images.txt")
+        images = read_colmap_model(model, with_points=False).images
+        return {image.name: image.cam_from_world for image in images}
     return (
         KaptureFolder(source).read().poses()
         if source.is_dir()
