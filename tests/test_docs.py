@@ -22,7 +22,7 @@ from megloc_kapture.cli.main import main
 from megloc_kapture.features.vlad import VladOptions
 from megloc_kapture.pipeline.presets import options_of
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.training.trainer import DescriptorOptions
+from megloc_kapture.training.train import DescriptorOptions
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGES = sorted([REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md")])

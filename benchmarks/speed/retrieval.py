@@ -47,8 +47,7 @@ from megloc_kapture.io.kapture import (
     write_pairs,
     write_sensors,
 )
-from megloc_kapture.io.kapture.features import feature_folder
-from megloc_kapture.io.kapture.vectors import KaptureVectors
+from megloc_kapture.io.kapture.features import KaptureVectors, feature_folder
 from megloc_kapture.retrieval.fusion import FusionOptions
 from megloc_kapture.retrieval.search import (
     FusedSearch,

@@ -62,7 +62,8 @@ class Evaluate(Common):
             results_without_truth,
         )
         from megloc_kapture.evaluation.metrics import Threshold
-        from megloc_kapture.evaluation.report.reports import AnyReported, report_text, write_report
+        from megloc_kapture.evaluation.report.reports import report_text, write_report
+        from megloc_kapture.evaluation.scoring import Reported
         from megloc_kapture.evaluation.statistics import compare
 
         self._check()
@@ -70,7 +71,7 @@ class Evaluate(Common):
             [self.gt, *self.input], side_tables=self.side_tables, dataset=self.dataset
         )
         thresholds = [Threshold.parse(text) for text in self.thresholds] or None
-        found: AnyReported
+        found: Reported
         if self.gt is None:
             found = results_without_truth(
                 self.input, benchmark, thresholds=thresholds, mapping=self.map

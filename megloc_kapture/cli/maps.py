@@ -21,7 +21,7 @@ from megloc_kapture.cli.common import (
 )
 from megloc_kapture.cli.stages import StageCommand, restrictions_beside
 from megloc_kapture.errors import OptionError
-from megloc_kapture.evaluation.report.wording import consistency_sentence
+from megloc_kapture.evaluation.report.content import consistency_sentence
 from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.kapture import KaptureFolder

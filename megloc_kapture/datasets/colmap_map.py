@@ -86,8 +86,8 @@ def find_colmap(
             path=path,
         )
     if len(models) > 1:
-        told = ", ".join(str(model.relative_to(path)) for model in models)
-        raise DataError(f"there are several models, give one of them: {told}", path=path)
+        choices = ", ".join(str(model.relative_to(path)) for model in models)
+        raise DataError(f"there are several models, give one of them: {choices}", path=path)
     model = models[0]
     if images is not None and not images.is_dir():
         raise DataError("no such folder of images", path=images)
@@ -144,17 +144,17 @@ class ColmapReconstruction:
         if source.images is not None:
             missing = sorted(name for name in names if not (source.images / name).is_file())
             if missing:
-                told = (
+                message = (
                     f"{len(missing)} of the model's {len(names)} images are not here, the first "
                     f"is {missing[0]}"
                 )
                 if source.database is None:
                     raise DataError(
-                        f"{told}; `megloc import colmap` takes their folder by --images",
+                        f"{message}; `megloc import colmap` takes their folder by --images",
                         path=source.images,
                     )
                     # the database has the features
-                _log.warning("%s: %s", source.images, told)
+                _log.warning("%s: %s", source.images, message)
         scaled = _scaled_cameras(source, model)
         scales = {
             names[image.name]: (new.width / old.width, new.height / old.height)

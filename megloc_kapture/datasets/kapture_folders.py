@@ -25,7 +25,6 @@ from megloc_kapture.io.dataset_tables import (
     read_groups,
     read_nowhere,
     read_side_tables,
-    table_path,
     write_nowhere,
     write_side_tables,
 )
@@ -72,11 +71,11 @@ def input_files(root: Path) -> Iterator[Path]:
             files = files_of(folder, images=part != QUERY_GT)
             # queries without image fail later, see stages/localized_folder.py
             yield from (path for path in files if part != QUERY or path.is_file())
-    if (nowhere := table_path(root / QUERY_GT, NOWHERE_FILE)).is_file():
+    if (nowhere := root / QUERY_GT / NOWHERE_FILE).is_file():
         yield nowhere
-    own = (GROUPS_FILE, PRIORS_FILE, PROTOCOL_FILE, WORLD_FILE, NAMES_FILE, RELOCALIZATION_FILE)
-    for name in own:
-        if (table := table_path(root / SIDE_TABLES, name)).is_file():
+    tables = (GROUPS_FILE, PRIORS_FILE, PROTOCOL_FILE, WORLD_FILE, NAMES_FILE, RELOCALIZATION_FILE)
+    for name in tables:
+        if (table := root / SIDE_TABLES / name).is_file():
             yield table
 
 
@@ -98,8 +97,8 @@ def files_of(folder: KaptureFolder, *, images: bool = True) -> Iterator[Path]:
 
 def tell_of_truth_without_query(folder: Path, images: Sequence[str]) -> None:
     """Warn of true poses of unknown queries: the image names may be wrong."""
-    said = "%s: true poses of %d images that are no query are left out, the first is %s"
-    _log.warning(said, folder, len(images), images[0])
+    message = "%s: true poses of %d images that are no query are left out, the first is %s"
+    _log.warning(message, folder, len(images), images[0])
 
 
 def checked_folders(
@@ -118,7 +117,7 @@ def checked_folders(
     if shared:
         raise DataError(
             f"{len(shared)} images have the same name in map and query, the first is "
-            f"{shared[0]}; give the queries a folder of their own with --query-prefix",
+            f"{shared[0]}; give the queries a separate folder with --query-prefix",
             path=root,
         )
     return mapping, map_data, query, query_data
@@ -179,7 +178,7 @@ def import_mapping(mapping: KaptureFolder, output: Path) -> dict[str, float]:
 
 def mapping_files(mapping: KaptureFolder) -> Iterator[Path]:
     yield from files_of(mapping)
-    if (groups := table_path(_tables_beside(mapping), GROUPS_FILE)).is_file():
+    if (groups := _tables_beside(mapping) / GROUPS_FILE).is_file():
         yield groups
 
 
@@ -277,9 +276,9 @@ def with_cameras_of_images(folder: KaptureFolder) -> KaptureData:
 def warn_of_scaled(place: Path, cameras: Sequence[tuple[Camera, Camera]]) -> None:
     if cameras:
         stored, scaled = cameras[0]
-        said = "%s: %d cameras are scaled to their images, the first from %dx%d to %dx%d"
+        message = "%s: %d cameras are scaled to their images, the first from %dx%d to %dx%d"
         sizes = (stored.width, stored.height, scaled.width, scaled.height)
-        _log.warning(said, place, len(cameras), *sizes)
+        _log.warning(message, place, len(cameras), *sizes)
 
 
 def prefixed(prefix: str) -> Callable[[str], str]:

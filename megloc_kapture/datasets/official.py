@@ -146,18 +146,19 @@ def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: boo
     for part, data in ((MAPPING, dataset.mapping), (QUERY, dataset.query)):
         write_sensors(output / part, data)
         link_records(output / part, dataset.links)
-        own = set(data.image_names()) if dataset.image_files else set()
-        link_records(output / part, {n: f for n, f in dataset.image_files.items() if n in own})
+        names = set(data.image_names()) if dataset.image_files else set()
+        files = {name: file for name, file in dataset.image_files.items() if name in names}
+        link_records(output / part, files)
     if dataset.query_gt is not None and dataset.query_gt.trajectories:
         write_sensors(output / QUERY_GT, dataset.query_gt)
     write_side_tables(output / SIDE_TABLES, dataset)
     if dataset.reference is not None:
-        names, points = dataset.reference.read()
+        model_names, points = dataset.reference.read()
         write_reference_map(
             output / REFERENCE,
             dataset.mapping,
             dataset.links,
-            names,
+            model_names,
             points,
             database=dataset.reference.database,
         )

@@ -31,10 +31,23 @@ _MAX_SHIFT_PX = 1.0
 
 @dataclass(frozen=True)
 class ReferenceModel:
-    """A dataset's model: a reader of image names and points, and its feature database."""
+    """A dataset's model: a reader of image names and points, and its feature database, if any."""
 
     read: Callable[[], tuple[Sequence[str], SparsePoints]]
-    database: Path | None
+    published_database: Path | None
+
+    @property
+    def database(self) -> Path | None:
+        path = self.published_database
+        return path if path is not None and path.is_file() else None
+
+    def remarks(self) -> list[str]:
+        if self.database is not None:
+            return []
+        return [
+            "The reference model comes without descriptors: its database is not there. "
+            "With map = given they are extracted again from the images."
+        ]
 
 
 def check_model_files(files: Iterable[Path]) -> None:

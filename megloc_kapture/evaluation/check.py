@@ -1,8 +1,4 @@
-"""Check of pose files: rows, names or pairs, and poses.
-
-Poses are compared with the map's cameras. If a whole file looks wrong, the usual conventions
-are tried and the one that fits the map is named.
-"""
+"""Check of pose files: rows, names or pairs, and poses against the cameras of the map."""
 
 from __future__ import annotations
 
@@ -10,7 +6,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation import pose_files
-from megloc_kapture.evaluation.pose_files import checked_pose, parse_number, parse_timestamp
+from megloc_kapture.evaluation.pose_files import parse_pose, parse_timestamp
 from megloc_kapture.evaluation.protocols import PROTOCOLS, Benchmark, benchmark_of
 from megloc_kapture.geometry.conventions import CONVENTIONS, better_conventions
 from megloc_kapture.geometry.poses import camera_centers, rotation_matrices, stack_poses
@@ -27,17 +23,17 @@ from megloc_kapture.io.files import read_text
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
 
-# error: the server would refuse the file, or its figures would be wrong as a whole; warning: single
-# poses are wrong, or queries are lost; note: good to know
+# error: the server refuses the file, or its figures are wrong as a whole; warning: single poses are
+# wrong, or queries are lost; note: good to know
 Severity = Literal["error", "warning", "note"]
 _SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-# findings of one kind that are printed one by one; JSON has all of them
+# findings of one kind that are printed; JSON has all
 _SHOWN_OF_A_KIND = 10
 _NAMES_SHOWN = 3
 
-# the server of this dataset is known to accept .jpg and .png
+# the server of this dataset accepts .jpg and .png
 _ANY_ENDING = "robotcar"
-# whether names have a folder, and their endings
+# names have a folder; their endings
 _SHAPES: dict[str, tuple[bool, tuple[str, ...]]] = {
     "aachen": (False, (".jpg",)),
     "inloc": (False, (".JPG",)),
@@ -48,20 +44,14 @@ _SHAPES: dict[str, tuple[bool, tuple[str, ...]]] = {
 _MIN_POSES = 3
 # poses compared in each convention, evenly spread over the file
 _SAMPLE = 500
-# a pose is near the map up to this many times the median distance of the best convention ...
-_NEAR = 2.0
-# ... which is at least this share of the map's extent: within it, directions hardly differ
-_LEAST = 0.02
-_DUMMY = RigidTransform.identity()
+# a pose is near the map within this multiple of the median distance of the best convention, or
+# within this share of the map's extent, below which directions hardly differ
+_NEAR, _LEAST = 2.0, 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One problem.
-
-    ``kind`` is a stable identifier for programs (``convention``, ``missing``); ``line``
-    counts from 1.
-    """
+    """One problem; ``kind`` is a stable identifier (``convention``, ``missing``)."""
 
     severity: Severity
     kind: str
@@ -77,7 +67,7 @@ class Finding:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckReport:
-    """Result of a check; ``findings`` are sorted by severity, file and line."""
+    """Result of a check, findings sorted by severity, file and line."""
 
     dataset: str
     file: str
@@ -121,7 +111,7 @@ class Reference(Benchmark):
     """Imported dataset and the rules of its benchmark.
 
     ``expected`` maps names in the pose file to scored queries; ``map_poses`` are ``cam_from_world``
-    in the workspace's local frame.
+    in the local frame.
     """
 
     folder: str = ""
@@ -131,7 +121,7 @@ class Reference(Benchmark):
 
 
 def read_reference(folder: Path) -> Reference:
-    """Read ``mapping/``, ``query/`` and ``megloc/`` of an import or workspace."""
+    """Read ``mapping/``, ``query/`` and ``megloc/`` of an imported dataset or workspace."""
     tables = folder / SIDE_TABLES
     mapping, query = (
         KaptureFolder(path) if (path / "sensors" / "sensors.txt").is_file() else None
@@ -158,10 +148,7 @@ def read_reference(folder: Path) -> Reference:
 def check_submission(
     path: Path, *, dataset: str, reference: Reference | None = None
 ) -> CheckReport:
-    """Check a pose file, or an MLAD challenge's folder of pose files.
-
-    Without ``reference`` only the file itself is checked.
-    """
+    """Check a pose file, or an MLAD challenge's folder, alone or against a reference."""
     if reference is None:
         reference = Reference(protocol=PROTOCOLS.get(dataset, Protocol()))
     if reference.protocol.pose_file == "mlad":
@@ -172,18 +159,16 @@ def check_submission(
         expected = len(reference.expected)
     if not reference.map_poses:
         findings.append(_not_checked("poses", reference))
-
-    def order(finding: Finding) -> tuple[int, bool, str, int]:
-        rank = _SEVERITIES.index(finding.severity)
-        return rank, finding.line is not None, finding.file, finding.line or 0
-
+    findings.sort(
+        key=lambda f: (_SEVERITIES.index(f.severity), f.line is not None, f.file, f.line or 0)
+    )
     return CheckReport(
         dataset=dataset,
         file=str(path),
         reference=reference.folder,
         poses=poses,
         expected=expected or None,
-        findings=tuple(sorted(findings, key=order)),
+        findings=tuple(findings),
     )
 
 
@@ -218,28 +203,27 @@ def _check_mlad(path: Path, reference: Reference) -> tuple[int, list[Finding]]:
     for name, file in files.items():
         rows = _read_rows(file, "mlad")
         poses += len(rows.poses)
-        found = list(rows.findings)
+        of_file = list(rows.findings)
         if wanted and name not in wanted:
             message = f"must be named like its relocalization file: {_some(wanted)}"
-            found.append(Finding("error", "file-name", message))
+            of_file.append(Finding("error", "file-name", message))
         elif wanted:
-            found += _check_pairs(rows, wanted[name], reference)
-        findings += [replace(finding, file=name) for finding in found]
+            of_file += _check_pairs(rows, wanted[name], reference)
+        findings += [replace(finding, file=name) for finding in of_file]
     if not wanted:
         findings.append(_not_checked("pairs", reference))
     return poses, findings
 
 
-@dataclass(frozen=True)
-class _Rows:
-    """Rows of a pose file by name, or by two timestamps with a blank between them.
+class _Rows(NamedTuple):
+    """Rows by name, or by two timestamps with a blank between them.
 
-    ``lines`` has every row, ``poses`` those with a usable pose.
+    ``lines`` has the line number of every row, ``poses`` those with a valid pose.
     """
 
-    lines: Mapping[str, int]
-    poses: Mapping[str, RigidTransform]
-    findings: Sequence[Finding]
+    lines: dict[str, int]
+    poses: dict[str, RigidTransform]
+    findings: list[Finding]
 
 
 def _read_rows(path: Path, kind: PoseFileFormat) -> _Rows:
@@ -269,8 +253,8 @@ def _read_rows(path: Path, kind: PoseFileFormat) -> _Rows:
             problem("comment", "a comment; the format has none, and no header")
             continue
         if len(fields) != num_keys + 7:
-            found = f"{_plural(len(fields), 'column')} instead of {num_keys + 7} ({columns})"
-            problem("columns", found + ("; separated by blanks, not commas" * ("," in line)))
+            message = f"{_plural(len(fields), 'column')} instead of {num_keys + 7} ({columns})"
+            problem("columns", message + "; separated by blanks, not commas" * ("," in line))
             if len(fields) < num_keys or "," in fields[0]:
                 continue
         key = " ".join(fields[:num_keys])
@@ -282,11 +266,7 @@ def _read_rows(path: Path, kind: PoseFileFormat) -> _Rows:
                 parse_timestamp(stamp)
             lines[key] = number
             if len(fields) == num_keys + 7:
-                values = [parse_number(value) for value in fields[num_keys:]]
-                (x, y, z), (qx, qy, qz, qw) = values[:3], values[3:]
-                if not is_mlad:
-                    (qw, qx, qy, qz), (x, y, z) = values[:4], values[4:]
-                poses[key] = checked_pose((qw, qx, qy, qz), (x, y, z), key)
+                poses[key] = parse_pose(fields[num_keys:], kind, key)
         except DataError as error:
             problem("pose", f"{error.message}; the columns are {columns}")
     if not lines:
@@ -301,7 +281,7 @@ def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -
         by_stem[_stem(name)].append(name)
     for image in reference.queries - set(expected.values()):
         unscored[_stem(image)].append(image)
-    given: dict[str, str] = {}  # query -> name
+    names: dict[str, str] = {}  # query -> name
     wrong, not_scored = dict[str, str](), []
     for name, line in lines.items():
         right = name
@@ -317,7 +297,7 @@ def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -
                 findings.append(Finding("error", "unknown", message, line=line, names=(name,)))
                 continue
             right = wrong[name] = likely[0]
-        if (other := given.setdefault(expected[right], name)) != name:
+        if (other := names.setdefault(expected[right], name)) != name:
             message = f"{name} and {other} (line {lines[other]}) are the same query"
             findings.append(Finding("error", "duplicate", message, line=line, names=(other, name)))
     if wrong:
@@ -329,14 +309,14 @@ def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -
         only_endings = all(n.rpartition(".")[0] == r.rpartition(".")[0] for n, r in wrong.items())
         severity: Severity = "error"
         if only_endings and dataset == _ANY_ENDING:
-            severity, message = "warning", f"{message} (the server is said to take either)"
+            severity, message = "warning", f"{message} (the server takes either)"
         elif len(wrong) == len(lines):
             message += "; the server finds none of them, and every figure is zero"
         findings.append(Finding(severity, "name", message, names=tuple(wrong)))
     if not_scored:
-        what = "of images that are not scored, which the server ignores"
-        findings.append(_about("note", "not-scored", not_scored, "row", what))
-    if missing := [name for name, image in expected.items() if image not in given]:
+        note = "of images that are not scored, which the server ignores"
+        findings.append(_about("note", "not-scored", not_scored, "row", note))
+    if missing := [name for name, image in expected.items() if image not in names]:
         what = f"of {len(expected)} without a row, which count as not localized"
         severity = "error" if len(missing) == len(expected) else "warning"
         findings.append(_about(severity, "missing", missing, "query", what))
@@ -370,16 +350,17 @@ def _check_pairs(rows: _Rows, wanted: Mapping[str, str], reference: Reference) -
     if missing := [key for key in wanted if key not in rows.lines]:
         what = f"of {len(wanted)} without a row, and every one needs one"
         findings.append(_about("error", "missing", missing, "pair", what))
-    # a dummy is no pose, and tells nothing of the convention of the others
-    if dummies := [key for key, pose in rows.poses.items() if pose == _DUMMY]:
+    # the identity fills in for a missing pose, and fits no convention
+    identity = RigidTransform.identity()
+    if dummies := [key for key, pose in rows.poses.items() if pose == identity]:
         findings.append(_about("note", "dummies", dummies, "row", "with the identity, a dummy"))
     map_poses, scale = reference.map_poses, reference.world.official_from_local.scale
     poses = {
         key: pose
         for key, pose in rows.poses.items()
-        if pose != _DUMMY and wanted.get(key) in map_poses
+        if pose != identity and wanted.get(key) in map_poses
     }
-    if scale == 1.0:  # a map in other units only lacks this comparison
+    if scale == 1.0:  # poses are not compared with a map in other units
         in_local = lambda key, pose: pose @ map_poses[wanted[key]]  # noqa: E731
         findings += _check_poses(poses, reference, in_local)
     return findings
@@ -394,18 +375,17 @@ def _check_poses(
     if min(len(map_poses), len(poses)) < _MIN_POSES:
         message = f"{_plural(len(poses), 'pose')} and {_plural(len(map_poses), 'map camera')}: too "
         return [Finding("note", "too-few", f"{message}few to compare")] if map_poses else []
-    _, centers = _frames(map_poses, 0.0)
-    extent = float(np.ptp(centers, axis=0).max()) or 1.0
-    # a wrong direction counts as much as a place at the other end of the map
-    tree = cKDTree(_frames(map_poses, extent)[0])
+    extent = float(np.ptp(_centers(map_poses), axis=0).max()) or 1.0
+    # a wrong direction counts as much as a camera at the other end of the map
+    tree = cKDTree(_frames(map_poses, extent))
     names = list(poses)
-    step = -(-len(names) // _SAMPLE)
+    sample = names[:: -(-len(names) // _SAMPLE)]
     distances = [
-        tree.query(_frames([in_local(n, read(poses[n])) for n in names[::step]], extent)[0])[0]
+        tree.query(_frames([in_local(n, read(poses[n])) for n in sample], extent))[0]
         for read in (lambda pose: pose, *CONVENTIONS.values())
     ]
-    near = max(_NEAR * min(float(np.median(own)) for own in distances), _LEAST * extent)
-    shares = [float((own <= near).mean()) for own in distances]
+    near = max(_NEAR * min(float(np.median(d)) for d in distances), _LEAST * extent)
+    shares = [float((d <= near).mean()) for d in distances]
     if better := better_conventions(shares):
         message = (
             f"{' or '.join(better)}: read so, {max(shares):.0%} of the poses are near the map's "
@@ -413,9 +393,9 @@ def _check_poses(
             "down, z forward"
         )
         return [Finding("error", "convention", message)]
-    _, centers_of_poses = _frames([in_local(name, pose) for name, pose in poses.items()], 0.0)
-    distance = cKDTree(centers).query(centers_of_poses)[0]
-    # where the queries were taken apart from the map, a distance that most of them have is usual
+    centers = _centers([in_local(name, pose) for name, pose in poses.items()])
+    distance = cKDTree(_centers(map_poses)).query(centers)[0]
+    # if the queries were taken apart from the map, their usual distance is not far
     limit = max(extent, min(4 * float(np.median(distance)), 3 * extent))
     order = np.argsort(-distance, kind="stable")
     far = order[distance[order] > limit].tolist()
@@ -433,18 +413,18 @@ def _check_poses(
     return [Finding("warning", "far", message, names=far_names)]
 
 
-def _frames(
-    poses: Sequence[RigidTransform], length: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Cameras as points of one space, (N, 9): the centre, and the ends of the x and z axes.
+def _centers(poses: Sequence[RigidTransform]) -> NDArray[np.float64]:
+    return camera_centers(*stack_poses(poses))
 
-    Distances between them grow with distance and angle alike; ``length`` is that of the axes.
-    Also returns the centres, (N, 3).
+
+def _frames(poses: Sequence[RigidTransform], length: float) -> NDArray[np.float64]:
+    """Return the centre and the ends of the x and z axes of each camera, (N, 9).
+
+    Their distances grow with the distance and the angle of two cameras.
     """
-    quats, translations = stack_poses(poses)
-    centers = camera_centers(quats, translations)
-    axes = length * rotation_matrices(quats)  # rows: x, y, z of the camera in the world
-    return np.hstack([centers, centers + axes[:, 0], centers + axes[:, 2]]), centers
+    centers = _centers(poses)
+    axes = length * rotation_matrices(stack_poses(poses)[0])  # rows: camera's x, y, z in the world
+    return np.hstack([centers, centers + axes[:, 0], centers + axes[:, 2]])
 
 
 def _stem(name: str) -> str:

@@ -1,9 +1,9 @@
-"""How well the confidence of poses tells the right ones from the wrong.
+"""Calibration of the confidences of poses.
 
-Right is a pose within the coarsest threshold; a query of which it is known that it shows nothing of
-the map has no right pose. Naeini et al., "Obtaining well calibrated probabilities using Bayesian
-binning", AAAI 2015 (calibration error); Geifman and El-Yaniv, "Selective classification for deep
-neural networks", NeurIPS 2017 (risk against coverage).
+A pose is right within the coarsest threshold; every pose of a query that shows nothing of the map
+is wrong. Naeini et al., "Obtaining well calibrated probabilities using Bayesian binning", AAAI 2015
+(calibration error); Geifman and El-Yaniv, "Selective classification for deep neural networks",
+NeurIPS 2017 (risk against coverage).
 """
 
 from __future__ import annotations
@@ -26,14 +26,7 @@ NUM_BINS = 10
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """Poses of similar confidence.
-
-    Attributes
-    ----------
-    low, high : the confidences that it holds, ``high`` included.
-    num_poses, num_right : how many there are, and how many of them are right.
-    mean_confidence : NaN where there is none.
-    """
+    """Poses with a confidence above ``low``, up to ``high``; the mean is NaN without poses."""
 
     low: float
     high: float
@@ -43,7 +36,6 @@ class Bin:
 
     @property
     def share_right(self) -> float:
-        """Of the poses; NaN where there is none."""
         return self.num_right / self.num_poses if self.num_poses else float("nan")
 
 
@@ -53,18 +45,14 @@ class Confidence:
 
     Attributes
     ----------
-    num_queries : all that count, with a pose or without.
     num_poses, num_wrong : poses with a confidence, and those beyond the coarsest threshold.
-    wrong_low, wrong_high : 95 % confidence interval of the share of wrong ones among the poses.
-    num_nowhere, num_nowhere_refused : queries that show nothing of the map, and those without a
-        pose, which is what is right.
-    bins : of the reliability diagram, by rising confidence.
-    calibration_error : mean distance of a bin's confidence from its share of right poses, by poses.
-    coverage, risk : (num_poses,) of all queries the share that is accepted, and of these the share
-        that is wrong, as poses are accepted from the most confident on.
-    area : under the curve of risk over the poses.
-    least_area : what it would be if every right pose came before every wrong one.
-    area_by_inliers : the same with the number of inliers instead; None where it is not known.
+    wrong_low, wrong_high : 95 % interval of the share of wrong poses.
+    num_nowhere_refused : of the queries that show nothing of the map, those without a pose.
+    calibration_error : mean distance of confidence and share of right poses, over bins.
+    coverage, risk : (num_poses,) share of queries that are accepted, most confident first, and
+        share of wrong poses among them.
+    area, least_area, area_by_inliers : area under the risk; the same if every right pose came
+        first; the same if ranked by inliers, None if unknown.
     """
 
     num_queries: int
@@ -86,8 +74,7 @@ class Confidence:
 def confidence_of(
     queries: Sequence[QueryResult], coarsest: Threshold, nowhere: Sequence[QueryResult] = ()
 ) -> Confidence | None:
-    """Judge the confidences of a result's poses; None where no pose has one and no query is known
-    to show nothing of the map (``nowhere``, each pose of which is wrong)."""
+    """Judge the confidences of poses; None if no pose has one and ``nowhere`` is empty."""
     posed = [q for q in queries if q.outcome == "localized" and q.confidence is not None]
     strays = [q for q in nowhere if q.outcome == "localized"]
     posed += [q for q in strays if q.confidence is not None]
@@ -122,28 +109,28 @@ def confidence_of(
 
 
 def reliability(confidences: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[Bin, ...]:
-    """Bins of equal width over confidences (N,) from 0 to 1, and which poses (N,) are right."""
+    """Count right poses (N,) in ten bins of equal width over their confidences (N,)."""
     number = np.clip(np.ceil(confidences * NUM_BINS).astype(int) - 1, 0, NUM_BINS - 1)
-    found = []
+    bins = []
     for index in range(NUM_BINS):
-        own = number == index
-        count = int(own.sum())
-        mean = float(confidences[own].mean()) if count else float("nan")
+        members = number == index
+        count = int(members.sum())
+        mean = float(confidences[members].mean()) if count else float("nan")
         edges = index / NUM_BINS, (index + 1) / NUM_BINS
-        found.append(Bin(*edges, count, int(right[own].sum()), mean))
-    return tuple(found)
+        bins.append(Bin(*edges, count, int(right[members].sum()), mean))
+    return tuple(bins)
 
 
 def calibration_error(bins: Sequence[Bin]) -> float:
-    """Expected calibration error: 0 where of poses of confidence p the share p is right."""
-    filled = [one for one in bins if one.num_poses]
-    total = sum(one.num_poses for one in filled)
-    distances = (abs(one.share_right - one.mean_confidence) * one.num_poses for one in filled)
+    """Return the expected calibration error; 0 if the share p of poses of confidence p is right."""
+    filled = [b for b in bins if b.num_poses]
+    total = sum(b.num_poses for b in filled)
+    distances = (abs(b.share_right - b.mean_confidence) * b.num_poses for b in filled)
     return sum(distances) / total if total else 0.0
 
 
 def risk_by_score(scores: NDArray[np.float64], right: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Share of wrong poses (N,) among the 1, 2, ... N best by score; ties count as their mean."""
+    """Return the share of wrong poses (N,) among the 1 ... N best; ties count as their mean."""
     order = np.argsort(-scores, kind="stable")
     _, inverse, counts = np.unique(-scores, return_inverse=True, return_counts=True)
     wrong = np.bincount(inverse, weights=~right) / counts
@@ -152,7 +139,7 @@ def risk_by_score(scores: NDArray[np.float64], right: NDArray[np.bool_]) -> NDAr
 
 
 def least_area(right: NDArray[np.bool_]) -> float:
-    """Area under risk against coverage where every right pose comes first; 0 without poses."""
+    """Return the area under the risk if every right pose comes first; 0 without poses."""
     if not len(right):
         return 0.0
     return float(risk_by_score(right.astype(np.float64), right).mean())

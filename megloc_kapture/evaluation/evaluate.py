@@ -1,4 +1,4 @@
-"""Evaluation of results on disk or in memory: against true poses, or without them."""
+"""Evaluation of results on disk or in memory, with or without true poses."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from megloc_kapture.values import Failure, Pose, RigidTransform
 _log = logging.getLogger(__name__)
 
 Align = Literal["none", "se3", "sim3"]
-# a similarity agrees with two poses' centres by construction
+# a similarity fits two centres by construction
 _MIN_AGREEING = 4
 _MOST_COMPARED = 500
 
@@ -60,29 +60,25 @@ def evaluate(
     label: str | None = None,
     align: Align = "none",
 ) -> Evaluation:
-    """Evaluate poses against true ones, by a benchmark's rules.
+    """Evaluate poses against true poses by the rules of a benchmark.
 
-    The result prints as the recall table with its confidence intervals; ``.html(path)`` writes the
-    report, ``.compare(other)`` tests the difference from another result, ``.to_pandas()`` is a
+    The result prints as the recall table with confidence intervals; ``.html(path)`` writes the
+    report, ``.compare(other)`` tests the difference from another result, ``.to_pandas()`` returns a
     table of the queries.
 
     Parameters
     ----------
-    estimated : a kapture folder with trajectories (and perhaps ``status.csv``), a pose file, a
-        COLMAP model, or image -> pose; poses in memory are ``cam_from_world`` in the frame of the
-        truth, metres.
-    truth : a kapture folder, a pose file, a COLMAP model, or image -> ``cam_from_world``. Queries
-        that show nothing of the map are in the kapture folder's ``nowhere.txt``, one a line: they
-        are right without a pose.
-    dataset : whose thresholds, conditions and pools hold; by default those of the side tables.
-    side_tables : the workspace's ``megloc/`` folder: conditions, which images are scored, the
-        protocol, and the world a pose file has to be brought back from; found beside truth or
-        result by itself.
-    thresholds : instead of the protocol's.
-    mapping : kapture folder of the map, for MLAD's pairs and for the report's pictures; found in
-        the workspace of ``estimated`` by itself.
-    label : what the result is called in tables; by default its path.
-    align : sim3 and se3: align the poses with the truth first, robustly, with and without scale.
+    estimated, truth : kapture folder, pose file, COLMAP model, or image -> ``cam_from_world`` in
+        metres. A folder of results may have a ``status.csv``, a folder of true poses a
+        ``nowhere.txt``: one query a line that shows nothing of the map and is right without a pose.
+    dataset : name of the dataset whose thresholds, conditions and pools hold; by default those of
+        the side tables.
+    side_tables : ``megloc/`` folder of the workspace, by default found near truth or result.
+    thresholds : recall thresholds instead of the protocol's.
+    mapping : kapture folder of the map, for MLAD's pairs and for pictures; by default found in the
+        workspace of ``estimated``.
+    label : name of the result in tables; by default its path.
+    align : align the poses with the truth first, robustly; ``sim3`` with scale, ``se3`` without.
     """
     benchmark = benchmark_beside([truth, estimated], side_tables=side_tables, dataset=dataset)
     labels = None if label is None else [label]
@@ -103,7 +99,7 @@ def benchmark_beside(
     side_tables: Path | str | None = None,
     dataset: str | None = None,
 ) -> Benchmark:
-    """The benchmark of side tables, by default of the first workspace that contains a path."""
+    """Return the benchmark of side tables, by default of the first workspace of the paths."""
     for path in beside:
         if isinstance(path, Path | str):
             side_tables = side_tables or side_tables_near(path)
@@ -120,12 +116,9 @@ def evaluate_results(
     labels: Sequence[str] | None = None,
     align: Align = "none",
 ) -> list[Evaluation]:
-    """Evaluate several results against one truth, by one benchmark; in their order.
+    """Evaluate several results in their order; see :func:`evaluate`.
 
-    Where the benchmark has MLAD's pairs, these are what counts, by MLAD's metric.
-
-    The other parameters are those of :func:`evaluate`; labels are by default the results' paths,
-    without the folders that all of them share.
+    If the benchmark has MLAD's pairs, these count, by MLAD's metric.
     """
     if isinstance(truth, Mapping):
         true_poses: Poses = result_in_memory(truth).poses
@@ -144,44 +137,22 @@ def evaluate_results(
             f"the {len(benchmark.pairs)} pairs to relocalize need the poses of their references, "
             "which are the map's: give it with --map"
         )
-    limits = thresholds or benchmark.thresholds()
-    evaluations = []
     read = _read(results, benchmark, contexts, labels, true_poses, references)
     if not isinstance(truth, Mapping) and side_tables_near(truth) is None:
         true_poses = _in_local_frame(true_poses, read, benchmark.world, truth)
-    if not relative:
-        true_poses = _by_names_of_results(true_poses, read, {*nowhere, *benchmark.names})
+    if relative:
+        return [
+            evaluate_pairs(result, true_poses, benchmark, references, thresholds=thresholds)
+            for result in read
+        ]
+    true_poses = _by_names_of_results(true_poses, read, {*nowhere, *benchmark.names})
+    evaluations = []
     for result in read:
-        found, alignment = (result, "") if relative else _aligned(result, true_poses, align)
-        if relative:
-            evaluation = evaluate_pairs(
-                found.poses_of_pairs(benchmark.pairs),
-                true_poses,
-                benchmark.pairs,
-                references,
-                thresholds=limits,
-                statuses=found.statuses,
-                label=found.label,
-            )
-        else:
-            known = {*true_poses, *found.poses, *nowhere}
-            evaluation = evaluate_poses(
-                found.poses,
-                true_poses,
-                conditions=benchmark.conditions(known),
-                thresholds=limits,
-                scored=benchmark.scored(known),
-                statuses=found.statuses,
-                condition_order=benchmark.protocol.conditions,
-                pools=benchmark.protocol.pools,
-                label=found.label,
-                nowhere=nowhere,
-                confidences=found.confidences,
-                covariances=found.covariances,
-            )
-        known_by = benchmark.protocol.truth
-        evaluation = replace(evaluation, truth_known_by=known_by, context=found.context)
-        evaluations.append(replace(evaluation, alignment=alignment))
+        aligned, note = _aligned(result, true_poses, align)
+        evaluation = evaluate_poses(
+            aligned, true_poses, benchmark, thresholds=thresholds, nowhere=nowhere
+        )
+        evaluations.append(replace(evaluation, alignment=note))
     return evaluations
 
 
@@ -193,30 +164,21 @@ def results_without_truth(
     mapping: Path | str | None = None,
     labels: Sequence[str] | None = None,
 ) -> WithoutTruth:
-    """Evaluate results without true poses.
+    """Evaluate results without true poses; see :func:`evaluate`.
 
-    The queries are those of the challenge's list; without one, those that the results are about.
-    The parameters are those of :func:`evaluate_results`.
+    The queries are those of the challenge's list, else those of the results and workspaces.
     """
     contexts = [_context(source, mapping) for source in results]
     if len(contexts) > 1:
         _warn_of_unit(contexts)
     map_poses = first_map_poses(contexts) if benchmark.pairs else {}
     known = {image for context in contexts for image in context.query_images()}
-    found = _read(results, benchmark, contexts, labels, known, map_poses)
+    read = _read(results, benchmark, contexts, labels, known, map_poses)
     queries = set(benchmark.names) or {pair.query for pair in benchmark.pairs}
     if not queries:
-        of_results = {image for result in found for image in result.images}
+        of_results = {image for result in read for image in result.images}
         queries = benchmark.scored(known | of_results)
-    return evaluate_without_truth(
-        found,
-        queries=sorted(queries),
-        conditions=benchmark.conditions(queries),
-        thresholds=thresholds or benchmark.thresholds(),
-        condition_order=benchmark.protocol.conditions,
-        pools=benchmark.protocol.pools,
-        statement=benchmark.protocol.truth,
-    )
+    return evaluate_without_truth(read, benchmark, queries=queries, thresholds=thresholds)
 
 
 def _read(
@@ -227,7 +189,7 @@ def _read(
     images: Collection[str],
     references: Poses,
 ) -> list[Result]:
-    found = []
+    read = []
     for source, label, context in zip(results, labels or _labels(results), contexts, strict=True):
         if isinstance(source, Mapping):
             result = result_in_memory(source, label=label)
@@ -235,14 +197,14 @@ def _read(
             result = read_result(
                 source, benchmark, images=images, references=references, label=label
             )
-        found.append(replace(result, context=context))
-    return found
+        read.append(replace(result, context=context))
+    return read
 
 
 def _by_names_of_results(
     true_poses: Poses, results: Sequence[Result], known: Collection[str]
 ) -> Poses:
-    """True poses by the images' names in the results, where these have other folders."""
+    """Rename the true poses if the results have the images in other folders."""
     images = {image for result in results for image in result.images}
     if not images & true_poses.keys():
         true_poses = poses_by_image(true_poses, images)
@@ -259,8 +221,10 @@ def _by_names_of_results(
 def _in_local_frame(
     true_poses: Poses, results: Sequence[Result], world: World, truth: Path | str
 ) -> Poses:
-    """True poses as they came, or, where they fit the results a thousand times as well from the
-    official frame, as a dataset's owner has them, brought to the results' local one."""
+    """Bring true poses in the official frame, as a dataset's owner has them, to the local frame.
+
+    They are taken to be official if they then fit the results a thousand times better.
+    """
     pairs = [
         (true_poses[i], pose) for r in results for i, pose in r.poses.items() if i in true_poses
     ]
@@ -281,7 +245,7 @@ def _in_local_frame(
 def _context(source: Localized, mapping: Path | str | None) -> ResultContext:
     if not isinstance(source, Mapping):
         return context_of(source, mapping=mapping)
-    poses = {image: found for image, found in source.items() if isinstance(found, Pose)}
+    poses = {image: pose for image, pose in source.items() if isinstance(pose, Pose)}
     return ResultContext(
         mapping=None if mapping is None else KaptureFolder(mapping),
         unit=METRES if mapping is None else unit_of(mapping),
@@ -296,36 +260,36 @@ def _warn_of_unit(contexts: Sequence[ResultContext]) -> None:
 
 
 def _aligned(result: Result, true_poses: Poses, align: Align) -> tuple[Result, str]:
-    """The result, aligned if asked for, and a sentence on the alignment, which may be empty."""
+    """Return the result, aligned if asked for, and a note on the alignment, which may be empty."""
     images = sorted(result.poses.keys() & true_poses.keys())
-    if align == "none":  # a remark needs no more, and time grows with the square of their number
+    if align == "none":  # enough for a note; time grows with the square of their number
         images = images[:: -(-len(images) // _MOST_COMPARED) or 1]
     estimated = stack_poses(result.poses[image] for image in images)
     true = stack_poses(true_poses[image] for image in images)
     try:
-        found = align_poses(estimated, true, with_scale=align != "se3")
+        alignment = align_poses(estimated, true, with_scale=align != "se3")
     except DataError:
         if align == "none":
             return result, ""
         raise
-    number = int(found.agrees.sum())
-    kind = "a rigid transform" if align == "se3" else f"a similarity of scale {found.scale:.6g}"
+    number = int(alignment.agrees.sum())
+    kind = "a rigid transform" if align == "se3" else f"a similarity of scale {alignment.scale:.6g}"
     if align == "none":
         fits = number >= _MIN_AGREEING and 2 * number > len(images)
-        if not fits or 2 * found.agreed_before.sum() > number:
+        if not fits or 2 * alignment.agreed_before.sum() > number:
             return result, ""
-        told = f"the results fit the truth after {kind}: --align sim3"
-        return result, f"{told} ({number} of {len(images)} poses agree)"
-    target_from_source = found.target_from_source
+        note = f"the results fit the truth after {kind}: --align sim3"
+        return result, f"{note} ({number} of {len(images)} poses agree)"
+    target_from_source = alignment.target_from_source
     similarity = SimilarityTransform(
         quat_wxyz=target_from_source.quat_wxyz,
         translation=target_from_source.translation,
-        scale=found.scale,
+        scale=alignment.scale,
     )
     world = World(official_from_local=similarity)
     moved = {image: world.pose_in_official(pose) for image, pose in result.poses.items()}
-    told = f"aligned with the truth by {kind}, with which {number} of {len(images)} poses agree"
-    return replace(result, poses=moved), told
+    note = f"aligned with the truth by {kind}, with which {number} of {len(images)} poses agree"
+    return replace(result, poses=moved), note
 
 
 def _labels(results: Sequence[Localized]) -> list[str]:

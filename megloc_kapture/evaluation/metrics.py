@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BeforeValidator, Field, PlainSerializer
+from pydantic import Field
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.geometry.poses import invert, rotation_angles_deg, stack_poses
@@ -17,13 +17,9 @@ from megloc_kapture.values import Options, RigidTransform
 
 
 class Threshold(Options):
-    """A query counts when both of its errors are at or below (``<=``).
+    """Upper bounds (``<=``) for the error of a camera centre and of a rotation.
 
-    Parameters
-    ----------
-    position_m : bound on the distance of the camera centres, metres.
-    angle_deg : bound on the rotation angle, degrees; None leaves the rotation out, as the MLAD
-        challenges do.
+    ``angle_deg`` None ignores the rotation, as the MLAD challenges do.
     """
 
     position_m: float = Field(ge=0.0, allow_inf_nan=False)
@@ -31,7 +27,7 @@ class Threshold(Options):
 
     @classmethod
     def parse(cls, text: str) -> Threshold:
-        """From ``"0.25,2"`` (metres, degrees) or ``"0.25"`` (position only); else OptionError."""
+        """Parse ``"0.25,2"`` (metres, degrees) or ``"0.25"`` (position only)."""
         parts = text.replace(",", " ").split()
         try:
             numbers = [float(part) for part in parts]
@@ -44,7 +40,6 @@ class Threshold(Options):
             ) from error
 
     def holds(self, position_m: ArrayLike, angle_deg: ArrayLike) -> NDArray[np.bool_]:
-        """Whether errors (...) lie at or below (``<=``) both bounds; infinite ones do not."""
         inside = np.asarray(np.asarray(position_m) <= self.position_m)
         if self.angle_deg is None:
             return inside
@@ -56,25 +51,15 @@ class Threshold(Options):
 
 
 def thresholds_from_pairs(pairs: Iterable[tuple[float, float | None]]) -> tuple[Threshold, ...]:
-    """Thresholds of (metres, degrees or None) pairs, as a protocol keeps them."""
     return tuple(Threshold(position_m=p, angle_deg=a) for p, a in pairs)
-
-
-DEFAULT_THRESHOLDS = thresholds_from_pairs(Protocol().thresholds)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PoseErrors:
-    """Errors of N queries, in the order of ``names``.
+    """Distances of camera centres (N,) and rotation angles (N,) of the queries ``names``.
 
-    A query without an estimated pose has infinite errors, both of them: it lies beyond every
-    threshold, sorts last, and raises a median instead of leaving it. Neither array holds NaN.
-
-    Parameters
-    ----------
-    names : the queries.
-    position_m : float64 (N,), distance between the camera centres, metres.
-    angle_deg : float64 (N,), angle of the rotation between the two, degrees in [0, 180].
+    Both errors of a query without a pose are infinite: it is beyond every threshold and raises
+    the median.
     """
 
     names: tuple[str, ...]
@@ -91,25 +76,20 @@ def pose_errors(
     truth: Mapping[str, RigidTransform],
     names: Iterable[str] | None = None,
 ) -> PoseErrors:
-    """Errors of ``estimated`` for the queries ``names``, by default all of ``truth``, sorted.
+    """Return the errors of ``names``, by default all images of ``truth``, sorted.
 
-    Parameters
-    ----------
-    estimated, truth : ``cam_from_world`` by image name, in one frame, metres. Estimates of images
-        that are not asked for are left alone.
-    names : must all be in ``truth``.
+    Poses are ``cam_from_world`` in one frame, in metres.
     """
     listed = tuple(sorted(truth) if names is None else names)
-    position_m = np.full(len(listed), np.inf)
-    angle_deg = np.full(len(listed), np.inf)
-    found = [i for i, name in enumerate(listed) if name in estimated]
-    if found:
+    position_m, angle_deg = np.full((2, len(listed)), np.inf)
+    posed = [i for i, name in enumerate(listed) if name in estimated]
+    if posed:
         # compared as world_from_cam, step by step as kapture does: figures then agree to the last
         # bit, and so do the queries that lie exactly on a threshold
-        quats, centers = invert(*stack_poses(estimated[listed[i]] for i in found))
-        true_quats, true_centers = invert(*stack_poses(truth[listed[i]] for i in found))
-        position_m[found] = np.linalg.norm(centers - true_centers, axis=1)
-        angle_deg[found] = rotation_angles_deg(quats, true_quats)
+        quats, centers = invert(*stack_poses(estimated[listed[i]] for i in posed))
+        true_quats, true_centers = invert(*stack_poses(truth[listed[i]] for i in posed))
+        position_m[posed] = np.linalg.norm(centers - true_centers, axis=1)
+        angle_deg[posed] = rotation_angles_deg(quats, true_quats)
     return PoseErrors(listed, position_m, angle_deg)
 
 
@@ -119,17 +99,11 @@ LEVEL = 0.95
 def confidence_interval(
     successes: ArrayLike, trials: ArrayLike, *, level: float = LEVEL
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Exact (Clopper-Pearson) confidence interval of a share; 0 to 1 where there was no trial.
+    """Return the exact (Clopper-Pearson) interval of a share; 0 to 1 without trials.
 
-    It holds the true share with at least ``level`` probability, whatever the share and the number
-    of trials. Wilson's interval is a little narrower but does so on average only: with 98 queries
-    its 95 % are 91 % where recall is near 99 %, which is where papers compare. Queries count as
-    independent draws; those of one drive are not quite, which makes the interval too narrow.
-
-    Parameters
-    ----------
-    successes, trials : whole numbers (...), ``0 <= successes <= trials``; shapes broadcast.
-    level : confidence, above 0 and below 1.
+    It contains the true share with at least ``level`` probability. Wilson's interval is narrower
+    but covers 91 % instead of 95 % near a recall of 99 % of 98 queries. Queries count as
+    independent draws, although those of one drive are not quite independent.
     """
     from scipy.special import betaincinv
 
@@ -146,22 +120,10 @@ def confidence_interval(
 
 ALL = "all"
 
-# JSON has no infinity: an infinite median ("most queries have no pose") is null there
-MaybeInfinite = Annotated[
-    float,
-    BeforeValidator(lambda value: np.inf if value is None else value),
-    PlainSerializer(lambda value: value if np.isfinite(value) else None, when_used="json"),
-]
 
-
-class RecallAt(Options):
-    """Recall at one threshold.
-
-    Parameters
-    ----------
-    num_within : queries within the threshold, of the row's ``num_queries``.
-    recall : their ratio; ``low``, ``high``: its 95 % :func:`confidence_interval`.
-    """
+@dataclass(frozen=True, slots=True)
+class RecallAt:
+    """Recall at one threshold: ``num_within / num_queries``, and its 95 % interval."""
 
     threshold: Threshold
     num_within: int
@@ -170,21 +132,12 @@ class RecallAt(Options):
     high: float
 
 
-class RecallRow(Options):
-    """Recall and medians of one group of queries.
+@dataclass(frozen=True, slots=True)
+class RecallRow:
+    """Recall and medians of one condition, pool or ``"all"``.
 
-    Parameters
-    ----------
-    name : the condition, or the name of a pool.
-    num_queries : every query of the group: the denominator of recall.
-    num_localized : queries whose pose was estimated.
-    num_fallback : queries whose pose is a fallback, a guess; they count in recall as any pose
-        does, but not as localized.
-    num_missing : queries without a pose.
-    recall : one entry per threshold, in the order of the thresholds.
-    median_position_m, median_angle_deg : over all queries, a missing pose counting as infinite.
-    median_localized_position_m, median_localized_angle_deg : over the localized queries only;
-        infinite if there are none.
+    Fallback poses are guesses: they count in recall, but not as localized. Medians are over all
+    queries, a missing pose counting as infinite, and over the localized queries.
     """
 
     name: str
@@ -193,14 +146,13 @@ class RecallRow(Options):
     num_fallback: int
     num_missing: int
     recall: tuple[RecallAt, ...]
-    median_position_m: MaybeInfinite
-    median_angle_deg: MaybeInfinite
-    median_localized_position_m: MaybeInfinite
-    median_localized_angle_deg: MaybeInfinite
+    median_position_m: float
+    median_angle_deg: float
+    median_localized_position_m: float
+    median_localized_angle_deg: float
 
 
 def within(errors: PoseErrors, threshold: Threshold) -> NDArray[np.bool_]:
-    """(N,) whether each query is at or below (``<=``) both bounds; one without a pose never is."""
     return threshold.holds(errors.position_m, errors.angle_deg)
 
 
@@ -212,8 +164,10 @@ def recall_row(
     members: NDArray[np.bool_] | None = None,
     fallback: NDArray[np.bool_] | None = None,
 ) -> RecallRow:
-    """Recall and medians of the queries ``members`` (N,), by default all; ``fallback`` (N,) says
-    whether a query's pose is one, by default none is."""
+    """Return recall and medians of the queries in the mask ``members`` (N,), by default all.
+
+    ``fallback`` (N,) marks poses that are guesses.
+    """
     chosen = np.ones(len(errors.names), bool) if members is None else members
     guessed = np.zeros(len(errors.names), bool) if fallback is None else fallback
     posed = errors.has_pose & chosen
@@ -244,42 +198,27 @@ def recall_row(
     )
 
 
-def row_members(
-    conditions: Sequence[str],
-    *,
-    order: Sequence[str] = (),
-    pools: Mapping[str, Sequence[str]] | None = None,
-) -> dict[str, NDArray[np.bool_]]:
-    """The rows of a recall table and the queries they count, bool (N,): one row per condition, then
-    one per pool, then ``"all"``.
+def row_members(conditions: Sequence[str], protocol: Protocol) -> dict[str, NDArray[np.bool_]]:
+    """Return a mask (N,) of queries for each row of a recall table.
 
-    A pool counts the queries of its conditions together; it is not the mean of their recalls.
-
-    Parameters
-    ----------
-    conditions : the condition of each of the N queries, ``""`` for none. Where no query has one,
-        there is only the row ``"all"``.
-    order : conditions in the order to report them; others follow, sorted, those without last.
-    pools : name -> conditions; a pool without queries is left out.
+    One row per condition (in the protocol's order, queries without a condition last), then one per
+    pool that has queries, then ``"all"``. A pool counts the queries of its conditions together; it
+    is not the mean of their recalls.
     """
+    order, pools = protocol.conditions, protocol.pools
     of_query = np.array(list(conditions), str)
     present = set(of_query.tolist())
     named = [c for c in order if c in present] + sorted(present - {""} - set(order))
     if named and "" in present:
         named.append("")
-    members: dict[str, NDArray[np.bool_]] = {c: of_query == c for c in named}
-    for pool, parts in (pools or {}).items():
-        _check_free(pool, members)
-        pooled = np.isin(of_query, list(parts))
-        if pooled.any():
-            members[pool] = pooled
-    _check_free(ALL, members)
-    return {**members, ALL: np.ones(len(of_query), bool)}
-
-
-def _check_free(name: str, taken: Mapping[str, object]) -> None:
-    if name in taken:
-        raise OptionError(f"two rows of the recall table would be called {name!r}; rename one")
+    rows = [(c, of_query == c) for c in named]
+    pooled = ((pool, np.isin(of_query, list(parts))) for pool, parts in pools.items())
+    rows += [(pool, members) for pool, members in pooled if members.any()]
+    rows.append((ALL, np.ones(len(of_query), bool)))
+    for name, number in Counter(name for name, _ in rows).items():
+        if number > 1:
+            raise OptionError(f"two rows of the recall table would be called {name!r}; rename one")
+    return dict(rows)
 
 
 def _median(values: NDArray[np.float64]) -> float:

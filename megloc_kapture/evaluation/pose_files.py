@@ -1,16 +1,13 @@
-"""Pose files: the text formats that challenges take, their numbers checked, and their provenance.
+"""Pose files of the challenges, and their provenance.
 
-visuallocalization.net (LTVL) has one line ``name qw qx qy qz tx ty tz`` per query. The pose is
-``cam_from_world`` and ``t`` its translation, not the camera centre. Single spaces, no header, every
-line ended by a newline; a query without a pose has no line.
+visuallocalization.net (LTVL) takes one line ``name qw qx qy qz tx ty tz`` per query: the pose is
+``cam_from_world`` and ``t`` its translation. Single spaces, no header, a newline after every line.
+A query without a pose has no line.
 
-The MLAD challenges (4Seasons) have ``src_ts tgt_ts tx ty tz qx qy qz qw`` per pair. The pose is
-``query_from_reference`` of the rectified left cameras: ``x_query = R x_ref + t``. The translation
-stands first and the quaternion's w last, unlike everywhere else here. A file has the name of the
-relocalization file it answers, and every pair of that one; the relocalization file has the same
-rows without poses, or, for training recordings, with the true ones.
-
-Beside a pose file stands where it comes from: versions, options, counts; no dates.
+The MLAD challenges (4Seasons) take ``src_ts tgt_ts tx ty tz qx qy qz qw`` per pair: the pose is
+``query_from_reference`` of the rectified left cameras. A file has the name and every pair of the
+relocalization file that it answers; that one has the same rows, with poses for training recordings
+only.
 """
 
 from __future__ import annotations
@@ -31,7 +28,11 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.dataset_tables import MAX_QUATERNION_NORM_ERROR, PoseFileNames
+from megloc_kapture.io.dataset_tables import (
+    MAX_QUATERNION_NORM_ERROR,
+    PoseFileFormat,
+    PoseFileNames,
+)
 from megloc_kapture.io.files import (
     read_content,
     read_json_model,
@@ -47,57 +48,45 @@ _log = logging.getLogger(__name__)
 COLUMNS = "name qw qx qy qz tx ty tz"
 
 Poses = Mapping[str, RigidTransform]
-# how images are called: by a rule, or by a table in the order of the challenge's list
+# a rule, or the challenge's list: image -> name in the pose file, in the list's order
 Names = PoseFileNames | Mapping[str, str]
 
 
 def name_by_rule(image: str, rule: PoseFileNames) -> str:
-    """Return the name of an image in a pose file by the challenge's rule."""
     return image if rule == "full" else image.rsplit("/", 1)[-1]
 
 
 def is_name(text: str) -> bool:
-    """Whether a row can begin with it: it has no white space, and is not empty."""
+    """Return whether a row can begin with ``text``: not empty, no white space."""
     return text.split() == [text]
 
 
 def names_in_pose_file(images: Iterable[str], names: Names) -> dict[str, str]:
-    """Image -> the name it bears in a pose file, in the order of the file.
+    """Return image -> name in the order of the pose file: by name, or the list's order.
 
-    By a rule that is the order of the names; by a table (image -> name) the table's, and images
-    that are not in it have no name.
+    Images that are not in the challenge's list are left out.
     """
     wanted = set(images)
     if isinstance(names, str):
-        called = {image: name_by_rule(image, names) for image in sorted(wanted)}
+        by_image = {image: name_by_rule(image, names) for image in sorted(wanted)}
+        by_image = dict(sorted(by_image.items(), key=lambda item: item[1]))
     else:
-        called = {image: name for image, name in names.items() if image in wanted}
-    bearer: dict[str, str] = {}
-    for image, name in called.items():
+        by_image = {image: name for image, name in names.items() if image in wanted}
+    by_name: dict[str, str] = {}
+    for image, name in by_image.items():
         if not is_name(name):
             raise DataError(f"image {image!r}: a pose file cannot hold the name {name!r}")
-        if name in bearer:
+        if name in by_name:
             raise DataError(
-                f"images {bearer[name]!r} and {image!r} would both be called {name!r} in the pose "
+                f"images {by_name[name]!r} and {image!r} would both be called {name!r} in the pose "
                 "file; use full names"
             )
-        bearer[name] = image
-    if isinstance(names, str):
-        called = dict(sorted(called.items(), key=lambda item: item[1]))
-    return called
+        by_name[name] = image
+    return by_image
 
 
 def format_pose_file(poses: Poses, *, names: Names = "full") -> str:
-    """The text of a pose file.
-
-    Numbers have the fewest digits that read back to the same float64, so nothing is lost.
-
-    Parameters
-    ----------
-    poses : image -> ``cam_from_world``.
-    names : a rule, and the rows are sorted by name; or the challenge's list as image -> name, and
-        the rows stand in its order: images that are not in it are left out.
-    """
+    """Return the text of a pose file; numbers read back to the same float64."""
     lines = []
     for image, name in names_in_pose_file(poses, names).items():
         pose = checked_pose(poses[image].quat_wxyz, poses[image].translation, f"image {image!r}")
@@ -107,16 +96,14 @@ def format_pose_file(poses: Poses, *, names: Names = "full") -> str:
 
 
 def write_pose_file(path: Path | str, poses: Poses, *, names: Names = "full") -> None:
-    """Write a pose file atomically; see :func:`format_pose_file`."""
     write_bytes(path, format_pose_file(poses, names=names).encode("utf-8"))
 
 
 def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
-    """Read a pose file or COLMAP's ``images.txt``: name -> ``cam_from_world``, in the file's order.
+    """Read name -> ``cam_from_world`` from a pose file or COLMAP's ``images.txt``, in its order.
 
-    Runs of spaces, tabs and CRLF line ends are taken; empty lines and comments are passed over. A
-    row of nan, or with a quaternion of zeros, is how other tools write a query that failed: it is
-    left out, and a warning is logged.
+    Rows of nan or with a zero quaternion are how other tools write failed queries: they are left
+    out with a warning. Tabs, CRLF, empty lines and comments are accepted.
     """
     text = read_text(path)
     rows = (_colmap_rows if is_colmap_images(text) else _rows)(text)
@@ -128,11 +115,9 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
                 raise DataError(f"{len(fields)} columns instead of 8 ({COLUMNS})")
             if name in poses:
                 raise DataError(f"{name!r} is given twice")
-            qw, qx, qy, qz, tx, ty, tz = values = [parse_number(field) for field in fields[1:]]
+            values = [parse_number(field) for field in fields[1:]]
             failed = not np.isfinite(values).all() or not any(values[:4])
-            poses[name] = (
-                None if failed else checked_pose((qw, qx, qy, qz), (tx, ty, tz), repr(name))
-            )
+            poses[name] = None if failed else parse_pose(fields[1:], "ltvl", repr(name))
         except DataError as error:
             raise DataError(error.message, path=path, line=number) from error
     if failures := [name for name, pose in poses.items() if pose is None]:
@@ -142,7 +127,7 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
 
 
 def is_colmap_images(text: str) -> bool:
-    """Whether a text is COLMAP's ``images.txt``: ID QW QX QY QZ TX TY TZ CAMERA_ID NAME."""
+    """Return whether a row is ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, as in ``images.txt``."""
     _, fields = next(_rows(text), (0, []))
     return len(fields) >= 10 and fields[0].isdecimal() and fields[8].isdecimal()
 
@@ -167,14 +152,11 @@ def poses_by_image(
     images: Iterable[str],
     names: Mapping[str, str] | None = None,
 ) -> dict[str, RigidTransform]:
-    """Give the poses of a pose file the names that ``images`` bear in kapture.
+    """Rename the poses of a pose file to the images of a kapture folder.
 
-    A name of the challenge's list becomes its image. Of the others, one that is an image stays;
-    one that ends exactly one image's path becomes that image, and so does one that ends with an
-    image's path; where none fits also with another ending (``.jpg`` for ``.png``, as servers take
-    it); any other stays as it is, unknown, for the evaluation to report.
-
-    ``names`` is the challenge's list, image -> name in the pose file.
+    A name matches, in this order: the challenge's list ``names`` (image -> name), an image, the end
+    of one image's path, an image that ends the name, and the same with another ending (``.jpg`` for
+    ``.png``, as servers accept). Other names stay, for the evaluation to report.
     """
     known = set(images)
     listed = {name: image for image, name in (names or {}).items()}
@@ -215,7 +197,6 @@ def _stem(name: str) -> str:
 
 
 def parse_number(text: str) -> float:
-    """A decimal number; "nan" and the like become one that :func:`checked_pose` refuses."""
     if FLOAT_PATTERN.fullmatch(text):
         return float(text)
     if text.lower().lstrip("+-") in ("nan", "inf", "infinity"):
@@ -228,8 +209,7 @@ def checked_pose(
     translation: tuple[float, float, float],
     whose: str,
 ) -> RigidTransform:
-    """Return the pose with a unit quaternion; an almost unit quaternion is unchanged."""
-    # beyond, squares overflow
+    # larger squares overflow
     if not all(abs(v) < 1e100 for v in (*quat_wxyz, *translation)):
         raise DataError(f"{whose}: the pose is not finite")
     norm = math.sqrt(sum(q * q for q in quat_wxyz))
@@ -241,14 +221,24 @@ def checked_pose(
     return RigidTransform(quat_wxyz, translation)
 
 
+def parse_pose(values: Sequence[str], kind: PoseFileFormat, whose: str) -> RigidTransform:
+    """Parse the seven numbers of a row."""
+    numbers = [parse_number(value) for value in values]
+    if kind == "mlad":
+        tx, ty, tz, qx, qy, qz, qw = numbers
+    else:
+        qw, qx, qy, qz, tx, ty, tz = numbers
+    return checked_pose((qw, qx, qy, qz), (tx, ty, tz), whose)
+
+
 MLAD_COLUMNS = "src_ts tgt_ts tx ty tz qx qy qz qw"
-# as an int it must be written again as it is, so there is no leading zero
+# no leading zero, so that an int is written back as it was
 _TIMESTAMP = re.compile("0|[1-9][0-9]{0,29}")
 
 
 @dataclass(frozen=True, slots=True)
 class RelativePose:
-    """One row: a pair of keyframes by their timestamps, and the pose where the row has one."""
+    """One row: the timestamps of two keyframes, and their pose unless the row has none."""
 
     reference: int
     query: int
@@ -256,7 +246,7 @@ class RelativePose:
 
 
 def timestamp_of(image: str) -> int:
-    """The timestamp that an image of 4Seasons is named after (``.../1600000000000000000.png``)."""
+    """Return the timestamp in an image name of 4Seasons (``.../1600000000000000000.png``)."""
     stem = PurePosixPath(image).stem
     if not _TIMESTAMP.fullmatch(stem):
         raise DataError(f"image {image!r} is not named after a timestamp, as MLAD's rows need")
@@ -266,20 +256,17 @@ def timestamp_of(image: str) -> int:
 def relative_pose(
     query_from_world: RigidTransform, reference_from_world: RigidTransform, *, scale: float = 1.0
 ) -> RigidTransform:
-    """``query_from_reference`` of two cameras; ``scale`` is metres per unit of the world."""
-    # taken in the local frame: from ECEF, millions of metres would have to cancel
-    pose = query_from_world @ reference_from_world.inverse()
-    if scale == 1.0:
-        return pose
-    x, y, z = (float(v) for v in scale * np.array(pose.translation))
+    """Return ``query_from_reference``; ``scale`` is metres per unit of the (local) world."""
+    return scaled_pose(query_from_world @ reference_from_world.inverse(), scale)
+
+
+def scaled_pose(pose: RigidTransform, scale: float) -> RigidTransform:
+    x, y, z = (scale * np.array(pose.translation)).tolist()
     return RigidTransform(pose.quat_wxyz, (x, y, z))
 
 
 def format_mlad_file(rows: Iterable[RelativePose]) -> str:
-    """The text of a pose file, in the order of ``rows``.
-
-    Numbers have the fewest digits that read back to the same float64.
-    """
+    """Return the text of a pose file; numbers read back to the same float64."""
     lines = []
     for row in rows:
         pair = f"{row.reference} {row.query}"
@@ -293,13 +280,9 @@ def format_mlad_file(rows: Iterable[RelativePose]) -> str:
 
 
 def read_mlad_file(path: Path | str) -> list[RelativePose]:
-    """Read a pose file or a relocalization file, ours or foreign, in its order.
-
-    Runs of spaces, tabs and CRLF line ends are taken; empty lines are passed over. The last line
-    may be without its end, as common tools write it.
-    """
+    """Read a pose file or a relocalization file in its order."""
     rows: list[RelativePose] = []
-    known: set[tuple[int, int]] = set()
+    pairs: set[tuple[int, int]] = set()
     columns = 0
     for number, line in enumerate(read_text(path).split("\n"), start=1):
         fields = line.split()
@@ -307,14 +290,19 @@ def read_mlad_file(path: Path | str) -> list[RelativePose]:
             continue
         columns = columns or (2 if len(fields) == 2 else 9)
         try:
-            row = _row(fields, columns)
-            pair = (row.reference, row.query)
-            if pair in known:
-                raise DataError(f"pair {pair[0]} {pair[1]} is given twice")
+            if len(fields) != columns:
+                wanted = f"9 ({MLAD_COLUMNS})" if columns == 9 else "2, as in the rows before"
+                raise DataError(f"{len(fields)} columns instead of {wanted}")
+            reference, query = (parse_timestamp(field) for field in fields[:2])
+            whose, pose = f"pair {reference} {query}", None
+            if (reference, query) in pairs:
+                raise DataError(f"{whose} is given twice")
+            if columns == 9:
+                pose = parse_pose(fields[2:], "mlad", whose)
         except DataError as error:
             raise DataError(error.message, path=path, line=number) from error
-        known.add(pair)
-        rows.append(row)
+        pairs.add((reference, query))
+        rows.append(RelativePose(reference, query, pose))
     return rows
 
 
@@ -322,18 +310,6 @@ def parse_timestamp(text: str) -> int:
     if not _TIMESTAMP.fullmatch(text):
         raise DataError(f"{text!r} is not a timestamp (a whole number)")
     return int(text)
-
-
-def _row(fields: list[str], columns: int) -> RelativePose:
-    if len(fields) != columns:
-        wanted = "9 (" + MLAD_COLUMNS + ")" if columns == 9 else "2, as in the rows before"
-        raise DataError(f"{len(fields)} columns instead of {wanted}")
-    reference, query = (parse_timestamp(field) for field in fields[:2])
-    if columns == 2:
-        return RelativePose(reference, query)
-    tx, ty, tz, qx, qy, qz, qw = (parse_number(field) for field in fields[2:])
-    pose = checked_pose((qw, qx, qy, qz), (tx, ty, tz), f"pair {reference} {query}")
-    return RelativePose(reference, query, pose)
 
 
 # what can change a pose or a figure of the report
@@ -358,12 +334,12 @@ def installed_version(package: str) -> str | None:
 
 
 def package_versions() -> dict[str, str]:
-    found = ((package, installed_version(package)) for package in _PACKAGES)
-    return {package: version for package, version in found if version is not None}
+    versions = {package: installed_version(package) for package in _PACKAGES}
+    return {package: version for package, version in versions.items() if version is not None}
 
 
 def provenance_path(target: Path | str) -> Path:
-    """Path of the provenance: ``x.txt.json`` of a file ``x.txt``, ``x.json`` of a folder ``x``."""
+    """Return ``x.txt.json`` for a file ``x.txt`` and ``x.json`` for a folder ``x``."""
     path = Path(target)
     return path.with_name(f"{path.name}.json")
 
@@ -375,33 +351,25 @@ def write_provenance(
     counts: Mapping[str, int],
     files: Sequence[str] | None = None,
 ) -> Path:
-    """Write the provenance of a pose file that has been written; returns its path.
+    """Write the provenance of a pose file, or of the ``files`` of a folder, and return its path.
 
-    The JSON holds the SHA-256 of each file, so that they can be told to belong together, the
-    package versions, ``counts`` and the entries of ``provenance`` (options, preset, inputs). It
-    holds no date and no duration: the same run gives the same bytes.
-
-    Parameters
-    ----------
-    target : the pose file, or the folder of a challenge that takes several.
-    files : names of the pose files below the folder ``target``; None: it is a file.
+    The JSON has the SHA-256 of each file, package versions, ``counts`` and the entries of
+    ``provenance`` (options, preset, inputs), but no date: the same run gives the same bytes.
     """
     target = Path(target)
     paths = {target.name: target} if files is None else {name: target / name for name in files}
     ours: dict[str, Any] = {
-        "files": {
-            name: hashlib.sha256(read_content(path)).hexdigest()
-            for name, path in sorted(paths.items())
-        },
+        "files": {name: _sha256(path) for name, path in sorted(paths.items())},
         "versions": package_versions(),
         "counts": dict(counts),
     }
-    taken = sorted(ours.keys() & provenance.keys())
-    if taken:
-        raise ValueError(f"provenance entries are already ours: {', '.join(taken)}")
     path = provenance_path(target)
     write_json(path, ours | dict(provenance))
     return path
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(read_content(path)).hexdigest()
 
 
 class _Beside(BaseModel):
@@ -409,15 +377,15 @@ class _Beside(BaseModel):
     confidence: Any = None
 
 
-class _Scores(BaseModel):
-    confidence: dict[str, Annotated[float, Field(ge=0, le=1)]] = {}
+class _Confidences(BaseModel):
+    confidence: dict[str, Annotated[float, Field(ge=0, le=1)]]
 
 
 def read_confidences(target: Path | str) -> dict[str, float]:
-    """Image -> confidence of its pose, as the JSON beside a pose file has it under ``confidence``.
+    """Read image -> confidence from the JSON beside a pose file.
 
-    Empty where there is none, where the JSON is about something else, and, with a warning, where
-    it tells the SHA-256 of another pose file.
+    Empty, with a warning, if the JSON has the SHA-256 of another pose file; empty without
+    confidences.
     """
     target, path = Path(target), provenance_path(target)
     try:
@@ -426,8 +394,7 @@ def read_confidences(target: Path | str) -> dict[str, float]:
         return {}
     if beside.confidence is None:
         return {}
-    known = beside.files.get(target.name)
-    if known is not None and known != hashlib.sha256(read_content(target)).hexdigest():
+    if beside.files.get(target.name) not in (None, _sha256(target)):
         _log.warning("%s is of another pose file; its confidences are left out", path)
         return {}
-    return read_json_model(path, _Scores).confidence
+    return read_json_model(path, _Confidences).confidence

@@ -1,4 +1,4 @@
-"""Thresholds, conditions, names and frames that each benchmark is scored by."""
+"""Rules of the benchmarks: thresholds, conditions, names and frames."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ PROTOCOLS = {
 
 
 def protocol_of(name: str) -> Protocol:
-    """The protocol of a dataset; ``synthetic-X`` is scored like X, and its truth is known."""
+    """Return the protocol of a dataset; ``synthetic-X`` is scored like X with known truth."""
     if name in PROTOCOLS:
         return PROTOCOLS[name]
     layout = name.removeprefix(TWIN_PREFIX)
@@ -86,15 +86,10 @@ _DEFAULT_GROUP = ImageGroup()
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A benchmark's rules, from the workspace's side tables or from a dataset's name.
+    """The rules of a benchmark.
 
-    Attributes
-    ----------
-    protocol : thresholds, conditions and pools, and who knows the truth.
-    groups : image -> condition and whether it is scored.
-    world : between the local frame of the truth and the official one of pose files.
-    names : image -> its name in a pose file, in the order of the challenge's list.
-    pairs : what an MLAD challenge asks for.
+    ``world`` relates the local frame of the truth to the official frame of pose files; ``names`` is
+    the challenge's list, image -> name in a pose file; ``pairs`` are those of an MLAD challenge.
     """
 
     protocol: Protocol = Protocol()
@@ -107,30 +102,24 @@ class Benchmark:
         return thresholds_from_pairs(self.protocol.thresholds)
 
     def scored(self, images: Iterable[str]) -> set[str]:
-        """Those of ``images`` that the benchmark counts."""
         return {i for i in images if self.groups.get(i, _DEFAULT_GROUP).scored}
 
     def conditions(self, images: Iterable[str]) -> dict[str, str]:
-        """Image -> condition.
+        """Return image -> condition, from the groups of the side tables.
 
-        Where no side table has groups, a folder in the image's path that is called like a condition
-        of the protocol is its condition (``query/night/x.jpg``).
+        Without groups a folder that is named like a condition gives it (``query/night/x.jpg``).
         """
         if self.groups:
             return {i: self.groups[i].condition for i in images if i in self.groups}
         known = set(self.protocol.conditions)
-        found = {}
-        for image in images:
-            parts = [part for part in PurePosixPath(image).parts[:-1] if part in known]
-            if len(parts) == 1:
-                found[image] = parts[0]
-        return found
+        folders = {i: [f for f in PurePosixPath(i).parts[:-1] if f in known] for i in images}
+        return {image: names[0] for image, names in folders.items() if len(names) == 1}
 
 
 def benchmark_of(side_tables: Path | str | None = None, dataset: str | None = None) -> Benchmark:
-    """Benchmark of a workspace's ``megloc/`` folder, of a dataset by name, or the default.
+    """Return the benchmark of a workspace's ``megloc/`` folder, of a dataset, or the default.
 
-    A name takes the place of the workspace's protocol; groups and frame stay the workspace's.
+    A dataset replaces the protocol of the workspace, not its groups and frame.
     """
     named = None if dataset is None else protocol_of(dataset)
     if side_tables is None:

@@ -1,27 +1,24 @@
-"""One result against true poses: errors, outcomes, recall; and by MLAD's metric of pairs.
+"""Errors, outcomes and recall of one result, by absolute poses or by MLAD's pairs.
 
-The MLAD challenges hand out pairs of a reference and a query and score ``|t - t_true|`` of
-``query_from_reference``, without the rotation. That length mixes the error of the camera's centre
-with the error of its rotation times the distance of the two cameras, so the distance of the
-centres is reported beside it.
+The MLAD challenges score ``|t - t_true|`` of ``query_from_reference`` for pairs of images. That
+length mixes the error of the camera centre with the error of the rotation times the distance of the
+two cameras, so the error of the centre is reported too.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.confidence import Confidence, confidence_of
 from megloc_kapture.evaluation.metrics import (
-    DEFAULT_THRESHOLDS,
     PoseErrors,
     RecallRow,
     Threshold,
@@ -29,18 +26,17 @@ from megloc_kapture.evaluation.metrics import (
     recall_row,
     row_members,
 )
-from megloc_kapture.evaluation.results import Poses, ResultContext
+from megloc_kapture.evaluation.protocols import Benchmark
+from megloc_kapture.evaluation.results import Poses, Result, ResultContext
 from megloc_kapture.geometry.poses import compose, invert, stack_poses
-from megloc_kapture.io.dataset_tables import RelocalizationPair
+from megloc_kapture.io.dataset_tables import ImageGroup, RelocalizationPair
 from megloc_kapture.io.files import write_bytes
-from megloc_kapture.io.tables import Fallback, QueryStatus
+from megloc_kapture.io.tables import Fallback
 from megloc_kapture.refinement.acceptance import squared_distance
-from megloc_kapture.values import RigidTransform
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from megloc_kapture.evaluation.report.reports import AnyReported
     from megloc_kapture.evaluation.statistics import Comparison
 
 _CHI2_95 = 12.592  # quantile of six degrees of freedom
@@ -56,19 +52,10 @@ _COLUMNS = {
 
 @dataclass(frozen=True, slots=True)
 class QueryResult:
-    """The outcome of one query.
+    """Outcome of one query: ``localized``, ``fallback`` (the pose is a guess) or ``missing``.
 
-    Parameters
-    ----------
-    image, condition : the query and what it is reported under (``""``: nothing).
-    outcome : ``localized``, ``fallback`` (its pose is a guess) or ``missing`` (no pose).
-    reason : why it was not localized; empty for a localized query.
-    position_m, angle_deg : errors in metres and degrees, infinite without a pose; NaN where the
-        truth is not known.
-    num_matches, num_inliers : from the status table; None without one.
-    fallback : what kind of guess a fallback pose is.
-    candidates : map images the pose comes from, best first; from the status table.
-    confidence : probability that the pose is right, as the result says; None where it does not.
+    Errors are infinite without a pose and NaN without a true pose. ``reason`` is empty for a
+    localized query. Counts are None without a status table, ``confidence`` where it is not known.
     """
 
     image: str
@@ -84,32 +71,42 @@ class QueryResult:
     confidence: float | None = None
 
 
-class Reported(ABC):
+class Reported:
+    """Base of everything that has a report."""
+
     __slots__ = ()
 
-    @abstractmethod
+    if TYPE_CHECKING:
+
+        @property
+        def evaluations(self) -> tuple[Evaluation, ...]: ...
+
     def per_query(self) -> dict[str, list[Any]]:
-        """Column -> one value per query, as in ``per_query.csv``."""
+        """Return the columns of ``per_query.csv``, with one value per query."""
+        columns: dict[str, list[Any]] = {}
+        for evaluation in self.evaluations:
+            label = f"{evaluation.label}: " if self.evaluations[1:] else ""
+            for name, values in _query_columns(evaluation).items():
+                shared = name in ("image", "condition")
+                columns.setdefault(name if shared else label + name, values)
+        return columns
 
     def __str__(self) -> str:
         from megloc_kapture.evaluation.report.reports import report_text
 
-        # the three subclasses are what reports know
-        return report_text(cast("AnyReported", self)).removesuffix("\n")
+        return report_text(self).removesuffix("\n")
 
     def html(self, path: Path | str) -> None:
         from megloc_kapture.evaluation.report.reports import render_report
 
-        write_bytes(path, render_report(cast("AnyReported", self)).encode("utf-8"))
+        write_bytes(path, render_report(self).encode("utf-8"))
 
     def to_pandas(self) -> DataFrame:
-        """One row per query, by image, with the columns of ``per_query.csv``.
+        """Return the columns of ``per_query.csv``, indexed by image.
 
-        Errors are in metres and degrees, and infinite where a query has no pose: they lie beyond
-        every threshold, and raise a median instead of leaving it. Counts that may be unknown are
-        pandas' nullable integers.
+        Errors are in metres and degrees; those of queries without a pose are infinite.
         """
-        import pandas as pd  # only those who ask for it wait for it
+        import pandas as pd  # slow import
 
         columns = {
             name: pd.array(values, dtype="Int64") if "num_" in name else values
@@ -120,35 +117,28 @@ class Reported(ABC):
 
 @dataclass(frozen=True, slots=True)
 class CovarianceCheck:
+    """Number of poses with a covariance, and of errors within its 95 % region."""
+
     num_poses: int
     num_within: int
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Evaluation(Reported):
-    """Everything known about one result.
+    """One result; without true poses ``truth`` and ``thresholds`` are empty.
 
-    Parameters
+    Attributes
     ----------
-    label : what the result is called in tables.
-    thresholds : of the recall rows, in their order.
-    rows : recall per condition, pools, and ``"all"``, which is the last.
-    members : row name -> bool (N,), the queries it counts.
-    queries : every counted query, sorted by name.
-    errors : the same queries' errors as arrays.
-    truth, estimated : ``cam_from_world`` of the counted queries (estimated: those that have one).
-    without_truth : images that were estimated (or asked to be scored) but have no true pose;
-        sorted. They are reported, never counted.
-    not_scored : images with a true pose that the benchmark does not count; sorted.
-    truth_known_by : who knows the true poses that are not published; empty: said nowhere.
-    pairs : of MLAD's challenges, what a query is called in ``queries`` -> its pair; else empty.
-    covariance : how many poses come with a covariance, and of how many the error lies within the
-        region that it claims to hold 95 % of the errors; None where none has one.
-    nowhere : queries that show nothing of the map, sorted by name; they are right without a pose,
-        and stand in no row.
-    by_center : of MLAD's pairs, the same queries' evaluation by the distance of the camera centres;
-        None where that is the position error anyway.
-    alignment : how the poses were aligned with the truth, or that they could be.
+    rows : recall per condition, per pool, and of ``"all"``, which is the last.
+    members : row name -> mask (N,) of its queries.
+    queries, errors : N counted queries, sorted by name, and their errors.
+    truth, estimated : ``cam_from_world`` of counted queries.
+    without_truth, not_scored : images that are reported but not counted, sorted.
+    truth_known_by : owner of true poses that are not published.
+    pairs : name of a query -> its pair, for the MLAD challenges.
+    nowhere : queries that show nothing of the map; right without a pose, and in no row.
+    by_center : of MLAD's pairs, the evaluation by the distance of camera centres.
+    alignment : note on how the poses were, or could be, aligned with the truth.
     """
 
     label: str
@@ -170,12 +160,18 @@ class Evaluation(Reported):
     alignment: str = ""
 
     @property
+    def evaluations(self) -> tuple[Evaluation, ...]:
+        return (self,)
+
+    @property
     def confidence(self) -> Confidence | None:
         return confidence_of(self.queries, self.thresholds[-1], self.nowhere)
 
     def rows_above(self, min_confidence: float) -> tuple[RecallRow, ...]:
-        """The recall rows when each pose below a confidence counts as a miss; empty where no pose
-        has a confidence."""
+        """Return recall rows that count poses below a confidence as misses.
+
+        Empty if no pose has a confidence.
+        """
         if all(query.confidence is None for query in self.queries):
             return ()
         doubtful = [
@@ -185,23 +181,13 @@ class Evaluation(Reported):
         position_m = np.where(doubtful, np.inf, self.errors.position_m)
         angle_deg = np.where(doubtful, np.inf, self.errors.angle_deg)
         errors = PoseErrors(self.errors.names, position_m, angle_deg)
-        return _rows(self.queries, errors, self.thresholds, self.members)
+        return recall_rows(self.queries, errors, self.thresholds, self.members)
 
     def compare(self, *others: Evaluation) -> Comparison:
-        """Test the differences from results on the same queries, which need other labels; see
-        :func:`megloc_kapture.evaluation.statistics.compare`."""
+        """Test the differences from other results on the same queries."""
         from megloc_kapture.evaluation.statistics import compare
 
         return compare([self, *others])
-
-    def per_query(self) -> dict[str, list[Any]]:
-        """Column -> one value per query; of MLAD's pairs the position error is the translation's
-        relative to the reference."""
-        columns = query_columns(self.queries)
-        if self.by_center is not None:
-            columns["reference"] = [self.pairs[query.image].reference for query in self.queries]
-            columns["center_error_m"] = [query.position_m for query in self.by_center.queries]
-        return columns
 
     def row(self, name: str = "all") -> RecallRow:
         for row in self.rows:
@@ -213,103 +199,85 @@ class Evaluation(Reported):
         return self.pairs[query].query if query in self.pairs else query
 
 
-def query_columns(queries: Sequence[QueryResult]) -> dict[str, list[Any]]:
-    """Column -> one value per query, as tables of queries have them."""
-    shown = dict(_COLUMNS)
-    if all(query.confidence is None for query in queries):
-        del shown["confidence"]
-    return {name: [getattr(query, own) for query in queries] for name, own in shown.items()}
+def _query_columns(evaluation: Evaluation) -> dict[str, list[Any]]:
+    columns = {
+        name: [getattr(query, attribute) for query in evaluation.queries]
+        for name, attribute in _COLUMNS.items()
+        if evaluation.truth or "error" not in name
+    }
+    if all(confidence is None for confidence in columns["confidence"]):
+        del columns["confidence"]
+    if evaluation.by_center is not None:
+        pairs, centers = evaluation.pairs, evaluation.by_center.queries
+        columns["reference"] = [pairs[query.image].reference for query in evaluation.queries]
+        columns["center_error_m"] = [query.position_m for query in centers]
+    return columns
 
 
 def evaluate_poses(
-    estimated: Poses,
+    result: Result,
     truth: Poses,
+    benchmark: Benchmark = Benchmark(),  # noqa: B008
     *,
-    conditions: Mapping[str, str] | None = None,
-    thresholds: Sequence[Threshold] = DEFAULT_THRESHOLDS,
-    scored: Collection[str] | None = None,
-    statuses: Mapping[str, QueryStatus] | None = None,
-    condition_order: Sequence[str] = (),
-    pools: Mapping[str, Sequence[str]] | None = None,
-    label: str = "",
+    thresholds: Sequence[Threshold] | None = None,
     nowhere: Collection[str] = (),
-    confidences: Mapping[str, float] | None = None,
-    covariances: Mapping[str, NDArray[np.float64]] | None = None,
 ) -> Evaluation:
-    """Errors, recall and outcomes of ``estimated``.
+    """Return errors, outcomes and recall of a result.
 
-    The queries are the images of ``truth``, those of them that are in ``scored`` where it is
-    given. Every one of them stands in the denominator of recall, with or without a pose.
-
-    Parameters
-    ----------
-    estimated, truth : ``cam_from_world`` by image name, in one frame, metres.
-    conditions : image -> condition; images may be absent from it.
-    scored : the images the benchmark counts; None counts all of ``truth``.
-    statuses : rows of ``status.csv``: reasons, inliers, and which poses are fallbacks.
-    condition_order, pools : see :func:`megloc_kapture.evaluation.metrics.row_members`.
-    label : what to call this result.
-    nowhere : images that are known to show nothing of the map.
-    confidences : of poses, where ``statuses`` do not say them.
-    covariances : of poses, float64 (6, 6) as of ``Pose``.
+    Every image of ``truth`` that the benchmark scores counts in the denominator of recall, with or
+    without a pose. ``nowhere`` are images that show nothing of the map.
     """
-    if not thresholds:
-        raise OptionError("at least one recall threshold is needed")
-    counted = tuple(sorted(n for n in truth if scored is None or n in scored))
     if both := set(nowhere).intersection(truth):
-        raise DataError(f"{min(both)!r} is said to show nothing of the map, and has a true pose")
+        raise DataError(
+            f"{min(both)!r} has a true pose, but is listed as showing nothing of the map"
+        )
+    counted = tuple(sorted(benchmark.scored(truth)))
     if not counted:
         raise DataError("no query with a true pose to count: is this the right ground truth?")
-    wanted = set(estimated) if scored is None else set(estimated) | set(scored)
-    errors = pose_errors(estimated, truth, counted)
-
-    def result(name: str, position_m: float, angle_deg: float) -> QueryResult:
-        status = (statuses or {}).get(name)
-        return query_result(
-            name,
-            (conditions or {}).get(name, ""),
-            status,
-            has_pose=name in estimated,
-            errors=(position_m, angle_deg),
-            confidence=(confidences or {}).get(name),
+    thresholds = tuple(thresholds or benchmark.thresholds())
+    conditions = benchmark.conditions({*counted, *nowhere})
+    errors = pose_errors(result.poses, truth, counted)
+    queries = tuple(
+        query_result(result, name, conditions, (position_m, angle_deg))
+        for name, position_m, angle_deg in zip(
+            counted, errors.position_m.tolist(), errors.angle_deg.tolist(), strict=True
         )
-
-    found = zip(counted, errors.position_m.tolist(), errors.angle_deg.tolist(), strict=True)
-    queries = tuple(result(*one) for one in found)
-    members = row_members(
-        [query.condition for query in queries], order=condition_order, pools=pools
     )
+    members = row_members([query.condition for query in queries], benchmark.protocol)
+    estimated = {name: result.poses[name] for name in counted if name in result.poses}
     return Evaluation(
-        label=label,
-        thresholds=tuple(thresholds),
-        rows=_rows(queries, errors, thresholds, members),
+        label=result.label,
+        thresholds=thresholds,
+        rows=recall_rows(queries, errors, thresholds, members),
         members=members,
         queries=queries,
         errors=errors,
         truth={name: truth[name] for name in counted},
-        estimated={name: estimated[name] for name in counted if name in estimated},
-        covariance=_check_covariances(queries, estimated, truth, covariances or {}),
-        nowhere=tuple(result(name, np.inf, np.inf) for name in sorted(nowhere)),
-        without_truth=tuple(sorted(wanted - set(truth) - set(nowhere))),
-        not_scored=tuple(sorted(set(truth) - set(counted))),
+        estimated=estimated,
+        covariance=_check_covariances(queries, result, truth),
+        nowhere=tuple(
+            query_result(result, name, conditions, (np.inf, np.inf)) for name in sorted(nowhere)
+        ),
+        without_truth=tuple(sorted(result.poses.keys() - truth.keys() - set(nowhere))),
+        not_scored=tuple(sorted(truth.keys() - set(counted))),
+        truth_known_by=benchmark.protocol.truth,
+        context=result.context,
     )
 
 
 def _check_covariances(
-    queries: Sequence[QueryResult],
-    estimated: Poses,
-    truth: Poses,
-    covariances: Mapping[str, NDArray[np.float64]],
+    queries: Sequence[QueryResult], result: Result, truth: Poses
 ) -> CovarianceCheck | None:
+    covariances = result.covariances
     names = [q.image for q in queries if q.outcome == "localized" and q.image in covariances]
     within = sum(
-        squared_distance(truth[name], estimated[name], covariances[name]) <= _CHI2_95
+        squared_distance(truth[name], result.poses[name], covariances[name]) <= _CHI2_95
         for name in names
     )
     return CovarianceCheck(len(names), within) if names else None
 
 
-def _rows(
+def recall_rows(
     queries: Sequence[QueryResult],
     errors: PoseErrors,
     thresholds: Sequence[Threshold],
@@ -323,18 +291,15 @@ def _rows(
 
 
 def query_result(
-    image: str,
-    condition: str,
-    status: QueryStatus | None,
-    *,
-    has_pose: bool,
-    errors: tuple[float, float],
-    confidence: float | None = None,
+    result: Result, image: str, conditions: Mapping[str, str], errors: tuple[float, float]
 ) -> QueryResult:
-    """Return the outcome of a query; errors are in metres and degrees."""
+    """Return the outcome of a query with errors in metres and degrees."""
+    has_pose, condition = image in result.poses, conditions.get(image, "")
+    status = result.statuses.get(image)
     if status is None:
         outcome: Outcome = "localized" if has_pose else "missing"
         reason = "" if has_pose else "no pose in the result"
+        confidence = result.confidences.get(image)
         return QueryResult(image, condition, outcome, reason, *errors, confidence=confidence)
     outcome, reason = "missing", status.reason
     if has_pose and status.fallback == "none":
@@ -362,44 +327,31 @@ def relative_translation_errors(
     truth: tuple[NDArray[np.float64], NDArray[np.float64]],
     references: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """``|t - t_true|`` (N,) of ``query_from_reference``, in metres.
+    """Return ``|t - t_true|`` (N,) of ``query_from_reference``.
 
-    Parameters
-    ----------
-    estimated, truth, references : ``cam_from_world`` of the queries, and of the reference each is
-        paired with, in one frame: quaternions (N, 4), w first, and translations (N, 3).
+    Arguments are quaternions (N, 4) and translations (N, 3) of ``cam_from_world`` in one frame.
     """
     world_from_reference = invert(*references)
-    _, found = compose(*estimated, *world_from_reference)
-    _, true = compose(*truth, *world_from_reference)
-    return np.asarray(np.linalg.norm(found - true, axis=1), dtype=np.float64)
+    _, translations = compose(*estimated, *world_from_reference)
+    _, true_translations = compose(*truth, *world_from_reference)
+    return np.asarray(np.linalg.norm(translations - true_translations, axis=1), dtype=np.float64)
 
 
 def evaluate_pairs(
-    estimated: Mapping[RelocalizationPair, RigidTransform],
+    result: Result,
     truth: Poses,
-    pairs: Sequence[RelocalizationPair],
+    benchmark: Benchmark,
     references: Poses,
     *,
-    thresholds: Sequence[Threshold],
-    statuses: Mapping[str, QueryStatus] | None = None,
-    label: str = "",
+    thresholds: Sequence[Threshold] | None = None,
 ) -> Evaluation:
     """Evaluate by MLAD's metric: every pair counts once, and each file is a condition.
 
-    A pair is called by its query; where that stands in several, with reference and file as well.
-
-    Parameters
-    ----------
-    estimated : ``cam_from_world`` of a pair's query; pairs may be absent.
-    truth, references : ``cam_from_world`` of queries and references, in the same frame, metres.
-    statuses : rows of ``status.csv`` by image.
-
-    Returns
-    -------
-    The errors' position is the relative translation's; ``by_center`` has the distances of the
-    centres. Pairs whose query has no true pose are named in ``without_truth``.
+    A pair is named like its query; if that is in several pairs, with reference and file as well.
+    Poses are ``cam_from_world`` in one frame, in metres. Position errors are those of the relative
+    translation; ``by_center`` has the distances of the camera centres.
     """
+    pairs, estimated = benchmark.pairs, result.poses_of_pairs(benchmark.pairs)
     absent = next((pair for pair in pairs if pair.reference not in references), None)
     if absent is not None:
         raise DataError(f"reference {absent.reference!r} of {absent.file!r} has no pose in the map")
@@ -410,24 +362,28 @@ def evaluate_pairs(
     }
     if len(named) != len(pairs):
         raise DataError("a pair of reference and query is listed twice in one file")
-    called = _conditions(dict.fromkeys(pair.file for pair in pairs))
-    statuses = statuses or {}
-    of_pairs = {n: statuses[p.query] for n, p in named.items() if p.query in statuses}
+    called = _conditions({pair.file for pair in pairs})
+    conditions = tuple(filter(None, dict.fromkeys(called[pair.file] for pair in pairs)))
     by_center = evaluate_poses(
-        {n: estimated[p] for n, p in named.items() if p in estimated},
+        replace(
+            result,
+            poses={n: estimated[p] for n, p in named.items() if p in estimated},
+            statuses={
+                n: result.statuses[p.query] for n, p in named.items() if p.query in result.statuses
+            },
+        ),
         {n: truth[p.query] for n, p in named.items() if p.query in truth},
-        conditions={n: called[p.file] for n, p in named.items()} if len(called) > 1 else None,
-        thresholds=thresholds,
-        scored=named.keys(),
-        statuses=of_pairs,
-        condition_order=list(called.values()),
-        label=label,
+        Benchmark(
+            protocol=benchmark.protocol.model_copy(update={"conditions": conditions, "pools": {}}),
+            groups={n: ImageGroup(condition=called[p.file]) for n, p in named.items()},
+        ),
+        thresholds=thresholds or benchmark.thresholds(),
     )
     names = by_center.errors.names
-    found = by_center.errors.has_pose
-    posed = [name for name, has in zip(names, found, strict=True) if has]
+    has_pose = by_center.errors.has_pose
+    posed = [name for name, has in zip(names, has_pose, strict=True) if has]
     position_m = np.full(len(names), np.inf)
-    position_m[found] = relative_translation_errors(
+    position_m[has_pose] = relative_translation_errors(
         stack_poses(estimated[named[name]] for name in posed),
         stack_poses(truth[named[name].query] for name in posed),
         stack_poses(references[named[name].reference] for name in posed),
@@ -441,13 +397,16 @@ def evaluate_pairs(
         by_center,
         errors=errors,
         queries=queries,
-        rows=_rows(queries, errors, thresholds, by_center.members),
+        rows=recall_rows(queries, errors, by_center.thresholds, by_center.members),
+        without_truth=tuple(sorted(n for n, p in named.items() if p.query not in truth)),
         pairs={name: named[name] for name in names},
         by_center=by_center,
     )
 
 
-def _conditions(files: Iterable[str]) -> dict[str, str]:
+def _conditions(files: Collection[str]) -> dict[str, str]:
+    if len(files) == 1:
+        return dict.fromkeys(files, "")
     whole = {file: PurePosixPath(file).stem for file in files}
     short = {}
     for file, stem in whole.items():

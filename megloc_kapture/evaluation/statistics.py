@@ -5,34 +5,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.metrics import LEVEL, Threshold, within
-from megloc_kapture.evaluation.scoring import Evaluation, Reported, query_columns
+from megloc_kapture.evaluation.scoring import Evaluation, Reported
 
 SIGNIFICANCE = 0.05
 NUM_RESAMPLES, _CHUNK = 2000, 250
-# of four queries the interval holds the true difference in 88 % of cases, of six in 95 %
-# (400 simulated results each); the sign test needs six as well to call anything real
+# with four queries the interval covers the true difference in 88 % of simulations, with six in 95 %
 MIN_RESAMPLED = 6
 
 
 @dataclass(frozen=True, slots=True)
 class PairedTest:
-    """Two results at one threshold, over all queries.
+    """Exact McNemar test of two results, by position, at one threshold.
 
-    Parameters
-    ----------
-    first, second : positions of the two results in the comparison.
-    only_first, only_second : queries within the threshold in one of the results only; sorted.
-    both, neither : numbers of the other queries.
-    p_value : of the exact McNemar test, two-sided: how often chance alone, at equal methods,
-        splits the differing queries at least as unevenly.
-    p_adjusted : the same after Holm's correction for all tests of the comparison.
+    ``only_first`` and ``only_second`` are the queries within the threshold in one result only;
+    ``both`` and ``neither`` count the others. ``p_adjusted`` has Holm's correction for all tests of
+    the comparison.
     """
 
     first: int
@@ -52,14 +45,10 @@ class PairedTest:
 
 @dataclass(frozen=True, slots=True)
 class MedianDifference:
-    """Difference of the median position errors of two results.
+    """Median position errors of two results, by position; infinite if most queries have no pose.
 
-    Parameters
-    ----------
-    first, second : positions of the two results in the comparison.
-    first_m, second_m : the medians in metres, infinite where most queries have no pose.
-    low_m, high_m : 95 % interval of ``first_m - second_m``, from resampling the queries; NaN for
-        fewer than six queries.
+    ``low_m`` to ``high_m`` is the 95 % interval of ``first_m - second_m`` from resampling the
+    queries; NaN for fewer than six.
     """
 
     first: int
@@ -82,15 +71,6 @@ class Comparison(Reported):
     tests: tuple[PairedTest, ...]
     medians: tuple[MedianDifference, ...]
 
-    def per_query(self) -> dict[str, list[Any]]:
-        """Column -> one value per query; those of a result are called ``label: column``."""
-        columns: dict[str, list[Any]] = {}
-        for evaluation in self.evaluations:
-            for name, values in query_columns(evaluation.queries).items():
-                shared = name in ("image", "condition")
-                columns.setdefault(name if shared else f"{evaluation.label}: {name}", values)
-        return columns
-
 
 def compare(evaluations: Sequence[Evaluation]) -> Comparison:
     """Compare at least two results on the same queries, thresholds and conditions."""
@@ -102,11 +82,11 @@ def compare(evaluations: Sequence[Evaluation]) -> Comparison:
         for threshold in evaluations[0].thresholds:
             a, b = (within(evaluations[k].errors, threshold) for k in (i, j))
             tables.append((i, j, threshold, a, b))
-        pair = [evaluations[k].row().median_position_m for k in (i, j)]
-        low_m, high_m = difference_interval(resampled[i], resampled[j])
-        if len(names) < MIN_RESAMPLED:
-            low_m = high_m = float("nan")
-        medians.append(MedianDifference(i, j, pair[0], pair[1], low_m, high_m))
+        first_m, second_m = (evaluations[k].row().median_position_m for k in (i, j))
+        interval_m = float("nan"), float("nan")
+        if len(names) >= MIN_RESAMPLED:
+            interval_m = difference_interval(resampled[i], resampled[j])
+        medians.append(MedianDifference(i, j, first_m, second_m, *interval_m))
     p_values = [mcnemar(int((a & ~b).sum()), int((b & ~a).sum())) for *_, a, b in tables]
     tests = tuple(
         PairedTest(
@@ -135,19 +115,23 @@ def _check_comparable(evaluations: Sequence[Evaluation]) -> None:
     if len(set(labels)) != len(labels):
         raise OptionError(f"two results are called {max(labels, key=labels.count)!r}")
     for other in evaluations[1:]:
-        if other.thresholds != first.thresholds:
-            raise OptionError(f"{first.label} and {other.label} have different thresholds")
-        if other.errors.names != first.errors.names:
-            raise OptionError(f"{first.label} and {other.label} count different queries")
-        if [q.condition for q in other.queries] != [q.condition for q in first.queries]:
-            raise OptionError(f"{first.label} and {other.label} have different conditions")
+        for kind, ours, theirs in (
+            ("thresholds", first.thresholds, other.thresholds),
+            ("queries", first.errors.names, other.errors.names),
+            (
+                "conditions",
+                [query.condition for query in first.queries],
+                [query.condition for query in other.queries],
+            ),
+        ):
+            if ours != theirs:
+                raise OptionError(f"{first.label} and {other.label} have different {kind}")
 
 
 def mcnemar(only_first: int, only_second: int) -> float:
     """Two-sided p-value of the exact McNemar test.
 
-    Queries that both or neither find say nothing about a difference; of the others each falls to
-    either side with probability one half when the methods are equally good.
+    Among queries that only one method finds, either method is as likely if both are equally good.
     """
     from scipy.special import bdtr
 
@@ -156,7 +140,7 @@ def mcnemar(only_first: int, only_second: int) -> float:
 
 
 def holm(p_values: ArrayLike) -> NDArray[np.float64]:
-    """p-values (N,) adjusted by Holm: the chance of even one false alarm among N stays as said."""
+    """Adjust p-values (N,) by Holm's method for the chance of any false alarm among N tests."""
     p = np.asarray(p_values, dtype=np.float64)
     order = np.argsort(p, kind="stable")
     adjusted = np.empty_like(p)
@@ -166,16 +150,16 @@ def holm(p_values: ArrayLike) -> NDArray[np.float64]:
 
 
 def _resampled_medians(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Medians (2000,) of values (N,) drawn again with replacement; values may be infinite.
+    """Return medians (2000,) of resampled values (N,), which may be infinite.
 
-    The same N draws the same positions, so that results on the same queries stay paired.
+    The same N draws the same positions, so results on the same queries stay paired.
     """
     rng = np.random.default_rng(0)
-    size, medians = len(values), list[NDArray[np.float64]]()
+    medians = list[NDArray[np.float64]]()
     for _ in range(NUM_RESAMPLES // _CHUNK):
-        drawn = values[rng.integers(size, size=(_CHUNK, size))]
+        drawn = values[rng.integers(len(values), size=(_CHUNK, len(values)))]
         # twice as fast as np.median
-        middle = (size - 1) // 2, size // 2
+        middle = (len(values) - 1) // 2, len(values) // 2
         drawn.partition(middle, axis=1)
         medians.append(0.5 * (drawn[:, middle[0]] + drawn[:, middle[1]]))
     return np.concatenate(medians)
@@ -184,12 +168,12 @@ def _resampled_medians(values: NDArray[np.float64]) -> NDArray[np.float64]:
 def difference_interval(
     first: NDArray[np.float64], second: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """The middle 95 % of the differences of paired medians; that of infinities is zero."""
+    """Return the middle 95 % of the differences of paired medians; inf - inf counts as zero."""
     with np.errstate(invalid="ignore"):
-        apart = first - second
-    apart = np.where(np.isnan(apart), 0.0, apart)
-    # of the values themselves: to interpolate between infinities gives NaN
+        difference = first - second
+    difference[np.isnan(difference)] = 0.0
+    # interpolation between infinities would give NaN
     tail = (1.0 - LEVEL) / 2.0
-    low = np.quantile(apart, tail, method="lower")
-    high = np.quantile(apart, 1.0 - tail, method="higher")
+    low = np.quantile(difference, tail, method="lower")
+    high = np.quantile(difference, 1.0 - tail, method="higher")
     return float(low), float(high)

@@ -1,11 +1,23 @@
-"""A 3D view of a map, and of a result in it: one HTML file."""
+"""The 3D view of a map and of queries in it: one self-contained HTML page, drawn by WebGL2.
+
+Coordinates are float32 relative to an origin in full precision. A page that would be large shows a
+part of the data and says so.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+import base64
+import contextlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+from pydantic.alias_generators import to_camel
 
 from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.evaluation.evaluate import (
@@ -14,18 +26,83 @@ from megloc_kapture.evaluation.evaluate import (
     evaluate_results,
     results_without_truth,
 )
+from megloc_kapture.evaluation.report.map_view import top_view
+from megloc_kapture.evaluation.report.queries import (
+    ShownQuery,
+    StoredInliers,
+    frame_of_query,
+    legend,
+    query_facts,
+    shown_queries,
+    spread,
+)
+from megloc_kapture.evaluation.report.reports import plain, template
 from megloc_kapture.evaluation.results import Poses, ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation
-from megloc_kapture.evaluation.without_truth import ResultWithoutTruth
+from megloc_kapture.geometry.cameras import bearing_rays
+from megloc_kapture.geometry.poses import camera_centers, stack_poses
 from megloc_kapture.io.files import write_bytes
+from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.values import Camera
+from megloc_kapture.values import Camera, RigidTransform
 
-if TYPE_CHECKING:
-    pass
-
-# what a view has near its beginning
+MAX_POINTS, MAX_CAMERAS, MAX_QUERIES = 60_000, 4_000, 2_000
+# points of depth by stereo, and map images that they come from, 0.2 s each
+MAX_DENSE, _MAX_DENSE_IMAGES = 40_000, 40
+# inliers of all queries, and of one
+_MAX_INLIERS, _MAX_INLIERS_OF_ONE = 40_000, 300
+# reading the inliers of a query takes 20 ms or more
+_MAX_QUERIES_WITH_INLIERS = 300
+_MAX_FRAMES = 255
+_MAX_COLOR_IMAGES = 150
+_SEED = 0
+# tan(80 degrees): wider frusta hide everything
+_WIDEST = 5.7
+# quantiles of points and cameras that are seen first
+_SEEN_AT_FIRST = 0.02, 0.98
+# a view has this within its first bytes
 _OURS, _HEAD_BYTES = b'content="megloc view"', 1000
+_ANY_CAMERA = Camera.pinhole(4, 3, 4)  # for unknown intrinsics
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Content of a view.
+
+    Attributes
+    ----------
+    origin : float64 (3,), subtracted from all coordinates.
+    points, colors : (P, 3); the last ``num_dense`` are depth by stereo, the others the map's.
+    camera_frusta, frusta, true_frusta : float32 (N, 5, 3) of map cameras, estimates and truths: the
+        centre, then rays at depth 1 through the upper left, upper right, lower right and lower left
+        corner of the image; NaN without a pose.
+    queries : worst first.
+    inliers : float32 (K, 3), ``num_inliers`` of each query in turn.
+    radius : of the visible content around the origin.
+    frames : names of coordinate frames, shown one at a time; ``point_frames``, ``camera_frames``
+        and ``query_frames`` are indices into them.
+    notes : sentences on what is left out.
+    """
+
+    title: str
+    origin: NDArray[np.float64]
+    up: NDArray[np.float64]
+    points: NDArray[np.float32]
+    colors: NDArray[np.uint8]
+    num_dense: int
+    cameras: tuple[str, ...]
+    camera_frusta: NDArray[np.float32]
+    queries: tuple[ShownQuery, ...]
+    frusta: NDArray[np.float32]
+    true_frusta: NDArray[np.float32]
+    inliers: NDArray[np.float32]
+    num_inliers: tuple[int, ...]
+    radius: float
+    frames: tuple[str, ...]
+    point_frames: NDArray[np.uint8]
+    camera_frames: NDArray[np.uint8]
+    query_frames: NDArray[np.uint8]
+    notes: tuple[str, ...]
 
 
 def write_view(
@@ -37,36 +114,23 @@ def write_view(
     cameras: Mapping[str, Camera] | None = None,
     force: bool = False,
 ) -> str:
-    """Write a page that shows a map in 3D, and the queries of a result in it.
+    """Write a self-contained 3D page of a map and of the queries of a result.
 
-    The page holds everything itself and needs no network. Click or tap a query to fly to it.
-
-    Parameters
-    ----------
-    path : of the file; another view is overwritten, anything else only with ``force``.
-    mapping : kapture folder with points, or with the poses of images alone.
-    result, truth : as in :func:`megloc_kapture.evaluation.evaluate.evaluate`; queries are coloured
-        by their error where the truth is known, else by their confidence.
-    cameras : of the queries of a result in memory, where they are known.
-
-    Returns
-    -------
-    What is left out of the page, in words; empty where nothing is.
+    Another view at ``path`` is overwritten, other files only with ``force``. ``result`` and
+    ``truth`` are as in :func:`megloc_kapture.evaluation.evaluate.evaluate`: queries are coloured by
+    their error, or by their confidence without truth. Returns sentences on what is left out.
     """
-    from megloc_kapture.evaluation.report.queries import StoredInliers, shown_queries
-    from megloc_kapture.evaluation.report.scene import render_view, scene_of
-
     path = Path(path)
     _check_output(path, force=force)
     folder = mapping if isinstance(mapping, KaptureFolder) else KaptureFolder(mapping)
     title = folder.root.resolve().name
     context, queries = ResultContext(mapping=folder), []
     if result is not None:
-        found = _judged(result, truth, folder)
-        context, queries = found.context, shown_queries(found)
-        # those that were estimated with the poses come first
+        evaluation = _evaluate(result, truth, folder)
+        context, queries = evaluation.context, shown_queries(evaluation)
+        # cameras that were estimated with the poses come first
         context = replace(context, cameras={**(cameras or {}), **context.cameras})
-        title = found.label or title
+        title = evaluation.label or title
     elif truth is not None:
         raise OptionError("a truth needs a result to be compared with")
     scene = scene_of(title, StoredInliers(context), queries)
@@ -76,14 +140,14 @@ def write_view(
     return " ".join(scene.notes)
 
 
-def _judged(
+def _evaluate(
     result: Localized, truth: Path | str | Poses | None, folder: KaptureFolder
-) -> Evaluation | ResultWithoutTruth:
+) -> Evaluation:
     benchmark = benchmark_beside([truth, result])
     labels = [""] if isinstance(result, Mapping) else None
     if truth is None:
-        judged = results_without_truth([result], benchmark, mapping=folder.root, labels=labels)
-        return judged.results[0]
+        reported = results_without_truth([result], benchmark, mapping=folder.root, labels=labels)
+        return reported.evaluations[0]
     return evaluate_results([result], truth, benchmark, mapping=folder.root, labels=labels)[0]
 
 
@@ -92,10 +156,270 @@ def _check_output(path: Path, *, force: bool) -> None:
         raise OutputError(f"{path}: is a folder; give the name of a file, such as view.html")
     if force or not path.exists():
         return
-    try:
-        with open(path, "rb") as file:
-            ours = _OURS in file.read(_HEAD_BYTES)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
-    if not ours:
+    with open(path, "rb") as file:
+        is_view = _OURS in file.read(_HEAD_BYTES)
+    if not is_view:
         raise OutputError(f"{path}: exists and is no view; -f overwrites it")
+
+
+def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = ()) -> Scene | None:
+    """Return the scene of a map and of queries, worst first; None if no camera has a pose."""
+    context, notes = stored.context, list[str]()
+    rng = np.random.default_rng(_SEED)
+    mapping = context.mapping
+    map_poses = context.map_poses()
+    points = np.zeros((0, 6))
+    if mapping is not None and mapping.has_points():
+        points = mapping.points3d()
+    frame_of = {name: context.frames.get(name, "") for name in map_poses}
+    frames = sorted(set(frame_of.values()))[:_MAX_FRAMES] or [""]
+    point_frames = _point_frames(mapping, frame_of, frames, len(points))
+    kept = np.flatnonzero(np.isfinite(points[:, :3]).all(axis=1))
+    if len(kept) > MAX_POINTS:
+        notes.append(f"{MAX_POINTS} of the map's {len(kept)} points are drawn.")
+        kept = np.sort(rng.choice(kept, MAX_POINTS, replace=False))
+    points, point_frames = points[kept], point_frames[kept]
+    names = list(map_poses)
+    if len(names) > MAX_CAMERAS:
+        notes.append(f"{MAX_CAMERAS} of the map's {len(names)} cameras are drawn.")
+        names = [names[at] for at in spread(len(names), MAX_CAMERAS)]
+    if len(queries) > MAX_QUERIES:
+        notes.append(f"The worst {MAX_QUERIES} of {len(queries)} queries are drawn and listed.")
+        queries = queries[:MAX_QUERIES]
+    poses = [map_poses[name] for name in names]
+    true = [query.truth for query in queries if query.truth is not None]
+    spanning = poses + true or [q.estimated for q in queries if q.estimated is not None]
+    if not spanning:
+        return None
+    quats, translations = stack_poses(spanning)
+    centers = camera_centers(quats, translations)
+    view = top_view(quats, centers)
+    # separately, so that ten cameras count beside a thousand points
+    ends = [np.quantile(a, _SEEN_AT_FIRST, axis=0) for a in (centers, points[:, :3]) if len(a)]
+    low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
+    # few digits, so that JSON has exactly what was subtracted
+    origin = np.round((low + high) / 2, 3)
+    rays = _rays(context.queries, [query.image for query in queries], context.cameras)
+    with_inliers = min(max(len(queries), 1), _MAX_QUERIES_WITH_INLIERS)
+    most = min(_MAX_INLIERS // with_inliers, _MAX_INLIERS_OF_ONE)
+    if stored.known and len(queries) > _MAX_QUERIES_WITH_INLIERS:
+        notes.append(f"Inliers are drawn of the worst {_MAX_QUERIES_WITH_INLIERS} queries.")
+    inliers = [
+        stored.of(query)[1] if query.num_inliers else np.zeros((0, 3))
+        for query in queries[:_MAX_QUERIES_WITH_INLIERS]
+    ]
+    inliers += [np.zeros((0, 3))] * (len(queries) - len(inliers))
+    if any(len(xyz) > most for xyz in inliers):
+        notes.append(f"Of a query's inliers at most {most} are drawn.")
+    inliers = [xyz[spread(len(xyz), most)] for xyz in inliers]
+    up = np.cross(view.right, view.up)
+    colors = _colors(points, up, mapping, kept)
+    dense, dense_colors, dense_images = _dense_points(mapping, notes)
+    dense_frames = _positions([frame_of.get(image, "") for image in dense_images], frames)
+    return Scene(
+        title=title,
+        origin=origin,
+        up=up,
+        points=(np.concatenate([points[:, :3], dense]) - origin).astype(np.float32),
+        colors=np.concatenate([colors, dense_colors]),
+        num_dense=len(dense),
+        cameras=tuple(names),
+        camera_frusta=_frusta(poses, _rays(mapping, names, {}), origin),
+        queries=tuple(queries),
+        frusta=_frusta([query.estimated for query in queries], rays, origin),
+        true_frusta=_frusta([query.truth for query in queries], rays, origin),
+        inliers=(np.concatenate([np.zeros((0, 3)), *inliers]) - origin).astype(np.float32),
+        num_inliers=tuple(map(len, inliers)),
+        radius=max(float(np.linalg.norm(high - low)) / 2, 1e-3),
+        frames=tuple(frames),
+        point_frames=np.concatenate([point_frames, dense_frames]),
+        camera_frames=_positions([frame_of[name] for name in names], frames),
+        query_frames=_positions([frame_of_query(q, context.frames) for q in queries], frames),
+        notes=tuple(notes),
+    )
+
+
+def render_view(scene: Scene) -> str:
+    """Render the page; it is self-contained and deterministic."""
+    failed = [query for query in scene.queries if query.estimated is None]
+    arrays = {
+        to_camel(field.name): _encoded(value)
+        for field in fields(scene)
+        if isinstance(value := getattr(scene, field.name), np.ndarray)
+    }
+    data = {
+        **arrays,
+        "origin": scene.origin.tolist(),
+        "up": np.round(scene.up, 9).tolist(),
+        "radius": scene.radius,
+        "numDense": scene.num_dense,
+        "cameras": scene.cameras,
+        "queries": [
+            {
+                "name": query.name,
+                "condition": query.condition,
+                "facts": query_facts(query),
+                "color": query.color,
+                "meaning": query.meaning,
+                "error": query.position_m,
+                "confidence": query.confidence,
+                "inliers": query.num_inliers,
+                "drawn": drawn,
+            }
+            for query, drawn in zip(scene.queries, scene.num_inliers, strict=True)
+        ],
+        "frames": scene.frames,
+    }
+    return template("view.html").render(
+        title=scene.title,
+        data=_script_data(data),
+        legend=legend(scene.queries),
+        counts={
+            "points": len(scene.points) - scene.num_dense,
+            "dense": scene.num_dense,
+            "cameras": len(scene.cameras),
+            "queries": len(scene.queries),
+            "failed": len(failed),
+        },
+        frames=scene.frames,
+        has_truth=bool(np.isfinite(scene.true_frusta).any()),
+        notes=scene.notes,
+    )
+
+
+def corner_rays(camera: Camera) -> NDArray[np.float64]:
+    """Return rays (4, 3) at depth 1 through the corners of an image, clockwise from upper left.
+
+    Corners beyond 80 degrees or the range of the lens model are moved towards the middle.
+    """
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
+    middle = np.array([camera.width, camera.height]) / 2
+    for share in np.linspace(1.0, 0.1, 10):
+        rays = bearing_rays(camera, middle + share * (corners - middle))
+        if np.isfinite(rays).all() and np.abs(rays).max() < _WIDEST:
+            return rays
+    return bearing_rays(_ANY_CAMERA, np.array([[0.0, 0], [4, 0], [4, 3], [0, 3]]))
+
+
+def _rays(
+    folder: KaptureFolder | None, images: Sequence[str], cameras: Mapping[str, Camera]
+) -> NDArray[np.float64]:
+    rays_of: dict[Camera, NDArray[np.float64]] = {}
+    rays = []
+    for image in images:
+        camera = cameras.get(image, _ANY_CAMERA)
+        with contextlib.suppress(DataError):
+            if folder is not None and image not in cameras:
+                camera = folder.read().camera_of(image)
+        if camera not in rays_of:
+            rays_of[camera] = corner_rays(camera)
+        rays.append(rays_of[camera])
+    return np.array(rays).reshape(-1, 4, 3)
+
+
+def _frusta(
+    poses: Sequence[RigidTransform | None], rays: NDArray[np.float64], origin: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    frusta = np.full((len(poses), 5, 3), np.nan, np.float32)
+    for frustum, pose, of_camera in zip(frusta, poses, rays, strict=True):
+        if pose is not None:
+            frustum[0] = pose.center() - origin
+            frustum[1:] = of_camera @ pose.rotation_matrix()  # R^T x of rows
+    return frusta
+
+
+def _positions(frames: Sequence[str], known: Sequence[str]) -> NDArray[np.uint8]:
+    at = {name: position for position, name in enumerate(known)}
+    return np.array([at.get(name, 0) for name in frames], np.uint8)
+
+
+def _point_frames(
+    mapping: KaptureFolder | None, frame_of: Mapping[str, str], frames: Sequence[str], number: int
+) -> NDArray[np.uint8]:
+    of_point = np.zeros(number, np.uint8)
+    if mapping is not None and number and len(frames) > 1:
+        for seen in mapping.observations().values():
+            of_image = _positions([frame_of.get(name, "") for name in seen.image_names], frames)
+            of_point[seen.point_ids] = of_image[seen.image_ids]
+    return of_point
+
+
+def _dense_points(
+    mapping: KaptureFolder | None, notes: list[str]
+) -> tuple[NDArray[np.float64], NDArray[np.uint8], list[str]]:
+    from megloc_kapture.mvs.views import Agreement  # slow imports
+    from megloc_kapture.stages.stereo_depth import fused_cloud, stereo_images
+
+    nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), list[str]()
+    if mapping is None:
+        return nothing
+    images = stereo_images(mapping)
+    names = list(images)
+    if len(names) > _MAX_DENSE_IMAGES:
+        notes.append(f"Depth is shown of {_MAX_DENSE_IMAGES} of {len(names)} images.")
+        names = [names[at] for at in spread(len(names), _MAX_DENSE_IMAGES)]
+    # a view without depth is better than none
+    with contextlib.suppress(DataError):
+        chosen = {name: images[name] for name in names}
+        cloud = fused_cloud(mapping, chosen, Agreement(), max_points=8 * MAX_DENSE)
+        kept = spread(len(cloud.xyz), MAX_DENSE) if len(cloud.xyz) else np.zeros(0, np.int64)
+        colors = np.asarray(np.round(cloud.colours[kept]), np.uint8)
+        return cloud.xyz[kept], colors, [names[int(row)] for row in cloud.image_ids[kept]]
+    return nothing
+
+
+def _colors(
+    points: NDArray[np.float64],
+    up: NDArray[np.float64],
+    mapping: KaptureFolder | None,
+    rows: NDArray[np.int64],
+) -> NDArray[np.uint8]:
+    """Return colours (P, 3) of the map, of its images, or greys that grow lighter upwards.
+
+    ``rows`` are the indices of the points in the map.
+    """
+    if points[:, 3:].any():
+        return np.asarray(np.clip(np.round(points[:, 3:]), 0, 255), np.uint8)
+    heights = points[:, :3] @ up
+    low, high = np.quantile(heights, _SEEN_AT_FIRST) if len(heights) else (0.0, 1.0)
+    share = np.clip((heights - low) / max(high - low, 1e-9), 0, 1)[:, None]
+    dark, light = np.array([70, 96, 128]), np.array([226, 230, 222])
+    colors = np.asarray(np.round(dark + share * (light - dark)), np.uint8)
+    if mapping is not None and len(points):
+        position = np.full(int(rows.max()) + 1, -1)
+        position[rows] = np.arange(len(rows))
+        with contextlib.suppress(DataError):
+            _color_from_images(colors, position, mapping)
+    return colors
+
+
+def _color_from_images(
+    colors: NDArray[np.uint8], position: NDArray[np.int64], mapping: KaptureFolder
+) -> None:
+    for name, seen in mapping.observations().items():
+        keypoints = mapping.keypoints(name)
+        order = np.argsort(seen.image_ids, kind="stable")
+        ends = np.searchsorted(seen.image_ids[order], np.arange(len(seen.image_names) + 1))
+        for at in spread(len(seen.image_names), _MAX_COLOR_IMAGES).tolist():
+            rows = order[ends[at] : ends[at + 1]]
+            rows = rows[seen.point_ids[rows] < len(position)]
+            drawn = position[seen.point_ids[rows]]
+            rows, drawn = rows[drawn >= 0], drawn[drawn >= 0]
+            if not len(rows):
+                continue
+            image = seen.image_names[at]
+            pixels = read_image_rgb(mapping.image_path(image))
+            x, y = np.floor(keypoints.read(image)[seen.keypoint_ids[rows], :2]).astype(int).T
+            height, width = pixels.shape[:2]
+            colors[drawn] = pixels[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
+
+
+def _encoded(array: NDArray[Any]) -> str:
+    little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+    return base64.b64encode(little.tobytes()).decode("ascii")
+
+
+def _script_data(data: Mapping[str, Any]) -> Markup:
+    """Return JSON that is safe in a script element, whatever names it contains."""
+    text = json.dumps(plain(data), ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))

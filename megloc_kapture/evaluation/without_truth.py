@@ -1,10 +1,10 @@
-"""What is known of results whose true poses nobody publishes."""
+"""Evaluation of results without true poses: counts, inliers, and agreement of results."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations, compress
 from typing import Any
 
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.metrics import (
-    DEFAULT_THRESHOLDS,
     PoseErrors,
     RecallAt,
     Threshold,
@@ -21,49 +20,27 @@ from megloc_kapture.evaluation.metrics import (
     recall_row,
     row_members,
 )
-from megloc_kapture.evaluation.results import Poses, Result, ResultContext
-from megloc_kapture.evaluation.scoring import QueryResult, Reported, query_columns, query_result
+from megloc_kapture.evaluation.protocols import Benchmark
+from megloc_kapture.evaluation.results import Result
+from megloc_kapture.evaluation.scoring import (
+    Evaluation,
+    Reported,
+    query_result,
+    recall_rows,
+)
 
 CAUTION = "None of these figures is accuracy: results that share a mistake agree."
 
 
-@dataclass(frozen=True, slots=True)
-class RowWithoutTruth:
-    """One condition, pool or ``"all"`` of one result.
-
-    ``inliers_quartiles`` are 25, 50 and 75 % over the localized queries; None if unknown.
-    """
-
-    name: str
-    num_queries: int
-    num_localized: int
-    num_fallback: int
-    num_missing: int
-    inliers_quartiles: tuple[float, float, float] | None
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class ResultWithoutTruth:
-    """One result: rows, and queries whose errors are NaN."""
-
-    label: str
-    rows: tuple[RowWithoutTruth, ...]
-    queries: tuple[QueryResult, ...]
-    poses: Poses
-    context: ResultContext = field(default_factory=ResultContext)
+Quartiles = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class AgreementRow:
-    """Two results in one condition, pool or ``"all"``.
+    """Agreement of the results at positions ``first`` and ``second`` in one row of the table.
 
-    Parameters
-    ----------
-    first, second : positions of the results in the list.
-    num_both, num_only_first, num_only_second : queries with a pose in both or one of them.
-    within : per threshold the queries whose two poses differ by no more, as a share of all
-        queries, with its confidence interval.
-    median_m, median_deg : of the differences where both have a pose; infinite where none has.
+    ``within`` counts queries whose two poses differ by no more than a threshold, as a share of all
+    queries; the medians of the differences are over queries with a pose in both.
     """
 
     first: int
@@ -80,34 +57,21 @@ class AgreementRow:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class WithoutTruth(Reported):
-    """Results without truth.
+    """Results without true poses.
 
-    Parameters
-    ----------
-    statement : who knows the true poses.
-    thresholds : of the agreement between results.
-    agreement : per pair of results, per row; empty for one result.
-    apart : per pair of results the differences of their poses; infinite where one has none.
+    ``statement`` names the owner of the true poses; ``thresholds`` and ``agreement`` are for each
+    pair of results, as is ``apart``: the differences of their poses, infinite where one has none.
     """
 
     statement: str
     thresholds: tuple[Threshold, ...]
-    results: tuple[ResultWithoutTruth, ...]
+    evaluations: tuple[Evaluation, ...]
     agreement: tuple[AgreementRow, ...]
     apart: tuple[PoseErrors, ...]
 
     def per_query(self) -> dict[str, list[Any]]:
-        """Column -> one value per query; of several results they are called ``label: column``,
-        followed by the differences of their poses."""
-        columns: dict[str, list[Any]] = {}
-        for result in self.results:
-            before = f"{result.label}: " if self.results[1:] else ""
-            for name, values in query_columns(result.queries).items():
-                if name in ("image", "condition"):
-                    columns[name] = values
-                elif "error" not in name:
-                    columns[before + name] = values
-        labels = [result.label for result in self.results]
+        columns = Reported.per_query(self)
+        labels = [result.label for result in self.evaluations]
         for (first, second), apart in zip(combinations(labels, 2), self.apart, strict=True):
             columns[f"{first} to {second}: position_m"] = apart.position_m.tolist()
             columns[f"{first} to {second}: angle_deg"] = apart.angle_deg.tolist()
@@ -116,23 +80,15 @@ class WithoutTruth(Reported):
 
 def evaluate_without_truth(
     results: Sequence[Result],
+    benchmark: Benchmark = Benchmark(),  # noqa: B008
     *,
-    queries: Sequence[str] | None = None,
-    conditions: Mapping[str, str] | None = None,
-    thresholds: Sequence[Threshold] = DEFAULT_THRESHOLDS,
-    condition_order: Sequence[str] = (),
-    pools: Mapping[str, Sequence[str]] | None = None,
-    statement: str = "",
+    queries: Collection[str] | None = None,
+    thresholds: Sequence[Threshold] | None = None,
 ) -> WithoutTruth:
-    """Count localized queries and inliers, and compare results with each other, in one frame.
+    """Count localized queries, and compare results in one frame with each other.
 
-    Parameters
-    ----------
-    queries : every query that counts; by default all that any of the results is about.
-    conditions, condition_order, pools : as in
-        :func:`megloc_kapture.evaluation.scoring.evaluate_poses`.
-    thresholds : of the agreement between two results.
-    statement : who knows the true poses; empty: they were not given.
+    ``queries`` are by default all that any result names; ``thresholds`` limit the differences of
+    two results.
     """
     labels = [result.label for result in results]
     if not results or len(set(labels)) != len(labels):
@@ -140,10 +96,9 @@ def evaluate_without_truth(
     images = sorted({i for r in results for i in r.images} if queries is None else set(queries))
     if not images:
         raise DataError("no query: the results name no image")
-    of_image = conditions or {}
-    members = row_members(
-        [of_image.get(image, "") for image in images], order=condition_order, pools=pools
-    )
+    conditions = benchmark.conditions(images)
+    members = row_members([conditions.get(image, "") for image in images], benchmark.protocol)
+    thresholds = tuple(thresholds or benchmark.thresholds())
     agreement, apart = list[AgreementRow](), []
     for i, j in combinations(range(len(results)), 2):
         first, second = results[i].poses, results[j].poses
@@ -168,47 +123,46 @@ def evaluate_without_truth(
                 )
             )
     return WithoutTruth(
-        statement=statement or "No true poses were given.",
-        thresholds=tuple(thresholds),
-        results=tuple(_result(result, images, of_image, members) for result in results),
+        statement=benchmark.protocol.truth or "No true poses were given.",
+        thresholds=thresholds,
+        evaluations=tuple(_counted(result, images, conditions, members) for result in results),
         agreement=tuple(agreement),
         apart=tuple(apart),
     )
 
 
-def _result(
+def _counted(
     result: Result,
     images: Sequence[str],
     conditions: Mapping[str, str],
     members: Mapping[str, NDArray[np.bool_]],
-) -> ResultWithoutTruth:
-    queries = tuple(
-        query_result(
-            image,
-            conditions.get(image, ""),
-            (result.statuses or {}).get(image),
-            has_pose=image in result.poses,
-            errors=(math.nan, math.nan),
-            confidence=result.confidences.get(image),
-        )
-        for image in images
+) -> Evaluation:
+    queries = tuple(query_result(result, i, conditions, (math.nan, math.nan)) for i in images)
+    # rows count poses; without thresholds nothing depends on the errors
+    errors = pose_errors(result.poses, result.poses, images)
+    return Evaluation(
+        label=result.label,
+        thresholds=(),
+        rows=recall_rows(queries, errors, (), members),
+        members=members,
+        queries=queries,
+        errors=errors,
+        truth={},
+        estimated=result.poses,
+        without_truth=(),
+        not_scored=(),
+        context=result.context,
     )
-    rows = tuple(_row(name, list(compress(queries, chosen))) for name, chosen in members.items())
-    return ResultWithoutTruth(result.label, rows, queries, result.poses, result.context)
 
 
-def _row(name: str, queries: Sequence[QueryResult]) -> RowWithoutTruth:
-    localized = [query for query in queries if query.outcome == "localized"]
-    inliers = [query.num_inliers for query in localized if query.num_inliers is not None]
-    quartiles = None
-    if inliers:
-        low, middle, high = np.quantile(inliers, (0.25, 0.5, 0.75)).tolist()
-        quartiles = (low, middle, high)
-    return RowWithoutTruth(
-        name=name,
-        num_queries=len(queries),
-        num_localized=len(localized),
-        num_fallback=sum(query.outcome == "fallback" for query in queries),
-        num_missing=sum(query.outcome == "missing" for query in queries),
-        inliers_quartiles=quartiles,
-    )
+def inliers_quartiles(evaluation: Evaluation, row: str) -> Quartiles | None:
+    """Return 25, 50 and 75 % of the inliers of localized queries; None if unknown."""
+    inliers = [
+        query.num_inliers
+        for query in compress(evaluation.queries, evaluation.members[row])
+        if query.outcome == "localized" and query.num_inliers is not None
+    ]
+    if not inliers:
+        return None
+    low, middle, high = np.quantile(inliers, (0.25, 0.5, 0.75)).tolist()
+    return low, middle, high

@@ -94,11 +94,7 @@ class Aliked(LocalNetwork[AlikedOptions]):
 
 
 class AlikedNet(nn.Module):
-    """Network from image to score map and features; the keys are those of ``aliked-*.pth``.
-
-    ``channels``: of the four blocks; the last is the descriptor size; ``positions``: number of
-    sampling positions of a descriptor.
-    """
+    """Network from image to score map and features; the keys are those of ``aliked-*.pth``."""
 
     def __init__(self, channels: tuple[int, int, int, int], positions: int) -> None:
         super().__init__()
@@ -143,7 +139,9 @@ class AlikedNet(nn.Module):
         for k in range(len(images)):
             own = [level[k : k + 1] for level in coarse]
             fine = _level(level1[k : k + 1])
-            scores = torch.sigmoid(self._score_logits(fine, own)[0, 0].float())
+            # half precision would tie scores, and ties make duplicate keypoints
+            with torch.autocast(images.device.type, enabled=False):
+                scores = torch.sigmoid(self._score_logits(fine, own)[0, 0])
             scores = scores[top : top + height, left : left + width]
             found.append(AlikedMaps(self, scores, (top, left), fine, [_level(one) for one in own]))
         return found
@@ -155,18 +153,20 @@ class AlikedNet(nn.Module):
         )
         sums: torch.Tensor | None = None
         for level, weight in zip(coarse, others, strict=True):
-            reduced = (level.permute(0, 2, 3, 1) @ weight).permute(0, 3, 1, 2)
+            reduced = (level.float().permute(0, 2, 3, 1) @ weight).permute(0, 3, 1, 2)
             enlarged = functional.interpolate(
-                reduced.float(), fine.size, mode="bilinear", align_corners=True
+                reduced, fine.size, mode="bilinear", align_corners=True
             )
             sums = enlarged if sums is None else sums.add_(enlarged)
         assert sums is not None
         by_pixel = sums.permute(0, 2, 3, 1).reshape(len(fine.table), -1)
-        at_once = _STRIP_ROWS * fine.size[1]
+        # strips stay in a processor's cache; a GPU would only launch more kernels
+        rows = _STRIP_ROWS if by_pixel.device.type == "cpu" else fine.size[0]
+        at_once = rows * fine.size[1]
         for strip, into in zip(
             torch.split(fine.table, at_once), torch.split(by_pixel, at_once), strict=True
         ):
-            into += self.fine_tap(strip) @ first
+            into += self.fine_tap(strip.float()) @ first
         return self.score_head[1:](by_pixel.view(1, *fine.size, -1).permute(0, 3, 1, 2))
 
     def fine_tap(self, level1: torch.Tensor) -> torch.Tensor:

@@ -257,16 +257,10 @@ def aslfeat_from(tensors: Mapping[str, torch.Tensor], where: str) -> AslFeatNet:
 
 
 def peakiness(features: torch.Tensor, dilation: int, scale: torch.Tensor) -> torch.Tensor:
-    """Return the peakiness of each pixel in space and among channels (eq. 6 to 8), (H, W).
+    """Return the peakiness (H, W) of features (C, H, W) in space and among channels (eq. 6 to 8).
 
     max over channels of softplus(y - its mean over a 3x3 neighbourhood) times softplus(y - its mean
-    over the channels), where y = features / scale. At least float32.
-
-    Parameters
-    ----------
-    features : (C, H, W), both sides longer than the dilation; fastest in channels-last memory.
-    dilation : distance of the neighbours in pixels; the map is reflected at its border.
-    scale : ().
+    over the channels), where y = features / scale. The map is reflected at its border.
     """
     channels, height, width = features.shape
     pixels = features.permute(1, 2, 0)

@@ -59,9 +59,8 @@ def max_megapixels_of(extractor: object) -> float:
 def extract_bounded(extractor: Any, frames: Sequence[Frame]) -> list[LocalFeatures]:
     """Extract from images of one size, reduced to the extractor's limit.
 
-    x and y of the keypoints are pixels of the given images; other columns, as a scale, are of the
-    reduced ones. A pixel of a reduced mask is usable if all that it covers is. For several images
-    the extractor needs ``extract_many``.
+    Keypoints are in pixels of the given images. A pixel of a reduced mask is usable if all that it
+    covers is. For several images the extractor needs ``extract_many``.
     """
     bound = max_megapixels_of(extractor)
     small = [_reduced(*frame, bound) for frame in frames]

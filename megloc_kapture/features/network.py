@@ -75,10 +75,6 @@ class LocalNetwork(Checkpointed[LocalOptions], ABC):
 def in_image_px(
     xy: NDArray[Any], size: Sequence[int], image_size: Sequence[int]
 ) -> NDArray[np.float32]:
-    """Convert positions (N, 2) of a map, first centre (0, 0), to pixels of the whole image.
-
-    Its first centre is (0.5, 0.5), as COLMAP's, so that coordinates scale with the size (height,
-    width).
-    """
+    """Convert positions (N, 2) of a map, first centre (0, 0), to pixels of the whole image."""
     ratio = np.array([image_size[1] / size[1], image_size[0] / size[0]])
     return ((xy + 0.5) * ratio).astype(np.float32)

@@ -157,9 +157,8 @@ def load_r2d2(tensors: Mapping[str, torch.Tensor], where: str) -> R2D2Network:
 def pyramid_levels(image: torch.Tensor, *, min_size: int, max_size: int) -> Iterator[torch.Tensor]:
     """Yield an image at scales 1, 2^-1/4, 2^-1/2 and so on, each resized from the last.
 
-    R2D2's pyramid (Revaud et al., 2019, section 4); levels share the origin at the image's corner.
-    ``image``: float (B, C, H, W); ``min_size`` and ``max_size``: limits of the longer side in
-    pixels. An image smaller than ``min_size`` is the only level.
+    R2D2's pyramid (Revaud et al., 2019, section 4), with limits of the longer side. An image
+    smaller than ``min_size`` is the only level.
     """
     height, width = image.shape[-2:]
     longer = max(height, width)

@@ -120,11 +120,7 @@ def gray_tensor(image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
 
 
 class SuperPointNet(nn.Module):
-    """Network from gray image to scores per pixel and descriptors per cell of 8 x 8 pixels.
-
-    ``detector`` and ``descriptor`` select the heads; ``official_sampling`` see
-    :func:`sample_descriptors`.
-    """
+    """Network from gray image to scores per pixel and descriptors per cell of 8 x 8 pixels."""
 
     official_sampling: DescriptorSampling = "official"
 
@@ -160,22 +156,20 @@ class SuperPointNet(nn.Module):
         return torch.cat(strips, dim=2)
 
     def detect(self, features: torch.Tensor) -> torch.Tensor:
-        """Return scores (B, 8h, 8w) in (0, 1), before non-maximum suppression."""
         return pixel_scores(self.convPb(functional.relu_(self.convPa(features))))
 
     def describe(self, features: torch.Tensor) -> torch.Tensor:
-        """Return descriptors (B, 256, h, w) of unit length."""
         return functional.normalize(self.convDb(functional.relu_(self.convDa(features))), dim=1)
 
     def forward(self, gray: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return scores (B, 8h, 8w) and descriptors (B, 256, h, w) of gray images (B, 1, H, W)."""
+        """Return scores (B, 8h, 8w) and unit descriptors (B, 256, h, w) of gray images (B, 1, H,
+        W).
+        """
         features = self.encode(gray)
         return self.detect(features), self.describe(features)
 
 
 class SplitSuperPoint(nn.Module):
-    """Separate detector and descriptor networks (MegLoc, section "local features")."""
-
     official_sampling: DescriptorSampling = "official"
 
     def __init__(self, detector: SuperPointNet, descriptor: SuperPointNet) -> None:
@@ -219,9 +213,7 @@ def superpoint_with_descriptor(
 ) -> SuperPointNet | SplitSuperPoint:
     """Combine the detector of one checkpoint with the descriptors of another.
 
-    ``detector``: an official checkpoint, whose descriptor head is ignored; ``descriptor``: a
-    descriptor head alone, which uses the detector's features, or with a separate backbone; its
-    detector head is ignored.
+    A descriptor head without backbone uses the detector's features.
     """
     head = {key: value for key, value in descriptor.items() if not key.startswith("convP")}
     frozen = {key: value for key, value in detector.items() if not key.startswith("convD")}
@@ -241,15 +233,11 @@ def superpoint_with_descriptor(
 def sample_descriptors(
     descriptors: torch.Tensor, xy: torch.Tensor, sampling: DescriptorSampling
 ) -> torch.Tensor:
-    """Sample descriptors float32 (N, D) at pixels, bilinear between cells, unit length.
+    """Sample descriptors (D, h, w) at pixels xy (N, 2), whose first centre is (0, 0), bilinearly.
 
-    Parameters
-    ----------
-    descriptors : float32 (D, h, w), of unit length.
-    xy : (N, 2), pixels; the first pixel's centre is (0, 0).
-    sampling : ``exact`` puts the centre of cell (i, j) at pixel (8 i + 3.5, 8 j + 3.5).
-        ``official`` has a scale too small by (w - 1) / (w - 9/16), which drifts to 3.5 pixels at
-        the bottom right; SuperGlue was trained with it.
+    ``exact`` puts the centre of cell (i, j) at pixel (8 i + 3.5, 8 j + 3.5). ``official`` has a
+    scale too small by (w - 1) / (w - 9/16), which drifts to 3.5 pixels at the bottom right;
+    SuperGlue was trained with it.
     """
     size, height, width = descriptors.shape
     if len(xy) == 0:

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,6 @@ from pydantic import Field
 from megloc_kapture.errors import DataError
 from megloc_kapture.values import Options
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 Float32 = NDArray[np.float32]
 
 _CHUNK = 16384  # descriptors per block: bounds memory at 16384 x clusters floats
@@ -69,12 +67,7 @@ class VladOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class PcaWhitening:
-    """PCA whitening of global descriptors: ``y = projection (x - mean)``, then unit length.
-
-    Jegou and Chum, "Negative evidences and co-occurrences in image retrieval", ECCV 2012: whitening
-    compensates for co-occurrences and for redundant vocabularies. ``mean`` is float32 (D,),
-    ``projection`` float32 (d, D), rows of scaled principal components, the strongest first.
-    """
+    """``y = projection (x - mean)``, then unit length (Jegou and Chum, ECCV 2012)."""
 
     mean: Float32
     projection: Float32
@@ -91,10 +84,8 @@ class PcaWhitening:
 def learn_whitening(vectors: Float32, dimensions: int, power: float = 1.0) -> PcaWhitening:
     """Learn whitening from vectors (N, D), float32, which are overwritten.
 
-    With fewer images than dimensions the last components are noise, and full whitening would make
-    all vectors equally dissimilar. So the deviations are raised to ``power`` below one (Revaud et
-    al., ICCV 2019: the variance to the power 0.25, which is 0.5 here). The rank, less than N,
-    limits the number of dimensions.
+    With few images the last components are noise, so deviations are raised to ``power`` below one
+    (Revaud et al., ICCV 2019). The rank, less than N, limits the number of dimensions.
     """
     mean = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)
     vectors -= mean
@@ -137,10 +128,8 @@ class Vocabulary:
         return self.centres.size if self.whitening is None else len(self.whitening.projection)
 
 
-class Each(Protocol):
-    def __call__(
-        self, function: Callable[[Item], Result], items: Iterable[Item], /
-    ) -> Iterable[Result]: ...
+Each = Callable[[Callable[[str], Float32], Iterable[str]], Iterable[Float32]]
+"""A parallel map."""
 
 
 def train_vlad(
@@ -153,11 +142,7 @@ def train_vlad(
 ) -> Vocabulary:
     """Train vocabularies, and optionally their whitening, on the images of a map.
 
-    Parameters
-    ----------
-    length, read : functions for the number of an image's descriptors, and for the descriptors (N,
-        D).
-    each : parallel map for the vectors that whitening is learnt from.
+    ``length`` and ``read`` return an image's number of descriptors and its descriptors (N, D).
     """
     options = options or VladOptions()
     rows = sample_rows(map(length, images), options.training_descriptors, options.seed)
@@ -280,11 +265,7 @@ def sample_rows(counts: Iterable[int], total: int, seed: int) -> list[NDArray[np
 def aggregate(
     descriptors: NDArray[Any], vocabulary: Vocabulary, options: VladOptions | None = None
 ) -> Float32:
-    """Compute the VLAD of descriptors (N, D): float32 (``vocabulary.size``,), unit length.
-
-    Without whitening the order is vocabulary, cluster, dimension. An image without descriptors gets
-    the zero vector.
-    """
+    """Compute the VLAD of descriptors (N, D): float32, unit length; zero without descriptors."""
     options = options or VladOptions()
     data = np.ascontiguousarray(descriptors, dtype=np.float32)
     if len(data) and data.shape[1] != vocabulary.centres.shape[2]:

@@ -74,12 +74,6 @@ def with_distortion(camera: Camera, radial: float) -> Camera:
     return replace(camera, params=(*camera.params[:k], radial, *camera.params[k + 1 :]))
 
 
-def swap_principal_point(camera: Camera) -> Camera:
-    k = _principal_point_index(camera)
-    cx, cy = camera.params[k : k + 2]
-    return replace(camera, params=(*camera.params[:k], cy, cx, *camera.params[k + 2 :]))
-
-
 def with_two_focals(camera: Camera) -> Camera:
     """Return the same camera in a model with two focal lengths."""
     if camera.model not in ONE_FOCAL_MODELS:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import named, read_text
+from megloc_kapture.io.files import check_relative, named, read_text
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera
 
 _ROW = re.compile(
@@ -45,6 +45,14 @@ class CameraList:
 
 def read_cameras(path: Path) -> Camera | CameraList:
     """Read a list; a single row with a number as its name (COLMAP's id) applies to all images."""
+    cameras = read_camera_rows(path)
+    if len(cameras) == 1 and next(iter(cameras)).isdigit():
+        return next(iter(cameras.values()))
+    return CameraList(cameras)
+
+
+def read_camera_rows(path: Path) -> dict[str, Camera]:
+    """Read the cameras of a list by image name, in file order."""
     cameras: dict[str, Camera] = {}
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -52,22 +60,24 @@ def read_cameras(path: Path) -> Camera | CameraList:
         with named(path, number):
             row = _ROW.fullmatch(line.strip())
             if row is None:
-                raise DataError("not a row of a list of cameras: NAME MODEL WIDTH HEIGHT PARAMS...")
-            if row["name"] in cameras:
-                raise DataError(f"{row['name']!r} is listed twice")
-            cameras[row["name"]] = _camera(row["model"], re.split(r"[\s,]+", row["numbers"]))
+                raise DataError(
+                    "expected a row NAME MODEL WIDTH HEIGHT PARAMS..., MODEL one of "
+                    f"{', '.join(CAMERA_MODEL_NUM_PARAMS)}"
+                )
+            name = check_relative(row["name"])
+            if name in cameras:
+                raise DataError(f"{name!r} is listed twice")
+            cameras[name] = _camera(row["model"], re.split(r"[\s,]+", row["numbers"]))
     if not cameras:
         raise DataError("no camera in this list", path=path)
-    if len(cameras) == 1 and next(iter(cameras)).isdigit():
-        return next(iter(cameras.values()))
-    return CameraList(cameras)
+    return cameras
 
 
 def _camera(model: str, fields: list[str]) -> Camera:
     try:
         width, height, *params = map(float, fields)
     except ValueError as error:
-        raise DataError(f"width, height and parameters are numbers, got {fields}") from error
+        raise DataError(f"width, height and parameters must be numbers, got {fields}") from error
     if not (width.is_integer() and height.is_integer()):
         raise DataError(f"image size {width:g}x{height:g} is not in whole pixels")
     return Camera(model, int(width), int(height), tuple(params))

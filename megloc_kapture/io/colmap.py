@@ -196,12 +196,8 @@ def triangulate(
     if not images:
         return TriangulatedPoints(np.zeros((0, 3)), np.zeros(0), empty, empty, empty)
     for (i, j), pairs in matches.items():
-        if i == j or (j, i) in matches:
-            raise DataError(
-                f"images {images[i].name} and {images[j].name} are matched twice or are the same"
-            )
         both = np.array([len(images[i].keypoints_px), len(images[j].keypoints_px)])
-        if len(pairs) and ((np.asarray(pairs) >= both).any() or (np.asarray(pairs) < 0).any()):
+        if (np.asarray(pairs).reshape(-1, 2) >= both).any():
             raise DataError(
                 f"matches between {images[i].name} and {images[j].name} refer to keypoints "
                 f"that the images do not have ({both[0]} and {both[1]})"
@@ -390,27 +386,6 @@ def write_model(
         model.write(str(output))
     except (OSError, RuntimeError, ValueError) as error:
         raise OutputError(f"{output}: COLMAP cannot write its model: {error}") from error
-
-
-def read_model_poses(model: Path) -> dict[str, RigidTransform]:
-    """Read ``cam_from_world`` by image name from a binary model; its points may be missing."""
-    with tempfile.TemporaryDirectory(prefix=f".{owned_name()}") as folder:
-        for file in model.glob("*.bin"):
-            if file.name != "points3D.bin":
-                (Path(folder) / file.name).symlink_to(file.resolve())
-        (Path(folder) / "points3D.bin").write_bytes(bytes(8))  # no points
-        try:
-            images = load_pycolmap().Reconstruction(folder).images.values()
-        except (OSError, RuntimeError, ValueError, IndexError) as error:
-            raise DataError(f"COLMAP cannot read the model: {error}", path=model) from error
-    poses = {}
-    for image in images:
-        if image.has_pose:
-            pose = image.cam_from_world()
-            x, y, z, w = pose.rotation.quat.tolist()
-            tx, ty, tz = pose.translation.tolist()
-            poses[image.name] = RigidTransform((w, x, y, z), (tx, ty, tz))
-    return poses
 
 
 def undistort_model(model: Path, images: Path, output: Path) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -21,11 +21,10 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from megloc_kapture.errors import DataError, OutputError
+from megloc_kapture.errors import DataError
 from megloc_kapture.io.colmap import (
     NEVER,
     MapImage,
-    colmap_camera,
     database_folder,
     load_pycolmap,
     numbered_cameras,
@@ -75,42 +74,6 @@ def extract_sift(
     rows = [(k.x, k.y, k.compute_scale(), k.compute_orientation()) for k in found]
     keypoints = np.array(rows, dtype=np.float32).reshape(-1, 4)
     return keypoints, np.array(descriptors.data, dtype=np.uint8).reshape(-1, 128)
-
-
-@dataclass(frozen=True, eq=False)
-class DatabaseFeatures:
-    """An image of a COLMAP database: keypoints float32 (N, 2 or 4), descriptors uint8 (N, 128)."""
-
-    name: str
-    camera: Camera
-    keypoints_px: NDArray[np.float32]
-    descriptors: NDArray[np.uint8]
-
-
-def write_feature_database(path: Path, images: Iterable[DatabaseFeatures]) -> None:
-    """Write a COLMAP database of images with SIFT features; equal cameras are shared."""
-    pycolmap = load_pycolmap()
-    path = Path(path)
-    if path.exists():
-        raise OutputError(f"{path}: is there already")
-    camera_ids: dict[Camera, int] = {}
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        database = pycolmap.Database.open(str(path))
-        with pycolmap.DatabaseTransaction(database):
-            for image in images:
-                if image.camera not in camera_ids:
-                    camera = colmap_camera(image.camera)
-                    camera_ids[image.camera] = database.write_camera(camera)
-                entry = pycolmap.Image(name=image.name, camera_id=camera_ids[image.camera])
-                image_id = database.write_image(entry)
-                database.write_keypoints(image_id, np.ascontiguousarray(image.keypoints_px))
-                kind = pycolmap.FeatureExtractorType.SIFT
-                rows = pycolmap.FeatureDescriptors(kind, np.ascontiguousarray(image.descriptors))
-                database.write_descriptors(image_id, rows)
-        database.close()
-    except (OSError, RuntimeError) as error:
-        raise OutputError(f"{path}: cannot be written: {error}") from error
 
 
 # ----------------------------------------------------------------------------------- mappers
@@ -275,12 +238,12 @@ def _other_cameras(reconstruction: Any, doubtful: Collection[str]) -> dict[str, 
     after = _errors_px(apart)
     found: dict[str, str] = {}
     for camera_id in sorted(camera_id for camera_id, number in sharing.items() if number > 1):
-        own = [image for image in images if image.camera_id == camera_id]
-        focal = np.array([apart.cameras[image.image_id].mean_focal_length() for image in own])
+        members = [image for image in images if image.camera_id == camera_id]
+        focal = np.array([apart.cameras[image.image_id].mean_focal_length() for image in members])
         zooms = np.log(focal / np.median(focal)).tolist()
         others = sorted(
             (zoom, image.name)
-            for zoom, image in zip(zooms, own, strict=True)
+            for zoom, image in zip(zooms, members, strict=True)
             if abs(zoom) > _OTHER_ZOOM
             and image.name in doubtful
             and after[image.image_id] < _SMALLER_ERROR * before[image.image_id]
@@ -361,7 +324,7 @@ def _why_none(seen: Sequence[tuple[Any, float]]) -> str:
             "how far anything is; walk sideways between photographs"
         )
     return (
-        f"{len(seen)} pairs of photographs match, but no {MIN_IMAGES} of them hang together; take "
+        f"{len(seen)} pairs of photographs match, but no {MIN_IMAGES} of them are connected; take "
         "more, with more overlap and from more places"
     )
 

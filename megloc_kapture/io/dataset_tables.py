@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, FiniteFloat, field_validator
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import Column, ImageName, Table, flag
@@ -72,7 +72,7 @@ class SimilarityTransform(Options):
     """``x_a = scale * R x_b + t`` for a transform named ``a_from_b``."""
 
     quat_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    translation: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.0, 0.0, 0.0)
     scale: float = Field(default=1.0, gt=0.0, allow_inf_nan=False)
 
     @field_validator("quat_wxyz")
@@ -82,13 +82,6 @@ class SimilarityTransform(Options):
         if not abs(norm - 1.0) < MAX_QUATERNION_NORM_ERROR:
             raise ValueError(f"quaternion of length {norm:g}, not 1")
         return tuple(q / norm for q in quat) if abs(norm - 1.0) > 1e-12 else quat
-
-    @field_validator("translation")
-    @classmethod
-    def _finite(cls, translation: tuple[float, ...]) -> tuple[float, ...]:
-        if not all(math.isfinite(t) for t in translation):
-            raise ValueError("translation must be finite")
-        return translation
 
     def rotation(self) -> RigidTransform:
         return RigidTransform(self.quat_wxyz, (0.0, 0.0, 0.0))
@@ -127,6 +120,9 @@ class World(Options):
         return RigidTransform(rotation.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
 
 
+_Limit = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
 class Protocol(Options):
     """The evaluation rules of a dataset.
 
@@ -141,7 +137,7 @@ class Protocol(Options):
     """
 
     dataset: str = Field(default="kapture", min_length=1)
-    thresholds: tuple[tuple[float, float | None], ...] = (
+    thresholds: Annotated[tuple[tuple[_Limit, _Limit | None], ...], Field(min_length=1)] = (
         (0.05, 5.0),
         (0.25, 2.0),
         (0.5, 5.0),
@@ -153,18 +149,6 @@ class Protocol(Options):
     truth: str = ""
     conditions: tuple[str, ...] = ()
     pools: dict[str, tuple[str, ...]] = Field(default_factory=dict)
-
-    @model_validator(mode="after")
-    def _usable(self) -> Protocol:
-        if not self.thresholds:
-            raise ValueError("at least one threshold is needed")
-        for position_m, angle_deg in self.thresholds:
-            for value in (position_m, 0.0 if angle_deg is None else angle_deg):
-                if not (math.isfinite(value) and value >= 0):
-                    raise ValueError(f"threshold {value} is not a number at or above 0")
-        if len(set(self.conditions)) != len(self.conditions):
-            raise ValueError("a condition is listed twice")
-        return self
 
 
 def _word(text: str) -> str:
@@ -255,10 +239,6 @@ def write_side_tables(folder: Path, tables: SideTables) -> None:
         write_relocalization(folder, tables.relocalization)
 
 
-def table_path(folder: Path | str, name: str) -> Path:
-    return Path(folder) / name
-
-
 def read_groups(folder: Path | str) -> dict[str, ImageGroup]:
     names = tuple(ImageGroup.model_fields)
     return {
@@ -281,10 +261,6 @@ def read_priors(folder: Path | str) -> dict[str, tuple[str, ...]]:
 
 
 def write_priors(folder: Path | str, priors: Mapping[str, Sequence[str]]) -> None:
-    """Write ``priors.csv``, sorted; every query needs a permitted name."""
-    for query, groups in priors.items():
-        if not groups or not all(groups):
-            raise DataError(f"the prior of {query!r} permits nothing")
     rows = sorted({_PriorRow(query, group) for query in priors for group in priors[query]})
     _PRIORS.write(Path(folder) / PRIORS_FILE, rows)
 

@@ -88,17 +88,13 @@ def check_relative(text: str) -> str:
     """Return ``text`` if it is a plain relative path (``a/b.jpg``), else raise DataError."""
     if not text:
         raise DataError("empty path")
-    if "\\" in text:
-        raise DataError(f"backslash in path {text!r}")
-    if has_control_characters(text):
-        raise DataError(f"control character in path {text!r}")
-    if text.startswith("/"):
-        raise DataError(f"absolute path {text!r}; it must be relative to its folder")
-    for component in text.split("/"):
-        if component == "..":
-            raise DataError(f"path {text!r} leads out of its folder ('..')")
-        if component in ("", "."):
-            raise DataError(f"path {text!r} has an empty or '.' component")
+    if "\\" in text or has_control_characters(text):
+        raise DataError(f"backslash or control character in path {text!r}")
+    components = text.split("/")
+    if text.startswith("/") or ".." in components:
+        raise DataError(f"path {text!r} leads out of its folder: it begins with '/' or has '..'")
+    if "" in components or "." in components:
+        raise DataError(f"path {text!r} has an empty or '.' component")
     return text
 
 

@@ -7,12 +7,12 @@ orientation. Focal lengths from EXIF are uncertain because of zoom, stabilisatio
 from __future__ import annotations
 
 import math
-import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -161,9 +161,7 @@ def image_as_read_back(
     import cv2
 
     content = np.frombuffer(_encoded(Path(name), image, jpeg_quality), np.uint8)
-    decoded = cv2.imdecode(content, cv2.IMREAD_COLOR)
-    if decoded is None:
-        raise ValueError(f"{name}: cannot decode what was encoded")
+    decoded = np.asarray(cv2.imdecode(content, cv2.IMREAD_COLOR))
     return np.ascontiguousarray(decoded[:, :, ::-1], np.uint8)
 
 
@@ -178,13 +176,7 @@ def _encoded(path: Path, image: NDArray[np.uint8], jpeg_quality: int) -> bytes:
     import cv2
 
     suffix = _format_suffix(path.name)
-    pixels = np.asarray(image)
-    if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or 0 in pixels.shape:
-        raise ValueError(f"expected uint8 (H, W, 3) or (H, W), got {pixels.dtype} {pixels.shape}")
-    if pixels.ndim == 3:
-        if pixels.shape[2] != 3:
-            raise ValueError(f"expected 3 channels, got {pixels.shape[2]}")
-        pixels = pixels[:, :, ::-1]
+    pixels = image if image.ndim == 2 else image[:, :, ::-1]
     options = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if suffix in _JPEG else []
     done, encoded = cv2.imencode(suffix, np.ascontiguousarray(pixels), options)
     if not done:
@@ -236,10 +228,7 @@ def read_depth_map(path: Path | str, *, width: int, height: int) -> NDArray[np.f
 
 
 def write_depth_map(path: Path | str, depth_m: ArrayLike) -> None:
-    pixels = np.asarray(depth_m, dtype="<f4")
-    if pixels.ndim != 2:
-        raise ValueError(f"expected a depth map of shape (H, W), got {pixels.shape}")
-    write_bytes(path, np.ascontiguousarray(pixels).tobytes())
+    write_bytes(path, np.ascontiguousarray(depth_m, dtype="<f4").tobytes())
 
 
 def extract_frames(video: Path, folder: Path, every: int) -> Iterator[str]:
@@ -350,20 +339,9 @@ def _tried(read: Callable[[], T]) -> T | None:
 
 
 def _numbers(value: Any) -> list[float]:
-    """Return the numbers in an EXIF tag of any type, up to the first that is not finite."""
-    if isinstance(value, bytes):
-        text = value.decode("latin-1")
-        value = text if re.search(r"\d", text) else list(value)
-    if isinstance(value, str):
-        value = re.findall(r"[-+]?\d+(?:\.\d+)?", value)
-    elif not isinstance(value, tuple | list):
-        value = () if value is None else (value,)
-    found = []
-    for number in map(float, value):
-        if not math.isfinite(number):
-            break
-        found.append(number)
-    return found
+    """Return the numbers of an EXIF tag; unknown parts, such as seconds 0/0, end the list."""
+    values = value if isinstance(value, tuple) else (value,)
+    return list(takewhile(math.isfinite, map(float, values)))
 
 
 def _number(value: Any) -> float | None:
@@ -371,12 +349,9 @@ def _number(value: Any) -> float | None:
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, bytes):
-        value = value.decode("latin-1")
     if not isinstance(value, str):
         return ""
-    printable = "".join(c if c.isprintable() else " " for c in value.strip("\0").partition("\0")[0])
-    return " ".join(printable.split())
+    return " ".join("".join(c if c.isprintable() else " " for c in value).split())
 
 
 def turned_upright(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
@@ -398,13 +373,11 @@ def _centred(width: int, height: int, focal: float, deviation: float) -> Camera:
 def _position(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
     """Return latitude, longitude and height from EXIF's GPS table (EXIF 2.3, table 15)."""
     found = []
-    for reference, tag, sides, limit in ((1, 2, "NS", 90), (3, 4, "EW", 180)):
+    for reference, tag, sides in ((1, 2, "NS"), (3, 4, "EW")):
         side, parts = _text(gps.get(reference))[:1].upper(), _numbers(gps.get(tag))
         if side not in sides or not side or not parts:
             return None
         value = sum(part / 60**at for at, part in enumerate(parts[:3]))
-        if abs(value) > limit:
-            return None
         found.append(-value if side == sides[1] else value)
     below = gps.get(5) in (1, b"\x01")
     height = (_number(gps.get(6)) or 0.0) * (-1 if below else 1)

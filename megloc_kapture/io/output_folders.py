@@ -151,10 +151,8 @@ def _remove_old_files(folder: Path, names: Iterable[str]) -> None:
                 parent.rmdir()
 
 
-def _lies_in(name: str | bytes | int, folder: Path) -> bool:
-    if isinstance(name, int):
-        return False
-    return Path(os.path.abspath(os.fsdecode(name))).is_relative_to(os.path.abspath(folder))
+def _lies_in(name: str, folder: Path) -> bool:
+    return Path(os.path.abspath(name)).is_relative_to(os.path.abspath(folder))
 
 
 def _merge(source: Path, target: Path) -> None:

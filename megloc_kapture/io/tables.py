@@ -20,7 +20,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -265,25 +265,11 @@ def write_match_counts(features_dir: Path, type_name: str, counts: Iterable[Pair
     _MATCH_COUNTS.write(match_counts_path(features_dir, type_name), counts)
 
 
-class MaskCount(NamedTuple):
-    image: str
-    num_masked: int
-
-
-_MASK_COUNTS = Table(MaskCount)
-
-
 def mask_counts_path(features_dir: Path, type_name: str) -> Path:
     return features_dir / "local_features" / type_name / "masked.csv"
 
 
-def read_mask_counts(features_dir: Path, type_name: str) -> dict[str, int]:
-    """Read ``masked.csv``: image -> removed keypoints; empty without the file."""
-    path = mask_counts_path(features_dir, type_name)
-    return dict(_MASK_COUNTS.read_if_there(path))
-
-
 def write_mask_counts(features_dir: Path, type_name: str, counts: Mapping[str, int]) -> None:
     """Write ``masked.csv``: image with a mask -> removed keypoints."""
-    rows = (MaskCount(*row) for row in sorted(counts.items()))
-    _MASK_COUNTS.write(mask_counts_path(features_dir, type_name), rows)
+    rows = [(image, str(count)) for image, count in sorted(counts.items())]
+    write_csv_table(mask_counts_path(features_dir, type_name), ("image", "num_masked"), rows)

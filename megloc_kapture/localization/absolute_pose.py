@@ -1,13 +1,11 @@
 """Absolute pose of a camera or a rig: LO-RANSAC by poselib, then refinement with covariance.
 
-The minimal solver is P3P for one camera and GP3P for several. A seed determines the pose for any
-number of threads. The refinement is Levenberg-Marquardt with a Cauchy loss on the reprojection
-errors in pixels of all cameras under their own models. With the covariance C of a map point for a
-noise of 1 px, the covariance of a residual is ``sigma^2 (I + m^2 J C J^T)``; m is the noise of the
-map's keypoints relative to sigma. The scale of the loss follows the residuals, because maps differ
-in accuracy (docs/experiments/pose.md). The covariance of the pose is ``sigma^2 (J^T J)^-1``, with J
-the Jacobian of the whitened reprojections (Hartley and Zisserman, Multiple View Geometry, section
-5.2.2).
+P3P for one camera, GP3P for several. The refinement is Levenberg-Marquardt with a Cauchy loss on
+reprojection errors in pixels. With the covariance C of a map point for a noise of 1 px, the
+covariance of a residual is ``sigma^2 (I + m^2 J C J^T)``; m is the map's keypoint noise relative to
+sigma. The scale of the loss follows the residuals, because maps differ in accuracy
+(docs/experiments/pose.md). The pose covariance is ``sigma^2 (J^T J)^-1`` of the whitened
+reprojections (Hartley and Zisserman, Multiple View Geometry, section 5.2.2).
 """
 
 from __future__ import annotations
@@ -74,11 +72,8 @@ class AbsolutePoseOptions(Options):
 class PoseEstimate:
     """A pose with enough inliers, before its refinement.
 
-    Attributes
-    ----------
-    rig_from_world : equals ``cam_from_world`` for a single view at the rig's origin.
-    usable, inliers : bool (N,) over the matches of all views; usable if point and ray are finite.
-    errors_px : float64 (N,) reprojection errors; infinite behind a camera and where not usable.
+    ``usable`` and ``inliers``: bool (N,) over the matches of all views; usable if point and ray are
+    finite. ``errors_px``: float64 (N,), infinite behind a camera and where not usable.
     """
 
     rig_from_world: RigidTransform
@@ -98,10 +93,9 @@ def absolute_pose(
     options: AbsolutePoseOptions | None = None,
     point_covariances: Floats | None = None,
 ) -> Pose | Failure:
-    """Estimate ``cam_from_world`` of one camera, with inlier mask and covariance.
+    """Estimate ``cam_from_world`` of one camera from pixels (N, 2) and world points (N, 3).
 
-    Pixels (N, 2) have the first pixel's centre at (0.5, 0.5). World points are float64 (N, 3);
-    their covariances (N, 6) are as in :class:`View`.
+    Covariances (N, 6) are as in :class:`View`.
     """
     view = View(camera, RigidTransform.identity(), points_px, points_world, point_covariances)
     return rig_pose([view], options)
@@ -118,10 +112,6 @@ def rig_pose(views: Sequence[View], options: AbsolutePoseOptions | None = None) 
 
 
 def estimate_pose(problem: PoseProblem, options: AbsolutePoseOptions) -> PoseEstimate | Failure:
-    """Estimate ``rig_from_world`` from the matches of one or more cameras.
-
-    Views without matches, or with outliers only, are allowed.
-    """
     count = len(problem.points)
     if count < options.min_inliers:
         return Failure(
@@ -172,11 +162,8 @@ def match_errors(problem: PoseProblem, rig_from_world: RigidTransform) -> tuple[
 class _Projected:
     """Points of a problem projected in the recentred world.
 
-    Attributes
-    ----------
-    residuals : float64 (N, 2), pixels; NaN behind a camera and for points that are not finite.
-    slopes : float64 (N, 2, 3), derivatives with respect to the points in the rig frame.
-    in_rig, depths : float64 (N, 3) points in the rig frame, (N,) depths in the camera.
+    ``residuals`` (N, 2) in pixels, NaN behind a camera; ``slopes`` (N, 2, 3) by the points in the
+    rig frame; ``in_rig`` (N, 3); ``depths`` (N,) in the camera.
     """
 
     residuals: Floats
@@ -191,7 +178,7 @@ class _Projected:
         rig_from_world: RigidTransform,
         rows: NDArray[np.int64] | None = None,
     ) -> _Projected:
-        """Project the matches ``rows`` (N,), ascending; all of them by default."""
+        """Project the matches ``rows``, ascending; all of them by default."""
         from megloc_kapture.geometry.projection import project_with_jacobian
 
         rows = np.arange(len(problem.points)) if rows is None else rows
@@ -216,7 +203,7 @@ class _Projected:
         return np.where(np.isfinite(errors), errors, np.inf)
 
     def jacobian(self, whitening: Floats) -> Floats:
-        """Derivatives (N, 2, 6) of whitened residuals by a left perturbation of the pose."""
+        """Return derivatives (N, 2, 6) of whitened residuals by a left perturbation of the pose."""
         by_point = _whitened(self.slopes, whitening)
         # a^T (omega x p) = omega^T (p x a)
         (x, y, z), (a, b, c) = self.in_rig.T[:, :, None], np.moveaxis(by_point, 2, 0)
@@ -226,7 +213,7 @@ class _Projected:
 def _whitening(
     problem: PoseProblem, projected: _Projected, rig_from_world: RigidTransform, map_noise: float
 ) -> Floats:
-    """Inverse Cholesky factors of ``I + m^2 J C J^T``: float64 (N, 3), elements 00, 10, 11."""
+    """Return inverse Cholesky factors (N, 3) of ``I + m^2 J C J^T``: elements 00, 10, 11."""
     whitening = np.tile([1.0, 0.0, 1.0], (len(problem.points), 1))
     if len(problem.covariances) == 0 or map_noise == 0:
         return whitening
@@ -244,7 +231,7 @@ def _whitening(
 
 
 def _quadratic(covariances: Floats, u: Floats, v: Floats) -> Floats:
-    """``u^T C v`` (N,) of vectors (3, N), C stored as xx, xy, xz, yy, yz, zz."""
+    """Return ``u^T C v`` (N,) of vectors (3, N), C stored as xx, xy, xz, yy, yz, zz."""
     xx, xy, xz, yy, yz, zz = covariances.T
     return (
         u[0] * (xx * v[0] + xy * v[1] + xz * v[2])
@@ -313,10 +300,8 @@ def refine_pose(
 ) -> Pose | Failure:
     """Refine an estimate of ``rig_from_world`` of the same problem.
 
-    Returns
-    -------
-    Pose with ``rig_from_world`` as its ``cam_from_world``, its covariance, and the inlier mask over
-    the matches of all views (by errors in pixels, without the points' covariances); or Failure.
+    The Pose has it as its ``cam_from_world``, with its covariance and the inlier mask over all
+    views (by errors in pixels, without the points' covariances).
     """
     count = len(problem.points)
     pose = undo_recentring(estimate.rig_from_world, -problem.offset)
@@ -361,9 +346,8 @@ def _minimised(
 ) -> RigidTransform:
     """Minimise the Cauchy loss of whitened residuals by Levenberg-Marquardt.
 
-    With the weight ``w = 1 / (1 + e^2 / c^2)`` of a residual of length e, the gradient sums
-    ``w J^T r`` and the Hessian ``w^2 J^T J``, the expected second derivative over the directions
-    of r. It converges faster than reweighted least squares.
+    With the weight ``w = 1 / (1 + e^2 / c^2)`` of a residual of length e, the gradient sums ``w J^T
+    r`` and the Hessian ``w^2 J^T J``, its expectation over directions of r.
     """
     squared_scale = (_CAUCHY_EFFICIENT * sigma) ** 2
     best, least, damping = pose, np.inf, 0.0
@@ -395,9 +379,8 @@ def _minimised(
 def check_stable(
     pose: Pose, covariance: Floats, depth: float, options: AbsolutePoseOptions
 ) -> Pose | Failure:
-    """Return the pose, or a Failure if the covariance of its centre is too large.
-
-    ``depth`` is the inliers' median depth in the unit of the map.
+    """Return the pose, or a Failure if its centre is too uncertain for the inliers' median
+    ``depth``.
     """
     deviation = center_deviation(covariance) / depth
     if deviation <= _MAX_CENTER_DEVIATION:
@@ -413,8 +396,7 @@ def check_stable(
 def _variance(squared: Floats, squared_scale: float) -> float:
     """Return the variance factor of the Cauchy estimate's covariance, of squared residuals (M,).
 
-    Huber's proposal (Robust Statistics, section 7.6) with expectations over the directions of
-    residuals in the plane: ``E[w^2 e^2] / 2`` over ``E[w^2]^2``, w the weight of the loss.
+    Huber's proposal (Robust Statistics, section 7.6): ``E[w^2 e^2] / 2`` over ``E[w^2]^2``.
     """
     squared_weights = 1.0 / (1.0 + squared / squared_scale) ** 2
     degrees_of_freedom = max(2 * len(squared) - 6, 1)
@@ -432,8 +414,8 @@ def _median(values: Floats) -> float:
 def pose_covariance(information: Floats, variance_px2: float) -> Floats | None:
     """Return the pose covariance (6, 6) from the normal matrix ``J^T J`` for a noise of 1 px.
 
-    Order: rotation in radians, then translation in the unit of the map, of a left perturbation
-    ``cam_from_world_true = exp(rotation, translation) cam_from_world``. None if singular.
+    Rotation in radians, then translation, of a left perturbation ``exp(...) cam_from_world``; None
+    if singular.
     """
     if not np.isfinite(information).all() or not (np.diagonal(information) > 0).all():
         return None
@@ -447,19 +429,14 @@ def pose_covariance(information: Floats, variance_px2: float) -> Floats | None:
 
 
 def center_deviation(covariance: Floats) -> float:
-    """Return the largest standard deviation of the camera centre over all directions.
-
-    It is in the map's unit. To first order, a left perturbation moves the centre by its translation
-    in the camera frame.
-    """
+    """Return the camera centre's largest standard deviation over all directions."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
 
 
 def transform_covariance(covariance: Floats, cam_from_rig: RigidTransform) -> Floats:
     """Transform a covariance (6, 6) of ``rig_from_world`` to ``cam_from_rig @ rig_from_world``.
 
-    Both are of left perturbations, rotation first: ``Ad_C covariance Ad_C^T`` (Barfoot, State
-    Estimation for Robotics, section 7.1.4).
+    ``Ad_C covariance Ad_C^T`` (Barfoot, State Estimation for Robotics, section 7.1.4).
     """
     rotation = cam_from_rig.rotation_matrix()
     adjoint = np.zeros((6, 6))

@@ -1,8 +1,8 @@
 """Cluster-wise localization: one pose per cluster of candidates, the best one refined.
 
 MegLoc, section "Cluster-wise localization": retrieval returns images of several similar locations,
-and matches of one are outliers to the pose of another. The candidates are therefore clustered by
-their camera centres or by co-visibility, and each cluster is localized separately.
+and matches of one are outliers to the pose of another. So candidates are clustered by camera
+centres or co-visibility, and each cluster is localized separately.
 """
 
 from __future__ import annotations
@@ -53,8 +53,6 @@ MAX_CLUSTERS = 10
 
 
 class ClusterOptions(Options):
-    """Options of the clusters of a query's candidates."""
-
     by: Literal["none", "poses", "covisibility"] = Field(
         default="covisibility",
         description="none: all candidates are one cluster; poses: images whose centres are near; "
@@ -75,7 +73,7 @@ class ClusterOptions(Options):
 
 
 def cluster_by_centers(centers: NDArray[np.float64], radius: float) -> NDArray[np.int64]:
-    """Cluster centres (N, 3) by single linkage; labels int64 (N,) in order of first members."""
+    """Cluster centres (N, 3) by single linkage; labels (N,) in order of first members."""
     if len(centers) == 0:
         return np.zeros(0, np.int64)
     pairs = cKDTree(centers).query_pairs(radius, output_type="ndarray")
@@ -85,7 +83,7 @@ def cluster_by_centers(centers: NDArray[np.float64], radius: float) -> NDArray[n
 def cluster_by_shared_points(
     shared: NDArray[np.int64], min_shared_points: int
 ) -> NDArray[np.int64]:
-    """Cluster images by their shared points (N, N); labels int64 (N,) in order of first members.
+    """Cluster images by shared points (N, N); labels (N,) in order of first members.
 
     If no two images share a point (a map lifted from depth), all are one cluster.
     """
@@ -103,14 +101,9 @@ def cluster_candidates(
     centers: Mapping[str, NDArray[np.float64]],
     indices: Sequence[MapIndex],
 ) -> list[tuple[str, ...]]:
-    """Divide candidates into clusters, in the order of their first members.
+    """Divide candidates, best first, into clusters within one coordinate frame each.
 
-    Parameters
-    ----------
-    images, frames : candidates, best first, with their coordinate frames; clusters do not span
-        frames.
-    centers : camera centres in the world, (3,) each.
-    indices : map points by keypoints type; shared points of all types add up.
+    ``centers`` are camera centres (3,); ``indices`` are the map points by keypoints type.
     """
     clusters: list[list[int]] = []
     for frame in dict.fromkeys(frames):
@@ -142,7 +135,6 @@ def _components(count: int, pairs: NDArray[np.integer]) -> NDArray[np.int64]:
 
 
 def interleave(rankings: Sequence[Sequence[str]]) -> list[str]:
-    """Merge rankings by rank, each name once."""
     ranks = zip_longest(*rankings)
     return list(dict.fromkeys(name for rank in ranks for name in rank if name is not None))
 
@@ -166,16 +158,11 @@ def localize_in_clusters(
 
     Parameters
     ----------
-    clusters : map images of each, see :func:`cluster_candidates`.
     rank : scores of poses, higher is better.
     frames : coordinate frame of each cluster; clusters of different frames are not merged.
     centers : of the map images, (3,) each; needed for ``min_confidence``.
-    min_confidence : lower confidences are failures; None computes no confidence.
+    min_confidence : poses of lower confidence fail; None computes no confidence.
     scene : images used if the confidence is in doubt.
-
-    Returns
-    -------
-    The pose and its problem, or a Failure and None.
     """
     clock = Clock()
     matched = interleave([view.matched_images() for view in views])
@@ -340,7 +327,7 @@ class Clock:
         self._last = time.perf_counter()
 
     def start(self) -> None:
-        """Start a lap; discard the time since the last one."""
+        """Discard the time since the last lap."""
         self._last = time.perf_counter()
 
     def lap(self, step: str) -> None:
@@ -353,10 +340,9 @@ class Clock:
 def poses_of_cameras(
     views: Sequence[QueryView], rig: Pose, problem: PoseProblem
 ) -> list[Pose | Failure]:
-    """Return one result per camera of a localized rig, with its own matches and inliers.
+    """Return one result per camera of a rig localized by :func:`localize_in_clusters`.
 
-    ``rig`` and ``problem`` come from :func:`localize_in_clusters`. A camera without inliers fails,
-    even though the rig has a pose.
+    A camera without inliers fails, even though the rig has a pose.
     """
     if rig.inliers is None:
         raise ValueError("the inliers of the rig's pose are not known")

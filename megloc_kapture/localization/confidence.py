@@ -1,11 +1,10 @@
-"""Confidence of a pose: the probability that it is right, from what is known without the truth.
+"""Confidence of a pose: the probability that it is right, estimated without ground truth.
 
-A number of inliers says little by itself: of a thousand matches some agree with any pose. What is
-looked at (:func:`evidence_of`) is how far the inliers exceed chance, what share of all matches and
-of all that could match they are, how well they fit, by themselves and beside the map's own images,
-how firmly they hold the pose, and from where, and how many, map images saw them.
-A logistic model weighs it (:class:`Calibration`). Its weights are fitted by
-``benchmarks/confidence.py`` and stand, with their origin, in ``confidence.toml`` beside this file.
+:func:`evidence_of` measures how far the inliers exceed chance, their share of all matches and of
+the matchable points, how well they fit compared with the map's own images, how firmly they
+determine the pose, and the viewpoints of the map images that observe them. :class:`Calibration` is
+a logistic model of these terms; ``benchmarks/confidence.py`` fits its weights
+(``confidence.toml``).
 """
 
 from __future__ import annotations
@@ -27,21 +26,16 @@ from megloc_kapture.localization.map_index import Correspondences, PoseProblem, 
 from megloc_kapture.values import Failure, Pose, RigidTransform
 
 Floats = NDArray[np.float64]
-# of an a contrario test: matches that a pose is made of
-_SAMPLE = 3
-# inliers so near to each other count once, as a share of the image's diagonal
-_CELL = 0.01
-# a wrong map of few points agrees with itself: a pose is doubtful where the camera sees fewer
+_SAMPLE = 3  # matches that determine a pose
+_CELL = 0.01  # share of the image's diagonal within which inliers count once
+# a wrong map of few points agrees with itself: poses with fewer visible points are doubtful
 _MIN_VISIBLE = 50
-# as many points tell how many of all could be seen
-_MAX_PROJECTED = 2048
+_MAX_PROJECTED = 2048  # points to estimate the visible share
 _MIN_ERROR_PX = 0.5
-# no map is better than that, in pixels of the query
-_MIN_NOISE_PX = 0.3
-# an image of the scene fits worse than the map makes expected by less than that, and fewer inliers
-# than these say nothing about it
+_MIN_NOISE_PX = 0.3  # least map noise, pixels of the query
+# largest usual ratio of an image's error to the map's noise, and least inliers to measure it
 _USUAL_RATIO, _FEW = 2.9, 20
-# a wrong focal length may move the camera by as much, a share of the distance to what it sees
+# tolerated motion by a wrong focal length, as a share of the distance to the points
 _TOLERATED_SHIFT = 0.03
 
 TERMS: dict[str, str] = {
@@ -55,29 +49,27 @@ TERMS: dict[str, str] = {
     "distance_ratio": "the map's images saw these points from another distance",
     "support": "few map images agree with the pose",
 }
-"""The terms of the model, and what a low contribution of each says."""
+"""Terms of the model, with the reason that a low contribution gives."""
 
 MAP_POINTS = "map_points"
-"""Besides the terms: the number of map points in the camera's view over the number that a trusted
-pose needs. Present only where it is below 1."""
+"""Number of visible map points over the number that a trusted pose needs; present only below 1."""
 
 
 @dataclass(frozen=True, eq=False)
 class MatchSources:
-    """Where the 2D-3D matches of a pose problem come from, match by match.
+    """Origin of the N 2D-3D matches of a pose problem.
 
     Attributes
     ----------
-    support : int64 (N,), number of map images that say so.
-    centers : float64 (sum of support, 3), where these images were taken, match by match.
-    images : int64 (sum of support,), these images.
-    num_keypoints : of the query, in all its views and types.
-    noise : float64 (N, 2), of the match's type the median angle between an observation of the map
-        and its point, and their distance in pixels; NaN where that is not known.
-    seen : of each view the points (K, 3) that the map images of the cluster observe.
-    local_types : keypoints types of the matches.
-    displacements_rad : of a pose the angles by which the scene stands elsewhere in the query than
-        the pose says, by the looks of its map images; empty where that cannot be told.
+    support : int64 (N,), number of map images with the match.
+    centers, images : float64 (sum of support, 3) and int64, the map images' centres and indices,
+        grouped by match.
+    num_keypoints : of the query, over all views and types.
+    noise : float64 (N, 2), the map's median reprojection error as angle and in pixels; NaN if
+        unknown.
+    seen : per view the points (K, 3) observed by the cluster's map images.
+    displacements_rad : returns how far image patches of the map are displaced from a pose's
+        projections, see :func:`~.structure.displacements_rad`.
     """
 
     support: NDArray[np.int64]
@@ -93,11 +85,7 @@ class MatchSources:
 def evidence_of(
     problem: PoseProblem, pose: Pose, sources: MatchSources, max_error_px: float
 ) -> dict[str, float]:
-    """The terms that speak for a pose or against it, by the names of :data:`TERMS`.
-
-    The pose is of the problem, refined; of a rig ``rig_from_world``. Raises ValueError where it
-    brings no inliers or no covariance.
-    """
+    """Return the terms of :data:`TERMS` for a refined pose with inliers and covariance."""
     if pose.inliers is None or pose.covariance is None:
         raise ValueError("evidence needs the inliers and the covariance of a pose")
     rig_from_world = pose.cam_from_world
@@ -137,10 +125,9 @@ def with_confidence(
     min_confidence: float,
     misfit: FocalMisfit | None = None,
 ) -> Pose | Failure:
-    """The pose with its confidence and the evidence for it; a failure where that is too little.
+    """Return the pose with its confidence and evidence, or a Failure if the confidence is too low.
 
-    A focal length that does not fit moves the camera along with it: the confidence then falls with
-    the square of that shift.
+    A misfitting focal length moves the camera: the confidence falls with the square of that shift.
     """
     evidence = evidence_of(problem, pose, sources, max_error_px)
     model = calibration_for(sources.local_types)
@@ -166,15 +153,17 @@ def with_confidence(
 
 
 def _surprise(problem: PoseProblem, errors_px: Floats, max_error_px: float) -> float:
-    """How unlikely it is that so many matches agree by chance: -log10 of the number of false
-    alarms, at least 0.
+    """Return -log10 of the number of false alarms of the inliers, at least 0.
 
-    A contrario (Moisan and Stival, "A probabilistic criterion to detect rigid point matches between
-    two images and estimate the fundamental matrix", IJCV 2004; for poses Moulon et al., "Adaptive
-    structure from motion with a contrario model estimation", ACCV 2012): a wrong match falls within
-    r of its point's projection with the probability of that disc in the image, whatever the pose.
-    The radius is the one that surprises most. Matches that stand together count once.
+    A contrario (Moisan and Stival, IJCV 2004; for poses Moulon et al., ACCV 2012): a wrong match
+    falls within r of its projection with the probability of that disc in the image. The most
+    surprising radius counts, and matches in one cell count once.
     """
+    from scipy.special import gammaln
+
+    def log_choose(n: int | NDArray[np.int64], k: int | NDArray[np.int64]) -> Floats:
+        return np.asarray(gammaln(np.add(n, 1)) - gammaln(np.add(k, 1)) - gammaln(n - k + 1))
+
     errors, shares = [], []
     for view, of_view in zip(problem.views, problem.split(errors_px), strict=True):
         width, height = view.camera.width, view.camera.height
@@ -188,7 +177,7 @@ def _surprise(problem: PoseProblem, errors_px: Floats, max_error_px: float) -> f
     num = len(error)
     order = np.argsort(error, kind="stable")[: int((error <= max_error_px).sum())]
     counts = np.arange(1, len(order) + 1)
-    # of the k best the largest disc
+    # largest disc of the k best
     shares_of_best = np.maximum.accumulate(share[order])
     many = counts > _SAMPLE
     if not many.any():
@@ -196,19 +185,11 @@ def _surprise(problem: PoseProblem, errors_px: Floats, max_error_px: float) -> f
     counts = counts[many]
     log_alarms = (
         math.log(max(num - _SAMPLE, 1))
-        + _log_choose(num, counts)
-        + _log_choose(counts, _SAMPLE)
+        + log_choose(num, counts)
+        + log_choose(counts, _SAMPLE)
         + (counts - _SAMPLE) * np.log(shares_of_best[many])
     )
     return max(0.0, -float(log_alarms.min()) / math.log(10))
-
-
-def _log_choose(n: int | NDArray[np.int64], k: int | NDArray[np.int64]) -> Floats:
-    from scipy.special import gammaln
-
-    return np.asarray(
-        gammaln(np.add(n, 1)) - gammaln(np.add(k, 1)) - gammaln(np.subtract(n, k) + 1)
-    )
 
 
 def _misfit(
@@ -218,22 +199,19 @@ def _misfit(
     inliers: NDArray[np.bool_],
     sources: MatchSources,
 ) -> float:
-    """How much many inliers contradict the pose together.
+    """Return by how much the inliers together fit worse than the map's own images.
 
-    The scene in a mirror, or its like elsewhere, has hundreds of inliers that fit nearly; noise of
-    so many is known from the map's own images and the points' covariances, and a larger error is of
-    the pose, or of keypoints that are found elsewhere on the same things at night, which what
-    surrounds them tells. It is the logarithm of the inliers' median angular error, or of that of
-    their surroundings where it is smaller, over what map and points make expected, beyond what an
-    image of the scene may have, times that of their number; 0 where the map's noise is not known.
+    A mirrored or similar scene has hundreds of inliers that almost fit. The ratio of the inliers'
+    median angular error (or of their image patches' displacement, if smaller: keypoints move at
+    night) to the error expected from map and points, beyond the usual ratio, as a logarithm times
+    that of their number; 0 if the map's noise is unknown.
     """
     lengths = np.diff(problem.starts)
     focals = np.repeat([focal_px(view.camera) for view in problem.views], lengths)
-    # seen from as far the map's points are no better than they are, and a keypoint of a smaller
-    # image is off by as many of its larger pixels
+    # noise is an angle if the query is sharper than the map's images, else it is in pixels
     noise_rad, noise_px = sources.noise.T
     own_px = np.maximum(noise_rad * focals, np.maximum(noise_px, _MIN_NOISE_PX))
-    # points that little parallax placed are off by more where they are seen from elsewhere
+    # points of little parallax have larger errors seen from elsewhere
     share = (noise_px / own_px)[:, None] ** 2
     relative = replace(problem, covariances=problem.covariances * share[: len(problem.covariances)])
     _, explained = match_errors(relative, pose.cam_from_world)
@@ -253,7 +231,6 @@ def _misfit(
 def _num_visible(
     problem: PoseProblem, rig_from_world: RigidTransform, seen: Sequence[Floats]
 ) -> int:
-    """Of the points that the map's images observe, those that fall into a view."""
     total = 0.0
     for view, points in zip(problem.views, seen, strict=True):
         every = max(1, len(points) // _MAX_PROJECTED)
@@ -271,8 +248,9 @@ def _viewpoints(
     inliers: NDArray[np.bool_],
     sighted: NDArray[np.bool_],
 ) -> tuple[float, float]:
-    """Medians over the inliers' sightings: the angle between the rays of query and map image, in
-    right angles, and how the distances differ, as ``|log2|`` of their ratio."""
+    """Return medians over the inliers' map observations: viewing angle over 90 deg, and |log2| of
+    the distance ratio.
+    """
     seen = np.repeat(points, sources.support[inliers], axis=0)
     ours, theirs = center - seen, sources.centers[sighted] - seen
     length, other = np.linalg.norm(ours, axis=1), np.linalg.norm(theirs, axis=1)
@@ -285,19 +263,15 @@ def _viewpoints(
 
 @dataclass(frozen=True)
 class Calibration:
-    """A logistic model of the confidence, and the data that it was fitted to.
-
-    Its weights are of the terms, by name; a term without a weight counts nothing.
-    """
+    """Logistic model of the confidence; terms without a weight do not count."""
 
     origin: str
     bias: float
     weights: Mapping[str, float]
 
     def probability(self, evidence: Mapping[str, float]) -> float:
-        """The probability that a pose of this evidence is right, from 0 to 1.
-
-        That of the terms, times :data:`MAP_POINTS` where the evidence has it.
+        """Return the probability in [0, 1] that a pose is right, times :data:`MAP_POINTS` if
+        present.
         """
         logit = self.bias + sum(
             weight * evidence[name] for name, weight in sorted(self.weights.items())
@@ -311,7 +285,7 @@ OF_ALL = "all"
 
 @lru_cache(maxsize=1)
 def calibrations() -> Mapping[str, Calibration]:
-    """The package's calibrations: :data:`OF_ALL`, and by what keypoints types' names begin with."""
+    """Return the package's calibrations by prefix of keypoints types, and :data:`OF_ALL`."""
     text = resources.files(__package__).joinpath("confidence.toml").read_text(encoding="utf-8")
     return {
         name: Calibration(table["origin"], table["bias"], table["weights"])
@@ -320,7 +294,7 @@ def calibrations() -> Mapping[str, Calibration]:
 
 
 def calibration_for(local_types: Collection[str]) -> Calibration:
-    """The calibration of the keypoints types, where all of them share one of their own."""
+    """Return the calibration shared by all keypoints types."""
     known = calibrations()
     found = {
         next((name for name in known if name != OF_ALL and one.startswith(name)), OF_ALL)
@@ -335,7 +309,6 @@ def match_sources(
     cluster: Sequence[str],
     centers: Mapping[str, Floats],
 ) -> MatchSources:
-    """Where the matches of a cluster come from, and what its images see."""
     number = {image: at for at, image in enumerate(cluster)}
     center_of = np.array([centers[image] for image in cluster]).reshape(-1, 3)
     support, images, noise, seen = [], [], [], []

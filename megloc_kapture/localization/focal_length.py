@@ -1,12 +1,11 @@
 """Focal length and other intrinsics of a query's camera, estimated from the inliers of its pose.
 
-A wrong focal length moves the camera along its axis while most matches still agree, so the focal
-length is freed once a pose is known (Gauss-Newton on rays, Cauchy weights). A calibrated camera is
-kept; if another focal length fits far better, the pose gets a remark and a lower confidence. A
-camera with an uncertain focal length (``Camera.focal_deviation``) gets the most probable focal
-length, principal point and radial distortion given a prior (EXIF, the image centre, no distortion),
-and the pose covariance includes their uncertainty; pycolmap's refinement has no prior. A flat scene
-seen frontally does not determine the focal length; the prior is kept then.
+A wrong focal length moves the camera along its axis while most matches still agree, so it is freed
+once a pose is known (Gauss-Newton on rays, Cauchy weights). A calibrated camera is kept; if another
+focal length fits far better, the pose gets a remark and a lower confidence. An uncertain camera
+(``Camera.focal_deviation``) gets the most probable intrinsics given a prior (EXIF, image centre, no
+distortion), and the pose covariance includes their uncertainty; pycolmap's refinement has no prior.
+If the scene does not determine the focal length, the prior is kept.
 """
 
 from __future__ import annotations
@@ -74,27 +73,18 @@ _ALIKE = 2.0
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Best correction of a camera and the corresponding pose.
+    """Best correction of a camera and its pose.
 
-    Attributes
-    ----------
-    change : float64 (1, 3 or 4,): logarithm of the focal length factor; shift of the principal
-        point over the focal length; radial distortion.
-    deviations : standard deviations of ``change``.
-    pose_covariance : float64 (6, 6), contribution of the camera's uncertainty.
-    depth : median depth of the inliers in the unit of the map.
+    ``change`` (1, 3 or 4,): logarithm of the focal length factor; shift of the principal point over
+    the focal length; radial distortion. ``pose_covariance`` (6, 6): contribution of the camera's
+    uncertainty. ``depth``: the inliers' median.
     """
 
     change: Floats
-    deviations: Floats
+    deviation: float  # relative, of the focal length
     rig_from_world: RigidTransform
     pose_covariance: Floats
     depth: float
-
-    @property
-    def deviation(self) -> float:
-        """Relative deviation of the focal length."""
-        return float(self.deviations[0])
 
 
 def is_uncertain(problem: PoseProblem) -> bool:
@@ -104,9 +94,8 @@ def is_uncertain(problem: PoseProblem) -> bool:
 
 @dataclass(frozen=True)
 class FocalMisfit:
-    """A focal length that fits the matches far better than the given one.
-
-    ``shift`` is the resulting motion of the camera as a share of the distance to the points.
+    """A focal length that fits far better; ``shift``: motion of the camera over the points'
+    distance.
     """
 
     remark: str
@@ -148,13 +137,10 @@ def focal_misfit(
 
 @dataclass(frozen=True)
 class _Freed:
-    """Pose with a free focal length.
+    """Pose with a free focal length and its relative deviation.
 
-    Attributes
-    ----------
-    deviation : relative deviation of the focal length.
-    cost : sum of squared errors of all matches, truncated at the inlier threshold.
-    distance : median distance of the inliers.
+    ``cost``: sum of squared errors of all matches, truncated at the inlier threshold; ``distance``:
+    the inliers' median.
     """
 
     focal_px: float
@@ -167,7 +153,7 @@ class _Freed:
         return math.log(self.focal_px / focal_px(given))
 
     def deviation_from(self, given: Camera) -> float:
-        """Return the deviation of the logarithm, with calibration error and verification bias."""
+        """Return the logarithm's deviation, with calibration error and verification bias."""
         return math.hypot(self.deviation, _CALIBRATED, _BIASED_BY * self.change_from(given))
 
     def contradicts(self, given: Camera) -> bool:
@@ -182,7 +168,7 @@ def _freed(
 ) -> _Freed | None:
     """Free the focal length, and the other intrinsics within their calibration error.
 
-    Return None if the matches do not determine it. Inliers are selected again in each round.
+    None if the matches do not determine it. Inliers are selected again in each round.
     """
     (view,) = problem.views
     focal = focal_px(view.camera)
@@ -228,7 +214,6 @@ def misfits_text(remarks: Iterable[str], where: str) -> str | None:
 
 
 def estimate_remark(camera: Camera, given: Camera) -> str:
-    """Return a remark on the estimated focal length."""
     found_px, given_px = focal_px(camera), focal_px(given)
     return (
         f"focal length estimated: {found_px:.0f} +- {camera.focal_deviation * found_px:.0f} px "
@@ -239,10 +224,9 @@ def estimate_remark(camera: Camera, given: Camera) -> str:
 def estimate_with_intrinsics(
     problem: PoseProblem, options: AbsolutePoseOptions
 ) -> tuple[PoseProblem, PoseEstimate | Failure]:
-    """Estimate pose and intrinsics of an uncertain camera.
+    """Estimate pose and intrinsics of an uncertain camera; the returned problem has that camera.
 
-    The returned problem has the estimated camera. Its ``focal_deviation`` is increased if the
-    matches contradict the given focal length, for example EXIF of another lens.
+    Its ``focal_deviation`` is increased if the matches contradict the given focal length.
     """
     given = problem.views[0].camera
     found = estimate_pose(problem, options)
@@ -296,8 +280,7 @@ def refine_with_intrinsics(
 ) -> tuple[PoseProblem, Pose | Failure]:
     """Refine pose and intrinsics of an uncertain camera in alternation.
 
-    ``given`` is the camera with its prior deviation. The returned problem and Pose have the refined
-    camera with the posterior deviation.
+    ``given`` is the camera with its prior deviation; problem and Pose get the posterior one.
     """
     updates = 0
     while True:
@@ -374,7 +357,7 @@ def _fit(
     of_camera, between = covariance[6:, 6:], covariance[:6, 6:]
     return _Fit(
         change=change,
-        deviations=np.sqrt(np.diagonal(of_camera)),
+        deviation=math.sqrt(of_camera[0, 0]),
         rig_from_world=view.cam_from_rig.inverse() @ moved @ start,
         pose_covariance=between @ np.linalg.solve(of_camera, between.T),
         depth=depth,
@@ -390,19 +373,11 @@ def _free_camera(
     deviations: Floats,
     correlated: float,
 ) -> tuple[Floats, RigidTransform, float, Floats] | None:
-    """Fit a pose and a camera change to inliers; None if they do not determine it.
+    """Fit pose and camera change to inliers' rays (N, 2) and points (N, 3) in the camera frame.
 
-    Parameters
-    ----------
-    rays, points : (N, 2) undistorted, (N, 3) in the camera frame.
-    change : initial value, see :class:`_Fit`.
-    expected, deviations : prior of the change.
-    correlated : factor by which correlated errors increase the deviations.
-
-    Returns
-    -------
-    The change, the motion of the points, their median depth, and the covariance of motion (left
-    perturbation) and change.
+    ``expected`` and ``deviations`` are the prior of ``change`` (:class:`_Fit`); ``correlated``
+    scales the deviations. Returns the change, the motion of the points, their median depth and the
+    covariance of motion (left perturbation) and change; None if undetermined.
     """
     rotation, translation = np.eye(3), np.zeros(3)
     prior_weight = (correlated / deviations) ** 2
@@ -443,8 +418,8 @@ def _free_camera(
 def _linearized(rays: Floats, points: Floats, change: Floats) -> tuple[Floats, Floats]:
     """Return residuals (N, 2) of points in front of the camera and their derivatives (N, 2, 6 + C).
 
-    The columns are a left rotation, a translation of the points, and ``change`` (:class:`_Fit`).
-    The slope of the distortion is ignored in the pose columns: the change is small.
+    The columns are a left rotation, a translation and ``change``; distortion slopes are ignored in
+    the pose columns.
     """
     x, y, z = points.T
     u, v = x / z, y / z
@@ -470,10 +445,7 @@ def _linearized(rays: Floats, points: Floats, change: Floats) -> tuple[Floats, F
 
 
 def shared_camera(cameras: Sequence[Camera]) -> Camera:
-    """Average estimates of one camera by medians weighted with their inverse variances.
-
-    The cameras have one model and size, and each has a ``focal_deviation``.
-    """
+    """Average estimates of one camera by medians weighted with their inverse variances."""
     weights = np.array([camera.focal_deviation**-2.0 for camera in cameras])
     params = np.array([camera.params for camera in cameras])
     order = np.argsort(params, axis=0, kind="stable")
@@ -487,8 +459,7 @@ def shared_camera(cameras: Sequence[Camera]) -> Camera:
 def solve_with_shared_camera(poses: Sequence[Pose], options: AbsolutePoseOptions) -> list[Pose]:
     """Re-solve poses of photographs of one camera with a shared estimate of its intrinsics.
 
-    A pose is kept if its own focal length contradicts the others (another zoom) or if it was
-    refined by other means. Each pose has its estimated camera and its inliers.
+    A pose is kept if its focal length contradicts the others (zoom) or if it was refined otherwise.
     """
     usable = [p.camera for p in poses if p.camera is not None and p.camera.focal_deviation > 0]
     if len(usable) < 2:

@@ -1,7 +1,4 @@
-"""A map's points as arrays, a query's matches with them, and the pose problem that they make.
-
-One view or the views of a rig are treated alike; each keypoints type has an index of its own.
-"""
+"""Arrays of a map's points, 2D-3D matches of a query, and the resulting pose problem."""
 
 from __future__ import annotations
 
@@ -9,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -24,20 +22,18 @@ ImageMatches = tuple[str, NDArray[np.int64], NDArray[np.floating]]
 
 @dataclass(frozen=True, eq=False)
 class MapIndex:
-    """Observations grouped by image; read-only, and safe to use from many threads.
+    """Observations grouped by image; read-only, for use by several threads.
 
     Attributes
     ----------
-    xyz : float64 (N, 3), the points in the world frame.
-    row_of_image : image name -> row of ``offsets``.
-    offsets : int64 (I + 1,); image i's observations are rows offsets[i] to offsets[i + 1].
-    keypoint_ids : int32 (O,), ascending within an image.
-    point_ids : int32 (O,), rows of ``xyz``.
-    covariances : float64 (N, 6) of the points as xx, xy, xz, yy, yz, zz in the map's unit squared,
-        for a measurement noise of 1 px, NaN where unknown; None where the map has none.
-    local_type : the keypoints type that it is of; empty where nobody asks.
-    noise_rad, noise_px : median angle, and distance in the image, between an observation and its
-        point, seen by the map's image; NaN where they are not known.
+    xyz : float64 (N, 3), points in the world.
+    row_of_image : row of ``offsets`` by image name.
+    offsets : int64 (I + 1,); rows offsets[i] to offsets[i + 1] are image i's observations.
+    keypoint_ids, point_ids : int32 (O,), ascending within an image.
+    covariances : float64 (N, 6) as xx, xy, xz, yy, yz, zz for a noise of 1 px, NaN if unknown; or
+        None.
+    noise_rad, noise_px : median reprojection error of the map as angle and in pixels; NaN if
+        unknown.
     """
 
     xyz: Floats
@@ -60,31 +56,29 @@ class MapIndex:
         point_ids: Integers,
         covariances: Floats | None = None,
     ) -> MapIndex:
-        """Group observations, given as parallel arrays (O,), by image and keypoint."""
-        from megloc_kapture.localization import kernels
-
+        """Group observations, parallel arrays (O,), by image and keypoint."""
         counts = np.bincount(image_ids, minlength=len(image_names))
         offsets = np.zeros(len(image_names) + 1, dtype=np.int64)
         np.cumsum(counts, out=offsets[1:])
-        keypoints = np.empty(len(image_ids), dtype=np.int32)
-        points = np.empty(len(image_ids), dtype=np.int32)
-        kernels.group_by_image(image_ids, keypoint_ids, point_ids, offsets, keypoints, points)
+        keys = _paired(keypoint_ids, point_ids)[np.argsort(image_ids, kind="stable")]
+        for first, last in pairwise(offsets.tolist()):
+            keys[first:last].sort()
         return cls(
             xyz=_read_only(np.ascontiguousarray(xyz, dtype=np.float64)),
             row_of_image={name: row for row, name in enumerate(image_names)},
             offsets=_read_only(offsets),
-            keypoint_ids=_read_only(keypoints),
-            point_ids=_read_only(points),
+            keypoint_ids=_read_only((keys >> 32).astype(np.int32)),
+            point_ids=_read_only((keys & 0xFFFFFFFF).astype(np.int32)),
             covariances=covariances,
         )
 
     @cached_property
     def seen_once(self) -> NDArray[np.bool_]:
-        """Points (N,) that one image observes: lifted through its depth, not triangulated."""
+        """Return the points (N,) with one observation: lifted by depth, not triangulated."""
         return np.bincount(self.point_ids, minlength=len(self.xyz)) == 1
 
     def observed(self, image: str) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Keypoint rows (ascending) and their point rows of one image; empty if it has none."""
+        """Return keypoint rows (ascending) and point rows of an image; empty for unknown images."""
         row = self.row_of_image.get(image)
         if row is None:
             return self.keypoint_ids[:0], self.point_ids[:0]
@@ -92,34 +86,37 @@ class MapIndex:
         return self.keypoint_ids[part], self.point_ids[part]
 
     def seen_by(self, images: Sequence[str]) -> Floats:
-        """The points that some of the images observe, each once, (K, 3)."""
+        """Return the points (K, 3) that at least one of the images observes."""
         seen = np.zeros(len(self.xyz), dtype=np.bool_)
         for image in images:
             seen[self.observed(image)[1]] = True
         return self.xyz[np.flatnonzero(seen)]
 
-    def rows_of(self, images: Sequence[str]) -> NDArray[np.int64]:
-        """Row of each image in ``offsets``, -1 where it is not in the map; int64 (n,)."""
-        return np.array([self.row_of_image.get(image, -1) for image in images], dtype=np.int64)
-
     def shared_points(self, images: Sequence[str]) -> NDArray[np.int64]:
-        """Number of points that every two of the images both observe, int64 (n, n), symmetric.
-
-        The diagonal has the points that an image observes. The cost grows with these images'
-        observations, not with the map; an image that is not in the map shares nothing.
+        """Count the points observed by both of two images, int64 (n, n); the diagonal has each
+        one's own.
         """
-        from megloc_kapture.localization import kernels
-
-        rows = self.rows_of(images)
-        keys = kernels.sightings(self.offsets, self.point_ids, rows)
-        keys.sort()
-        shared = np.zeros((len(rows), len(rows)), dtype=np.int64)
-        kernels.count_shared(keys, shared)
+        count, seen_by = len(images), [self.observed(image)[1] for image in images]
+        rows = np.repeat(np.arange(count), [len(points) for points in seen_by])
+        keys = np.unique(_paired(np.concatenate([self.point_ids[:0], *seen_by]), rows))
+        points, rows = keys >> 32, keys & 0xFFFFFFFF
+        shared = np.diag(np.bincount(rows, minlength=count))
+        for step in range(1, count):
+            same = points[step:] == points[:-step]
+            if not same.any():
+                break
+            pairs = rows[:-step][same] * count + rows[step:][same]
+            each = np.bincount(pairs, minlength=count**2).reshape(count, count)
+            shared = shared + each + each.T
         return shared
 
 
+def _paired(high: Integers, low: Integers) -> NDArray[np.int64]:
+    """Join two indices of 31 bits in one number, for faster sorting."""
+    return (high.astype(np.int64) << 32) | low
+
+
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:
-    """The array, not to be written to: also the one kind that the compiled loops then meet."""
     view = array.view()
     view.setflags(write=False)
     return view
@@ -127,14 +124,14 @@ def _read_only(array: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """2D-3D matches: every keypoint and every point at most once.
+    """2D-3D matches with unique keypoints and points.
 
     Attributes
     ----------
     keypoint_ids, point_ids : int64 (N,), rows of the query's keypoints, ascending, and of the
         points.
-    support : int64 (N,), number of map images that say so.
-    image_rows : int64 (sum of support,), these images, match by match.
+    support : int64 (N,), number of map images with the match.
+    image_rows : int64 (sum of support,), these images, grouped by match.
     """
 
     keypoint_ids: NDArray[np.int64]
@@ -150,23 +147,17 @@ def resolve_conflicts(
     image_rows: NDArray[np.int64],
     seen_once: NDArray[np.bool_] | None = None,
 ) -> Correspondences:
-    """One point per keypoint and one keypoint per point, of matches (M,) with conflicts and all.
+    """Select one point per keypoint and one keypoint per point from conflicting matches (M,).
 
-    The same keypoint can meet several points through different map images, and the reverse. A point
-    that several images observe comes before one that was lifted through one's depth (``seen_once``;
-    None: there is none); then what most images say wins; then the best similarity, higher is
-    better; then the smaller ids. Conflicts are settled greedily from the best on, so that a loser
-    may still get its second choice. ``image_rows`` are the map images that the matches are with.
+    Greedy from the best: triangulated points before lifted ones (``seen_once``), then by the number
+    of map images (``image_rows``), then by similarity, then by smaller ids.
     """
-    from megloc_kapture.localization import kernels
-
     if len(keypoint_ids) == 0:
         none = np.zeros(0, dtype=np.int64)
         return Correspondences(none, none, none, none)
-    # both in one number: equals are the same pair, and their order does not matter
-    order = np.argsort((keypoint_ids << 32) | point_ids)
+    order = np.argsort(_paired(keypoint_ids, point_ids))
     keypoints, points = keypoint_ids[order], point_ids[order]
-    # every distinct pair once, sorted by keypoint, then point
+    # distinct pairs, sorted by keypoint, then point
     first = np.flatnonzero(np.diff(keypoints, prepend=-1) | np.diff(points, prepend=-1))
     best = np.maximum.reduceat(similarities[order], first)
     support = np.diff(first, append=len(order))
@@ -174,11 +165,16 @@ def resolve_conflicts(
     worth = [-best, -support]
     if seen_once is not None:
         worth.append(seen_once[order][first])
-    chosen = kernels.choose(
-        np.lexsort(worth),
-        np.cumsum(np.diff(keypoints, prepend=keypoints[0]) != 0),
-        np.unique(points, return_inverse=True)[1],
-    )
+    ranked = np.lexsort(worth)
+    chosen = np.zeros(len(ranked), np.bool_)
+    used_keypoints: set[int] = set()
+    used_points: set[int] = set()
+    pairs = zip(keypoints[ranked].tolist(), points[ranked].tolist(), strict=True)
+    for row, (keypoint, point) in zip(ranked.tolist(), pairs, strict=True):
+        if keypoint not in used_keypoints and point not in used_points:
+            used_keypoints.add(keypoint)
+            used_points.add(point)
+            chosen[row] = True
     return Correspondences(
         keypoints[chosen],
         points[chosen],
@@ -189,10 +185,10 @@ def resolve_conflicts(
 
 @dataclass(frozen=True, eq=False)
 class TypedMatches:
-    """Matches of one query image in one keypoints type, and the map's points of the type.
+    """Matches of one query image in one keypoints type.
 
-    Of the query's keypoints, float32 (N, 2 or more), with each candidate: its name, rows of query
-    and map keypoints (K, 2), scores (K,). A candidate that is not in the map has nothing to say.
+    ``keypoints_px`` float32 (N, 2 or more) are the query's; ``matches`` has the map image, rows of
+    query and map keypoints (K, 2) and scores (K,) per candidate.
     """
 
     index: MapIndex
@@ -201,40 +197,36 @@ class TypedMatches:
 
     @cached_property
     def observed(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats, NDArray[np.int64]]:
-        """The matches whose map keypoint observes a point, conflicts and all.
+        """Return the matches with points of the map, conflicts included, (M,) each.
 
-        Rows of the query's keypoints and of the map's points, scores, and which of the candidates
-        each is with; (M,) each.
+        They are query keypoint rows, point rows, scores and candidate indices.
         """
-        from megloc_kapture.localization import kernels
-
-        if not self.matches:
-            empty = np.zeros(0, dtype=np.int64)
-            return empty, empty, np.zeros(0), empty
-        images, pairs, scores = zip(*self.matches, strict=True)
-        starts = np.zeros(len(images) + 1, dtype=np.int64)
-        np.cumsum([len(own) for own in pairs], out=starts[1:])
-        index = self.index
-        found: tuple[NDArray[np.int64], NDArray[np.int64], Floats, NDArray[np.int64]]
-        found = kernels.observed(
-            index.offsets,
-            index.keypoint_ids,
-            index.point_ids,
-            index.rows_of(images),
-            starts,
-            np.concatenate(pairs, dtype=np.int64),
-            np.concatenate(scores, dtype=np.float64),
+        empty = np.zeros(0, dtype=np.int64)
+        rows, points, similarities, candidates = [empty], [empty], [np.zeros(0)], [empty]
+        for candidate, (image, pairs, scores) in enumerate(self.matches):
+            keypoint_ids, point_ids = self.index.observed(image)
+            at = np.searchsorted(keypoint_ids, pairs[:, 1])
+            known = at < len(keypoint_ids)
+            known[known] = keypoint_ids[at[known]] == pairs[known, 1]
+            rows.append(pairs[known, 0].astype(np.int64))
+            points.append(point_ids[at[known]].astype(np.int64))
+            similarities.append(scores[known].astype(np.float64))
+            candidates.append(np.full(len(rows[-1]), candidate))
+        return (
+            np.concatenate(rows),
+            np.concatenate(points),
+            np.concatenate(similarities),
+            np.concatenate(candidates),
         )
-        return found
 
     def are_with(self, images: Sequence[str]) -> NDArray[np.bool_]:
-        """Mask (M,) of the observed matches that are with some images."""
+        """Return a mask (M,) of the observed matches with some images."""
         members = set(images)
         asked = np.array([image in members for image, _, _ in self.matches], bool)
         return np.asarray(asked[self.observed[3]])
 
     def correspondences(self, images: Sequence[str] | None = None) -> Correspondences:
-        """2D-3D matches, see :func:`resolve_conflicts`; only these images have a say, or all."""
+        """Return 2D-3D matches with some images, or all; see :func:`resolve_conflicts`."""
         taken: Any = slice(None) if images is None else self.are_with(images)
         keypoint_ids, point_ids, similarities, image_rows = self.observed
         return resolve_conflicts(
@@ -248,17 +240,12 @@ class TypedMatches:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One camera and its matches; a camera on its own is a rig of one, at its origin.
-
-    Raises DataError where the arrays do not have these shapes.
+    """One camera of a rig and its matches; a single camera is a rig of one.
 
     Attributes
     ----------
-    points_px, points_world : float (N, 2) pixels, first pixel's centre at (0.5, 0.5), and float64
-        (N, 3) the points that they are matched with.
-    point_covariances : float64 (N, 6) of the points as xx, xy, xz, yy, yz, zz in the map's unit
-        squared, for a measurement noise of 1 px, not finite where unknown; or None. An unknown
-        covariance counts as none at all.
+    points_px, points_world : float (N, 2), the first pixel's centre is (0.5, 0.5); float64 (N, 3).
+    point_covariances : float64 (N, 6), see :class:`MapIndex`; None or not finite counts as zero.
     """
 
     camera: Camera
@@ -274,22 +261,18 @@ class View:
                 f"pixels {self.points_px.shape} and points {self.points_world.shape} of a view "
                 "are not (N, 2) and (N, 3)"
             )
-        if self.point_covariances is not None and self.point_covariances.shape != (count, 6):
-            raise DataError(
-                f"covariances {self.point_covariances.shape} of {count} points are not ({count}, 6)"
-            )
 
 
 @dataclass(frozen=True, eq=False)
 class PoseProblem:
-    """The matches of a camera, or of all cameras of a rig, that its pose is estimated from.
+    """The matches of all cameras of a rig.
 
     Attributes
     ----------
-    points_px, points : float64 (N, 2) and (N, 3), the latter minus ``offset`` (3,), a point amid
-        the others: far from the origin (ECEF) float64 loses what a recentred world keeps.
-    covariances : float64 (N, 6), or (0, 6) where no view has any.
-    starts : int64 (V + 1,) first match of each view.
+    points_px, points : float64 (N, 2) and (N, 3), the latter minus ``offset`` (3,): float64 loses
+        digits far from the origin (ECEF).
+    covariances : float64 (N, 6), or (0, 6) if all are unknown.
+    starts : int64 (V + 1,), first match of each view.
     """
 
     views: tuple[View, ...]
@@ -301,7 +284,6 @@ class PoseProblem:
 
     @classmethod
     def of(cls, views: Sequence[View]) -> PoseProblem:
-        """The problem of any number of views, their matches in the same order."""
         starts = np.zeros(len(views) + 1, dtype=np.int64)
         np.cumsum([len(view.points_px) for view in views], out=starts[1:])
         world = _joined([view.points_world for view in views], 3)
@@ -323,7 +305,7 @@ class PoseProblem:
         )
 
     def split(self, per_match: NDArray[Any]) -> list[NDArray[Any]]:
-        """One part for each view of what runs over the matches of all views, as inliers (N,)."""
+        """Split an array over all matches into one part per view."""
         return np.split(per_match, self.starts[1:-1])
 
 
@@ -339,14 +321,14 @@ def _amid(points: Floats) -> Floats:
 
 
 def undo_recentring(pose: RigidTransform, offset: Floats) -> RigidTransform:
-    """``rig_from_world`` of a pose in a world that was moved by minus ``offset`` (3,)."""
+    """Return ``rig_from_world`` for a pose in a world that was moved by minus ``offset`` (3,)."""
     t = np.array(pose.translation) - pose.rotation_matrix() @ offset
     return RigidTransform(pose.quat_wxyz, (float(t[0]), float(t[1]), float(t[2])))
 
 
 @dataclass(frozen=True, eq=False)
 class QueryView:
-    """One camera of a query: its pose on the rig, and its matches by keypoints type."""
+    """One camera of a query with its pose in the rig and its matches by keypoints type."""
 
     name: str
     camera: Camera
@@ -354,12 +336,12 @@ class QueryView:
     cam_from_rig: RigidTransform = RigidTransform.identity()
 
     def matched_images(self) -> list[str]:
-        """Map images with a match, in the order given."""
+        """Return the map images with matches, in the given order."""
         named = (image for own in self.matches for image, pairs, _ in own.matches if len(pairs))
         return list(dict.fromkeys(named))
 
     def among(self, images: Sequence[str]) -> QueryView:
-        """With its matches with these map images only."""
+        """Keep the matches with these map images only."""
         members = set(images)
         kept = (
             replace(typed, matches=[one for one in typed.matches if one[0] in members])
@@ -368,7 +350,7 @@ class QueryView:
         return replace(self, matches=tuple(kept))
 
     def view(self, found: Sequence[Correspondences]) -> View:
-        """The camera with its 2D-3D matches of all types, one after another."""
+        """Return the camera with its 2D-3D matches, all types concatenated."""
         pixels, points, covariances = [np.zeros((0, 2))], [np.zeros((0, 3))], [np.zeros((0, 6))]
         for typed, own in zip(self.matches, found, strict=True):
             pixels.append(typed.keypoints_px[own.keypoint_ids, :2].astype(np.float64))

@@ -1,8 +1,8 @@
-"""Pose rankers: scores of the candidate poses of a query, by inliers or by what is seen there.
+"""Rankers of candidate poses: by inliers, or by the image distance to warped map images.
 
-MegLoc, section "Cluster-wise localization", indoor strategy: a view near the query is rendered at
-each cluster's pose, and the one that looks most alike wins. The ranker ``perceptual`` warps that
-view from the cluster's map images with depth.
+MegLoc, section "Cluster-wise localization", indoor strategy: a view is rendered at each cluster's
+pose and the most similar one wins. ``perceptual`` warps it from the cluster's map images with
+depth.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from megloc_kapture.geometry.warping import WarpedView, WarpSource, warp_to_view
 from megloc_kapture.plugin_loading import load_plugin, weights_of
 from megloc_kapture.plugins import (
     IMAGE_DISTANCES,
-    HypothesisView,
     ImageDistance,
     PluginChoice,
     PoseHypothesis,
@@ -37,7 +36,6 @@ class InlierCount:
     def score(
         self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene
     ) -> NDArray[np.float64]:
-        """Scores (H,)."""
         return np.array(
             [sum(int(view.inliers.sum()) for view in each.views) for each in hypotheses],
             dtype=np.float64,
@@ -45,8 +43,6 @@ class InlierCount:
 
 
 class DistinctiveInliersOptions(Options):
-    """Options of the ranker ``distinctive``."""
-
     radius: float = Field(
         default=0.03, ge=0, description="of a place's inliers, share of the image's longer side"
     )
@@ -54,15 +50,12 @@ class DistinctiveInliersOptions(Options):
 
 
 class DistinctiveInliers:
-    """Plugin ``distinctive``: inliers, each weighted by how few hypotheses explain it.
+    """Plugin ``distinctive``: inliers weighted by how few hypotheses explain them.
 
-    Rooms that are alike all explain the query's walls and furniture, and which of them gives most
-    inliers hangs on how well each was mapped. What only one of them explains tells them apart. So
-    an inlier has the weight ``1 / n ** power``, where ``n`` counts the hypotheses with an inlier
-    within a radius, its own included (no hypothesis has a match for every keypoint of what it
-    explains): after the geometric bursts between places of Sattler et al., "Large-scale location
-    recognition and the geometric burstiness problem", CVPR 2016. Hypotheses of which either's pose
-    explains the other's inliers do not count against each other.
+    Similar rooms all explain the query's walls and furniture. An inlier has the weight ``1 / n **
+    power``, with ``n`` the number of hypotheses that have an inlier within a radius (after the
+    geometric bursts of Sattler et al., CVPR 2016). Hypotheses that explain each other's inliers do
+    not compete.
     """
 
     Options = DistinctiveInliersOptions
@@ -73,7 +66,6 @@ class DistinctiveInliers:
     def score(
         self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene
     ) -> NDArray[np.float64]:
-        """Scores (H,)."""
         scores = np.zeros(len(hypotheses))
         same = [[poses_agree(a, b) for b in hypotheses] for a in hypotheses]
         for number in range(len(hypotheses[0].views) if hypotheses else 0):
@@ -94,7 +86,7 @@ class DistinctiveInliers:
 
 
 def poses_agree(one: PoseHypothesis, other: PoseHypothesis) -> bool:
-    """True if either pose has at least half of the other's inliers as inliers too."""
+    """Return True if one pose explains at least half of the other's inliers."""
     return _explains(one, other) or _explains(other, one)
 
 
@@ -111,12 +103,10 @@ def _explains(this: PoseHypothesis, other: PoseHypothesis) -> bool:
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_ANOTHER_VIEW = 0.2  # of references, how unlike; radians: with equal centres, 11 degrees
+_ANOTHER_VIEW = 0.2  # least difference of references, radians
 
 
-class AlignedViewOptions(Options):
-    """How map images are brought to a pose."""
-
+class PerceptualOptions(Options):
     references: int = Field(
         default=5,
         ge=1,
@@ -126,11 +116,6 @@ class AlignedViewOptions(Options):
     long_side: int = Field(
         default=320, ge=16, description="of the views compared, pixels; never enlarged"
     )
-
-
-class PerceptualOptions(AlignedViewOptions):
-    """Options of the ranker ``perceptual``."""
-
     distance: PluginChoice = Field(
         default=PluginChoice(name="structure"),
         description="how different two aligned images look: structure, lpips, or another's",
@@ -156,24 +141,19 @@ class PerceptualOptions(AlignedViewOptions):
 
 
 class _Compared(NamedTuple):
-    """One view of a query and what a cluster shows at its pose."""
-
     query: NDArray[np.uint8]
     aligned: NDArray[np.uint8]
     valid: Mask
 
 
 class PerceptualRanker:
-    """Plugin ``perceptual``: the least distance of the query to the view warped to its pose.
+    """Plugin ``perceptual``: smallest image distance of the query to the view warped to its pose.
 
-    Clusters whose inliers are a fair share of the most are compared. Distances over different
-    parts of an image say little about each other: so the few best by their own distance (the
-    finalists) are compared pair by pair, over the pixels that both show, and a finalist's score is
-    by how much its distance is less than the others', on average. The rest follow by their own
-    distances, then come clusters that cannot be told: without depth, or hopeless.
-
-    Where the place that the ranker ``distinctive`` would choose cannot be told, pictures decide
-    nothing: its scores are the result then. One cluster alone needs no comparing and has score 0.
+    Clusters with a fair share of the most inliers are compared. The best by their own distance, the
+    finalists, are compared pairwise over pixels valid in both, since distances over different image
+    parts do not compare; a score is the mean margin. The others follow by their own distance, then
+    clusters without depth or with few inliers. If the best cluster of ``distinctive`` has no valid
+    view, that ranker's scores are returned.
     """
 
     Options = PerceptualOptions
@@ -184,23 +164,20 @@ class PerceptualRanker:
         self._distance: ImageDistance = load_plugin(IMAGE_DISTANCES, choice.name, choice.options)
 
     def plugins(self) -> tuple[object, ...]:
-        """Those it is made of."""
         return (self._distance,)
 
     def weights(self) -> dict[str, str]:
-        """Those of the image distance."""
         return weights_of(self._distance)
 
     def score(self, hypotheses: Sequence[PoseHypothesis], scene: RankingScene) -> Floats:
-        """Scores (H,); raises DataError where the query's pixels or the map's cannot be read."""
         if len(hypotheses) < 2:
             return np.zeros(len(hypotheses))
         otherwise = DistinctiveInliers().score(hypotheses, scene)
         inliers = [sum(int(v.inliers.sum()) for v in each.views) for each in hypotheses]
         enough = self.options.min_inlier_share * max(inliers)
-        shown = _Shown(scene, self.options)
+        read = cache(scene.query_image), cache(partial(warp_source, scene=scene))
         compared = [
-            shown.views(each) if count >= enough else None
+            self._views(each, scene, *read) if count >= enough else None
             for each, count in zip(hypotheses, inliers, strict=True)
         ]
         own = np.array(
@@ -224,10 +201,29 @@ class PerceptualRanker:
         scores[untold] = scores[told].min() - 1.0 - 1.0 / (1.0 + otherwise[untold])
         return scores
 
+    def _views(
+        self,
+        hypothesis: PoseHypothesis,
+        scene: RankingScene,
+        query_image: Callable[[str], NDArray[np.uint8]],
+        source_of: Callable[[str], WarpSource | None],
+    ) -> list[_Compared]:
+        views, options, images = [], self.options, hypothesis.images
+        for view in hypothesis.views:
+            place = view.camera, view.cam_from_world
+            warped = aligned_view(*place, images, scene, options, source_of=source_of)
+            height, width = warped.valid.shape
+            mask, valid = scene.query_mask(view.name), warped.valid
+            if mask is not None:
+                valid = valid & _mask_at_size(mask, width, height)
+            query = query_at_size(query_image(view.name), width, height)
+            views.append(_Compared(query, warped.image, valid))
+        return views
+
     def _against_each_other(
         self, finalists: Sequence[Sequence[_Compared] | None], own: Floats, at: NDArray[np.int64]
     ) -> Floats:
-        """By how much each one's distance is less than the others', on average."""
+        """Return how much smaller each distance is than the others', on average."""
         margins = np.zeros(len(finalists))
         for i, one in enumerate(finalists):
             for j, other in enumerate(finalists[:i]):
@@ -242,7 +238,7 @@ class PerceptualRanker:
         return margins / max(len(finalists) - 1, 1)
 
     def _mean_distance(self, views: Sequence[_Compared], valid: Sequence[Mask]) -> float:
-        """Mean over a rig's views by their valid pixels; infinite with too few of them."""
+        """Average over a rig's views, weighted by valid pixels; infinite for too few of them."""
         counts = np.array([int(each.sum()) for each in valid])
         if counts.sum() < max(1.0, self.options.min_valid * sum(each.size for each in valid)):
             return float("inf")
@@ -256,41 +252,7 @@ class PerceptualRanker:
         return float(np.average(np.array(distances)[known], weights=counts[known]))
 
 
-class _Shown:
-    """A query's images and what clusters show in their place; reads everything once."""
-
-    def __init__(self, scene: RankingScene, options: AlignedViewOptions) -> None:
-        self._scene, self._options = scene, options
-        self._queries: dict[str, tuple[NDArray[np.uint8], Mask | None]] = {}
-        self._source = cache(partial(warp_source, scene=scene))
-
-    def views(self, hypothesis: PoseHypothesis) -> list[_Compared]:
-        """The views of a hypothesis."""
-        return [self._view(view, hypothesis.images) for view in hypothesis.views]
-
-    def _view(self, view: HypothesisView, images: Sequence[str]) -> _Compared:
-        warped = aligned_view(
-            view.camera,
-            view.cam_from_world,
-            images,
-            self._scene,
-            self._options,
-            source_of=self._source,
-        )
-        height, width = warped.valid.shape
-        if view.name not in self._queries:
-            image, mask = self._scene.query_image(view.name), self._scene.query_mask(view.name)
-            self._queries[view.name] = (
-                query_at_size(image, width, height),
-                None if mask is None else _mask_at_size(mask, width, height),
-            )
-        query, usable = self._queries[view.name]
-        valid = warped.valid if usable is None else warped.valid & usable
-        return _Compared(query, warped.image, valid)
-
-
 def warp_source(name: str, scene: RankingScene) -> WarpSource | None:
-    """A map image to warp from; None where it has no depth. Raises DataError."""
     depth = scene.map_depth(name)
     if depth is None:
         return None
@@ -310,20 +272,12 @@ def aligned_view(
     cam_from_world: RigidTransform,
     images: Sequence[str],
     scene: RankingScene,
-    options: AlignedViewOptions | None = None,
+    options: PerceptualOptions | None = None,
     *,
     source_of: Callable[[str], WarpSource | None] | None = None,
 ) -> WarpedView:
-    """What map images show of a query's view, at reduced size.
-
-    Parameters
-    ----------
-    camera, cam_from_world : of the query and where it may stand.
-    images : map images of the place, best first; those nearest to the pose that have depth are
-        warped.
-    source_of : reads a map image; default :func:`warp_source`.
-    """
-    options = options or AlignedViewOptions()
+    """Warp the map images with depth that are nearest to a pose into its view, at reduced size."""
+    options = options or PerceptualOptions()
     read = source_of or (lambda name: warp_source(name, scene))
     sources: list[WarpSource] = []
     for name in _nearest_first(images, cam_from_world, scene):
@@ -336,14 +290,12 @@ def aligned_view(
 
 
 def query_at_size(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """A query's pixels reduced to the size of an aligned view, uint8 (height, width, 3)."""
     if image.shape[:2] == (height, width):
         return image
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _mask_at_size(mask: Mask, width: int, height: int) -> Mask:
-    """True where every pixel below is."""
     share = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
     return np.asarray(share > 0.999, np.bool_)
 
@@ -351,11 +303,10 @@ def _mask_at_size(mask: Mask, width: int, height: int) -> Mask:
 def _nearest_first(
     images: Sequence[str], cam_from_world: RigidTransform, scene: RankingScene
 ) -> list[str]:
-    """Images by how much like the pose they look; those that show what an earlier one does, last.
+    """Sort images by similarity to the pose; images that repeat an earlier view come last.
 
-    How unlike two views are is the angle of their axes and the distance of their centres; a radian
-    weighs as much as the median distance to the pose, whatever the size of the place. The frames of
-    a film and repeated photographs show the same: a few of them would leave most of a view empty.
+    The difference of two views is the angle of their axes plus the distance of their centres, over
+    the median distance to the pose. Repeated video frames would leave most of a view uncovered.
     """
     if not images:
         return []

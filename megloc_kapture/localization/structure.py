@@ -1,4 +1,4 @@
-"""Locally normalised correlation of images: the distance ``structure``, and displaced scenes."""
+"""Locally normalised image correlation: the distance ``structure``, and patch displacements."""
 
 from __future__ import annotations
 
@@ -45,10 +45,8 @@ class StructureOptions(Options):
 class StructureDistance:
     """Plugin ``structure``: one minus the local correlation of two images' brightness.
 
-    The correlation is SSIM's structure term with its contrast (Wang et al., "Image quality
-    assessment", IEEE TIP 2004, eq. 10): in a window, ``(cov + c) / (s_a s_b + c)``. Means and
-    deviations are the window's own, so that neither exposure nor shading counts. Windows are taken
-    of the valid pixels alone.
+    SSIM's structure term (Wang et al., IEEE TIP 2004, eq. 10), ``(cov + c) / (s_a s_b + c)`` in
+    Gaussian windows over valid pixels; exposure and shading do not count.
     """
 
     name = "structure"
@@ -60,9 +58,9 @@ class StructureDistance:
     def distance(
         self, a: NDArray[np.uint8], b: NDArray[np.uint8], valid: NDArray[np.bool_]
     ) -> float:
-        """Distance of two RGB images uint8 (H, W, 3) over the valid pixels (H, W), 0 to 2.
+        """Return the distance of RGB images uint8 (H, W, 3) over the valid pixels (H, W), 0 to 2.
 
-        Infinite where no window is at least half valid.
+        Infinite if no window is at least half valid.
         """
         sigma = self.options.window * max(valid.shape)
         weight = valid.astype(np.float32)
@@ -93,7 +91,7 @@ class StructureDistance:
 
 
 def _grey(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> Float32:
-    """Brightness float32 (H, W), about zero: squares then lose no digits."""
+    """Return brightness float32 (H, W) around zero, so that squares keep their digits."""
     grey = _grey_levels(image).astype(np.float32)
     return np.asarray(grey - grey[valid].mean(), np.float32)
 
@@ -109,15 +107,12 @@ def displacements_rad(
     scene: RankingScene,
     pose: Pose,
 ) -> NDArray[np.float64]:
-    """Angles by which the scene stands elsewhere in a query than a pose says, of its inliers.
+    """Return the angles between inliers' projections and the same patches found in the query.
 
-    The keypoints of a photograph at night or in another season are off by pixels although its pose
-    is right: a detector finds another place on the same corner. The surroundings of the corner, as
-    the first map image of a match shows them, are where the pose says. In the scene's like, or its
-    mirror image, they are off as its keypoints are.
-
-    Of matches ``found`` in each view, by keypoints type. Only of those whose surroundings are
-    found, at most a few hundred of a view; none without pixels of the query or the map.
+    Detectors find other points of the same corner at night or in another season, although the pose
+    is right; the patch around it, taken from the first map image of a match, is then at the
+    projection. In a similar or mirrored scene it is displaced like its keypoint. Empty without
+    pixels of query or map.
     """
     assert pose.inliers is not None  # it was estimated here
     angles = [np.zeros(0)]
@@ -148,10 +143,7 @@ def _displacements_px(
     shown_by: Sequence[str],
     scene: RankingScene,
 ) -> NDArray[np.float64]:
-    """Distances of points' surroundings, where they are found in a query, from the projections.
-
-    Of points (N, 3) in the world, with a map image each that observes it.
-    """
+    """Return displacements in pixels for points (N, 3) with one map image each."""
     most = [image for image, _ in Counter(shown_by).most_common(_MAX_IMAGES)]
     rows = [row for row, image in enumerate(shown_by) if image in most]
     rows = rows[:: max(1, math.ceil(len(rows) / _MAX_POINTS))]
@@ -174,7 +166,6 @@ def _found_in(
     image: str,
     scene: RankingScene,
 ) -> list[float]:
-    """The displacements of the points of one map image."""
     map_camera, map_pose = scene.map_camera(image), scene.map_pose(image)
     shown = _grey_levels(scene.map_image(image))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -208,7 +199,7 @@ def _found_in(
 
 
 def _peak(values: NDArray[Any], at: int) -> float:
-    """Position of a maximum between samples, by a parabola."""
+    """Return the position of a maximum between samples, by a parabola."""
     if not 0 < at < len(values) - 1:
         return float(at)
     before, here, after = (float(value) for value in values[at - 1 : at + 2])

@@ -1,10 +1,7 @@
 """Depth maps of map images: keypoints lifted to 3D points, and points verified by depth.
 
-An observation says that an image sees a point. Where the image has a depth map, the point must then
-lie on the surface that the sensor saw there. A surface is not known better than the sensor's noise,
-and near an edge not better than to some pixels; a triangulated point not better than its images
-determine it. So the point's depth is compared with the least and the greatest depth in a small
-window, widened by some standard deviations of both. Where the sensor has no depth, nothing is said.
+A point observed by an image with depth must lie on the surface seen by the sensor, within the noise
+of sensor and point and a small window for edges. Without depth nothing is rejected.
 """
 
 from __future__ import annotations
@@ -19,11 +16,11 @@ from megloc_kapture.geometry.cameras import bearing_rays, focal_px, px_from_cam
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
-# a depth sensor beside the camera sees each point at a pixel that depends on its depth; a few
-# rounds find it, and what has not settled to a hundredth of its depth lies behind an edge
+# a point's pixel in a depth sensor beside the camera depends on its depth, so it is iterated;
+# points that do not converge are behind an edge
 _ROUNDS = 6
 _SETTLED = 0.01
-# one over the noise, in pixels, that a deviation of estimated depth is due to
+# one over the keypoint noise, in pixels, of the deviations of estimated depth
 _PIXELS_OF_SIGMA = 3.0
 # the four depths around a keypoint may differ by this share of the smallest; beyond, it lies on an
 # edge and has no depth
@@ -35,7 +32,7 @@ _KEYPOINT_NOISE_PX = 2.0
 _WINDOW_PX = 3
 _SAME_CENTRE_M = 1e-9  # an offset that is left over from composing transforms
 # coefficients of z^0, z^1, z^2 of 0.0012 + 0.0019 (z - 0.4)^2
-_STRUCTURED_LIGHT = (0.001504, -0.00152, 0.0019)
+STRUCTURED_LIGHT = (0.001504, -0.00152, 0.0019)
 
 
 def lift_keypoints(
@@ -45,21 +42,18 @@ def lift_keypoints(
     depth_camera: Camera,
     image_from_depth: RigidTransform,
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """3D points of an image's keypoints, through a depth map of the same moment.
+    """Lift an image's keypoints (N, 2 or more) by a depth map of the same moment.
 
-    Depth is interpolated between the four pixels around a keypoint; where some of them have none,
-    the nearest that has counts.
+    Depth is interpolated between four pixels; if some are unknown, the nearest known one counts.
 
     Parameters
     ----------
-    keypoints_px : (N, 2 or more), x and y first, in the image; COLMAP's pixel origin.
     depth_m : float32 (H, W), along the depth camera's axis, 0 or less where unknown.
     image_from_depth : from the depth camera's frame to the image camera's, metres.
 
     Returns
     -------
-    Points float64 (N, 3) in the image camera's frame, metres, NaN where there is no depth; and a
-        mask.
+    Points float64 (N, 3) in the image camera's frame, NaN without depth, and a mask (N,).
     """
     rays = bearing_rays(image_camera, np.asarray(keypoints_px, np.float64)[:, :2])
     depth_from_image = image_from_depth.inverse()
@@ -67,7 +61,7 @@ def lift_keypoints(
     if not len(rays) or not (depth_m > 0).any():
         return points, np.zeros(len(rays), bool)
     same_centre = bool(np.linalg.norm(image_from_depth.translation) < _SAME_CENTRE_M)
-    # of one centre, all points of a ray are seen at one pixel
+    # with one centre, all points of a ray are at one pixel
     z = np.full(len(rays), 1.0 if same_centre else float(np.median(depth_m[depth_m > 0])))
     settled = np.zeros(len(rays), bool)
     for _ in range(1 if same_centre else _ROUNDS):
@@ -91,12 +85,11 @@ def lift_with_covariances(
     image_camera: Camera,
     depth_camera: Camera,
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """:func:`lift_keypoints` through a depth map of the image's own centre, with covariances.
+    """Lift keypoints by a depth map of the image's own centre, with covariances (N, 3, 3).
 
-    Across the ray a keypoint is off by its own noise; along it by the deviation of depth,
-    ``sigma_m`` float32 (H, W), 0 where unknown, which is taken for that of keypoints with a noise
-    of a third of a pixel (``map_noise`` of the pose). The covariances are float64 (N, 3, 3) in the
-    camera's frame for a noise of 1 px, between the points and the mask.
+    ``sigma_m`` float32 (H, W) are the deviations of depth, 0 where unknown, taken as those for a
+    keypoint noise of a third of a pixel (the pose's ``map_noise``). Covariances are for a noise of
+    1 px, in the camera's frame.
     """
     same = RigidTransform.identity()
     points, valid = lift_keypoints(keypoints_px, depth_m, image_camera, depth_camera, same)
@@ -118,16 +111,10 @@ def lift_with_covariances(
 def sample_depth(
     depth_m: NDArray[np.float32], pixels: Floats, max_jump: float, *, whole: bool = False
 ) -> Floats:
-    """Depth (N,) at pixels of a depth map, interpolated as :func:`lift_keypoints` does.
+    """Return interpolated depths (N,) at pixels (N, 2), see :func:`lift_keypoints`.
 
-    NaN outside, where the depth is unknown, and where it jumps.
-
-    Parameters
-    ----------
-    depth_m : float32 (H, W), 0 or less where unknown.
-    pixels : float64 (N, 2) of the depth map, COLMAP's pixel origin; may be NaN.
-    max_jump : see ``MAX_DEPTH_JUMP``.
-    whole : all four depths around a pixel must be known, else some of them.
+    NaN outside the map, where depth is unknown, and where it jumps; ``whole`` requires all four
+    pixels.
     """
     height, width = depth_m.shape
     result = np.full(len(pixels), np.nan)
@@ -155,12 +142,10 @@ def sample_depth(
 
 
 class DepthVerificationOptions(Options):
-    """Options of depth verification: the noise of the sensor, and the allowed distance from it.
+    """Options of depth verification: noise of the sensor and largest distance.
 
-    The default noise is that of a structured-light sensor (Kinect): 0.0012 + 0.0019 (z - 0.4)^2,
-    Nguyen, Izadi and Lovell, Modeling Kinect Sensor Noise for Improved 3D Reconstruction and
-    Tracking, 3DIMPVT 2012, eq. 4; Khoshelham and Elberink, Sensors 12(2), 2012, find 0.0014 z^2. A
-    laser scan has about ``[0.003, 0, 0]``.
+    The default noise is a structured-light sensor's: 0.0012 + 0.0019 (z - 0.4)^2 (Nguyen et al.,
+    3DIMPVT 2012, eq. 4). A laser scan has about ``[0.003, 0, 0]``.
     """
 
     max_sigmas: float | None = Field(
@@ -170,7 +155,7 @@ class DepthVerificationOptions(Options):
         "observation is dropped; none: depth maps are not looked at",
     )
     noise: tuple[float, float, float] = Field(
-        default=_STRUCTURED_LIGHT,
+        default=STRUCTURED_LIGHT,
         description="a, b, c of the noise a + b z + c z^2 at depth z, in the map's unit",
     )
 
@@ -178,7 +163,7 @@ class DepthVerificationOptions(Options):
     @classmethod
     def _positive(cls, noise: tuple[float, float, float]) -> tuple[float, float, float]:
         a, b, c = noise
-        # least where z = -b / 2c, if that lies before the sensor, else at the sensor itself
+        # minimum at z = -b / 2c, if positive, else at 0
         lowest = a - b * b / (4.0 * c) if c > 0 and b < 0 else a
         if not np.isfinite(noise).all() or lowest <= 0 or c < 0 or (c == 0 and b < 0):
             raise ValueError("noise is not positive at every depth")
@@ -186,7 +171,7 @@ class DepthVerificationOptions(Options):
 
 
 def depth_noise(depth: Floats, noise: tuple[float, float, float]) -> Floats:
-    """Standard deviation of a sensor's depth (...), in its unit, by a + b z + c z^2."""
+    """Return the standard deviation of a sensor's depth, a + b z + c z^2."""
     a, b, c = noise
     return a + depth * (b + depth * c)
 
@@ -200,20 +185,10 @@ def contradicted_by_depth(
     *,
     deviations: Floats | None = None,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Find the points that do not lie on the surface of a depth map.
+    """Find the points (N, 3), in the image camera's frame, that are off the surface of a depth map.
 
-    Parameters
-    ----------
-    points_in_image : float64 (N, 3) in the image camera's frame, metres.
-    depth_m : float32 (H, W) along the depth camera's axis, 0 or less or not finite where unknown.
-    image_from_depth : from the depth camera's frame to the image camera's, metres.
-    deviations : float64 (N,), standard deviations of the points along the depth camera's axis for a
-        noise of 1 px; NaN where unknown, which counts as none.
-
-    Returns
-    -------
-    Masks (N,): contradicted, never where there is no depth; and where there is depth to compare
-        with.
+    ``deviations`` (N,) are the points' along the depth camera's axis for a noise of 1 px, NaN if
+    unknown. Returns masks (N,) of contradicted points and of points with depth to compare with.
     """
     own = 0.0 if deviations is None else np.nan_to_num(deviations) * _KEYPOINT_NOISE_PX
     before, behind, checked = compare_with_depth(
@@ -230,16 +205,9 @@ def compare_with_depth(
     options: DepthVerificationOptions,
     sigmas: Floats | float,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Compare points with the surface of a depth map; see :func:`contradicted_by_depth`.
+    """Compare points, with standard deviations ``sigmas``, with the surface of a depth map.
 
-    Parameters
-    ----------
-    sigmas : float64 (N,) or one for all, standard deviations of the points, metres.
-
-    Returns
-    -------
-    Masks (N,): clearly before the surface, which the camera then sees through the point; clearly
-        behind it, hidden; and where there is depth to compare with.
+    Returns masks (N,): before the surface, behind it, and with depth to compare with.
     """
     points = image_from_depth.inverse().apply(np.asarray(points_in_image, np.float64))
     before, behind, checked = np.zeros((3, len(points)), bool)
@@ -250,14 +218,13 @@ def compare_with_depth(
     with np.errstate(invalid="ignore"):
         inside = (pixels >= 0).all(axis=1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
     rows = np.flatnonzero(inside)
-    # the centre of the first pixel is (0.5, 0.5): the whole part is the pixel
     column, line = np.floor(pixels[rows]).astype(np.int64).T
     reach = np.arange(-_WINDOW_PX, _WINDOW_PX + 1)
     columns = np.clip(column[:, None, None] + reach[None, None, :], 0, width - 1)
     lines = np.clip(line[:, None, None] + reach[None, :, None], 0, height - 1)
     window = depth_m[lines, columns].reshape(len(rows), len(reach) ** 2).astype(np.float64)
     known = np.isfinite(window) & (window > 0)
-    # beside a hole the surface may be the one that the sensor has not seen
+    # next to a hole, the surface may be invisible to the sensor
     whole = known.all(axis=1)
     rows, window = rows[whole], window[whole]
     z, low, high = points[rows, 2], window.min(axis=1), window.max(axis=1)

@@ -1,7 +1,4 @@
-"""Compiled loops over a map's observations: arrays in, arrays out.
-
-Imported where they are called, not where their module is: numba costs half a second to import.
-"""
+"""Compiled loops over a map's observations; import only where called: numba loads slowly."""
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
 
@@ -15,16 +12,14 @@ import numpy as np
 from numba import get_num_threads
 
 from megloc_kapture.compiling import compiled_loop
-from megloc_kapture.geometry.projection import PINHOLES, distorted, moved, project_point
+from megloc_kapture.geometry.projection import PINHOLES, distorted
 
-# information whose pivots are this far apart does not determine its point
+# least ratio of the information's pivots that determine a point
 _MIN_RATIO = 1e-13
-_MAX_SWEEPS = 16
-_SMALL = 2.3e-16
 
 
 def in_chunks(count: int, size: int, work: Callable[[int, int], object]) -> None:
-    """Call ``work(first, last)`` for parts of ``range(count)``, which must not mind the order."""
+    """Call ``work(first, last)`` for independent parts of ``range(count)``, in threads."""
     chunks = [(first, min(first + size, count)) for first in range(0, count, size)]
     if len(chunks) < 2:
         for first, last in chunks:
@@ -39,11 +34,12 @@ def in_chunks(count: int, size: int, work: Callable[[int, int], object]) -> None
 def most_shared(
     first, last, starts, of_image, images, track, track_starts, window, min_shared, best
 ):
-    """Images that share most points with each of ``first`` to ``last``, rows of ``best`` (I, K).
+    """Find the images that share most points with images ``first`` to ``last``: rows of ``best``
+    (I, K).
 
-    Observations of image i are ``of_image[starts[i]:starts[i + 1]]``; they are sorted by track,
-    then image, and those of track t run from ``track_starts[t]`` to ``track_starts[t + 1]``. An
-    image looks no farther in a track than ``window`` before and after itself.
+    Image i has observations ``of_image[starts[i]:starts[i + 1]]``; observations are sorted by
+    track, then image, and track t has ``track_starts[t]`` to ``track_starts[t + 1]``. At most
+    ``window`` observations before and after are visited.
     """
     shared = np.zeros(len(best), np.int64)
     touched = np.empty(len(best), np.int64)
@@ -63,7 +59,7 @@ def most_shared(
         for k in range(count):
             other = touched[k]
             if other != image and shared[other] >= min_shared:
-                # most shared first, then the first image, as one number that ascends
+                # sort key: most shared first, then the image
                 touched[enough] = (-shared[other] << 32) | other
                 enough += 1
             shared[other] = 0
@@ -73,53 +69,10 @@ def most_shared(
 
 
 @compiled_loop
-def shares_seen(
-    first, last, pairs, starts, points, xyz, rotations, translations, models, params, sizes, shares
-):
-    """Share of one image's points in the other's frustum, the larger of the two; ``shares`` (P,).
-
-    NaN where neither image has points.
-    """
-    out = np.empty(8)
-    for pair in range(first, last):
-        shares[pair] = np.nan
-        for side in range(2):
-            begin, end = starts[pairs[pair, side]], starts[pairs[pair, side] + 1]
-            if begin == end:
-                continue
-            other = pairs[pair, 1 - side]
-            r, t, p = rotations[other], translations[other], params[other]
-            seen = 0
-            for k in range(begin, end):
-                x, y, z = moved(r, t, xyz, points[k])
-                project_point(models[other], p, x, y, z, out)
-                inside = 0.0 <= out[0] < sizes[other, 0] and 0.0 <= out[1] < sizes[other, 1]
-                if inside and out[2] * out[6] > out[3] * out[5]:
-                    seen += 1
-            share = seen / (end - begin)
-            if not shares[pair] >= share:
-                shares[pair] = share
-
-
-@compiled_loop
-def mean_depths(starts, image_ids, xyz, rotations, translations, out):
-    """Mean depths (N,) of points in their images; NaN where no image observes one."""
-    for i in range(len(xyz)):
-        total = 0.0
-        for o in range(starts[i], starts[i + 1]):
-            k = image_ids[o]
-            r = rotations[k]
-            total += r[2, 0] * xyz[i, 0] + r[2, 1] * xyz[i, 1] + r[2, 2] * xyz[i, 2]
-            total += translations[k, 2]
-        count = starts[i + 1] - starts[i]
-        out[i] = total / count if count > 0 else math.nan
-
-
-@compiled_loop
 def covariances_of_points(
     first, last, starts, image_ids, xyz, rotations, translations, models, params, out
 ):
-    """Covariances of the points ``first`` to ``last``, rows of ``out`` (N, 6)."""
+    """Compute covariances of the points ``first`` to ``last``, rows of ``out`` (N, 6)."""
     for i in range(first, last):
         xx = xy = xz = yy = yz = zz = 0.0
         px, py, pz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
@@ -132,11 +85,11 @@ def covariances_of_points(
             y = r10 * px + r11 * py + r12 * pz + translations[k, 1]
             z = r20 * px + r21 * py + r22 * pz + translations[k, 2]
             if not z > 0.0:
-                continue  # behind the camera: such an observation says nothing
+                continue  # behind the camera
             inverse = 1.0 / z
             u, v = x * inverse, y * inverse
             au, av, bu, bv = 1.0, 0.0, 0.0, 1.0
-            if models[k] > PINHOLES:  # to ask a pinhole too makes its loop twice as slow
+            if models[k] > PINHOLES:  # twice as fast for pinholes
                 _, _, au, av, bu, bv = distorted(models[k], params[k], u, v)
             fx, fy = params[k, 0] * inverse, params[k, 1] * inverse
             # z times the derivatives of u and v by the point in the world
@@ -172,44 +125,3 @@ def covariances_of_points(
         cxy = -l10 * cyy - l20 * cyz
         out[i, 0] = 1.0 / xx - l10 * cxy - l20 * cxz
         out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = cxy, cxz, cyy, cyz, czz
-
-
-@compiled_loop
-def _rotated(a, b, ab, ac, bc):
-    """One Jacobi rotation of axes a and b, c the third: the new entries, the new ``ab`` is zero."""
-    if ab == 0.0:
-        return a, b, ab, ac, bc
-    theta = (b - a) / (2.0 * ab)
-    t = 1.0 / (abs(theta) + math.sqrt(theta * theta + 1.0))
-    if theta < 0.0:
-        t = -t
-    cosine = 1.0 / math.sqrt(t * t + 1.0)
-    sine = t * cosine
-    return a - t * ab, b + t * ab, 0.0, cosine * ac - sine * bc, sine * ac + cosine * bc
-
-
-@compiled_loop
-def deviations_of_points(first, last, covariances, out):
-    """Square roots of the eigenvalues of covariances (N, 6), ascending, rows of ``out`` (N, 3).
-
-    Cyclic Jacobi: slower than the closed formula, and accurate in the small eigenvalues too, where
-    that is not (Golub and van Loan, Matrix Computations, section 8.5).
-    """
-    for i in range(first, last):
-        a, b, c = covariances[i, 0], covariances[i, 3], covariances[i, 5]
-        ab, ac, bc = covariances[i, 1], covariances[i, 2], covariances[i, 4]
-        for _ in range(_MAX_SWEEPS):
-            # each off-diagonal entry against its own diagonal: a small eigenvalue counts as much
-            if (
-                ab * ab <= _SMALL * _SMALL * a * b
-                and ac * ac <= _SMALL * _SMALL * a * c
-                and bc * bc <= _SMALL * _SMALL * b * c
-            ):
-                break
-            a, b, ab, ac, bc = _rotated(a, b, ab, ac, bc)
-            a, c, ac, ab, bc = _rotated(a, c, ac, ab, bc)
-            b, c, bc, ab, ac = _rotated(b, c, bc, ab, ac)
-        low, high = min(a, b), max(a, b)
-        out[i, 0] = math.sqrt(min(low, c))
-        out[i, 1] = math.sqrt(max(low, min(high, c)))
-        out[i, 2] = math.sqrt(max(high, c))

@@ -1,13 +1,8 @@
-"""A foreign map's conventions: its pixel origin, and whether it agrees with itself.
+"""Checks of a prebuilt map: its pixel origin, and its consistency.
 
-COLMAP has (0, 0) at the corner of the first pixel, many networks and simulators at its centre.
-Keypoints and intrinsics of one map need not agree. What can be measured is their offset: half a
-pixel too much or too little shows in the reprojection error of the map's own points. Where the
-two agree, the principal points tell which origin they share: a camera whose principal point is
-((w - 1) / 2, (h - 1) / 2) exactly was described with the origin at the centre.
-
-A map whose observations do not fit is named with the mistake that explains it best: what files of
-other tools get wrong is mostly one of a few conventions, and each can be tried.
+COLMAP's pixel origin is the corner of the first pixel, that of many networks and simulators its
+centre. An offset between keypoints and intrinsics shows in the reprojection error. Otherwise
+principal points at exactly ((w - 1) / 2, (h - 1) / 2) indicate the centre.
 """
 
 from __future__ import annotations
@@ -16,7 +11,6 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import permutations, product
 from typing import Literal
 
 import numpy as np
@@ -28,7 +22,6 @@ from megloc_kapture.geometry.cameras import (
     principal_point_px,
     project,
     scale_focal,
-    swap_principal_point,
 )
 from megloc_kapture.geometry.conventions import CONVENTIONS
 from megloc_kapture.values import Camera, RigidTransform
@@ -37,21 +30,16 @@ Origin = Literal["corner", "centre"]
 Floats = NDArray[np.float64]
 
 _HALF = 0.5
-# a smaller gain than this is noise, and the simpler explanation stands
-_MIN_GAIN = 0.005
-# of the larger side of an image: no map that serves is worse, none that is made wrongly is better
-_MAX_SHARE = 0.01
-_MIN_LIMIT_PX = 8.0
-# images that may fail: some poses of a good map are wrong
-_MAX_FAILING = 0.2
-_UNITS = {1000.0: "millimetres", 100.0: "centimetres", 1 / 1000: "kilometres", 1 / 0.3048: "feet"}
+_MIN_GAIN = 0.005  # smaller gains are noise
+# largest median error of an image, as a share of its larger side
+_MAX_SHARE, _MIN_LIMIT_PX = 0.01, 8.0
+_MAX_FAILING = 0.2  # images: some poses of a good map are wrong
 
 
 @dataclass(frozen=True, eq=False)
 class ObservedKeypoints:
-    """A map image with its keypoints (K, 2) and its observations.
-
-    ``rows`` and ``points`` int (M,) are rows of its keypoints and of the map's points.
+    """A map image with keypoints (K, 2), and its observations as rows of keypoints and of points
+    (M,).
     """
 
     name: str
@@ -62,8 +50,9 @@ class ObservedKeypoints:
     points: NDArray[np.integer]
 
     def errors_px(self, xyz: Floats, shift_px: float = 0.0) -> Floats:
-        """Distances (M,) of the points (N, 3), seen by the camera, from the keypoints moved by
-        ``shift_px``; NaN for a point behind it."""
+        """Return reprojection errors (M,) of points (N, 3), keypoints shifted; NaN behind the
+        camera.
+        """
         with np.errstate(invalid="ignore"):
             seen = project(self.camera, self.cam_from_world, xyz[self.points])
             return np.linalg.norm(seen - (self.keypoints_px[self.rows] + shift_px), axis=1)
@@ -71,10 +60,10 @@ class ObservedKeypoints:
 
 @dataclass(frozen=True)
 class PixelOrigin:
-    """Pixel origins of a map's intrinsics and keypoints as stored, and the evidence in words.
+    """Pixel origins of a map as stored, and the reason.
 
-    ``error_px`` is the median reprojection error with the intrinsics' origin taken as corner or
-    centre, the keypoints' origin as found; NaN without observations.
+    ``error_px`` is the median reprojection error by the intrinsics' origin; NaN without
+    observations.
     """
 
     intrinsics: Origin
@@ -84,12 +73,12 @@ class PixelOrigin:
 
     @property
     def intrinsics_shift_px(self) -> float:
-        """To be added to principal points to have COLMAP's."""
+        """Return the shift of principal points to COLMAP's origin."""
         return _HALF if self.intrinsics == "centre" else 0.0
 
     @property
     def keypoints_shift_px(self) -> float:
-        """To be added to keypoints to have COLMAP's."""
+        """Return the shift of keypoints to COLMAP's origin."""
         return _HALF if self.keypoints == "centre" else 0.0
 
 
@@ -100,10 +89,9 @@ def find_pixel_origin(
     cameras: Sequence[Camera],
     keypoints_at: Origin | None = None,
 ) -> PixelOrigin:
-    """Find the pixel origin of intrinsics and keypoints.
+    """Find the pixel origin of intrinsics and keypoints from a sample of map images.
 
-    Of a sample of the map's images, keypoints as stored, all points (N, 3) and all cameras;
-    ``keypoints_at`` is the keypoints' origin where it is known.
+    ``keypoints_at`` is the keypoints' origin if known.
     """
     observed = [image for image in images if len(image.rows)]
     errors = {
@@ -146,15 +134,10 @@ def find_pixel_origin(
     return PixelOrigin(intrinsics, keypoints, by_origin, reason)
 
 
-# of an image: camera, pose, observed pixels (M, 2) and points (M, 3)
-_View = tuple[Camera, RigidTransform, Floats, Floats]
-_Reading = Callable[[ObservedKeypoints], _View]
-
-
 def map_fault(images: Sequence[ObservedKeypoints], xyz: Floats) -> str | None:
-    """Say why a map contradicts itself; None where it does not.
+    """Return why a map contradicts itself; None if it is consistent.
 
-    Of a sample of its images, by name, and all its points, float64 (N, 3).
+    ``images`` is a sample sorted by name; ``xyz`` are all points, float64 (N, 3).
     """
     if not np.isfinite(xyz).all():
         count = int((~np.isfinite(xyz).all(axis=1)).sum())
@@ -171,25 +154,25 @@ def map_fault(images: Sequence[ObservedKeypoints], xyz: Floats) -> str | None:
     rounded = {tuple(round(v, 9) for v in (*p.quat_wxyz, *p.translation)) for p in poses}
     if len(images) > 2 and len(rounded) == 1:
         return f"all of {len(images)} images have one pose"
-    errors = _errors_px(observed, lambda image: _as_it_is(image, xyz))
+    errors = _median_errors_px(observed, xyz)
     sides = (max(image.camera.width, image.camera.height) for image in observed)
     limits = [max(_MIN_LIMIT_PX, _MAX_SHARE * side) for side in sides]
     failing = sum(not error <= limit for error, limit in zip(errors, limits, strict=True))
     if failing <= _MAX_FAILING * len(observed):
         return None
-    told = (
+    message = (
         f"the points do not fit the keypoints: of {len(observed)} images {failing} have a median "
         f"reprojection error above {min(limits):.3g} px, the median of all is "
         f"{float(np.median(errors)):.3g} px"
     )
     best, error = _likely_mistake(observed, xyz)
     if error > max(np.median(limits) / 2, 4.0) or error > np.median(errors) / 4:
-        return told
-    return f"{told}; with {best} it would be {error:.2g} px"
+        return message
+    return f"{message}; with {best} it would be {error:.2g} px"
 
 
 def camera_fault(camera: Camera) -> str | None:
-    """Say why no camera has these intrinsics; None where one may have."""
+    """Return why intrinsics are impossible; None if they are possible."""
     size = max(camera.width, camera.height)
     cx, cy = principal_point_px(camera)
     if not (-size <= cx <= 2 * size and -size <= cy <= 2 * size):
@@ -197,7 +180,7 @@ def camera_fault(camera: Camera) -> str | None:
     focal = focal_px(camera)
     if not 0.05 * size <= focal <= 100 * size:
         return f"the focal length is {focal:g} px in {camera.width}x{camera.height} pixels"
-    # halfway to the borders a lens still does what it is sold for
+    # distortion is moderate halfway to the borders
     halfway = np.array([[0.25, 0.5], [0.75, 0.5], [0.5, 0.25], [0.5, 0.75]])
     pixels = halfway * (camera.width, camera.height)
     rays = normalized_from_px(camera, pixels)
@@ -212,116 +195,65 @@ def camera_fault(camera: Camera) -> str | None:
     return None
 
 
-def _as_it_is(image: ObservedKeypoints, xyz: Floats) -> _View:
-    pixels = image.keypoints_px[image.rows].astype(np.float64)
-    return image.camera, image.cam_from_world, pixels, xyz[image.points]
-
-
-def _errors_px(images: Iterable[ObservedKeypoints], read: _Reading) -> Floats:
-    """Median reprojection error of each image, infinite where most points are not in front."""
-    medians = []
-    for image in images:
-        camera, pose, pixels, points = read(image)
-        with np.errstate(all="ignore"):
-            errors = np.linalg.norm(project(camera, pose, points) - pixels, axis=1)
-        medians.append(float(np.median(np.where(np.isfinite(errors), errors, np.inf))))
-    return np.array(medians)
+def _median_errors_px(images: Iterable[ObservedKeypoints], xyz: Floats) -> Floats:
+    """Return each image's median reprojection error, infinite if most points are behind it."""
+    errors = (image.errors_px(xyz) for image in images)
+    return np.array([np.median(np.where(np.isfinite(each), each, np.inf)) for each in errors])
 
 
 def _likely_mistake(images: Sequence[ObservedKeypoints], xyz: Floats) -> tuple[str, float]:
-    """The reading of the map that fits best, and the median error of its images."""
-    found = ("", np.inf)
+    """Return the reading of the map with the smallest error, and its median error."""
+    best = ("", np.inf)
     for name, read in _readings(images, xyz):
-        error = float(np.median(_errors_px(images, read)))
-        # of equals the first, which is the simplest
-        if error < 0.9 * found[1]:
-            found = (name, error)
-    return found
+        error = float(np.median(_median_errors_px(map(read, images), xyz)))
+        # the first of similar ones, which is the simplest
+        if error < 0.9 * best[1]:
+            best = (name, error)
+    return best
 
 
-def _readings(images: Sequence[ObservedKeypoints], xyz: Floats) -> Iterator[tuple[str, _Reading]]:
-    """Other readings of a map: what is done to it, in words, and the views that come of it."""
-
-    def changed(
-        pixels: Callable[[NDArray[np.floating], NDArray[np.integer]], NDArray[np.floating]]
-        | None = None,
-        points: Callable[[Floats], Floats] = lambda seen: seen,
-        pose: Callable[[RigidTransform], RigidTransform] = lambda pose: pose,
-        camera: Callable[[Camera], Camera] = lambda camera: camera,
-        point_shift: int = 0,
-    ) -> _Reading:
-        def read(image: ObservedKeypoints) -> _View:
-            keypoints, rows = image.keypoints_px, image.rows
-            found = keypoints[rows] if pixels is None else pixels(keypoints, rows)
-            seen = xyz[(image.points + point_shift) % len(xyz)]
-            where = camera(image.camera), pose(image.cam_from_world)
-            return *where, found.astype(np.float64), points(seen)
-
-        return read
-
-    def next_rows(by: int) -> _Reading:
-        return changed(lambda keypoints, rows: keypoints[(rows + by) % max(len(keypoints), 1)])
-
-    def times(factor: float) -> _Reading:
-        return changed(lambda keypoints, rows: keypoints[rows].astype(np.float64) * factor)
-
-    def axes(order: tuple[int, ...], signs: tuple[float, ...]) -> _Reading:
-        return changed(points=lambda seen: seen[:, list(order)] * np.array(signs))
-
-    yield "keypoints read as (y, x)", changed(lambda keypoints, rows: keypoints[rows][:, ::-1])
-    yield "keypoints in reverse order", changed(lambda keypoints, rows: keypoints[::-1][rows])
-    for by in (1, -1):
-        yield f"keypoint ids moved by {by:+d}", next_rows(by)
-        yield f"point ids moved by {by:+d}", changed(point_shift=by)
+def _readings(
+    images: Sequence[ObservedKeypoints], xyz: Floats
+) -> Iterator[tuple[str, Callable[[ObservedKeypoints], ObservedKeypoints]]]:
+    """Yield other readings of a map."""
+    yield (
+        "keypoints read as (y, x)",
+        lambda image: replace(image, keypoints_px=image.keypoints_px[:, ::-1]),
+    )
     for name, convention in CONVENTIONS.items():
-        yield name, changed(pose=convention)
-    for scale, unit in _UNITS.items():
-        yield f"points in {unit}", changed(points=partial(np.multiply, 1 / scale))
-        yield f"poses in {unit}", changed(pose=partial(_scaled, 1 / scale))
-    yield "cx and cy exchanged", changed(camera=swap_principal_point)
-    for by in (1, -1):
-        where = "after" if by > 0 else "before"
-        yield f"each pose given to the image {where} it", _moved(images, xyz, by)
-    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        if order != (0, 1, 2) or min(signs) < 0:
-            named = (
-                f"{'-' if sign < 0 else ''}{'xyz'[axis]}"
-                for axis, sign in zip(order, signs, strict=True)
-            )
-            yield f"points read as ({', '.join(named)})", axes(order, signs)
+        yield name, partial(_with_convention, convention)
     factors = _factors(images, xyz)
-    if (factor := factors.get("keypoints")) is not None:
-        yield f"keypoints of images {factor:.3g} times as large", times(factor)
-    if (factor := factors.get("focal")) is not None:
-        longer = changed(camera=partial(scale_focal, factor=factor))
-        yield f"a focal length {factor:.3g} times as long", longer
+    if (scale := factors.get("keypoints")) is not None:
+        yield (
+            f"keypoints of images {scale:.3g} times as large",
+            lambda image: replace(
+                image, keypoints_px=image.keypoints_px.astype(np.float64) * scale
+            ),
+        )
+    if (longer := factors.get("focal")) is not None:
+        yield (
+            f"a focal length {longer:.3g} times as long",
+            lambda image: replace(image, camera=scale_focal(image.camera, longer)),
+        )
 
 
-def _moved(images: Sequence[ObservedKeypoints], xyz: Floats, by: int) -> _Reading:
-    """Each image with the pose of a neighbour in the sample, which must be of neighbours."""
-    poses = {
-        image.name: images[(at + by) % len(images)].cam_from_world
-        for at, image in enumerate(images)
-    }
-    return lambda image: _as_it_is(replace(image, cam_from_world=poses[image.name]), xyz)
+def _with_convention(
+    convention: Callable[[RigidTransform], RigidTransform], image: ObservedKeypoints
+) -> ObservedKeypoints:
+    return replace(image, cam_from_world=convention(image.cam_from_world))
 
 
 def _factors(images: Sequence[ObservedKeypoints], xyz: Floats) -> dict[str, float]:
-    """By how much keypoints, or the focal length, would have to be scaled to fit."""
+    """Return the scale factors of keypoints and focal length that would fit."""
     of_keypoints, of_focal = [], []
     for image in images:
-        camera, pose, pixels, points = _as_it_is(image, xyz)
+        pixels = image.keypoints_px[image.rows].astype(np.float64)
         with np.errstate(all="ignore"):
-            seen = project(camera, pose, points)
+            seen = project(image.camera, image.cam_from_world, xyz[image.points])
             of_keypoints.append((seen / pixels).ravel())
-            centre = np.array(principal_point_px(camera))
+            centre = np.array(principal_point_px(image.camera))
             of_focal.append(((pixels - centre) / (seen - centre)).ravel())
-    found = {"keypoints": np.concatenate(of_keypoints), "focal": np.concatenate(of_focal)}
-    finite = {name: ratios[np.isfinite(ratios)] for name, ratios in found.items()}
-    medians = {name: float(np.median(ratios)) for name, ratios in finite.items() if len(ratios)}
+    ratios = {"keypoints": np.concatenate(of_keypoints), "focal": np.concatenate(of_focal)}
+    finite = {name: each[np.isfinite(each)] for name, each in ratios.items()}
+    medians = {name: float(np.median(each)) for name, each in finite.items() if len(each)}
     return {name: value for name, value in medians.items() if 0.02 < value < 50.0}
-
-
-def _scaled(factor: float, pose: RigidTransform) -> RigidTransform:
-    x, y, z = pose.translation
-    return RigidTransform(pose.quat_wxyz, (factor * x, factor * y, factor * z))

@@ -13,40 +13,39 @@ from scipy.spatial import cKDTree
 from megloc_kapture.geometry.cameras import bearing_rays, px_from_cam
 from megloc_kapture.values import Camera, Options, RigidTransform
 
-_BLOCK_ELEMENTS = 1 << 20  # distances held at once; each takes about 80 bytes on the way
-# where hardly any two images look the same way, an image searches no further than this
+_BLOCK_ELEMENTS = 1 << 20  # distances held at once, about 80 bytes each
+# most neighbours searched for similar viewing directions
 _MAX_SEARCHED = 1024
-# of a point that more images than this see, an image counts only those that near it
+# images before and after in a track that count as sharing its point
 _TRACK_WINDOW = 512
-# each is worked out by itself, so that chunks change nothing
-_IMAGES_AT_ONCE, _PAIRS_AT_ONCE = 256, 1024
-# pixels looked at, across and down; depths, in distances of the two centres
+_IMAGES_AT_ONCE = 256
+# pixels across and down; depths in distances of the two centres
 _GRID = (9, 7)
 _DEPTHS = 2.0 ** np.arange(-2, 8, 0.5)
 
 
 def exhaustive_pairs(count: int) -> NDArray[np.int64]:
-    """All pairs i < j of ``count`` images, int64 (P, 2), sorted; for small maps."""
+    """Return all pairs i < j of ``count`` images, int64 (P, 2), sorted."""
     return np.stack(np.triu_indices(count, 1), axis=1).astype(np.int64)
 
 
 def unique_pairs(pairs: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Pairs (P, 2) with i < j, sorted, each once, none with itself."""
+    """Return distinct pairs (P, 2) with i < j, sorted."""
     low, high = pairs.min(axis=1), pairs.max(axis=1)
-    # a pair in one number: sorted much faster than rows are
+    # a pair as one number sorts faster
     base = int(high.max(initial=0)) + 1
     keys = each_once((low * base + high)[low != high])
     return np.stack(np.divmod(keys, base), axis=1)
 
 
 def each_once(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The keys (K,) sorted, each once; what np.unique does, which takes ten times as long."""
+    """Return distinct keys (K,), sorted; ten times as fast as np.unique."""
     ascending = np.sort(keys)
     return ascending[np.append(True, ascending[1:] != ascending[:-1])[: len(keys)]]
 
 
 class PairsByPosesOptions(Options):
-    """Options of pairs by poses; the distance is per image, so it needs no metric scale."""
+    """Options of pairs by poses; neighbours are counted, so no metric scale is needed."""
 
     num_neighbours: int = Field(default=20, gt=0, description="nearest centres taken per image")
     max_angle_deg: float = Field(default=60.0, gt=0, le=180, description="between optical axes")
@@ -55,10 +54,9 @@ class PairsByPosesOptions(Options):
 def pairs_by_poses(
     cams_from_world: list[RigidTransform], options: PairsByPosesOptions | None = None
 ) -> NDArray[np.int64]:
-    """Pairs (P, 2) of images that stand close and look the same way, i < j, sorted, each once.
+    """Return pairs (P, 2) of nearby images with similar viewing directions, i < j, sorted.
 
-    Candidates come from a k-d tree in growing neighbourhoods, block by block. An image looks at no
-    more than the 1024 nearest centres, so that time and memory grow with the number of images.
+    Searches growing neighbourhoods of a k-d tree, at most the 1024 nearest centres.
     """
     options = options or PairsByPosesOptions()
     count = len(cams_from_world)
@@ -99,8 +97,6 @@ _MIN_SHARED_POINTS = 15
 
 
 class PairsByCovisibilityOptions(Options):
-    """Options of pairs by co-visibility."""
-
     top_k: int = Field(default=20, gt=0, description="images taken that share most points")
 
 
@@ -110,20 +106,17 @@ def pairs_by_covisibility(
     image_ids: NDArray[np.integer[Any]],
     options: PairsByCovisibilityOptions | None = None,
 ) -> NDArray[np.int64]:
-    """Pairs of each image with those that share most points with it; of equals the first.
+    """Pair each image with those that share most points; int64 (P, 2), i < j, sorted.
 
-    Of observations (O,), in any order, repeated ones count once; int64 (P, 2), indices i < j,
-    sorted, each pair once. It is the sparse product of the observations with themselves, row by
-    row, of which only the best of each row are kept. Its time is the number of observations times
-    the length of a track, which is bounded: of a point that very many images see, an image counts
-    as seeing it only the 512 before and the 512 after it in the order of the images.
+    Observations (O,) are in any order. In longer tracks, only the 512 images before and after
+    count.
     """
     from megloc_kapture.mapping import kernels
 
     options = options or PairsByCovisibilityOptions()
     if len(point_ids) == 0:
         return np.zeros((0, 2), dtype=np.int64)
-    # an observation in one number, sorted by point, then image
+    # observations as numbers, sorted by point, then image
     keys = each_once(np.asarray(point_ids, dtype=np.int64) * num_images + image_ids)
     points, images = np.divmod(keys, num_images)
     track_ends = np.flatnonzero(np.append(points[1:] != points[:-1], True)) + 1
@@ -142,8 +135,6 @@ def pairs_by_covisibility(
 
 
 class PairsBySequenceOptions(Options):
-    """Options of pairs by temporal sequence."""
-
     window: int = Field(default=5, gt=0, description="images that each is paired with after it")
     loop: bool = Field(default=False, description="the first image follows the last one")
 
@@ -151,11 +142,7 @@ class PairsBySequenceOptions(Options):
 def pairs_by_sequence(
     cameras: Sequence[str], timestamps: Sequence[int], options: PairsBySequenceOptions
 ) -> NDArray[np.int64]:
-    """Pairs (P, 2) of each image with the next ones of its camera, i < j, sorted, each once.
-
-    Of N images it is given which camera took each and when; images of one camera at the same time
-    follow each other as they are given.
-    """
+    """Pair each image with the next ones of its camera; (P, 2), i < j, sorted."""
     sequences: dict[str, list[int]] = {}
     for image in sorted(range(len(cameras)), key=lambda image: timestamps[image]):
         sequences.setdefault(cameras[image], []).append(image)
@@ -175,10 +162,9 @@ def views_can_overlap(
     second: Camera,
     second_from_world: RigidTransform,
 ) -> bool:
-    """True if some point in the view of one camera is in that of the other, whatever is seen.
+    """Return True if a point in one camera's view may be in the other's.
 
-    Looked for along the rays of a grid of pixels, from a quarter of the distance between the
-    cameras to infinity.
+    Tested along rays of a pixel grid, from a quarter of the cameras' distance to infinity.
     """
     between = second_from_world @ first_from_world.inverse()
     return _reaches(first, second, between) or _reaches(second, first, between.inverse())
@@ -192,7 +178,7 @@ def _reaches(first: Camera, second: Camera, second_from_first: RigidTransform) -
     turned = rays @ second_from_first.rotation_matrix().T
     offset = np.asarray(second_from_first.translation)
     depths = _DEPTHS * np.linalg.norm(offset)
-    # without a distance between them, and at infinity, only the turn counts
+    # at infinity only the rotation counts
     points = [turned, *(turned * depth + offset for depth in depths[depths > 0])]
     with np.errstate(invalid="ignore"):
         seen = px_from_cam(second, np.concatenate(points))

@@ -1,18 +1,10 @@
-"""Covariances of the points of a map, and rejection of points and of their observations.
+"""Covariances of map points, and rejection of uncertain points.
 
-MegLoc, section "Mapping": a point's uncertainty from its observations, poses and cameras fixed.
-With ``p_c = R_cw p_w + t_cw`` and the camera's projection ``pi``, an observation has the Jacobian
-
-    J = d pi(p_c) / d p_w = d pi / d p_c  R_cw,
-
-for a pinhole ``[f_x / z, 0, -f_x x / z^2; 0, f_y / z, -f_y y / z^2] R_cw``. (The equation as
-printed has a malformed middle term, and ``R_wc`` where the rotation from world to camera is meant.)
-For independent noise of one pixel the information about the point is ``sum J^T J`` over its
-observations, its inverse the point's covariance, and the roots of the covariance's eigenvalues are
-the deviations along three orthogonal axes. ``d pi / d p_c`` is that of the camera's own model,
-distortion included.
-
-Arrays in, masks out; nothing is moved.
+MegLoc, section "Mapping": with ``p_c = R_cw p_w + t_cw`` and the projection ``pi``, an observation
+has the Jacobian ``J = d pi / d p_c  R_cw`` (the equation as printed has a malformed middle term,
+and ``R_wc`` for ``R_cw``), with poses and cameras fixed. For independent noise of one pixel a
+point's covariance is the inverse of ``sum J^T J``; the roots of its eigenvalues are deviations
+along orthogonal axes. ``d pi / d p_c`` includes the camera's distortion.
 """
 
 from __future__ import annotations
@@ -31,7 +23,7 @@ from megloc_kapture.values import Camera, Options, RigidTransform
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_CHUNK = 1 << 14  # points; each is worked out by itself, so that chunks change nothing
+_CHUNK = 1 << 14  # points
 
 
 def point_covariances(
@@ -41,22 +33,13 @@ def point_covariances(
     cameras: Sequence[Camera],
     cams_from_world: Sequence[RigidTransform],
 ) -> Floats:
-    """Covariances of points (N, 3) for a noise of 1 px in their images, poses and cameras exact.
+    """Return covariances (N, 6) of points (N, 3) as xx, xy, xz, yy, yz, zz for a noise of 1 px.
 
-    Of observations (O,), rows of ``xyz`` and of ``cameras``, in any order, faster where the points
-    ascend. Raises DataError for ids that are no rows, or not as many poses as cameras.
-
-    Returns
-    -------
-    float64 (N, 6): xx, xy, xz, yy, yz, zz in the map's unit squared; NaN where the observations do
-        not determine the point (a single view, no parallax). A point behind a camera is not
-        observed by it.
+    Observations (O,) are in any order; those behind a camera are ignored. NaN if undetermined.
     """
     from megloc_kapture.geometry.projection import packed_views
     from megloc_kapture.mapping import kernels
 
-    if len(cameras) != len(cams_from_world):
-        raise DataError(f"{len(cameras)} cameras and {len(cams_from_world)} poses, not as many")
     out = np.full((len(xyz), 6), np.nan)
     starts, image_ids = _by_point(point_ids, image_ids, len(xyz), len(cameras))
     if len(image_ids) == 0:
@@ -75,30 +58,19 @@ def point_covariances(
 
 
 def point_deviations(covariances: Floats) -> Floats:
-    """Standard deviations of points along their three principal axes, of covariances (N, 6).
-
-    float64 (N, 3) in the map's unit for a noise of 1 px, ascending; NaN where unknown.
-    """
-    from megloc_kapture.mapping import kernels
-
-    out = np.full((len(covariances), 3), np.nan)
-    known = np.ascontiguousarray(covariances, dtype=np.float64)
-    kernels.in_chunks(
-        len(covariances), _CHUNK, lambda a, b: kernels.deviations_of_points(a, b, known, out)
-    )
-    return out
+    """Return deviations (N, 3) along the principal axes, ascending; NaN if unknown."""
+    deviations = np.full((len(covariances), 3), np.nan)
+    known = np.isfinite(covariances).all(axis=1)
+    matrices = covariances[known][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    # rounding may turn the smallest eigenvalue negative
+    deviations[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(matrices), 0.0))
+    return deviations
 
 
 def _by_point(
     point_ids: NDArray[np.integer], image_ids: NDArray[np.integer], num_points: int, num_images: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """First observation of each point (N + 1,), and the images (O,) in that order.
-
-    The compiled loops check no bounds: ids that are no rows end here.
-    """
-    point_ids, image_ids = np.asarray(point_ids), np.asarray(image_ids)
-    if point_ids.shape != image_ids.shape or point_ids.ndim != 1:
-        raise DataError(f"ids of points {point_ids.shape} and of images {image_ids.shape} differ")
+    """Return the first observation of each point (N + 1,), and the images (O,) in that order."""
     for name, ids, count in (("point", point_ids, num_points), ("image", image_ids, num_images)):
         if len(ids) and not (ids.min() >= 0 and ids.max() < count):
             raise DataError(
@@ -111,17 +83,15 @@ def _by_point(
 
 
 def _starts(ids: NDArray[np.integer], count: int) -> NDArray[np.int64]:
-    """First row of each of ``count`` ascending ids, and the end of the last one's (count + 1,)."""
     starts = np.zeros(count + 1, dtype=np.int64)
     np.cumsum(np.bincount(ids, minlength=count), out=starts[1:])
     return starts
 
 
 class UncertaintyOptions(Options):
-    """A limit on the points' uncertainty.
+    """Limit of the points' uncertainty: the largest deviation for a noise of 1 px.
 
-    The deviation of a point is the largest of its three, for a noise of 1 px in the images. Points
-    whose uncertainty is not known (lifted ones, which a single image sees) stay.
+    Points of unknown uncertainty (lifted ones with a single observation) are kept.
     """
 
     max_robust_sigmas: float | None = Field(
@@ -135,10 +105,7 @@ class UncertaintyOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class ObservedPoints:
-    """Points float64 (N, 3) and the images that observe them.
-
-    Of O observations, the rows of ``xyz``, int64, ascending, and of ``cameras`` and poses, int32.
-    """
+    """Points float64 (N, 3) with observations (O,), sorted by point."""
 
     xyz: Floats
     point_ids: NDArray[np.int64]
@@ -147,11 +114,11 @@ class ObservedPoints:
     cams_from_world: Sequence[RigidTransform]
 
     def starts(self) -> NDArray[np.int64]:
-        """First observation of each point, and the end of the last one's; int64 (N + 1,)."""
+        """Return the first observation of each point and the end; int64 (N + 1,)."""
         return _starts(self.point_ids, len(self.xyz))
 
     def by_image(self) -> Iterator[tuple[int, NDArray[np.int64]]]:
-        """Every image that observes something, and the rows of its observations, ascending."""
+        """Yield each observing image with its rows of observations, ascending."""
         ids = self.image_ids
         # numpy sorts integers of 16 bits in linear time
         narrow = ids.astype(np.uint16) if len(self.cameras) < 1 << 16 else ids
@@ -165,28 +132,25 @@ class ObservedPoints:
 
 
 def mean_depths(observed: ObservedPoints) -> Floats:
-    """Mean depth (N,) of each point in the images that observe it; NaN where none does."""
-    from megloc_kapture.geometry.projection import packed_views
-    from megloc_kapture.mapping import kernels
-
-    depths = np.empty(len(observed.xyz))
-    poses = packed_views(observed.cameras, observed.cams_from_world)[:2]
-    kernels.mean_depths(observed.starts(), observed.image_ids, observed.xyz, *poses, depths)
-    return depths
+    """Return mean depths (N,) of the points in their images; NaN without observations."""
+    poses = observed.cams_from_world
+    axes = np.array([pose.rotation_matrix()[2] for pose in poses]).reshape(-1, 3)
+    offsets = np.array([pose.translation[2] for pose in poses])
+    points, images = observed.xyz[observed.point_ids], observed.image_ids
+    depths = np.einsum("oi,oi->o", axes[images], points) + offsets[images]
+    with np.errstate(invalid="ignore"):
+        sums = np.bincount(observed.point_ids, depths, minlength=len(observed.xyz))
+        return np.asarray(sums / track_lengths(observed))
 
 
 def track_lengths(observed: ObservedPoints) -> NDArray[np.int64]:
-    """Number of observations (N,) of each point."""
+    """Return the number of observations (N,) of each point."""
     return np.bincount(observed.point_ids, minlength=len(observed.xyz))
 
 
 def too_uncertain(deviations: Floats, depths: Floats, max_robust_sigmas: float) -> Mask:
-    """Mask (N,) of the points to reject by their uncertainty; see :class:`UncertaintyOptions`.
-
-    Of deviations (N,), the largest of each point, in the map's unit, NaN where unknown, and the
-    :func:`mean_depths`.
-    """
-    with np.errstate(invalid="ignore"):  # comparisons with NaN are false, as they should be
+    """Return a mask (N,) of points to reject by their largest deviation and mean depth (N,)."""
+    with np.errstate(invalid="ignore"):  # comparisons with NaN are false
         relative = deviations / depths
         usual = relative[np.isfinite(relative) & (relative > 0)]
         if len(usual) == 0:
@@ -200,11 +164,7 @@ def too_uncertain(deviations: Floats, depths: Floats, max_robust_sigmas: float) 
 def left_with_too_few(
     point_ids: NDArray[np.int64], dropped: Mask, num_points: int, min_observations: int
 ) -> Mask:
-    """Points (N,) that lost an observation and have fewer than ``min_observations`` left.
-
-    Of observations (O,). Who has lost nothing stays, however few there were: a lifted point has a
-    single one.
-    """
+    """Return points (N,) that lost an observation and have fewer than ``min_observations`` left."""
     lost = np.bincount(point_ids[dropped], minlength=num_points)
     left = np.bincount(point_ids[~dropped], minlength=num_points)
     return (lost > 0) & (left < min_observations)

@@ -1,17 +1,13 @@
-"""Guided pyramid matching: a pair with few matches is tried again at other scales and turns.
+"""Guided pyramid matching: pairs with few matches are matched again at other scales and rotations.
 
-MegLoc, section "Guided pyramid matching". Where a pair has fewer than 100 matches, features are
-extracted from the image scaled and turned, and matched with the other image as it is. The paper
-counts the matcher's matches; counting those that verification leaves suits any matcher. The matches
-are put together (``all``), or the richest variant's are kept (``max``).
+MegLoc, section "Guided pyramid matching": for pairs with fewer than 100 matches, features of scaled
+and rotated variants of one image are matched with the other image. All matches are combined
+(``all``), or the richest variant's are kept (``max``). The paper counts the matcher's matches;
+counting verified ones suits any matcher.
 
-With verification each variant is verified by itself: most of them are turned the wrong way and
-have matches by chance only, in which a two-view model over all variants together would drown. But
-without poses a few matches fit some model by chance, a different one for each variant, so all must
-then agree with that of the richest. Only keypoints that take part in a match are added to an image,
-for a variant has as many keypoints as the image itself.
-
-The array functions here know of no file; extraction, matching and verification are given to them.
+Each variant is verified separately: most are rotated wrongly, and their random matches would drown
+a common two-view model. Without known poses a few random matches fit some model, so all variants
+must agree with the model of the richest. Only matched keypoints are added to an image.
 """
 
 from __future__ import annotations
@@ -30,7 +26,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.values import ImageFeatures, LocalFeatures, Options
 
 _SUFFIX = "-pyramid"
-# an enlargement that the bound cuts down to less than this beyond the next smaller one is left out
+# least ratio of a reduced enlargement to the next smaller scale
 _MIN_STEP = 1.2
 
 Extract = Callable[[NDArray[np.uint8], NDArray[np.bool_] | None], LocalFeatures]
@@ -40,48 +36,34 @@ Match = Callable[[ImageFeatures, Sequence[ImageFeatures]], Sequence[PairMatches]
 
 @dataclass(frozen=True, order=True)
 class ImageVariant:
-    """An image scaled and turned by quarters, and the exact map of its pixels to the original's.
+    """An image scaled, then rotated counter-clockwise by quarters.
 
-    Pixel coordinates are continuous, the first pixel's centre at (0.5, 0.5): an image of size (w,
-    h) covers [0, w] x [0, h]. A variant covers the same scene from edge to edge, so that
-    coordinates scale by the ratio of the sizes, which is not exactly ``scale`` where a size had to
-    be rounded. After scaling it is turned by 0, 90, 180 or 270 degrees, counter-clockwise as one
-    sees it.
+    A variant covers the same scene from edge to edge: pixel coordinates, the first centre at (0.5,
+    0.5), scale by the ratio of the rounded sizes.
     """
 
     scale: float = 1.0
     rotation_deg: int = 0
-
-    def __post_init__(self) -> None:
-        if self.rotation_deg not in (0, 90, 180, 270):
-            raise ValueError(f"a rotation is 0, 90, 180 or 270 degrees, got {self.rotation_deg}")
-        if not 0 < self.scale < np.inf:
-            raise ValueError(f"scale {self.scale} is not positive")
 
     def __str__(self) -> str:
         return f"{self.scale:.4g}@{self.rotation_deg}"
 
     @property
     def is_identity(self) -> bool:
-        """True if it is the image as it is."""
         return self == ImageVariant()
 
     def scaled_size(self, width: int, height: int) -> tuple[int, int]:
-        """Width and height before turning."""
+        """Return width and height before rotation."""
         return max(1, round(width * self.scale)), max(1, round(height * self.scale))
 
     def size(self, width: int, height: int) -> tuple[int, int]:
-        """Width and height of the variant of an image of this size."""
+        """Return width and height of the variant."""
         scaled = self.scaled_size(width, height)
         return scaled if self.rotation_deg % 180 == 0 else (scaled[1], scaled[0])
 
     def of_image(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The variant of an image, uint8 (H, W) or (H, W, 3).
-
-        A smaller pixel is the mean of the area it covers, so that nothing aliases; a larger image
-        is interpolated linearly, rounded the same way on every processor.
-        """
-        import cv2  # 0.1 s, and most that imports this never looks at an image
+        """Transform an image, uint8 (H, W) or (H, W, 3)."""
+        import cv2  # takes 0.1 s, and is rarely needed
 
         height, width = image.shape[:2]
         size = self.scaled_size(width, height)
@@ -92,7 +74,7 @@ class ImageVariant:
         return np.ascontiguousarray(np.rot90(image, self.rotation_deg // 90))
 
     def of_mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """The variant of a mask (H, W): True where every pixel it covers a part of is True."""
+        """Transform a mask (H, W); True where all covered pixels are True."""
         height, width = mask.shape
         scaled_width, scaled_height = self.scaled_size(width, height)
         ignored = np.zeros((height + 1, width + 1), dtype=np.int64)
@@ -110,7 +92,7 @@ class ImageVariant:
     def px_in_original(
         self, px: NDArray[np.floating[Any]], width: int, height: int
     ) -> NDArray[np.float64]:
-        """Pixels (N, 2) of the variant, in the original of this size; float64 (N, 2)."""
+        """Transform pixels (N, 2) of the variant to pixels of the original of this size."""
         scaled = self.scaled_size(width, height)
         x, y = np.asarray(px, dtype=np.float64).T
         back = {
@@ -125,7 +107,7 @@ class ImageVariant:
 
 
 def _covered(length: int, scaled: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First pixel, and the one behind the last, that each of ``scaled`` pixels covers a part of."""
+    """Return the first and the past-the-end pixel that each of ``scaled`` pixels covers."""
     at = np.arange(scaled, dtype=np.int64)
     return at * length // scaled, -((at + 1) * -length // scaled)
 
@@ -172,15 +154,15 @@ class GuidedPyramidOptions(Options):
         return tuple(sorted({rotation % 360 for rotation in rotations}))
 
     def is_hard(self, num_found: int, num_verified: int) -> bool:
-        """Whether a pair with so many matches, before and after verification, is tried again."""
+        """Return True if a pair with these numbers of matches is tried again."""
         count = num_found if self.count == "matches" else num_verified
         return self.mode != "off" and count < self.min_matches
 
     def variants(self, width: int, height: int) -> list[ImageVariant]:
-        """List the variants of an image of this size, sorted; not the image as it is.
+        """List the variants of an image of this size, without the identity.
 
-        A scale that would enlarge it beyond ``_MAX_SIDE_PX`` is reduced to it, and left out where
-        that is hardly more than the next smaller scale.
+        Scales beyond ``_MAX_SIDE_PX`` are reduced to it, or omitted if the next smaller one is
+        close.
         """
         limit = max(1.0, _MAX_SIDE_PX / max(width, height))
         scales = [scale for scale in self.scales if scale <= limit]
@@ -191,30 +173,24 @@ class GuidedPyramidOptions(Options):
 
 
 def pyramid_type(local_type: str) -> str:
-    """Name of the keypoints type that has a type's keypoints first, then those that were added."""
+    """Return the type of keypoints that begin with those of a type, followed by the added ones."""
     return local_type + _SUFFIX
 
 
 def base_type(local_type: str) -> str:
-    """The type a pyramid's keypoints begin with; the type itself where it is none of a pyramid."""
+    """Return the type that a pyramid's keypoints begin with."""
     return local_type.removesuffix(_SUFFIX)
 
 
 def equivalent_types(local_type: str) -> tuple[str, ...]:
-    """The types whose features of a query serve matches of a type, the fitting first.
-
-    A pyramid begins with the features of its base: a query that brings either lacks nothing.
-    """
+    """Return the types whose query features serve matches of a type, best first."""
     base = base_type(local_type)
     return tuple(dict.fromkeys((local_type, base, pyramid_type(base))))
 
 
 @dataclass(frozen=True, eq=False)
 class VariantFeatures:
-    """Features of an image's variant, as the matcher gets them, in the variant's own pixels.
-
-    ``keypoints_px`` float32 (N, C) are x and y in pixels of the original; other columns as found.
-    """
+    """Features of a variant in its own pixels, and keypoints float32 (N, C) in the original's."""
 
     variant: ImageVariant
     features: ImageFeatures
@@ -225,8 +201,8 @@ class VariantFeatures:
 class VariantMatches:
     """Verified matches of a variant with another image.
 
-    Keypoints float32 (K, C), in pixels of the original, descriptors (K, D), scores float32 (K,),
-    and the other image's keypoints int64 (K,).
+    Keypoints float32 (K, C) in pixels of the original, descriptors (K, D), rows of the other
+    image's keypoints int64 (K,) and scores float32 (K,).
     """
 
     variant: ImageVariant
@@ -239,7 +215,6 @@ class VariantMatches:
         return len(self.other_rows)
 
     def only(self, good: NDArray[np.bool_]) -> VariantMatches:
-        """Those of a mask (K,)."""
         return VariantMatches(
             self.variant,
             self.keypoints_px[good],
@@ -251,11 +226,10 @@ class VariantMatches:
 
 @dataclass(frozen=True)
 class PairVerifier:
-    """Verifies an image's matches with another one.
+    """Verifier of an image's matches with another one.
 
-    ``verify`` says which matches (K, 2) of a variant, rows of it and of the other image, best
-    first, are right; ``agree`` what remains of several variants' verified matches that need not
-    agree.
+    ``verify`` returns a mask of matches (K, 2) of a variant, best first; ``agree`` filters the
+    verified matches of all variants.
     """
 
     verify: Callable[[VariantFeatures, NDArray[np.int64]], NDArray[np.bool_]]
@@ -267,7 +241,9 @@ def verify_best_first(
     matches: NDArray[np.int64],
     scores: NDArray[np.floating[Any]],
 ) -> NDArray[np.bool_]:
-    """The mask (N,) that ``verify`` gives of matches (N, 2) that it gets by falling scores (N,)."""
+    """Return the mask (N,) of ``verify`` for matches (N, 2), which it gets by descending scores
+    (N,).
+    """
     order = np.argsort(-scores, kind="stable")
     good = np.zeros(len(matches), dtype=bool)
     good[order] = verify(matches[order])
@@ -282,15 +258,14 @@ def extract_variants(
     *,
     like: ImageFeatures,
 ) -> tuple[list[VariantFeatures], dict[ImageVariant, str]]:
-    """Extract features of an image's variants; of those without any, say why.
+    """Extract features of an image's variants; return the reasons for variants without any.
 
     Parameters
     ----------
-    image, mask : uint8 (H, W, 3), RGB; bool (H, W), True = use, changed along with the image.
-    extract : image and mask to features. A DataError that names no file is about the image, for
-        example one that is too small for the network: that variant is skipped.
-    like : features of the image as it is: what is added has as many columns, else it is a
-        DataError.
+    image, mask : uint8 (H, W, 3), RGB; bool (H, W), True = use.
+    extract : a DataError without path, as for an image too small for the network, skips the
+        variant.
+    like : features of the image itself, which define the number of columns.
     """
     height, width = image.shape[:2]
     found, skipped = [], {}
@@ -328,11 +303,7 @@ def match_variants(
     match: Match,
     judgements: Sequence[PairVerifier],
 ) -> list[list[VariantMatches]]:
-    """Match an image's variants with each of several other images, and verify the matches.
-
-    ``match`` gives matches of one image with each of several, see ``plugins.Matcher``; there is a
-    verifier for each of ``others``.
-    """
+    """Match an image's variants with several other images, each with its verifier."""
     found: list[list[VariantMatches]] = [[] for _ in others]
     for variant in variants:
         matched = match(variant.features, others)

@@ -1,9 +1,4 @@
-"""Exact mutual nearest neighbours of local descriptors, blocked.
-
-The mutual check needs no second search: the best row of a column is known by its value, so one
-matrix product, one argmax over rows and one running maximum over columns suffice, and no block
-is larger than the processor's cache likes.
-"""
+"""Exact mutual nearest neighbours of local descriptors, by one blocked matrix product."""
 
 from __future__ import annotations
 
@@ -37,18 +32,14 @@ def match_nearest(
     descriptors_b: NDArray[Any],
     options: NearestNeighbourOptions | None = None,
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Match descriptors by largest inner product (smallest distance for unit vectors).
-
-    Descriptors (N, D) and (M, D) of any real type have rows of about one length, for which the
-    largest product is the smallest distance. Raises DataError for different dimensions.
+    """Match descriptors (N, D) and (M, D) of about equal lengths by the largest inner product.
 
     Returns
     -------
-    matches : int64 (K, 2), rows of a and b, sorted by a; ties go to the smaller index.
-    scores : float32 (K,), how distinctive: 1 less the squared distance to the best over that to the
-        second best (Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004,
-        section 7.1), at most 1; 0 without a second. It tells right matches from wrong ones better
-        than the similarity itself (docs/experiments/matching.md).
+    matches : int64 (K, 2), sorted by the first column; ties go to the smaller index.
+    scores : float32 (K,), 1 minus the squared ratio of the best to the second-best distance (Lowe,
+        IJCV 2004, section 7.1), 0 without a second; better than the similarity
+        (docs/experiments/matching.md).
     """
     options = options or NearestNeighbourOptions()
     a = np.ascontiguousarray(descriptors_a, dtype=np.float32)
@@ -69,7 +60,7 @@ def match_nearest(
         clear = to_best <= options.max_ratio**2 * to_second
         rows, to_best, to_second = rows[clear], to_best[clear], to_second[clear]
     if options.mutual:
-        # two rows with exactly the best value of one column: the first one has it
+        # of rows with the same best column and value, keep the first
         first = np.sort(np.unique(best[rows], return_index=True)[1])
         rows, to_best, to_second = rows[first], to_best[first], to_second[first]
     ratio = np.divide(to_best, to_second, out=np.ones(len(rows)), where=to_second > 0)
@@ -79,9 +70,10 @@ def match_nearest(
 def _search(
     a: NDArray[np.float32], b: NDArray[np.float32], *, mutual: bool
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
-    """Best column and its value per row, best value per column, second-best column per row.
+    """Return each row's best column and its value, each column's best value, and second-best
+    columns.
 
-    Where ``mutual``, the second best only of rows that can still be their column's best.
+    With ``mutual``, the second best only of rows that can still be mutual.
     """
     best = np.empty(len(a), dtype=np.int64)
     similarity = np.empty(len(a), dtype=np.float32)
@@ -105,13 +97,12 @@ def _search(
 
 
 def _squared_distance(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Squared distance of each row of a to that of b, (N,); right for any length of rows."""
     difference = a - b
     return np.asarray(np.einsum("nd,nd->n", difference, difference), dtype=np.float64)
 
 
 class NearestNeighbours:
-    """The matcher plugin ``nn``: :func:`match_nearest` with its options."""
+    """Matcher plugin ``nn``: :func:`match_nearest`."""
 
     Options = NearestNeighbourOptions
 
@@ -121,5 +112,4 @@ class NearestNeighbours:
     def match(
         self, a: ImageFeatures, b: ImageFeatures
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """See :func:`match_nearest`."""
         return match_nearest(a.descriptors, b.descriptors, self.options)

@@ -1,7 +1,5 @@
-"""Matchers that are networks.
-
-SuperGlue (Sarlin et al., CVPR 2020), for keypoints that carry a score; LightGlue (Lindenberger et
-al., ICCV 2023), and LighterGlue, its small form for XFeat.
+"""Matching networks: SuperGlue (Sarlin et al., CVPR 2020), LightGlue (Lindenberger et al., ICCV
+2023) and LighterGlue, its small form for XFeat.
 """
 
 from __future__ import annotations
@@ -36,24 +34,18 @@ PairOptions = TypeVar("PairOptions", bound=NetworkOptions)
 
 
 class PairNetwork(Checkpointed[PairOptions], ABC):
-    """A network that matches one image with each of several, in one batch."""
-
     def match(self, a: ImageFeatures, b: ImageFeatures) -> Matches:
-        """Match two images: int64 (K, 2), rows sorted by a, each once; scores float32 (K,).
-
-        Raises as :meth:`match_many`.
-        """
+        """Match two images: int64 (K, 2), sorted by a, keypoints unique; scores float32 (K,)."""
         return self.match_many(a, [b])[0]
 
     @abstractmethod
     def match_many(self, a: ImageFeatures, others: Sequence[ImageFeatures]) -> list[Matches]:
-        """Match one image with each of several, in one batch; see :meth:`match`."""
+        """Match one image with several in one batch; see :meth:`match`."""
 
 
 def _matched(
     num_others: int, rows: Sequence[int], found: Iterable[tuple[torch.Tensor, torch.Tensor]]
 ) -> list[Matches]:
-    """The matches of those of the others that a network has seen, and none of the rest."""
     matches: list[Matches] = [
         (np.zeros((0, 2), np.int64), np.zeros(0, np.float32)) for _ in range(num_others)
     ]
@@ -63,7 +55,7 @@ def _matched(
 
 
 class SuperGlueOptions(NetworkOptions):
-    """Options of SuperGlue; threshold and iterations are the authors' own."""
+    """Options of SuperGlue; threshold and iterations are the authors'."""
 
     weights: str = Field(
         default="superglue_outdoor",
@@ -74,19 +66,11 @@ class SuperGlueOptions(NetworkOptions):
 
 
 class SuperGlue(PairNetwork[SuperGlueOptions]):
-    """The matcher plugin ``superglue``.
-
-    Takes keypoints whose third column is the detector's score, and descriptors of the size that
-    the weights were trained with: 256, SuperPoint's, for the official ones.
-    """
+    """Matcher plugin ``superglue``: keypoints need the detector's score as third column."""
 
     Options = SuperGlueOptions
 
     def match_many(self, a: ImageFeatures, others: Sequence[ImageFeatures]) -> list[Matches]:
-        """As of the base, scores in (0, 1].
-
-        Raises DataError for keypoints without scores in (0, 1], or descriptors of another size.
-        """
         options = self.options
         net, device = self.network(superglue)
         with inference(device, options.half_precision):
@@ -104,9 +88,8 @@ class SuperGlue(PairNetwork[SuperGlueOptions]):
 def network_input(
     image: ImageFeatures, descriptor_size: int, where: str, device: torch.device
 ) -> ImageKeypoints:
-    """Keypoints of an image as the network takes them; ``where`` names the weights in messages.
-
-    Raises DataError for keypoints without scores in (0, 1], or descriptors of another size.
+    """Convert an image's features for SuperGlue; DataError without scores in (0, 1], or for
+    descriptors of another size. ``where`` names the weights.
     """
     table = np.asarray(image.keypoints_px, dtype=np.float32)
     descriptors = np.asarray(image.descriptors, dtype=np.float32)
@@ -126,7 +109,8 @@ def network_input(
             f"{where} takes descriptors of {descriptor_size} dimensions, one "
             f"for each of {len(table)} keypoints; these have the shape {descriptors.shape}"
         )
-    xy = torch.from_numpy(table[:, :2] - np.float32(0.5)).to(device)  # its first pixel is (0, 0)
+    # the network's first pixel centre is (0, 0)
+    xy = torch.from_numpy(table[:, :2] - np.float32(0.5)).to(device)
     return ImageKeypoints(
         normalise_keypoints(xy, image.width, image.height),
         torch.from_numpy(scores.copy()).to(device),
@@ -134,10 +118,13 @@ def network_input(
     )
 
 
-class LightGlueKindOptions(NetworkOptions):
-    """Options that LightGlue and LighterGlue share."""
+class LightGlueOptions(NetworkOptions):
+    """Options of LightGlue."""
 
-    weights: str
+    weights: str = Field(
+        default="superpoint_lightglue",
+        description="superpoint_lightglue, aliked_lightglue, disk_lightglue, or a file",
+    )
     threshold: float = Field(default=0.1, ge=0, lt=1, description="probability of a match")
     depth_confidence: float = Field(
         default=-1.0, ge=-1, le=1, description="stop early at this confidence; -1: all layers"
@@ -147,20 +134,17 @@ class LightGlueKindOptions(NetworkOptions):
     )
 
 
-KindOptions = TypeVar("KindOptions", bound=LightGlueKindOptions)
+class LightGlue(PairNetwork[LightGlueOptions]):
+    """Matcher ``lightglue`` by kornia, for the features of its weights, without padding."""
 
+    Options = LightGlueOptions
+    _load: Any = staticmethod(load_lightglue)
 
-class _LightGlueKind(PairNetwork[KindOptions]):
-    """A matcher that is kornia's LightGlue; a pair at a time, so that none is padded."""
-
-    _load: Any  # of a checkpoint's tensors, the file's name and the options
-
-    def __init__(self, options: KindOptions | None = None) -> None:
+    def __init__(self, options: LightGlueOptions | None = None) -> None:
         require_kornia("LightGlue")
         super().__init__(options)
 
     def match_many(self, a: ImageFeatures, others: Sequence[ImageFeatures]) -> list[Matches]:
-        """As of the base; scores are the matches' probabilities."""
         options = self.options
         confidences = options.depth_confidence, options.width_confidence
         network, device = self.network(
@@ -190,10 +174,10 @@ def _check(image: ImageFeatures, expected: int, file: WeightsFile) -> None:
 
 
 def _kornia_input(image: ImageFeatures, device: torch.device) -> dict[str, torch.Tensor]:
-    """Return keypoints, descriptors and size of an image, each with a first axis of length 1.
+    """Return keypoints, descriptors and size of an image with a leading axis of length 1.
 
-    The networks were trained with the first pixel's centre at (0, 0). A keypoint of the first row
-    or column is up to half a pixel outside then, and is clamped: kornia refuses it.
+    The networks' first pixel centre is (0, 0); keypoints are clamped, since kornia rejects negative
+    ones.
     """
     xy = image.keypoints_px[:, :2].astype(np.float32) - np.float32(0.5)
     size = np.array([image.width, image.height], np.float32)
@@ -202,30 +186,14 @@ def _kornia_input(image: ImageFeatures, device: torch.device) -> dict[str, torch
     return {name: torch.from_numpy(array)[None].to(device) for name, array in values.items()}
 
 
-class LightGlueOptions(LightGlueKindOptions):
-    """Options of LightGlue."""
-
-    weights: str = Field(
-        default="superpoint_lightglue",
-        description="superpoint_lightglue, aliked_lightglue, disk_lightglue, or a file",
-    )
-
-
-class LightGlue(_LightGlueKind[LightGlueOptions]):
-    """The matcher ``lightglue``, for the features that its weights are of; needs kornia."""
-
-    Options = LightGlueOptions
-    _load = staticmethod(load_lightglue)
-
-
-class LighterGlueOptions(LightGlueKindOptions):
+class LighterGlueOptions(LightGlueOptions):
     """Options of LighterGlue."""
 
     weights: str = Field(default="xfeat-lighterglue", description="name in the registry, or a file")
 
 
-class LighterGlue(_LightGlueKind[LighterGlueOptions]):
-    """The matcher ``lighterglue`` for features of type ``xfeat``; needs kornia."""
+class LighterGlue(LightGlue):
+    """Matcher ``lighterglue`` for features of type ``xfeat``."""
 
     Options = LighterGlueOptions
-    _load = staticmethod(load_lighterglue)
+    _load: Any = staticmethod(load_lighterglue)

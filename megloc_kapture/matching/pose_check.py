@@ -1,4 +1,4 @@
-"""Given poses against the matches of the images: do they contradict each other, and why."""
+"""Contradictions between given poses and the matches of the images."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from megloc_kapture.geometry.conventions import CONVENTIONS, better_conventions
 from megloc_kapture.matching.verification import Floats, KnownPoseOptions, verify_with_poses
 from megloc_kapture.values import RigidTransform
 
-# share of the larger side, more than a degree: poses of depth sensors are off by nearly as much
+# share of the larger side, more than a degree: poses of depth sensors have such errors
 _MAX_ERROR_SHARE = 0.02
-_AGREEING = 0.5  # share of a pair's matches that have to fit its poses
+_AGREEING = 0.5  # least share of a pair's matches that fit its poses
 _MOST = 0.5
-_FEW = 3  # compared images, too few to refuse a map for
+_FEW = 3  # least compared images to reject a map
 
 
 @dataclass(frozen=True)
 class PairEvidence:
-    """A pair of images, how many of its matches a two-view model explains, and how many of these
-    fit the poses: as given, then in each of :data:`CONVENTIONS`."""
+    """Number of verified matches of a pair, and of those that fit the poses as given and in each of
+    :data:`CONVENTIONS`.
+    """
 
     image: str
     other: str
@@ -32,7 +33,6 @@ class PairEvidence:
 
     @property
     def agrees(self) -> bool:
-        """Whether most matches fit the poses as given."""
         return self.fitting[0] >= _AGREEING * self.num
 
 
@@ -44,10 +44,9 @@ def count_fitting(
     poses: tuple[RigidTransform, RigidTransform],
     side_px: int,
 ) -> tuple[int, ...]:
-    """Count the matches that fit the given poses of both images, and those of each convention.
+    """Count the matched rays that fit the poses as given, and in each convention.
 
-    Of matched rays and slopes as in :func:`verify_with_poses`; ``side_px`` is the images' larger
-    side.
+    Rays and slopes: see :func:`verify_with_poses`; ``side_px``: larger side of the images.
     """
     options = KnownPoseOptions(max_error_px=_MAX_ERROR_SHARE * side_px)
     counts = []
@@ -61,7 +60,7 @@ def count_fitting(
 
 
 def pose_contradiction(pairs: Sequence[PairEvidence]) -> tuple[str, bool] | None:
-    """Return how the poses contradict the matches, and whether most do; None where they agree."""
+    """Return the contradiction and True if it concerns most images; None without one."""
     if not pairs:
         return None
     total = sum(pair.num for pair in pairs)
@@ -87,11 +86,10 @@ def pose_contradiction(pairs: Sequence[PairEvidence]) -> tuple[str, bool] | None
 
 
 def _split(pairs: Sequence[PairEvidence]) -> tuple[list[str], int]:
-    """Return the images whose poses most of their pairs contradict, and the number of those with a
-    pair that agrees.
+    """Return the images with contradicting poses, and the number of images with an agreeing pair.
 
-    A wrong pose spoils the pairs of right images too: the worst image is taken out with its pairs
-    before the next one is judged. A single pair says nothing against an image.
+    A wrong pose spoils the pairs of right images too, so the worst image is removed first,
+    repeatedly. A single pair is no evidence against an image.
     """
     number = Counter(image for pair in pairs for image in (pair.image, pair.other))
     wrong: list[str] = []

@@ -1,7 +1,7 @@
-"""The matches of a pair and of its variants put together, and the keypoints that they add.
+"""Combination of the matches of a pair and its variants, and their added keypoints.
 
-MegLoc, section "Guided pyramid matching": ALL is the union, MAX the richest. In both a keypoint has
-one match at most with the other image, as everywhere.
+MegLoc, section "Guided pyramid matching": ALL is the union, MAX the richest. A keypoint has at most
+one match per other image.
 """
 
 from __future__ import annotations
@@ -28,15 +28,13 @@ TriedVariant = tuple[int, VariantMatches]
 
 @dataclass(frozen=True, eq=False)
 class Combined:
-    """The matches of a pair, with those of its variants.
+    """Matches of a pair, combined with those of its variants.
 
     Attributes
     ----------
-    matches, scores : int64 (K, 2), rows of both images' keypoints, each at most once; float64 (K,).
-    best : which of the tried variants has most matches, None where the images as they are have as
-        many.
-    added : for both images, of each keypoint that was appended: the tried variant it comes from,
-        and which of its matches; int64 (A, 2).
+    matches, scores : int64 (K, 2) and float64 (K,).
+    best : tried variant with most matches; None if the images themselves have as many.
+    added : per image, variant and match index of each appended keypoint, int64 (A, 2).
     """
 
     matches: NDArray[np.int64]
@@ -51,12 +49,11 @@ def combine(
     mode: Literal["all", "max"],
     keypoints: tuple[KeypointUnion, KeypointUnion | None],
 ) -> Combined:
-    """Put the matches of a pair and of its variants together, and append their keypoints.
+    """Combine the matches of a pair and its variants, and append their keypoints.
 
-    The base's matches (K, 2) and scores (K,) of the images as they are come first, then those of
-    the richest variant, in each the best first; one whose keypoint has a match already, in either
-    image, has nothing to add. By ``max`` the richest variant stands for the base where it has more.
-    The second image's keypoints are not needed where no variant is of it.
+    The base matches (K, 2) come first, then the variants', richest first and best matches first;
+    matches of used keypoints are skipped. With ``max`` the richest variant replaces the base if it
+    has more. The second image's keypoints may be None without variants of it.
     """
     base_matches, base_scores = base
     order = sorted(range(len(tried)), key=lambda at: -len(tried[at][1]))
@@ -68,7 +65,7 @@ def combine(
             alone.take(best, tried[best])
             if len(alone.matches) > len(base_matches):
                 return alone.result(best)
-            # several of its keypoints are the same one
+            # identical keypoints have reduced its matches
             for union, length in zip(keypoints, lengths, strict=True):
                 if union is not None:
                     union.truncate(length)
@@ -80,8 +77,6 @@ def combine(
 
 
 class _Combination:
-    """Matches of a pair that grow, every keypoint in at most one."""
-
     def __init__(
         self, base: PairMatches, keypoints: tuple[KeypointUnion, KeypointUnion | None]
     ) -> None:
@@ -95,7 +90,7 @@ class _Combination:
         self._added: tuple[list[tuple[int, int]], list[tuple[int, int]]] = ([], [])
 
     def take(self, number: int, tried: TriedVariant) -> None:
-        """Add the matches of a variant whose keypoints have none yet."""
+        """Add the matches of a variant between unused keypoints."""
         side, found = tried
         union = self._keypoints[side]
         if union is None:
@@ -107,7 +102,7 @@ class _Combination:
             if other in used_other:
                 continue
             row = int(known[k])
-            if row < 0:  # it may have been appended since
+            if row < 0:  # may have been appended in this loop
                 row = union.find_added(found.keypoints_px[k])
             if row < 0:
                 row = union.append(found.keypoints_px[k])
@@ -130,11 +125,9 @@ class _Combination:
 
 
 class KeypointUnion:
-    """Keypoints that were there, which keep their rows, and behind them those that are added.
+    """Base keypoints float32 (N, C), followed by added ones.
 
-    Of keypoints float32 (N, C), x and y first, in pixels of the original image, and those (M, C)
-    that were added before. A keypoint within a pixel of one that is there already is that one (the
-    nearest, of equals the first), and never adds a row.
+    A keypoint within a pixel of an existing one is identified with the nearest such keypoint.
     """
 
     def __init__(self, base: Float32, added: Float32 | None = None) -> None:
@@ -149,7 +142,7 @@ class KeypointUnion:
         return len(self._base) + len(self._added)
 
     def find(self, keypoints_px: Float32) -> NDArray[np.int64]:
-        """Row (K,) of the keypoint that stands where each of (K, C) does, -1 where none does."""
+        """Return the rows (K,) of the identical keypoints, -1 if there are none."""
         found = np.full(len(keypoints_px), -1, dtype=np.int64)
         if self._tree is not None and len(keypoints_px):
             near = self._tree.query_ball_point(
@@ -163,7 +156,7 @@ class KeypointUnion:
         return found
 
     def find_added(self, keypoint_px: Float32) -> int:
-        """As :meth:`find` of one keypoint (C,), among those that were added."""
+        """Find one keypoint (C,) among the added ones, see :meth:`find`."""
         x, y = _cell(keypoint_px)
         rows = [
             row
@@ -174,19 +167,19 @@ class KeypointUnion:
         return self._nearest(keypoint_px, near) if near else -1
 
     def append(self, keypoint_px: Float32) -> int:
-        """Add a keypoint (C,) that stands nowhere yet; its row."""
+        """Append a new keypoint (C,) and return its row."""
         row = len(self)
         self._added.append(np.array(keypoint_px, dtype=np.float32))
         self._rows_in[_cell(keypoint_px)].append(row)
         return row
 
     def truncate(self, length: int) -> None:
-        """Take back what was added since there were ``length`` keypoints."""
+        """Remove the keypoints added last, down to ``length``."""
         while len(self) > length:
             self._rows_in[_cell(self._added.pop())].pop()
 
     def added(self) -> Float32:
-        """The keypoints that were added, float32 (M, C)."""
+        """Return the added keypoints, float32 (M, C)."""
         if not self._added:
             return np.zeros((0, self._base.shape[1]), dtype=np.float32)
         return np.stack(self._added)
@@ -202,5 +195,4 @@ class KeypointUnion:
 
 
 def _cell(keypoint_px: Float32) -> tuple[int, int]:
-    """The square of a pixel's size that a keypoint stands in."""
     return int(np.floor(keypoint_px[0])), int(np.floor(keypoint_px[1]))

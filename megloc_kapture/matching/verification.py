@@ -1,17 +1,12 @@
 """Geometric verification of matches: with known poses, or by a two-view model.
 
-Known poses (mapping pairs): the essential matrix is given, so verification is one vectorised
-Sampson distance and a test that the rays meet in front of both cameras; no sampling. The distance
-is in pixels of the images as they were taken: how far both measurements together have to move, to
-first order, until their rays meet. Unknown pose (query pairs): LO-RANSAC of the relative pose by
-poselib, whose samples are of the best matches first (Chum and Matas, "Matching with PROSAC", CVPR
-2005), and of all matches alike by the last iteration: then scores that say nothing do no harm.
+With known poses (mapping pairs): Sampson distance in pixels of the original images, and rays that
+meet in front of both cameras. Without (query pairs): LO-RANSAC of the relative pose by poselib with
+progressive sampling (Chum and Matas, CVPR 2005).
 
-With rays r = (x, y, 1), the epipolar constraint is C = r_b . E r_a. Its derivatives with respect to
-the four measured coordinates follow from those of C with respect to x and y and from the inverse of
-d px / d (x, y), which is the derivative of the camera's own projection; the distance is |C| over
-their norm (Hartley and Zisserman, Multiple View Geometry, eq. 4.13; for one focal length and no
-distortion it is their eq. 11.9 times the focal length).
+With rays r = (x, y, 1) the epipolar constraint is C = r_b . E r_a. The distance is |C| over the
+norm of its derivatives by the four pixel coordinates, which use the derivative of the camera's
+projection (Hartley and Zisserman, Multiple View Geometry, eq. 4.13).
 """
 
 from __future__ import annotations
@@ -34,14 +29,11 @@ from megloc_kapture.matching.guided_pyramid import (
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
-# a ray that is seen this far from its pixel is none of this pixel
-_MAX_RAY_ERROR_PX = 0.1
-# of a variant's matches, whose own model is another one where fewer agree
-_MIN_AGREEING = 0.5
-_SAMPLE = 5  # matches that a relative pose of calibrated cameras is made of
-# shares of the threshold: the most telling one counts, as in the paper of false alarms
-_THRESHOLDS = (1.0, 0.5, 0.25)
-# matches of one thing in two images are not independent of each other, so few must be expected
+_MAX_RAY_ERROR_PX = 0.1  # round trip of a pixel
+_MIN_AGREEING = 0.5  # share of a variant's matches
+_SAMPLE = 5  # matches that determine a relative pose
+_THRESHOLDS = (1.0, 0.5, 0.25)  # shares of the error threshold, of which the best counts
+# strict, since matches on one object are not independent
 _MAX_FALSE_ALARMS = 1e-10
 _MAX_WRONG_PAIRS = 20_000
 # a pair with fewer verified matches counts as not overlapping
@@ -50,13 +42,13 @@ _MIN_ITERATIONS, _CONFIDENCE = 20, 0.999  # RANSAC of relative poses
 
 
 class KnownPoseOptions(Options):
-    """Options of verification with the known poses."""
+    """Options of verification with known poses."""
 
     max_error_px: float = Field(default=4.0, gt=0, description="Sampson distance in the images")
 
 
 class TwoViewOptions(Options):
-    """Options of two-view verification; calibrated, so a plane is no degenerate case."""
+    """Options of two-view verification; cameras are calibrated, so planes are not degenerate."""
 
     max_error_px: float = Field(
         default=4.0, gt=0, description="distance from the epipolar line of an inlier"
@@ -68,16 +60,15 @@ class TwoViewOptions(Options):
 
 
 def essential_matrix(b_from_a: RigidTransform) -> Floats:
-    """E (3, 3) with ``ray_b . E ray_a = 0``."""
+    """Return E (3, 3) with ``ray_b . E ray_a = 0``."""
     return cross_matrix(np.array(b_from_a.translation)) @ b_from_a.rotation_matrix()
 
 
 def ray_slopes(camera: Camera, keypoints_px: NDArray[np.floating[Any]], rays: Floats) -> Floats:
-    """Derivatives d (x, y) / d px (N, 2, 2) of rays by their pixels, under the camera's own model.
+    """Return derivatives d (x, y) / d px (N, 2, 2) of rays (N, 3) by their pixels (N, 2).
 
-    Of pixels (N, 2) and their homogeneous rays float64 (N, 3), last component 1. NaN where a ray is
-    not that of its pixel: the distortion cannot be undone there, or the pixel looks sideways or
-    back, as pixels of a fisheye may.
+    NaN where the ray does not project to its pixel: distortion without inverse, or sideways rays of
+    a fisheye.
     """
     from megloc_kapture.geometry.projection import project_with_jacobian
 
@@ -85,7 +76,7 @@ def ray_slopes(camera: Camera, keypoints_px: NDArray[np.floating[Any]], rays: Fl
     a, b, c, d = (jacobian[:, row, column] for row in (0, 1) for column in (0, 1))
     determinant = a * d - b * c
     error = np.abs(px - keypoints_px).max(axis=1)
-    # beyond the radius where a distortion turns back, it is mirrored
+    # a distortion polynomial that turns back mirrors
     good = (error <= _MAX_RAY_ERROR_PX) & (determinant > 0)
     slopes = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2)
     slopes /= np.where(good, determinant, np.nan)[:, None, None]
@@ -95,10 +86,9 @@ def ray_slopes(camera: Camera, keypoints_px: NDArray[np.floating[Any]], rays: Fl
 def sampson_error_px(
     rays_a: Floats, slopes_a: Floats, rays_b: Floats, slopes_b: Floats, b_from_a: RigidTransform
 ) -> Floats:
-    """Sampson distance in pixels (N,) of matched rays (N, 3), last component 1, see above.
+    """Return Sampson distances (N,) in pixels of matched rays (N, 3) with slopes (N, 2, 2).
 
-    Of slopes (N, 2, 2), see :func:`ray_slopes`. Infinite where there is no epipolar line, NaN where
-    a slope is.
+    Infinite without an epipolar line, NaN if a slope is.
     """
     essential = essential_matrix(b_from_a)
     line_b = rays_a @ essential.T
@@ -113,10 +103,7 @@ def sampson_error_px(
 
 
 def in_front_of_both(rays_a: Floats, rays_b: Floats, b_from_a: RigidTransform) -> NDArray[np.bool_]:
-    """Mask (N,): the midpoint of two rays' common perpendicular is in front of both cameras.
-
-    Rays so close to parallel that the point is at infinity pass: they do no harm.
-    """
+    """Return a mask (N,) of rays whose midpoint is in front of both cameras, or at infinity."""
     rotation = b_from_a.rotation_matrix()
     a = rays_a / np.linalg.norm(rays_a, axis=1, keepdims=True)
     b = (rays_b / np.linalg.norm(rays_b, axis=1, keepdims=True)) @ rotation
@@ -141,10 +128,10 @@ def verify_with_poses(
     *,
     min_matches: int = MIN_MATCHES,
 ) -> NDArray[np.bool_]:
-    """Mask (N,) of the matches that agree with a known relative pose.
+    """Return a mask (N,) of the matched rays (N, 3) that agree with a relative pose.
 
-    Of matched homogeneous rays float64 (N, 3), last component 1, and their :func:`ray_slopes`; a
-    match with NaN is refused. All False when fewer than ``min_matches`` agree.
+    ``slopes`` see :func:`ray_slopes`, NaN is rejected. All False if fewer than ``min_matches``
+    agree.
     """
     options = options or KnownPoseOptions()
     if len(rays_a) == 0:
@@ -163,12 +150,10 @@ def verify_two_view(
     camera_b: Camera,
     options: TwoViewOptions | None = None,
 ) -> NDArray[np.bool_]:
-    """Mask (N,) of the matches that agree with one relative pose of two calibrated cameras.
+    """Return a mask (N,) of the matches that agree with one relative pose of calibrated cameras.
 
-    Of matched keypoints (N, 2), the best matches first, see
-    :func:`~.guided_pyramid.verify_best_first`; in any other order it takes more iterations. All
-    False when no model has ``MIN_MATCHES`` inliers; False where a camera's distortion cannot be
-    undone.
+    Keypoints (N, 2) are best first, see :func:`~.guided_pyramid.verify_best_first`. All False if no
+    model has ``MIN_MATCHES`` inliers.
     """
     options = options or TwoViewOptions()
     none = np.zeros(len(keypoints_a_px), dtype=bool)
@@ -179,7 +164,7 @@ def verify_two_view(
         return none
     focal = 0.5 * (focal_px(camera_a) + focal_px(camera_b))
     best_first = {"progressive_sampling": True, "max_prosac_iterations": options.max_iterations}
-    # the pose is not asked for, and the inliers are known before it is refined
+    # only the inliers are needed, which refinement does not change
     unrefined = {"max_iterations": 0}
     _, info = _ransac(rays_a[usable], rays_b[usable], focal, options, best_first, unrefined)
     inliers = np.asarray(info["inliers"], dtype=bool)
@@ -198,16 +183,16 @@ def two_view_of_variants(
     base_matches: NDArray[np.int64],
     options: TwoViewOptions,
 ) -> PairVerifier:
-    """Verification by a two-view model; the richest's decides which variants agree.
+    """Return a two-view verifier; variants must agree with the model of the richest.
 
-    Of a camera, the image that the variants are of, with its own keypoints (N, 2 or more), the
-    other image's (M, 2 or more), and the verified matches int64 (K, 2) of the two as they are.
+    Keypoints are (N, 2 or more) and (M, 2 or more); ``base_matches`` int64 (K, 2) are the verified
+    matches of the images themselves.
     """
     focal, other_focal = focal_px(camera), focal_px(other_camera)
     pairs = image_px[base_matches[:, 0], :2], other_px[base_matches[:, 1], :2]
 
     def verify(found: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
-        # an error counts at the mean focal length of both cameras, and a variant's has its scale
+        # poselib's errors are at the mean focal length; a variant's are larger by its scale
         coarser = (focal + other_focal) / (_precision(found.variant) * focal + other_focal)
         return verify_two_view(
             found.keypoints_px[matches[:, 0], :2],
@@ -221,7 +206,7 @@ def two_view_of_variants(
         if not found:
             return found
         sets = [pairs, *((one.keypoints_px, other_px[one.other_rows]) for one in found)]
-        richest = max(range(len(sets)), key=lambda at: len(sets[at][0]))  # of equals the first
+        richest = max(range(len(sets)), key=lambda at: len(sets[at][0]))
         other_from_image = relative_pose(
             bearing_rays(camera, sets[richest][0][:, :2]),
             bearing_rays(other_camera, sets[richest][1][:, :2]),
@@ -237,7 +222,7 @@ def two_view_of_variants(
         for one in found:
             px = one.keypoints_px[:, :2]
             rays = bearing_rays(camera, px)
-            # a ray turns so much more with a pixel of the smaller image
+            # pixels of a smaller image are larger angles
             slopes = ray_slopes(camera, px, rays) / _precision(one.variant)
             others = one.other_rows
             good = verify_with_poses(
@@ -263,10 +248,8 @@ def known_pose_of_variants(
     other_from_image: RigidTransform,
     options: KnownPoseOptions,
 ) -> PairVerifier:
-    """Verification with the known poses.
-
-    Of the camera of the image that the variants are of, and of the other image's keypoints the rays
-    float64 (M, 3) and slopes (M, 2, 2).
+    """Return a verifier by a known pose; the other image's rays (M, 3) and slopes (M, 2, 2) are
+    given.
     """
 
     def verify(found: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -288,10 +271,9 @@ def relative_pose(
     *,
     min_matches: int = MIN_MATCHES,
 ) -> RigidTransform | None:
-    """Estimate ``other_from_image`` of matched rays, with a translation of length 1, by RANSAC.
+    """Estimate ``other_from_image`` of matched rays (N, 3) by RANSAC, with a unit translation.
 
-    Of homogeneous rays (N, 3), last component 1, at a focal length in pixels, at which an error
-    counts. None where no model has ``min_matches`` inliers.
+    ``focal`` in pixels scales errors. None if no model has ``MIN_MATCHES`` inliers.
     """
     if len(rays) < min_matches:
         return None
@@ -309,8 +291,7 @@ def _ransac(
     sampling: dict[str, Any],
     refinement: dict[str, Any],
 ) -> tuple[Any, dict[str, Any]]:
-    """poselib's relative pose, of normalised coordinates at a focal length: so it needs to know no
-    camera model, and ours knows them all."""
+    """Estimate poselib's relative pose of normalised coordinates, which need no camera model."""
     import poselib
 
     pinhole = {"model": "PINHOLE", "width": 1, "height": 1, "params": [focal, focal, 0.0, 0.0]}
@@ -326,7 +307,7 @@ def _ransac(
 
 
 def _precision(variant: ImageVariant) -> float:
-    """Pixels of the image that a keypoint was found in, for one of the original; 1 at most."""
+    """Return pixels of a variant per pixel of the original, at most 1."""
     return min(1.0, variant.scale)
 
 
@@ -338,16 +319,13 @@ def agree_by_chance(
     num_matches: int,
     options: TwoViewOptions,
 ) -> bool:
-    """True if wrong matches of two images may agree with a relative pose as well as these do.
+    """Return True if wrong matches may agree with a relative pose as well as these do.
 
-    These are the matches (N, 2) that two-view verification kept of ``num_matches``. Of matches that
-    are all wrong some lie near the epipolar lines of any model, and RANSAC finds the model with
-    most of them. The number of false alarms (Moisan and Stival, A probabilistic criterion to detect
-    rigid point matches between two images, IJCV 2004) is how many models as good as this one are
-    expected among wrong matches. There a wrong match falls anywhere in the image; but keypoints
-    stand where the texture is, and wrong matches are of things that look alike. How often one is
-    near its line is therefore counted, on the keypoints themselves: each with the others' partners.
-    Few keypoints tell little of that, so it is never taken to be less than anywhere.
+    Keypoints (N, 2) are the verified ones of ``num_matches``. RANSAC finds a model even for wrong
+    matches. The number of false alarms (Moisan and Stival, IJCV 2004) is the expected number of
+    models as good among wrong matches. Keypoints cluster on texture, so the probability of a wrong
+    match near its epipolar line is measured on mismatched pairs of the keypoints, and is at least
+    that of uniform positions.
     """
     from scipy.special import gammaln
     from scipy.stats import binom
@@ -375,7 +353,7 @@ def agree_by_chance(
     samples = gammaln(num_matches + 1) - gammaln(num_matches - _SAMPLE + 1) - gammaln(_SAMPLE + 1)
     for share in _THRESHOLDS:
         threshold_px = share * options.max_error_px
-        # a wrong match that falls anywhere in the image; a Sampson error is of both together
+        # probability for uniform positions; a Sampson error is of both images together
         anywhere = max(
             2 * math.sqrt(2) * threshold_px * math.hypot(c.width, c.height) / (c.width * c.height)
             for c in (camera_a, camera_b)

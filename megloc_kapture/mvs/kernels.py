@@ -47,11 +47,8 @@ def window_sums(image, other, radius, row, columns, sums):
 def correlate(reference, warped, radius, costs):
     """Compute the matching cost under one plane: 1 - the mean of the two best correlations.
 
-    Parameters
-    ----------
-    reference : float32 (H, W).
-    warped : float32 (S, H, W), the sources warped by the plane.
-    costs : uint8 (H, W), filled: 255 times 1 - ZNCC, at most 255, also where invisible.
+    ``warped``: float32 (S, H, W), the sources warped by the plane. ``costs``: uint8 (H, W), filled
+    with 255 (1 - ZNCC), at most 255, also where invisible.
     """
     height, width = reference.shape
     num_sources = len(warped)
@@ -85,17 +82,11 @@ def correlate(reference, warped, radius, costs):
 
 @compiled_loop
 def add_path(cost, grey, p1, p2, edge, dy, dx, total):
-    """Add the costs of best paths along one direction (Hirschmueller, PAMI 2008, eq. 13).
+    """Add the costs of best paths along one direction to ``total`` (Hirschmueller, PAMI 2008, eq.
+    13).
 
     ``L(p, d) = C(p, d) + min(L(q, d), L(q, d +- 1) + p1, min_k L(q, k) + p2') - min_k L(q, k)``
-    with q the pixel before p, and ``p2' = max(p1, p2 edge / (edge + |I(p) - I(q)|))``.
-
-    Parameters
-    ----------
-    cost : uint8 (H, W, D).
-    grey : float32 (H, W).
-    dy, dx : -1, 0 or 1, from q to p.
-    total : uint16 (H, W, D), added to.
+    with q the pixel before p by (dy, dx), and ``p2' = max(p1, p2 edge / (edge + |I(p) - I(q)|))``.
     """
     height, width, depth = cost.shape
     before = np.full((width, depth + 2), _FAR, np.float32)
@@ -158,15 +149,10 @@ def best_labels(total, labels):
 def count_agreeing(
     inverse, other, infinity, baseline, back_infinity, back_baseline, max_px, max_share, counts
 ):
-    """Count another view whose depth agrees in both directions.
+    """Count another view whose inverse depth (H, W) agrees in both directions, in ``counts``.
 
-    Parameters
-    ----------
-    inverse, other : float32 (H, W), inverse depth of both views, 0 where unknown.
-    infinity, baseline : into the other view; ``back_infinity``, ``back_baseline``: back.
-    max_px : largest round-trip error.
-    max_share : largest relative depth difference.
-    counts : uint8 (H, W), added to.
+    ``infinity`` and ``baseline`` project into the other view; ``max_px`` limits the round-trip
+    error, ``max_share`` the relative depth difference.
     """
     height, width = inverse.shape
     rows, columns = other.shape

@@ -166,20 +166,12 @@ def _noise(y, x, turn, k):
 def refine_planes(
     reference, sources, infinities, baselines, planes, costs, reach, tone, turn, step, limits
 ):
-    """Run one pass of PatchMatch over slanted planes (Bleyer et al., BMVC 2011), in place.
+    """Run one pass of PatchMatch over slanted planes (H, W, 3) (Bleyer et al., BMVC 2011), in
+    place.
 
     Rows are traversed alternately down and up. Candidates are the planes of two previous neighbours
-    and three random changes: depth, slope, and both at half size.
-
-    Parameters
-    ----------
-    sources : float32 (S, H, W).
-    infinities, baselines : float64 (S, 3, 3) and (S, 3), see :mod:`megloc_kapture.mvs.sweep`.
-    planes : float64 (H, W, 3).
-    costs : float32 (H, W), computed on turn 0.
-    turn : number of the pass.
-    step : inverse depth, about a pixel's motion.
-    limits : least and greatest inverse depth.
+    and three random changes: depth, slope, and both at half size. ``costs`` (H, W) are computed on
+    turn 0; ``step`` is about a pixel's motion; ``limits`` bound the inverse depth.
     """
     height, width = reference.shape
     count = (2 * reach + 1) ** 2
@@ -229,12 +221,12 @@ def refine_planes(
 def plane_deviations(
     reference, sources, infinities, baselines, planes, reach, tone, calibration, out
 ):
-    """Estimate the standard deviation of every pixel's inverse depth from its matching.
+    """Estimate the standard deviation of every pixel's inverse depth, 0 where invisible.
 
     The least-squares bound for a window of N pixels with correlation rho, gradient g and motion m
     per inverse depth along the epipolar line is ``(1 - rho^2) Var / (N mean((g m)^2))``, averaged
-    over the sources, which share noise and misfit. A matching error of ``calibration[0]`` pixels is
-    added to ``calibration[1]`` times its root. ``out``: float32 (H, W), filled; 0 where invisible.
+    over the sources. A matching error of ``calibration[0]`` pixels is added to ``calibration[1]``
+    times its root.
     """
     height, width = reference.shape
     count = (2 * reach + 1) ** 2

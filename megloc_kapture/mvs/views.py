@@ -54,11 +54,7 @@ def relative_projection(reference: StereoView, source: StereoView) -> tuple[Floa
 
 
 def pixel_step(projections: Projections, camera: Camera, limits: Floats) -> float:
-    """Return the inverse depth step that moves a pixel by one in the most sensitive source.
-
-    The median over the image, averaged over the limits (far, near); ``projections``: see
-    :func:`relative_projection`.
-    """
+    """Return the inverse depth step that moves a pixel by one in the most sensitive source."""
     x, y = np.meshgrid(*(np.linspace(0.1, 0.9, 5) * n for n in (camera.width, camera.height)))
     pixels = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
     steps = np.linspace(limits[0], limits[1], 17)[:, None]
@@ -119,17 +115,11 @@ def choose_sources(
     centers: Floats,
     count: int,
 ) -> list[int]:
-    """Choose sources for an image, best first, by shared points and angles.
+    """Choose at most ``count`` sources for an image, best first, by shared points and angles.
 
     A shared point has weight 1 at 5 to 20 degrees, decreasing with the squared ratio outside.
-
-    Parameters
-    ----------
-    candidates : bool (I,), allowed images.
-    points_of : rows of ``xyz`` observed per image.
-    images_of : first observation of each point (N + 1,), and the images (O,) in that order.
-    centers : float64 (I, 3), of the cameras.
-    count : at most.
+    ``points_of``: rows of ``xyz`` per image; ``images_of``: first observation of each point (N +
+    1,), and the images (O,) in that order.
     """
     starts, images = images_of
     points = points_of[image]
@@ -150,7 +140,7 @@ def choose_sources(
 
 
 def depth_range(depths: Floats) -> tuple[float, float] | None:
-    """Return the depth range of sparse points (N,), widened 1st and 99th percentiles, or None."""
+    """Return the widened 1st and 99th percentile of depths (N,); None for too few."""
     depths = depths[depths > 0]
     if len(depths) < 8:
         return None

@@ -44,7 +44,7 @@ def pick_device(device: Device) -> torch.device:
         raise OptionError(f"device={device}: this machine has no GPU that torch can use; take auto")
     if int(device.partition(":")[2] or 0) >= count:
         raise OptionError(f"device={device}: this machine has {count} GPUs, the first is cuda:0")
-    return torch.device("cuda" if device == "auto" else device)
+    return torch.device("cuda", int(device.partition(":")[2] or 0))
 
 
 @contextmanager
@@ -61,14 +61,21 @@ def inference(device: torch.device, half_precision: bool = False) -> Iterator[No
 def _without_tf32() -> Iterator[None]:
     """TF32 is a setting of the process, so only one thread computes at a time."""
     with _computing:
-        convolutions = torch.backends.cudnn.allow_tf32
-        products = torch.backends.cuda.matmul.allow_tf32
-        torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
+        products: Any = torch.backends.cuda.matmul
+        convolutions: Any = torch.backends.cudnn
+        name: str = "allow_tf32"
+        exact: Any = False
+        if hasattr(products, "fp32_precision"):  # torch 2.9 refuses a mix with the older settings
+            convolutions, name, exact = convolutions.conv, "fp32_precision", "ieee"
+        settings = products, convolutions
+        before = [getattr(setting, name) for setting in settings]
+        for setting in settings:
+            setattr(setting, name, exact)
         try:
             yield
         finally:
-            torch.backends.cudnn.allow_tf32 = convolutions
-            torch.backends.cuda.matmul.allow_tf32 = products
+            for setting, value in zip(settings, before, strict=True):
+                setattr(setting, name, value)
 
 
 def image_tensor(image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:

@@ -254,7 +254,8 @@ class Evaluate(_RunStage):
             found = results_without_truth(
                 [localized], benchmark_of(tables), labels=[self._run.label]
             )
-            found = replace(found, results=(replace(found.results[0], context=context),))
+            single = replace(found.evaluations[0], context=context)
+            found = replace(found, evaluations=(single,))
             write_report(output, found, map_poses=map_poses, provenance=provenance)
             return {"queries_with_truth": 0}
         evaluation = evaluate(

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.datasets.kapture_folders import cameras_of_folder, warn_of_scaled
 from megloc_kapture.errors import DataError, OptionError, OutputError, suggestion
-from megloc_kapture.evaluation.report.scene import corner_rays
+from megloc_kapture.evaluation.view import corner_rays
 from megloc_kapture.geometry.cameras import principal_point_px
 from megloc_kapture.io.colmap import MapImage, undistort_model, write_model
 from megloc_kapture.io.files import write_bytes

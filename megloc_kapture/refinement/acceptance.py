@@ -142,7 +142,6 @@ def accept_or_keep(
 def squared_distance(
     old: RigidTransform, new: RigidTransform, covariance: NDArray[np.float64]
 ) -> float:
-    """Return the squared Mahalanobis distance of two poses by the new one's covariance (6, 6)."""
     old_from_new = old @ new.inverse()
     w, x, y, z = old_from_new.quat_wxyz
     turn = 2.0 * np.copysign(1.0, w) * np.array([x, y, z])
@@ -198,8 +197,6 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Two poses compared; ``significance`` is the cost's decrease in standard errors."""
-
     before: Fit
     after: Fit
     significance: float
@@ -324,13 +321,10 @@ def _inverse_curvature(
 def whitened_directions(
     problem: LevelProblem, system: NormalEquations
 ) -> tuple[Float64, float] | None:
-    """Return steps of the pose that whiten the normal equations.
+    """Return steps of the pose (6, 6), in columns, that whiten the normal equations.
 
-    Returns
-    -------
-    steps : float64 (6, 6), in columns, each half a pixel of the level; the least determined
-        direction first.
-    change : of the weighted sum of squared residuals, by each step.
+    Each is half a pixel of the level, the least determined direction first. Returns also each
+    step's change of the weighted sum of squared residuals.
     """
     reduced = system.reduced()
     if reduced is None:

@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 
 from megloc_kapture.geometry.cameras import focal_px, in_image, px_from_cam
 from megloc_kapture.geometry.poses import rotation_angles_deg
+from megloc_kapture.mapping.depth import STRUCTURED_LIGHT, depth_noise
 from megloc_kapture.plugins import DepthView, PoseRefinement, RankingScene
 from megloc_kapture.refinement.icp_surface import (
     NORMAL_NEIGHBOURS,
@@ -36,8 +37,6 @@ from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
 
-# coefficients of z^0, z^1, z^2 of 0.0012 + 0.0019 (z - 0.4)^2
-_STRUCTURED_LIGHT = (0.001504, -0.00152, 0.0019)
 # query pixels in the last step: more cost time without effect
 _MAX_PIXELS = 10000
 # pixel step of a reference's depth map for its overlap
@@ -70,7 +69,7 @@ class IcpOptions(Options):
         default_factory=DepthCloudOptions, description="which depths are trusted"
     )
     noise: tuple[float, float, float] = Field(
-        default=_STRUCTURED_LIGHT,
+        default=STRUCTURED_LIGHT,
         description="a, b, c of the noise a + b z + c z^2 at depth z, metres; its proportions "
         "weight the pixels of the query",
     )
@@ -116,7 +115,7 @@ class IcpOptions(Options):
                 raise ValueError(f"{name} must be positive, and fall: {values}")
         if len(self.voxels_m) != len(self.max_distances_m):
             raise ValueError("voxels_m and max_distances_m must have the same number of levels")
-        if (_noise(np.linspace(0.0, self.depth.max_depth_m, 256), self.noise) <= 0).any():
+        if (depth_noise(np.linspace(0.0, self.depth.max_depth_m, 256), self.noise) <= 0).any():
             raise ValueError(f"noise is not positive at every depth: {self.noise}")
         return self
 
@@ -140,10 +139,8 @@ def refine_by_icp(
 ) -> PoseRefinement:
     """Fit a query's cloud, float64 (N, 3) in the camera's frame, to the map's (M, 3), in metres.
 
-    The measures are ``residual_before_m`` and ``residual_after_m`` (median distance from the map's
-    planes within the coarsest distance), ``overlap_before`` and ``overlap_after`` (share of points
-    within the finest distance), ``moved_m``, ``moved_deg`` and ``condition``. The covariance is
-    that of :func:`~megloc_kapture.refinement.icp_surface.fit_covariance`.
+    Residuals are median distances from the map's planes within the coarsest distance, overlaps the
+    shares of points within the finest one.
     """
     options = options or IcpOptions()
     # coordinates are small near the camera, whatever the world's origin
@@ -221,16 +218,11 @@ def _fit_levels(
         moved = found
         if reason := _reason_too_far(start, moved, options):
             return start, reason
-    finest, noise = levels[-1], _noise(pixels[:, 2], options.noise)
+    finest, noise = levels[-1], depth_noise(pixels[:, 2], options.noise)
     found = fit_weighted(finest.surface, pixels, noise, moved, finest.max_distance_m)
     if found is None:
         return start, "the surfaces do not determine the pose"
     return found, _reason_too_far(start, found, options)
-
-
-def _noise(depth_m: Floats, noise: tuple[float, float, float]) -> Floats:
-    a, b, c = noise
-    return a + depth_m * (b + depth_m * c)
 
 
 def _movement(start: RigidTransform, end: RigidTransform) -> tuple[float, float]:
@@ -288,11 +280,10 @@ def map_cloud(
     scene: RankingScene,
     options: IcpOptions,
 ) -> Floats:
-    """Return the map's points around a query under its estimated pose, float64 (M, 3), world.
+    """Return the map's points (M, 3) around a query under its estimated pose.
 
     They come from the depth maps of the references with most overlap, one per view within 0.2 m and
-    10 deg, or from the references' sparse points without depth. ``query_points``: float64 (N, 3) in
-    the query camera's frame; ``references``: map images, best first.
+    10 deg, or from the references' sparse points without depth.
     """
     margin_m = options.max_distances_m[0]
     low, high = query_points.min(axis=0) - margin_m, query_points.max(axis=0) + margin_m
@@ -326,7 +317,6 @@ def _overlaps(
     scene: RankingScene,
     options: IcpOptions,
 ) -> list[tuple[str, float]]:
-    """Return references with depth and the share that agrees with the query's; most first."""
     found = []
     depth_from_world = query_depth.image_from_depth.inverse() @ cam_from_world
     for name in references:

@@ -55,12 +55,10 @@ def depth_cloud(
     image_mask: NDArray[np.bool_] | None = None,
     step_px: int = 1,
 ) -> Floats:
-    """Return the points of a depth map, float64 (N, 3), in the frame of its image, in metres.
+    """Return the points (N, 3) of a depth map in the frame of its image, in metres.
 
-    Pixels without depth, beyond the greatest depth, at depth edges (sensors smear them: Khoshelham
-    and Elberink, Sensors 12(2), 2012) and hidden by the mask are dropped. ``image_camera`` and
-    ``image_mask``: camera and mask of the image, bool (H, W), True = use; ``step_px``: sampling
-    step along both axes.
+    Pixels without depth, too far, at depth edges (sensors smear them: Khoshelham and Elberink,
+    Sensors 12(2), 2012) and hidden by the image's mask are dropped.
     """
     options = options or DepthCloudOptions()
     depth = np.asarray(view.depth_m, np.float32)
@@ -109,7 +107,6 @@ class Surface:
     _tree: Any
 
     def nearest(self, points: Floats) -> tuple[NDArray[np.int64], Floats]:
-        """Return rows and distances of the nearest surface points, for points (M, 3)."""
         rows, squared = self._tree.batch_knn_search(np.ascontiguousarray(points), 1)
         return rows[:, 0].astype(np.int64), np.sqrt(squared[:, 0])
 
@@ -140,11 +137,9 @@ def surface_of(points: Floats) -> Surface:
 def fit_to_surface(
     surface: Surface, points: Floats, surface_from_points: RigidTransform, max_distance_m: float
 ) -> RigidTransform | None:
-    """Fit points (N, 3) to a surface: point-to-plane ICP by Levenberg-Marquardt.
+    """Fit points (N, 3) to a surface: point-to-plane ICP by Levenberg-Marquardt (``PLANE_ICP``).
 
-    Chen and Medioni, "Object modelling by registration of multiple range images", Image and Vision
-    Computing 10(3), 1992; small_gicp's ``PLANE_ICP``. None without correspondences within
-    ``max_distance_m``.
+    None without correspondences within ``max_distance_m``.
     """
     start = np.eye(4)
     start[:3, :3] = surface_from_points.rotation_matrix()
@@ -203,9 +198,8 @@ def surface_fit(
 def condition_number(fit: SurfaceFit) -> float:
     """Return the condition number of the fit's normal matrix; infinite for fewer than 6 points.
 
-    Points are centred and scaled to a mean distance of 1, so that rotation and translation weigh
-    alike (Gelfand, Ikemoto, Rusinkiewicz and Levoy, "Geometrically stable sampling for the ICP
-    algorithm", 3DIM 2003, section 2).
+    Points are centred and scaled, so that rotation and translation weigh alike (Gelfand et al.,
+    3DIM 2003, section 2).
     """
     if len(fit.points) < 6:
         return np.inf
@@ -217,10 +211,9 @@ def condition_number(fit: SurfaceFit) -> float:
 
 
 def fit_covariance(fit: SurfaceFit) -> Floats:
-    """Estimate the covariance (6, 6) of ``cam_from_world`` for a cloud in the camera's frame.
+    """Estimate the covariance (6, 6) of ``cam_from_world``, rotation first, left perturbation.
 
-    Rotation in radians, then translation in metres, of a left perturbation. Residuals count as
-    independent; systematic sensor errors are not included.
+    Residuals count as independent; systematic sensor errors are not included.
     """
     jacobian = np.column_stack([np.cross(fit.points, fit.normals), fit.normals])
     deviation = deviation_by_median(fit.residuals_m)
@@ -234,11 +227,10 @@ def fit_weighted(
     surface_from_points: RigidTransform,
     max_distance_m: float,
 ) -> RigidTransform | None:
-    """Refine a fit of points (N, 3) to a nearby surface, point to plane, weighted by noise.
+    """Refine a fit of points (N, 3) to a nearby surface, point to plane, weighted by noise (N,).
 
-    Gauss-Newton on Cauchy's loss of the distances over ``noise`` (N,), which is proportional to the
-    standard deviations. Correspondences are searched anew in every step. None for fewer than six
-    points within ``max_distance_m`` or an undetermined transform.
+    Gauss-Newton on Cauchy's loss. None for fewer than six points within ``max_distance_m`` or an
+    undetermined transform.
     """
     transform = surface_from_points
     for _ in range(_MAX_ITERATIONS):

@@ -70,7 +70,6 @@ class FieldRendering:
 
 
 def build_field(kind: Kind, num_images: int, num_lights: int) -> FieldModule:
-    """Build an untrained field; torch's global generator draws its parameters."""
     return (NerfW if kind == "nerfw" else TriPlane)(num_images, num_lights)
 
 
@@ -84,10 +83,7 @@ def light_rows(images: Sequence[str], lights: Lights) -> list[int]:
 class NeuralField:
     """A field, its frame and its training images.
 
-    Parameters
-    ----------
-    images : names, in the order of the transient embedding's rows.
-    light_rows : row of the appearance embedding of each image.
+    ``light_rows`` are the images' rows of the appearance embedding.
     """
 
     def __init__(
@@ -135,7 +131,6 @@ class NeuralField:
         return FieldRendering(rgb, depth_m.reshape(shape).astype(np.float32), camera)
 
     def render_rays(self, rays: Rays, appearance: torch.Tensor | None = None) -> Rendered:
-        """Render rays in chunks with one appearance (A,) or the mean, without transients."""
         parts, size = [], _CPU_CHUNK if self.device.type == "cpu" else _CHUNK
         for start in range(0, len(rays.origins), size):
             part = select(rays, slice(start, start + size))
@@ -174,7 +169,6 @@ class NeuralField:
         return fitted.detach()
 
     def fitted_appearance(self, view: FieldView, max_side_px: int) -> torch.Tensor | None:
-        """Fit the appearance embedding (A,) of a view, reduced to a longer side."""
         camera, rgb, usable, _ = pixels_of(view, max_side_px)
         rows = torch.from_numpy(np.flatnonzero(usable)).to(self.device)
         if not len(rows):

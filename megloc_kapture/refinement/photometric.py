@@ -63,11 +63,8 @@ class Alignment:
 class LevelProblem:
     """Residuals of chosen points at one level of the query, as functions of the pose.
 
-    Parameters
-    ----------
-    camera : of the query at full size.
-    near : alignment whose ``cam_from_world`` gives the distance of the points.
-    num_groups : number of references, including those without points.
+    ``near``: pose that gives the distance of the points; ``num_groups`` includes references without
+    points.
     """
 
     def __init__(
@@ -97,7 +94,6 @@ class LevelProblem:
         return LevelProblem(chosen, level, self.camera, self._near, num_groups=self.num_groups)
 
     def subset(self, which: NDArray[Any]) -> LevelProblem:
-        """Return the problem for a mask (N,) or rows of points."""
         return self._of(self.chosen.subset(which), self.level)
 
     def thinned(self, most: int) -> LevelProblem:
@@ -105,7 +101,6 @@ class LevelProblem:
         return self if few else self._of(self.chosen.thinned(most), self.level)
 
     def within(self, mask: NDArray[np.bool_]) -> LevelProblem:
-        """Return the problem restricted to a mask of the query, bool (H, W)."""
         size = self.level.valid.shape[1::-1]
         seen = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         return self._of(self.chosen, replace(self.level, valid=self.level.valid & seen))
@@ -194,7 +189,6 @@ class NormalEquations:
         return cls(pose, mixed, own, pose_gradient, own_gradient, cost / max(count, 1), count)
 
     def reduced(self, damping: float = 0.0) -> tuple[Float64, Float64, Float64] | None:
-        """Eliminate gains and biases: matrix (6, 6), gradient (6,), factor (G, C, 6, 2)."""
         # keeps the block of an invisible reference invertible
         gain, bias = _solve_pairs(self.own[:, :, None], self.mixed)
         projection = np.stack([gain, bias], axis=-1)

@@ -91,7 +91,7 @@ def _read(values, row, column, a, b, c):
 
 @compiled_loop
 def read_values(values, valid, x, y, out, found):
-    """Interpolate values (N, C) at N pixels bilinearly, and set a mask of valid ones, bool (N,)."""
+    """Interpolate values (N, C) at N pixels bilinearly; ``found`` (N,) marks valid ones."""
     for k in range(len(x)):
         row, column, a, b = _corner(valid, x[k], y[k])
         found[k] = row >= 0
@@ -103,15 +103,12 @@ def read_values(values, valid, x, y, out, found):
 
 @compiled_loop
 def evaluate(chosen, query, alignment, out):
-    """Evaluate residuals and derivatives per point: float64 (N, C, 8), NaN where invisible.
+    """Evaluate residuals and derivatives per point: ``out`` float64 (N, C, 8), NaN where invisible.
 
-    Parameters
-    ----------
-    chosen : points (N, 3) in the world, values (N, C) and reference index (N,).
-    query : a level (h, w, C), its valid pixels (h, w), its scale (2,), and its :func:`camera_of`.
-    alignment : rotation and translation of ``cam_from_world``, gains and biases (G, C).
-    out : filled with the residual, its six derivatives by a left perturbation of the pose, rotation
-        first, and the query's value.
+    ``out``: the residual, six derivatives by a left perturbation of the pose (rotation first), and
+    the query's value. ``chosen``: points (N, 3), values (N, C) and reference index (N,). ``query``:
+    a level (h, w, C), its valid pixels, its scale (2,) and its :func:`camera_of`. ``alignment``:
+    rotation and translation of ``cam_from_world``, gains and biases (G, C).
     """
     points, values, groups = chosen
     level, valid, scale_xy, camera = query
@@ -152,15 +149,10 @@ def evaluate(chosen, query, alignment, out):
 def normal_equations(rows, groups, squared_scale, sums):
     """Add up the robust normal equations of :func:`evaluate`; return cost sum and point count.
 
-    A point's ``e^2`` is the mean of its squared residuals over channels; its cost is Geman and
-    McClure's ``s^2 / 2  e^2 / (s^2 + e^2)`` and its weight ``(1 + e^2 / s^2)^-2``; an infinite s^2
-    gives least squares.
-
-    Parameters
-    ----------
-    rows, groups : (N, C, 8), and (N,).
-    sums : added to. Pose (6, 6), upper half; pose with gain and bias (G, C, 6, 2); gain gain, gain
-        bias, bias bias (G, C, 3); gradients of the pose (6,) and of gain and bias (G, C, 2).
+    A point's ``e^2`` is the mean of its squared residuals over channels, its cost Geman and
+    McClure's ``s^2 / 2  e^2 / (s^2 + e^2)``; an infinite s^2 gives least squares. ``sums``, added
+    to: pose (6, 6), upper half; pose with gain and bias (G, C, 6, 2); gain gain, gain bias, bias
+    bias (G, C, 3); gradients of the pose (6,) and of gain and bias (G, C, 2).
     """
     pose, mixed, own, pose_gradient, own_gradient = sums
     channels = rows.shape[1]
@@ -217,14 +209,9 @@ def evaluated_equations(chosen, query, alignment, squared_scale, sums):
 
 @compiled_loop
 def splat_depths(points, camera, size_xy, cell_px, r, t, nearest, cells, depths):
-    """Put points into cells of an image and keep each cell's smallest depth.
+    """Put points (N, 3) into cells of an image and keep each cell's smallest depth in ``nearest``.
 
-    Parameters
-    ----------
-    points : (N, 3), in the world.
-    size_xy : (2,), of the image in pixels.
-    nearest : (rows, columns), initially infinity or other points' depths; updated.
-    cells, depths : (N,), filled with the flat cell index (-1 outside the image) and the depth.
+    ``cells`` and ``depths`` (N,) are filled with flat cell indices, -1 outside, and depths.
     """
     columns = nearest.shape[1]
     shown_at = np.empty((11, min(len(points), _ROWS)))
@@ -248,8 +235,8 @@ def splat_depths(points, camera, size_xy, cell_px, r, t, nearest, cells, depths)
 def strongest_per_cell(x, y, energy, wanted, cell_px, best):
     """Find the wanted point with the largest ``energy`` (h, w) in each cell of a level.
 
-    ``x`` and ``y`` (N,) are pixels of the level, ``wanted`` is bool (N,). ``best``, int64 (rows,
-    columns), is filled with point indices, -1 for zero energy.
+    ``x`` and ``y`` (N,) are pixels of the level. ``best`` is filled with point indices, -1 for zero
+    energy.
     """
     best[:] = -1
     h, w = energy.shape

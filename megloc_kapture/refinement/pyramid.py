@@ -92,7 +92,6 @@ def lift_points(camera: Camera, cam_from_world: RigidTransform, depth: DepthView
 def visibility(
     references: Sequence[DepthPoints], camera: Camera, cam_from_world: RigidTransform
 ) -> Visibility:
-    """Find visible points of several references by a coarse z-buffer."""
     from megloc_kapture.refinement.photometric_kernels import camera_of, splat_depths
 
     sides = np.array([camera.width, camera.height], np.float64)
@@ -167,15 +166,10 @@ def build_pyramid(
     max_side_px: int = 640,
     appearance: Appearance = "normalised",
 ) -> list[Level]:
-    """Build the levels of an image, finest first.
+    """Build the levels of an RGB image, finest first; none is smaller than 16 px.
 
-    Parameters
-    ----------
-    image, mask : RGB, uint8 (H, W, 3), and bool (H, W), True = use.
-    levels : at most; none is smaller than 16 px.
-    max_side_px : longer side of the finest level.
-    appearance : ``normalised`` is brightness of zero mean and unit deviation in a window around
-        each pixel, ``colours`` the same of red, green and blue.
+    ``normalised`` is brightness of zero mean and unit deviation in a window around each pixel,
+    ``colours`` the same of red, green and blue.
     """
     height, width = image.shape[:2]
     if mask is not None and mask.shape != (height, width):
@@ -250,10 +244,7 @@ def choose_points(
     wanted: Sequence[NDArray[np.bool_]],
     max_points: int,
 ) -> ChosenPoints:
-    """Choose at most ``max_points`` of each reference, evenly spread, with their values at a level.
-
-    ``wanted`` are masks (N,) per reference.
-    """
+    """Choose at most ``max_points`` of each reference, evenly spread, with their values."""
     from megloc_kapture.refinement.photometric_kernels import read_values, strongest_per_cell
 
     points, values, groups = [], [], []

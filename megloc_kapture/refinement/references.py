@@ -8,11 +8,9 @@ not detected.
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import lru_cache
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +19,8 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import in_image, project
 from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, stack_poses
 from megloc_kapture.plugins import DepthView, RankingScene
-from megloc_kapture.refinement.acceptance import CHI2_OF_CHANCE
+from megloc_kapture.refinement.acceptance import CHI2_OF_CHANCE, RenderingOptions
 from megloc_kapture.refinement.pyramid import (
-    Appearance,
     DepthPoints,
     Level,
     build_pyramid,
@@ -33,8 +30,6 @@ from megloc_kapture.refinement.pyramid import (
 from megloc_kapture.values import Camera, RigidTransform
 
 _FORWARD = np.array([0.0, 0.0, 1.0])
-# prepared references per process; one of 640x480 takes about 8 MB
-_KEPT_REFERENCES = 32
 # images with known displacement that suffice, that are required (all of five on the wrong side of a
 # median has a chance of 1 in 32), and that are tried
 MAX_TESTED, MIN_TESTED, MAX_TRIED = 24, 5, 96
@@ -70,12 +65,7 @@ class ReferenceImages:
     ) -> list[str]:
         """Return images with a similar viewing direction, nearest first, half from ``first``.
 
-        Parameters
-        ----------
-        first : images that the pose comes from, which are known to match.
-        only_first : use no other images.
-        max_angle_deg : largest angle between viewing directions.
-        min_distance_m : least distance of the centres, unit of the map.
+        ``first`` are images that match; ``only_first`` uses no others.
         """
         forward = cam_from_world.rotation_matrix()[2]
         facing = self._directions @ forward >= np.cos(np.deg2rad(max_angle_deg))
@@ -93,8 +83,6 @@ class ReferenceImages:
 
 @dataclass(frozen=True, eq=False)
 class RenderingQuery:
-    """An image to refine: RGB uint8 (H, W, 3), mask True = use."""
-
     image: NDArray[np.uint8]
     camera: Camera
     mask: NDArray[np.bool_] | None = None
@@ -120,58 +108,24 @@ def reference_of(name: str, scene: RankingScene) -> RenderingReference | None:
     return RenderingReference(image, camera, scene.map_pose(name), depth, scene.map_mask(name))
 
 
-@dataclass(frozen=True)
-class PyramidKind:
-    levels: int
-    max_side_px: int
-    appearance: Appearance
+def lifted(reference: RenderingReference) -> DepthPoints:
+    return lift_points(reference.camera, reference.cam_from_world, reference.depth)
 
 
-@dataclass(frozen=True, eq=False)
-class PreparedReference:
-    pyramid: list[Level]
-    points: DepthPoints
-
-
-def prepared(reference: RenderingReference, kind: PyramidKind) -> PreparedReference:
-    return _prepared(_ByContent(_content(reference), reference), kind)
-
-
-@dataclass(frozen=True)
-class _ByContent:
-    content: tuple[Any, ...]
-    reference: RenderingReference = field(compare=False)
-
-
-@lru_cache(maxsize=_KEPT_REFERENCES)
-def _prepared(key: _ByContent, kind: PyramidKind) -> PreparedReference:
-    return prepare(key.reference, kind)
-
-
-def prepare(reference: RenderingReference, kind: PyramidKind) -> PreparedReference:
-    points = lift_points(reference.camera, reference.cam_from_world, reference.depth)
-    return PreparedReference(pyramid_of(reference, kind), points)
-
-
-def pyramid_of(view: RenderingQuery | RenderingReference, kind: PyramidKind) -> list[Level]:
+def pyramid_of(view: RenderingQuery | RenderingReference, options: RenderingOptions) -> list[Level]:
     """Build the pyramid of an image, finest first."""
     image, camera = view.image, view.camera
     if image.shape != (camera.height, camera.width, 3):
         raise DataError(
             f"an image of {image.shape} does not fit a camera of {camera.width}x{camera.height}"
         )
-    return build_pyramid(image, view.mask, **vars(kind))
-
-
-def _content(reference: RenderingReference) -> tuple[Any, ...]:
-    depth = reference.depth
-    digest = hashlib.blake2b(digest_size=16)
-    for array in (reference.image, depth.depth_m, reference.mask):
-        if array is not None:
-            digest.update(f"{array.dtype.str} {array.shape}".encode())
-            digest.update(np.ascontiguousarray(array).data)
-    cameras = reference.camera, reference.cam_from_world, depth.camera, depth.image_from_depth
-    return digest.digest(), *cameras
+    return build_pyramid(
+        image,
+        view.mask,
+        levels=options.levels,
+        max_side_px=options.max_side_px,
+        appearance=options.appearance,
+    )
 
 
 @dataclass(frozen=True)
@@ -188,14 +142,7 @@ class Displacement:
 
     @property
     def contradicts(self) -> bool:
-        """True if it exceeds the claimed uncertainty and the resolution of alignment."""
         return self.squared_distance > CHI2_OF_CHANCE and self.moved_px > _RESOLVED_PX
-
-
-Displace = Callable[
-    [RenderingQuery, Sequence[RenderingReference], RigidTransform], Displacement | None
-]
-"""Refines a pose that should be right; None where the references do not determine it."""
 
 
 @dataclass(frozen=True)
@@ -208,7 +155,6 @@ class Consistency:
 
     @property
     def consistent(self) -> bool:
-        """True unless the tests contradict the claimed accuracy."""
         return not self.reason
 
 
@@ -234,7 +180,7 @@ def spread_names(names: Sequence[str]) -> list[str]:
 
 
 def judge_consistency(displacements: Iterable[Displacement | None]) -> Consistency:
-    """Judge a map by at most ``MAX_TESTED`` displacements of :func:`refine_held_out`."""
+    """Judge a map by at most ``MAX_TESTED`` displacements of held-out images."""
     known: list[Displacement] = []
     for each in displacements:
         if each is not None:
@@ -263,38 +209,11 @@ def judge_consistency(displacements: Iterable[Displacement | None]) -> Consisten
     return Consistency(len(known), contradicting, median, reason)
 
 
-def refine_held_out(
-    image: str,
-    images: ReferenceImages,
-    scene: RankingScene,
-    displace: Displace,
-    *,
-    max_references: int,
-) -> Displacement | None:
-    """Refine a map image against others from its given pose and return the displacement.
-
-    None without depth, or where the others do not determine the pose.
-
-    Parameters
-    ----------
-    images : of the map, in one coordinate frame.
-    scene : source of pixels, cameras, poses and depth; no query data is read.
-    max_references : the references with most overlap and another viewing angle.
-    """
-    view = reference_of(image, scene)
-    if view is None:
-        return None
-    own = lift_points(view.camera, view.cam_from_world, view.depth)
-    references = _references_elsewhere(view, own, images, scene)[:max_references]
-    if not references:
-        return None
-    query = RenderingQuery(view.image, view.camera, view.mask)
-    return displace(query, references, view.cam_from_world)
-
-
-def _references_elsewhere(
-    view: RenderingReference, own: DepthPoints, images: ReferenceImages, scene: RankingScene
+def references_elsewhere(
+    view: RenderingReference, images: ReferenceImages, scene: RankingScene
 ) -> list[RenderingReference]:
+    """Return images of the map with another viewing angle, those with most overlap first."""
+    own = lifted(view)
     points = own.points[:: max(1, len(own.points) // _ASKED_POINTS)]
     if len(points) == 0:
         return []
@@ -316,7 +235,7 @@ def _share_inside(points: NDArray[np.float64], name: str, scene: RankingScene) -
 
 
 def _share_seen(view: RenderingReference, own: DepthPoints, other: RenderingReference) -> float:
-    points = lift_points(other.camera, other.cam_from_world, other.depth)
+    points = lifted(other)
     seen = visibility([own, points], view.camera, view.cam_from_world).seen[1]
     free = DepthPoints(points.points[seen], points.px[seen])
     return float(visibility([free], view.camera, view.cam_from_world).covered.mean())

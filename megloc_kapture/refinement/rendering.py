@@ -8,7 +8,6 @@ from a few pixels, so it begins at a coarse level, from several perturbed poses.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 
@@ -37,14 +36,13 @@ from megloc_kapture.refinement.pyramid import (
 )
 from megloc_kapture.refinement.references import (
     Displacement,
-    PyramidKind,
     ReferenceImages,
     RenderingQuery,
     RenderingReference,
-    prepared,
+    lifted,
     pyramid_of,
     reference_of,
-    refine_held_out,
+    references_elsewhere,
 )
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -63,20 +61,13 @@ def refine_by_rendering(
     cam_from_world: RigidTransform,
     options: RenderingOptions | None = None,
 ) -> PoseRefinement:
-    """Refine the pose of an image by references lifted by their depth.
+    """Refine the pose of an image, in metres, by references lifted by their depth.
 
     ``measures`` of the result: cost (robust loss, 0 to 0.5), correlation and overlap before and
     after, decrease of the cost in standard errors, motion in m and deg, points and references.
-
-    Parameters
-    ----------
-    references : all are used.
-    cam_from_world : of the query, in the frame of the references' poses, metres.
     """
     options = options or RenderingOptions()
-    # independent work on two threads; results keep the order of the work
-    with ThreadPoolExecutor(2) as threads:
-        return _Refining(query, references, options, threads).refine(cam_from_world)
+    return _Refining(query, references, options).refine(cam_from_world)
 
 
 def judge_by_rendering(
@@ -90,11 +81,9 @@ def judge_by_rendering(
 ) -> PoseRefinement:
     """Judge a pose found by other means, after alignment at the finest level.
 
-    ``start`` and ``found``: old and new ``cam_from_world``; ``judged``: bool (H, W), pixels of the
-    query for acceptance, all by default.
+    ``judged``: bool (H, W), pixels of the query for acceptance, all by default.
     """
-    with ThreadPoolExecutor(2) as threads:
-        return _Refining(query, references, options, threads).judge(start, found, judged)
+    return _Refining(query, references, options).judge(start, found, judged)
 
 
 def displacement_by_rendering(
@@ -109,11 +98,10 @@ def displacement_by_rendering(
     too small, or the minimum is out of bounds.
     """
     options = options or RenderingOptions()
-    with ThreadPoolExecutor(2) as threads:
-        refining = _Refining(query, references, options, threads)
-        refined = refining.refine(cam_from_world)
-        if not refined.accepted:
-            refined = refining.judge(cam_from_world, cam_from_world, None)
+    refining = _Refining(query, references, options)
+    refined = refining.refine(cam_from_world)
+    if not refined.accepted:
+        refined = refining.judge(cam_from_world, cam_from_world, None)
     found = refined.measures
     if "squared_distance" not in found or (
         found["moved_m"] > options.max_translation_m
@@ -130,17 +118,12 @@ class _Refining:
         query: RenderingQuery,
         references: Sequence[RenderingReference],
         options: RenderingOptions,
-        threads: Executor,
     ) -> None:
         self.options, self.least_overlap = options, max(options.min_overlap, 1e-9)
         self.camera = query.camera
-        self.threads = threads
-        kind = PyramidKind(options.levels, options.max_side_px, options.appearance)
-        ours = threads.submit(pyramid_of, query, kind)
-        theirs = list(threads.map(lambda each: prepared(each, kind), references))
-        self.query_levels = ours.result()
-        self.levels = [each.pyramid for each in theirs]
-        self.points = [each.points for each in theirs]
+        self.query_levels = pyramid_of(query, options)
+        self.levels = [pyramid_of(each, options) for each in references]
+        self.points = [lifted(each) for each in references]
 
     def refine(self, start: RigidTransform) -> PoseRefinement:
         sight, overlap = self._visibility(start)
@@ -213,8 +196,7 @@ class _Refining:
         fewer = problem.thinned(_START_POINTS)
         here = minimise(fewer, fewer.nuisance_at(pose), last_step_px=_COARSE_STEP_PX)
         starts = [here, *perturbed_starts(fewer, here)[:_MAX_STARTS]]
-        align = partial(minimise, fewer, last_step_px=_COARSE_STEP_PX, rounds=1)
-        tried = list(self.threads.map(align, starts))
+        tried = [minimise(fewer, each, last_step_px=_COARSE_STEP_PX, rounds=1) for each in starts]
         return max(tried, key=partial(correlation, fewer)).cam_from_world
 
     def _decide(
@@ -245,11 +227,15 @@ class Rendering:
     def hold_out(
         self, image: str, images: ReferenceImages, scene: RankingScene
     ) -> Displacement | None:
+        view = reference_of(image, scene)
+        if view is None:
+            return None
+        references = references_elsewhere(view, images, scene)[: self.options.max_references]
+        if not references:
+            return None
+        query = RenderingQuery(view.image, view.camera, view.mask)
         options = self.options.model_copy(update={"accept_always": False})
-        displace = partial(displacement_by_rendering, options=options)
-        return refine_held_out(
-            image, images, scene, displace, max_references=self.options.max_references
-        )
+        return displacement_by_rendering(query, references, view.cam_from_world, options)
 
     def refine(
         self,
@@ -259,7 +245,6 @@ class Rendering:
         references: Sequence[str],
         scene: RankingScene,
     ) -> PoseRefinement:
-        """Refine the pose of a query by its best references with depth."""
         used: list[RenderingReference] = []
         for name in references:
             if len(used) == self.options.max_references:

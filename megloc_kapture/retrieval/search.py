@@ -1,8 +1,4 @@
-"""Exact nearest neighbours among global descriptors, as blocked matrix products.
-
-Databases are read block by block, and no more than one block of similarities per feature is kept:
-what the search needs does not grow with the database.
-"""
+"""Exact nearest neighbours among global descriptors, as blocked matrix products."""
 
 from __future__ import annotations
 
@@ -22,38 +18,24 @@ from megloc_kapture.retrieval.fusion import (
     normalized_weights,
 )
 
-# products of large blocks are faster: the matrix library's threads wait for each other less often
 _BLOCK_ELEMENTS = 1 << 24  # similarities held at once, per feature: 64 MiB of float32
 _VECTOR_ELEMENTS = 1 << 25  # of a block of database rows, per feature: 128 MiB of float32
 _MOST_ROWS = 1 << 14  # of a block, however short they are
-_CACHED_ELEMENTS = 1 << 18  # of similarities ranked at once: 1 MiB, which a cache holds
 Float32 = NDArray[np.float32]
 Matrices = Sequence[NDArray[np.floating[Any]]]
 Found = tuple[NDArray[np.int64], Float32]
 
 
 class VectorBlocks(Protocol):
-    """Global descriptors of a database, of which no more than a block has to be in memory.
+    """Unit rows of a database, read in blocks; zero for images without features."""
 
-    Rows are finite and of unit length, so that the inner product is the cosine; a zero row, of an
-    image without features, is similar to nothing.
-    """
-
-    def __len__(self) -> int:
-        """Number of rows."""
-        ...
+    def __len__(self) -> int: ...
 
     @property
-    def dimension(self) -> int:
-        """Length D of a row."""
-        ...
+    def dimension(self) -> int: ...
 
-    def read(self, start: int, stop: int, out: Float32 | None = None) -> Float32:
-        """The rows from ``start`` to ``stop``, float32 (stop - start, D); they are not written to.
-
-        They may be in ``out``, a C-contiguous array of that shape: memory that is used again and
-        again is much faster than new memory.
-        """
+    def read(self, start: int, stop: int) -> Float32:
+        """Return rows float32 (stop - start, D)."""
         ...
 
 
@@ -61,8 +43,6 @@ VectorSource = VectorBlocks | NDArray[np.floating[Any]]
 
 
 class ArrayBlocks:
-    """An array (N, D) of unit or zero rows as a source of blocks."""
-
     def __init__(self, rows: NDArray[np.floating[Any]]) -> None:
         if rows.ndim != 2:
             raise DataError(f"global descriptors {rows.shape} are of different dimensions")
@@ -75,18 +55,16 @@ class ArrayBlocks:
     def dimension(self) -> int:
         return self._rows.shape[1]
 
-    def read(self, start: int, stop: int, out: Float32 | None = None) -> Float32:
-        # a view where the array is float32 already
+    def read(self, start: int, stop: int) -> Float32:
         return np.ascontiguousarray(self._rows[start:stop], dtype=np.float32)
 
 
 def as_blocks(source: VectorSource) -> VectorBlocks:
-    """The source itself, or the array as one."""
     return ArrayBlocks(source) if isinstance(source, np.ndarray) else source
 
 
 def common_length(sources: Sequence[VectorBlocks]) -> int:
-    """Number of rows that all sources have; DataError where they differ."""
+    """Return the number of rows of all sources; DataError if they differ."""
     lengths = {len(source) for source in sources}
     if len(lengths) != 1:
         raise DataError(f"features of one set of images have {sorted(lengths)} rows")
@@ -95,10 +73,7 @@ def common_length(sources: Sequence[VectorBlocks]) -> int:
 
 @dataclass(frozen=True)
 class FusedSearch:
-    """The ``top_k`` best database rows of queries by several features, part by part of a database.
-
-    One feature alone is not fused. The weights are positive, one per feature; all equal by default.
-    """
+    """Search of the ``top_k`` best database rows by several features, part by part."""
 
     top_k: int
     fusion: FusionOptions
@@ -107,24 +82,17 @@ class FusedSearch:
     def lists(
         self, queries: Sequence[NDArray[np.floating[Any]]], database: Sequence[VectorSource]
     ) -> list[Found]:
-        """Rank the rows of a part: one ranking, or of methods that fuse ranks one per feature.
+        """Rank the rows of a part: one ranking, or one per feature for fusion of ranks.
 
-        Parameters
-        ----------
-        queries : per feature float (Q, D_i), rows of unit length for cosine similarity. A zero row,
-            of an image without features, has similarity 0 with everything.
-        database : per feature float (M, D_i), or a source of blocks of them.
-
-        Returns
-        -------
-        Of each ranking indices, int64 (Q, min(K, M)), best first, where equal scores keep the
-        database's order, and scores float32; K is ``top_k``, or more of rankings that are fused.
+        ``queries`` and ``database`` have (Q, D_i) and (M, D_i) per feature. A ranking has indices
+        int64 (Q, min(K, M)), best first, ties in the database's order, and scores float32; K is
+        ``top_k``, or more for fusion of ranks.
         """
         if len(queries) == 0 or len(queries) != len(database):
             raise OptionError(
                 f"{len(queries)} global features of the queries, {len(database)} of the map"
             )
-        normalized_weights(self.weights, len(queries))  # refused before anything is read
+        normalized_weights(self.weights, len(queries))  # check before reading
         if len(queries) == 1 or self.fusion.fuses_ranks():
             return _search(queries, database, self._list_length(), lambda matrices: matrices)
 
@@ -134,10 +102,7 @@ class FusedSearch:
         return _search(queries, database, self.top_k, fused)
 
     def ranking(self, parts: Sequence[Sequence[Found]]) -> Found:
-        """Rank the whole from the lists of its parts, whose rows are the whole's.
-
-        Indices and scores are (Q, min(top_k, M)).
-        """
+        """Merge the lists of all parts: indices and scores (Q, min(top_k, M))."""
         lists = [_merged(found, self._list_length()) for found in zip(*parts, strict=True)]
         if len(lists) == 1:
             indices, scores = lists[0]
@@ -150,7 +115,6 @@ class FusedSearch:
 
 
 def _merged(parts: Sequence[Found], length: int) -> Found:
-    """The best of the parts' rankings (Q, K), best first; of equal ones the earlier part's."""
     if len(parts) == 1:
         return parts[0]
     indices, scores = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
@@ -164,7 +128,7 @@ def _search(
     length: int,
     combine: Callable[[Matrices], Matrices],
 ) -> list[Found]:
-    """A ranking of at most ``length`` rows per matrix of scores that ``combine`` returns."""
+    """Rank at most ``length`` rows by each matrix of scores that ``combine`` returns."""
     sources = [as_blocks(source) for source in database]
     vectors = [_checked(rows, source) for rows, source in zip(queries, sources, strict=True)]
     num_queries, num_rows = len(vectors[0]), common_length(sources)
@@ -172,29 +136,17 @@ def _search(
         raise DataError(f"features of {', '.join(str(len(rows)) for rows in vectors)} queries")
     step = _VECTOR_ELEMENTS // max(1, *(source.dimension for source in sources))
     step = max(1, min(step, _MOST_ROWS, _BLOCK_ELEMENTS))
-    height = min(step, num_rows)
     at_once = min(max(1, _BLOCK_ELEMENTS // step), num_queries)
-    buffers = [np.empty((height, source.dimension), dtype=np.float32) for source in sources]
-    products = [np.empty(at_once * height, dtype=np.float32) for _ in sources]
     num_rankings = len(combine([np.zeros((0, 0), np.float32)] * len(sources)))
     best = [_BestRows(num_queries, min(length, num_rows)) for _ in range(num_rankings)]
     for left in range(0, num_rows, step) if num_queries else ():
         right = min(left + step, num_rows)
-        blocks = [
-            source.read(left, right, out=buffer[: right - left])
-            for source, buffer in zip(sources, buffers, strict=True)
-        ]
+        blocks = [source.read(left, right) for source in sources]
         for first in range(0, num_queries, at_once):
-            matrices = []
-            for rows, block, out in zip(vectors, blocks, products, strict=True):
-                some = rows[first : first + at_once]
-                product = out[: len(some) * len(block)].reshape(len(some), len(block))
-                matrices.append(np.matmul(some, block.T, out=product))
-            few = max(1, _CACHED_ELEMENTS // (right - left))
-            for start in range(0, len(matrices[0]), few):
-                fused = combine([matrix[start : start + few] for matrix in matrices])
-                for scores, ranking in zip(fused, best, strict=True):
-                    ranking.add(first + start, left, scores)
+            some = slice(first, first + at_once)
+            products = [rows[some] @ block.T for rows, block in zip(vectors, blocks, strict=True)]
+            for scores, ranking in zip(combine(products), best, strict=True):
+                ranking.add(first, left, scores)
     return [(ranking.rows, ranking.scores) for ranking in best]
 
 
@@ -209,40 +161,34 @@ def _checked(queries: NDArray[np.floating[Any]], source: VectorBlocks) -> Float3
 
 
 class _BestRows:
-    """For each query the ``top_k`` best database rows so far, best first; of equal ones the first.
-
-    ``rows`` int64 (Q, top_k), -1 where fewer came, and ``scores`` float32, -inf there.
-    """
+    """Best ``top_k`` rows so far of each query: ``rows`` int64, -1 if fewer, ``scores`` float32."""
 
     def __init__(self, num_queries: int, top_k: int) -> None:
         self.rows = np.full((num_queries, top_k), -1, dtype=np.int64)
         self.scores = np.full((num_queries, top_k), -np.inf, dtype=np.float32)
 
     def add(self, first_query: int, first_row: int, scores: NDArray[np.floating[Any]]) -> None:
-        """Take finite scores (q, b) of queries and database rows from these on.
-
-        Blocks of rows come in the order of the database.
-        """
+        """Add scores (q, b) of queries and database rows; blocks come in the database's order."""
         known = slice(first_query, first_query + len(scores))
         top_k = self.rows.shape[1]
         found, columns = _first_best(np.asarray(scores, np.float32), top_k)
         both = np.concatenate([self.scores[known], found], axis=1)
         rows = np.concatenate([self.rows[known], first_row + columns], axis=1)
-        # what was known comes first, so that of equal scores the earlier rows stay
+        # known rows come first, so that they win ties
         order = np.argsort(-both, axis=1, kind="stable")[:, :top_k]
         self.scores[known] = np.take_along_axis(both, order, axis=1)
         self.rows[known] = np.take_along_axis(rows, order, axis=1)
 
 
 def _first_best(scores: Float32, count: int) -> tuple[Float32, NDArray[np.int64]]:
-    """The ``count`` best of each row (q, b) and their columns, ascending; of equal the first."""
+    """Return the ``count`` best of each row (q, b) and their columns; ties to the first."""
     height, width = scores.shape
     if width <= count:
         return scores, np.broadcast_to(np.arange(width), scores.shape)
     bound = np.partition(scores, width - count, axis=1)[:, width - count, None]
     chosen = scores >= bound
     surplus = np.count_nonzero(chosen, axis=1) - count
-    for row in np.flatnonzero(surplus):  # several are equal to the last one
+    for row in np.flatnonzero(surplus):  # ties with the last one
         equal = np.flatnonzero(scores[row] == bound[row])
         chosen[row, equal[len(equal) - surplus[row] :]] = False
     columns = np.nonzero(chosen)[1].reshape(height, count)

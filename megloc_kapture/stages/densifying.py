@@ -41,6 +41,7 @@ from megloc_kapture.plugins import (
     StereoView,
 )
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.devices import is_out_of_memory
 from megloc_kapture.stages.given_map import copy_features
 from megloc_kapture.stages.local_features import read_frame
 from megloc_kapture.stages.scene import depth_records
@@ -296,6 +297,10 @@ def _estimate(job: _Job) -> str:
         found = job.estimator.estimate(views[0], views[1:], job.range_m)
     except MeglocError as error:
         return str(error)
+    except RuntimeError as error:
+        if not is_out_of_memory(error):
+            raise
+        return "out of memory; make mvs.max_size_px smaller"
     write_array(_scratch(job, job.image, "depth"), found.depth_m)
     write_array(_scratch(job, job.image, "sigma"), found.sigma_m)
     write_array(_scratch(job, job.image, "normals"), found.normals)

@@ -72,7 +72,7 @@ def in_batches(
         try:
             results = run(batch)
         except RuntimeError as error:
-            if not _is_out_of_memory(error):
+            if not is_out_of_memory(error):
                 raise
             if len(batch) == 1:
                 raise DeviceMemoryError(
@@ -88,11 +88,24 @@ def in_batches(
     return found
 
 
-def _is_out_of_memory(error: RuntimeError) -> bool:
+# of plain RuntimeErrors: allocation by the CPU, by CUDA contexts, cuBLAS and cuDNN
+_OUT_OF_MEMORY = (
+    "can't allocate memory",
+    "out of memory",
+    "CUBLAS_STATUS_ALLOC_FAILED",
+    "CUDNN_STATUS_ALLOC_FAILED",
+    "CUDNN_STATUS_INTERNAL_ERROR_HOST_ALLOCATION_FAILED",
+    "CUDNN_STATUS_INTERNAL_ERROR_DEVICE_ALLOCATION_FAILED",
+)
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return whether torch ran out of memory, on any device and in any library below it."""
     torch: Any = sys.modules.get("torch")
-    # on the CPU torch raises a plain RuntimeError
-    return torch is not None and (
-        isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
+    if torch is None or not isinstance(error, RuntimeError):
+        return False
+    return isinstance(error, torch.OutOfMemoryError) or any(
+        text in str(error) for text in _OUT_OF_MEMORY
     )
 
 

@@ -14,7 +14,7 @@ from pydantic import Field
 from megloc_kapture.errors import DataError, OptionError, suggestion
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
-from megloc_kapture.io.kapture.vectors import KaptureVectors
+from megloc_kapture.io.kapture.features import KaptureVectors
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.mapping.pairs import (
     PairsByCovisibilityOptions,

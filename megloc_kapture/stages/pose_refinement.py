@@ -278,7 +278,8 @@ def refine_poses(
     uses = {image: refiners.uses(pose) for image, pose in poses.items()}
     jobs = [(image, pose, *uses[image]) for image, pose in poses.items()]
     refine = partial(_refine, refiners.map, FolderSpec(query), refiners.refiners)
-    found = dict(zip(poses, work.map(refine, jobs, "refining"), strict=True))
+    results = work.map(refine, jobs, "refining", plugins=refiners.refiners)
+    found = dict(zip(poses, results, strict=True))
     _write(output, data, localized, statuses, found)
     tested = refiners.tested()
     if tested:

@@ -326,7 +326,7 @@ def localize_from_matches(
     specs = FolderSpec(map_folder), FolderSpec(query), FolderSpec(matches)
     with shared_index(measured, scratch) as indices:
         localizer = _StoredQueries(*specs, indices, options, ranker)
-        for results in work.map(localizer, jobs, "localizing"):
+        for results in work.map(localizer, jobs, "localizing", plugins=(ranker,)):
             yield from results
 
 

@@ -1,9 +1,8 @@
-"""Labels of a pair's keypoints: the partner in the other image, that there is none, or unknown.
+"""Labels of a pair's keypoints: the partner in the other image, unmatched, or ignored.
 
-Depth and poses, or a homography, bring each keypoint into the other image. The rules are those of
-the open trainings of matchers (glue-factory's ``gt_generation``): two keypoints are partners that
-are each other's nearest and near in both images, where neither is hidden; a keypoint is unmatched
-that is far from all of the other image. What lies between is ignored.
+Depth and poses, or a homography, transform keypoints into the other image. As in glue-factory's
+``gt_generation``, partners are mutual nearest neighbours, near in both images and visible;
+unmatched keypoints are far from all others; the rest is ignored.
 """
 
 from __future__ import annotations
@@ -22,14 +21,14 @@ from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 UNMATCHED, IGNORED = -1, -2
-# pixels across and down that overlap is measured at
+# grid of pixels to measure overlap
 _GRID = (24, 18)
 
 Floats = NDArray[np.float64]
 
 
 class LabelOptions(Options):
-    """Options of labels; the distances are glue-factory's, in the images that are trained on."""
+    """Options of labels, with glue-factory's distances."""
 
     positive_px: float = Field(default=3.0, gt=0, description="partners are nearer, in both images")
     negative_px: float = Field(
@@ -50,11 +49,7 @@ class LabelOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class PosedView:
-    """An image whose depth and pose are known.
-
-    ``camera`` is in the resolution that keypoints are given in, ``depth`` the depth map of its
-    moment, in its own.
-    """
+    """An image with pose and depth; ``camera`` has the resolution of the keypoints."""
 
     camera: Camera
     cam_from_world: RigidTransform
@@ -63,17 +58,13 @@ class PosedView:
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """Labels of the N and M keypoints of two images.
-
-    ``partner_a`` is int64 (N,), the row in b, UNMATCHED or IGNORED; ``partner_b`` (M,) the row in
-    a.
-    """
+    """Partners int64 (N,) and (M,): the row in the other image, UNMATCHED or IGNORED."""
 
     partner_a: NDArray[np.int64]
     partner_b: NDArray[np.int64]
 
     def matches(self) -> NDArray[np.int64]:
-        """Return the matches, int64 (K, 2), sorted by the row in a."""
+        """Return the matches, int64 (K, 2), sorted."""
         rows = np.flatnonzero(self.partner_a >= 0)
         return np.stack([rows, self.partner_a[rows]], axis=1)
 
@@ -85,11 +76,10 @@ def labels_of_views(
     b: PosedView,
     options: LabelOptions | None = None,
 ) -> Labels:
-    """Labels by depth and poses, of any of COLMAP's camera models.
+    """Label keypoints (N, 2) and (M, 2) by depth and poses.
 
-    A keypoint without depth is unmatched where it is farther than ``negative_px`` (Sampson
-    distance) from the epipolar curves of all keypoints that have no partner; otherwise it is
-    ignored. ``px_a`` and ``px_b`` are (N, 2) and (M, 2), of COLMAP's pixel origin.
+    A keypoint without depth is unmatched if it is farther than ``negative_px`` (Sampson distance)
+    from the epipolar curves of all keypoints without partner, else ignored.
     """
     options = options or LabelOptions()
     a_in_b, known_a, visible_a = reproject(px_a, a, b, options)
@@ -117,10 +107,7 @@ def labels_of_homography(
     size_b: tuple[int, int],
     options: LabelOptions | None = None,
 ) -> Labels:
-    """Labels by a homography (3, 3) between the pixels, of COLMAP's origin, of two images.
-
-    ``size_a`` and ``size_b`` are width and height of the images.
-    """
+    """Label keypoints by a homography (3, 3) between the pixels of two images of sizes (w, h)."""
 
     def side(px: NDArray[np.floating[Any]], matrix: Floats, size: tuple[int, int]) -> _Side:
         moved = np.column_stack([px, np.ones(len(px))]) @ matrix.T
@@ -136,11 +123,9 @@ def labels_of_homography(
 def reproject(
     px: NDArray[np.floating[Any]], a: PosedView, b: PosedView, options: LabelOptions | None = None
 ) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Find where b has the points that a sees at pixels.
+    """Transform pixels (N, 2) of a into b by depth.
 
-    Returns ``px``: float64 (N, 2) in b; NaN behind it and without depth; ``known`` and ``visible``:
-    bool (N,), where a has depth; where b shows the point: inside the image, and of the depth that b
-    has.
+    Returns pixels (N, 2), NaN without depth, and masks (N,): with depth in a, and visible in b.
     """
     options = options or LabelOptions()
     points, known = lift_keypoints(
@@ -156,7 +141,7 @@ def reproject(
 
 
 def overlap(a: PosedView, b: PosedView, options: LabelOptions | None = None) -> float:
-    """Share of the pixels with depth that the other image shows: the smaller of both ways."""
+    """Return the share of pixels with depth visible in the other image, the smaller of two."""
     shares = []
     for one, other in ((a, b), (b, a)):
         size = one.camera.width, one.camera.height
@@ -193,7 +178,6 @@ def _labels(a: _Side, b: _Side, options: LabelOptions) -> Labels:
 def _distances(
     first: NDArray[np.floating[Any]], second: NDArray[np.floating[Any]]
 ) -> NDArray[np.float64]:
-    """(N, M) pixels; infinite where the first is not known."""
     found = np.linalg.norm(first[:, None].astype(np.float64) - second[None], axis=2)
     return np.where(np.isfinite(found), found, np.inf)
 
@@ -206,7 +190,7 @@ def _inside(px: Floats, width: int, height: int) -> NDArray[np.bool_]:
 def _epipolar_error_px(
     px_a: NDArray[np.floating[Any]], px_b: NDArray[np.floating[Any]], a: PosedView, b: PosedView
 ) -> Floats:
-    """(N, M) pixels; 0 where the geometry does not tell: views of one centre, undefined rays."""
+    """Return Sampson distances (N, M) in pixels; 0 if undefined."""
     rays = [bearing_rays(view.camera, px) for view, px in ((a, px_a), (b, px_b))]
     slopes = [
         ray_slopes(view.camera, px, ray)

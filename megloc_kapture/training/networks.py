@@ -1,7 +1,7 @@
 """Trained networks, their loss and their metrics on held-out pairs.
 
 SuperGlue is trained on frozen features, or a descriptor network under a frozen detector, as in
-MegLoc (section on local features).
+MegLoc (section "local features").
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ from megloc_kapture.training.pairs import TrainingPair
 from megloc_kapture.values import ImageFeatures, RigidTransform
 
 _FEATURES_KEPT = 1024  # images
-_FIRST_SCALE = 10.0  # of products of descriptors; SuperGlue's final projection learns its own
-_FIRST_DUSTBIN = 0.7  # cosine at which a product is as good as nothing
-_CONFIDENT = 0.2  # the matcher's own threshold
+_FIRST_SCALE = 10.0  # initial scale of descriptor products
+_FIRST_DUSTBIN = 0.7  # initial cosine of the dustbin
+_CONFIDENT = 0.2  # the matcher's threshold
 
 Image = NDArray[np.uint8]
 AUC_DEG = (5, 10, 20)
@@ -54,8 +54,6 @@ _SAME_CENTRE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class PreparedPair:
-    """A pair with its frozen features and their labels."""
-
     pair: TrainingPair
     features: tuple[ImageFeatures, ImageFeatures]
     labels: Labels
@@ -66,10 +64,7 @@ class PreparedPair:
 
 
 class FrozenFeatures:
-    """Features of an extractor, the best of each image; those of images that come again are kept.
-
-    Its keypoints carry a score as third column; ``max_keypoints`` are kept of each image.
-    """
+    """Best keypoints of an extractor; those of named images are cached."""
 
     def __init__(self, extractor: LocalFeatureExtractor, max_keypoints: int) -> None:
         self.extractor, self._max_keypoints = extractor, max_keypoints
@@ -93,7 +88,7 @@ class FrozenFeatures:
 
 
 class SuperPointDescriber(nn.Module):
-    """SuperPoint's backbone and descriptor head; its file is an option ``descriptor_weights``."""
+    """SuperPoint's backbone and descriptor head; saved as option ``descriptor_weights``."""
 
     def __init__(self, extractor: SuperPoint) -> None:
         super().__init__()
@@ -110,10 +105,7 @@ class SuperPointDescriber(nn.Module):
 
 
 class XFeatDescriber(nn.Module):
-    """XFeat's backbone; its file has all of XFeat's keys, as ``descriptor_weights`` has them.
-
-    Its normalisation keeps the statistics it has: pairs of one step are few.
-    """
+    """XFeat's descriptor network with frozen normalisation statistics, since batches are small."""
 
     def __init__(self, extractor: XFeat) -> None:
         super().__init__()
@@ -135,7 +127,7 @@ class XFeatDescriber(nn.Module):
 
 
 def describer_of(extractor: LocalFeatureExtractor) -> SuperPointDescriber | XFeatDescriber:
-    """The descriptor network of an extractor, as it begins; raises OptionError, DataError."""
+    """Return the descriptor network of an extractor."""
     if isinstance(extractor, SuperPoint):
         return SuperPointDescriber(extractor)
     if isinstance(extractor, XFeat):
@@ -146,10 +138,7 @@ def describer_of(extractor: LocalFeatureExtractor) -> SuperPointDescriber | XFea
 
 
 class ProductHead(nn.Module):
-    """Matching by the descriptors' products alone, as nearest neighbours do.
-
-    Their optimal transport with a scale and a dustbin that are learned, and not used afterwards.
-    """
+    """Matching by products of descriptors, with a learned scale and dustbin for training only."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -159,7 +148,6 @@ class ProductHead(nn.Module):
     def forward(
         self, pairs: Sequence[tuple[ImageKeypoints, ImageKeypoints]], iterations: int
     ) -> list[torch.Tensor]:
-        """As :class:`SuperGlueNet`."""
         cosines = (a.descriptors.float() @ b.descriptors.float().T for a, b in pairs)
         products = [self.scale * cosine for cosine in cosines]
         return log_optimal_transport(products, self.scale * self.dustbin, iterations)
@@ -167,11 +155,10 @@ class ProductHead(nn.Module):
 
 @torch.no_grad()
 def begin_at_products(net: SuperGlueNet) -> None:
-    """Let a new SuperGlue match by its descriptors' products alone, as :class:`ProductHead` does.
+    """Initialise a new SuperGlue to match by products of descriptors, as :class:`ProductHead` does.
 
-    The last layers of the keypoint encoder and of every message are zero, the final projection is
-    the identity: what descriptors tell need not be learned once more, and what attention adds is
-    learned on top of it (as residual branches that begin at zero: Bachlechner et al., UAI 2021).
+    Last layers of keypoint encoder and messages are zero, the final projection is the identity
+    (residual branches that begin at zero: Bachlechner et al., UAI 2021).
     """
     perceptrons = [module for module in net.modules() if isinstance(module, nn.Sequential)]
     for last in (net.final_proj, *(perceptron[-1] for perceptron in perceptrons)):
@@ -184,7 +171,7 @@ def begin_at_products(net: SuperGlueNet) -> None:
 
 
 def encoder_sizes(descriptor_size: int) -> tuple[int, ...]:
-    """Sizes of SuperGlue's keypoint encoder, in the proportions of the official network."""
+    """Return the layer sizes of SuperGlue's keypoint encoder, in the official proportions."""
     if descriptor_size % 8:
         raise OptionError(
             f"SuperGlue takes descriptors of a multiple of 8 dimensions, not {descriptor_size}"
@@ -193,13 +180,10 @@ def encoder_sizes(descriptor_size: int) -> tuple[int, ...]:
 
 
 class PairModel(nn.Module):
-    """A matcher, and what describes the keypoints, as one module that is trained.
+    """A matcher and an optional descriptor network (None: frozen descriptors) as one module.
 
-    Parameters
-    ----------
-    describer : None: the frozen features' own descriptors.
-    iterations : of the optimal transport.
-    deep_supervision : the loss is the mean over the head's cross-attention layers.
+    ``iterations``: of the optimal transport; ``deep_supervision``: mean loss over the head's
+    layers.
     """
 
     def __init__(
@@ -219,7 +203,7 @@ class PairModel(nn.Module):
             self._after.append(layers)
 
     def forward(self, pairs: Sequence[PreparedPair]) -> torch.Tensor:
-        """Mean loss (); 0 where no pair has keypoints in both images."""
+        """Return the mean loss (), 0 without keypoints."""
         usable = [one for one in pairs if one.usable]
         losses = [
             transport_loss(assignment, one.labels)
@@ -232,7 +216,7 @@ class PairModel(nn.Module):
 
     @torch.no_grad()
     def match(self, pair: PreparedPair) -> tuple[NDArray[np.int64], float]:
-        """Matches (K, 2) and the loss of a pair; by products mutual nearest neighbours."""
+        """Return matches (K, 2) and the loss of a pair."""
         if not pair.usable:
             return np.zeros((0, 2), np.int64), 0.0
         assignment = self._assignments([pair])[-1][0]
@@ -259,12 +243,10 @@ class PairModel(nn.Module):
 
 
 def transport_loss(log_assignment: torch.Tensor, labels: Labels) -> torch.Tensor:
-    """Negative log likelihood () of labels; ignored keypoints do not count, nothing labelled is 0.
+    """Return the negative log likelihood () of labels for log assignments (N + 1, M + 1).
 
-    SuperGlue's equation 10 (Sarlin et al., CVPR 2020), with the means of the matched and of the
-    unmatched keypoints weighted alike, as LightGlue does (Lindenberger et al., ICCV 2023, equation
-    9): how many there are of each depends on the images. ``log_assignment`` are logarithms (N + 1,
-    M + 1), the dustbins last.
+    SuperGlue's equation 10, with equal weights of the means over matched and unmatched keypoints
+    (LightGlue, equation 9). Ignored keypoints do not count.
     """
     device = log_assignment.device
     rows, columns = torch.from_numpy(labels.matches()).to(device).T
@@ -272,24 +254,20 @@ def transport_loss(log_assignment: torch.Tensor, labels: Labels) -> torch.Tensor
     lost_b = torch.from_numpy(labels.partner_b == UNMATCHED).to(device)
     matched = log_assignment[rows, columns]
     unmatched = torch.cat([log_assignment[:-1, -1][lost_a], log_assignment[-1, :-1][lost_b]])
-    # a mean of nothing is not a number
     return -sum(0.5 * part.sum() / max(len(part), 1) for part in (matched, unmatched))  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)
 class HeldOutResult:
-    """Figures of a matcher on pairs."""
-
     pairs: int
     loss: float  # mean over the pairs
-    precision: float  # share of right ones among all matches whose keypoints are labelled
-    recall: float  # share of the labelled matches that are found
-    # area under the curve of the relative pose's error up to 5, 10 and 20 degrees, in [0, 1]
+    precision: float  # share of right matches of labelled keypoints
+    recall: float  # share of the labelled matches
+    # area under the curve of the relative pose error up to 5, 10 and 20 degrees, in [0, 1]
     auc: tuple[float, ...]
 
 
 def held_out_result(model: PairModel, pairs: Sequence[PreparedPair]) -> HeldOutResult:
-    """Match pairs with a model that is set to evaluate."""
     right = told = labelled = 0
     losses, errors = [], []
     for pair in pairs:
@@ -308,19 +286,20 @@ def held_out_result(model: PairModel, pairs: Sequence[PreparedPair]) -> HeldOutR
 def judged(
     matches: NDArray[np.int64], labels: Labels
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Matches (K, 2) that are right, and those of which a label tells it, bool (K,) both."""
+    """Return masks (K,) of right matches and of matches with a label."""
     a, b = labels.partner_a[matches[:, 0]], labels.partner_b[matches[:, 1]]
     return a == matches[:, 1], (a != IGNORED) | (b != IGNORED)
 
 
 def pose_error_deg(pair: PreparedPair, matches: NDArray[np.int64]) -> float:
-    """The larger of the angles of rotation and translation, degrees; infinite without a pose.
+    """Return the larger error of rotation and translation direction in degrees; infinite without a
+    pose.
 
-    The translation's sign is left open, as SuperGlue's evaluation does; between views of one centre
-    only the rotation counts.
+    The translation's sign is ignored, as in SuperGlue's evaluation, and the translation for views
+    of one centre.
     """
     views, truth = pair.pair.views, pair.pair.b_from_a
-    assert views is not None and truth is not None  # who calls has asked
+    assert views is not None and truth is not None
     rays = [
         bearing_rays(view.camera, features.keypoints_px[matches[:, side], :2])
         for side, (view, features) in enumerate(zip(views, pair.features, strict=True))
@@ -342,7 +321,7 @@ def relative_pose_error_deg(found: RigidTransform, truth: RigidTransform) -> flo
 
 
 def pose_auc(errors_deg: Sequence[float] | NDArray[Any]) -> tuple[float, ...]:
-    """Area under the curve of recall over the error, up to each of AUC_DEG, over that bound."""
+    """Return the normalised area under the recall curve up to each of AUC_DEG."""
     ascending = np.sort(np.asarray(errors_deg, np.float64))
     if not len(ascending):
         return (0.0,) * len(AUC_DEG)

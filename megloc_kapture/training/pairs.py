@@ -1,10 +1,8 @@
-"""Pairs of images to train on: of a kapture with depth and poses, or views of photographs.
+"""Training pairs: images of a kapture with depth and poses, or views of single photographs.
 
-A source draws pairs at random from a generator that it is given, and keeps no state of its own: the
-pair of a step depends on the seed and the step alone.
-Views of a photograph are under random homographies and random light, as SuperPoint and the open
-matchers are pretrained (DeTone et al., CVPR workshops 2018, section 5): any folder of photographs
-will do.
+Sources draw from a given generator and keep no state: a step's pairs depend on seed and step only.
+Views of a photograph have random homographies and light (DeTone et al., CVPR workshops 2018,
+section 5).
 """
 
 from __future__ import annotations
@@ -39,7 +37,7 @@ from megloc_kapture.training.labels import (
 )
 from megloc_kapture.values import Options, RigidTransform
 
-# near images that look anything like the same way; their overlap is then measured
+# candidates, whose overlap is then measured
 _CANDIDATES = PairsByPosesOptions(num_neighbours=40, max_angle_deg=90)
 _VIEWS_KEPT = 64
 
@@ -50,8 +48,6 @@ _HALF = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
 
 
 class HomographyOptions(Options):
-    """Options of random views of a photograph."""
-
     min_scale: float = Field(default=0.5, gt=0, le=1, description="of a view, of the photograph")
     max_angle_deg: float = Field(default=45.0, ge=0, le=180, description="of a view's rotation")
     perspective: float = Field(
@@ -63,8 +59,6 @@ class HomographyOptions(Options):
 
 
 class PairOptions(Options):
-    """Options of pairs and their labels."""
-
     max_size_px: int = Field(
         default=640, ge=64, description="longer side that images are reduced to"
     )
@@ -85,17 +79,15 @@ class PairOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class TrainingPair:
-    """Two images, and how the keypoints that are found in them are labelled."""
-
     images: tuple[Image, Image]  # uint8 (H, W, 3), RGB
-    keys: tuple[str, str] | None  # of images that come again as they are; None of those that do not
+    keys: tuple[str, str] | None  # cache keys; None for images that do not recur
     label: Labelling  # labels of keypoints (N, 2) and (M, 2) of the images
-    # cameras, poses and depth of a pair of posed images; None under a homography
+    # None under a homography
     views: tuple[PosedView, PosedView] | None = None
 
     @property
     def b_from_a(self) -> RigidTransform | None:
-        """Relative pose of posed images."""
+        """Return the relative pose of posed images."""
         if self.views is None:
             return None
         a, b = self.views
@@ -103,10 +95,9 @@ class TrainingPair:
 
 
 class PosedPairs:
-    """Pairs of a kapture's images that have poses and depth, by the overlap of what they show.
+    """Pairs of a kapture's images with poses and depth, drawn evenly by overlap.
 
-    ``measured`` is a file of pairs with their overlap as score; it is read where it is there, else
-    made.
+    ``measured`` is a file of pairs with overlaps, read if present, else written.
     """
 
     def __init__(
@@ -121,7 +112,6 @@ class PosedPairs:
         poses, records = data.poses(), depth_records(data)
         self._poses, self._records = poses, records
         self._names = [name for name in sorted(poses) if name in records]
-        # bound to this object, so that it goes with it
         self._view = lru_cache(maxsize=_VIEWS_KEPT)(self._read_view)
         if measured is not None and measured.is_file():
             near, overlaps = self._read_overlaps(measured)
@@ -190,7 +180,7 @@ class PosedPairs:
 
 
 class Photographs:
-    """Pairs of views of single photographs, of all image files below a folder."""
+    """Pairs of views of single photographs: all image files below a folder."""
 
     def __init__(self, folder: Path, options: PairOptions) -> None:
         self.folder, self._options = Path(folder), options
@@ -220,7 +210,7 @@ PairSource = PosedPairs | Photographs
 
 
 def reduced_size(width: int, height: int, max_size_px: int) -> tuple[int, int]:
-    """Width and height of an image that is reduced to a longer side; itself where it is smaller."""
+    """Return width and height reduced to a longer side."""
     scale = min(1.0, max_size_px / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
@@ -232,10 +222,10 @@ def _size(view: PosedView) -> tuple[int, int]:
 def random_view(
     image: Image, size: tuple[int, int], rng: np.random.Generator, options: HomographyOptions
 ) -> tuple[Image, Floats]:
-    """A view of a quadrilateral of the photograph, which lies in it as a whole.
+    """Warp a random quadrilateral inside a photograph to a view of a size (w, h).
 
-    Returns ``view``: uint8 (height, width, 3), of ``size``, width and height; ``view_from_image``:
-    float64 (3, 3), of pixels whose first centre is (0.5, 0.5).
+    Returns the view, uint8 (h, w, 3), and ``view_from_image``, float64 (3, 3), for pixels whose
+    first centre is (0.5, 0.5).
     """
     width, height = size
     sides = np.array([image.shape[1], image.shape[0]], np.float64)
@@ -245,7 +235,7 @@ def random_view(
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     corners = (moved - rectangle.mean(axis=0)) @ turn.T
     extent = np.ptp(corners, axis=0)
-    # as large a part of the photograph as fits, times the scale
+    # the largest part of the photograph that fits, times the scale
     corners *= rng.uniform(options.min_scale, 1.0) * (sides / extent).min()
     corners -= corners.min(axis=0)
     corners += rng.uniform(0, 1, 2) * (sides - corners.max(axis=0))
@@ -261,17 +251,14 @@ def random_view(
 
 
 def relit(image: Image, rng: np.random.Generator, strength: float = 1.0) -> Image:
-    """The photograph in other light, by another camera: gamma, exposure, cast, noise, blur, JPEG.
-
-    A ``strength`` of 0 changes nothing.
-    """
+    """Change gamma, exposure, cast, noise, blur and JPEG at random."""
     if strength <= 0:
         return image
     gamma, exposure = np.exp2(rng.uniform(-1, 1, 2) * strength)
     cast = np.exp2(rng.normal(0, 0.12 * strength, 3))
     noise, blur = rng.uniform(0, 0.04 * strength), rng.uniform(0, 1.2 * strength)
     level = (image.astype(np.float32) / 255) ** np.float32(gamma)
-    # what is brighter than white is lost, so exposure mostly takes light away
+    # values above white are lost, so exposure is mostly reduced
     level *= (min(exposure, 1.3) * cast).astype(np.float32)
     if blur > 0.3:
         level = np.asarray(cv2.GaussianBlur(level, (0, 0), float(blur)), np.float32)

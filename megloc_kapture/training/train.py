@@ -1,31 +1,227 @@
-"""Training from folders to files: networks, curves, and a manifest of the options."""
+"""Training of matchers and descriptors: a seeded loop, its options and its files.
+
+A step's pairs depend on seed and step only, so the state is networks, optimizer and step.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 import torch
+from pydantic import Field
 from safetensors.torch import save
 
 from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.files import read_content, remove, write_bytes, write_json
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.nets.runtime import state_bytes
-from megloc_kapture.nets.superglue import SuperGlueNet
-from megloc_kapture.stages.work import HERE, Work
-from megloc_kapture.training.pairs import PairSource, Photographs, PosedPairs
-from megloc_kapture.training.trainer import (
-    COLUMNS,
-    DescriptorOptions,
-    Trainer,
-    TrainingOptions,
-    TrainingState,
+from megloc_kapture.io.weights import find_weights, read_weights
+from megloc_kapture.nets.runtime import NetworkOptions, load_state, pick_device, state_bytes
+from megloc_kapture.nets.superglue import SuperGlueNet, superglue
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import LOCAL_FEATURES, LocalFeatureExtractor, PluginChoice
+from megloc_kapture.stages.work import HERE, Work, ordered_map
+from megloc_kapture.training.networks import (
+    AUC_DEG,
+    FrozenFeatures,
+    HeldOutResult,
+    PairModel,
+    PreparedPair,
+    ProductHead,
+    begin_at_products,
+    describer_of,
+    encoder_sizes,
+    held_out_result,
 )
+from megloc_kapture.training.pairs import PairOptions, PairSource, Photographs, PosedPairs
+
+COLUMNS = (
+    *("step", "learning_rate", "loss", "held_out_loss", "precision", "recall"),
+    *(f"auc_{bound}" for bound in AUC_DEG),
+)
+_LAST_RATE = 0.01  # of the first
+_MAX_GRADIENT = 1.0  # norm
+
+
+class TrainingOptions(NetworkOptions):
+    """Options of training SuperGlue on a frozen extractor's features."""
+
+    half_precision: bool = Field(
+        default=False, description="bfloat16 but for keypoints, transport and loss"
+    )
+    features: PluginChoice = PluginChoice(name="superpoint")
+    max_keypoints: int = Field(default=512, gt=0, description="best kept of each image")
+    pairs: PairOptions = PairOptions()
+    steps: int = Field(default=100_000, gt=0)
+    pairs_per_step: int = Field(default=16, gt=0, description="pairs of a batch")
+    learning_rate: float = Field(
+        default=1e-4, gt=0, description="Adam's, for half of the steps; then down to 1 % of it"
+    )
+    layers: int = Field(
+        default=18, gt=0, multiple_of=2, description="of attention, self and cross in turn"
+    )
+    deep_supervision: bool = Field(
+        default=False, description="the loss is the mean over all layers of cross attention"
+    )
+    sinkhorn_iterations: int = Field(default=50, gt=0, description="in training and evaluation")
+    matcher_weights: str | None = Field(
+        default=None, description="SuperGlue to begin with; none: random weights"
+    )
+    check_every: int = Field(
+        default=1000, gt=0, description="steps between evaluations, which are kept on disk"
+    )
+    held_out_pairs: int = Field(default=100, gt=0, description="of each held-out kapture")
+    seed: int = Field(default=0, ge=0)
+
+
+class DescriptorOptions(TrainingOptions):
+    """Options of training descriptors of a frozen detector's keypoints."""
+
+    through: Literal["superglue", "products"] = Field(
+        default="superglue",
+        description="superglue: trained with it, as MegLoc; products: for nearest neighbours",
+    )
+
+
+@dataclass
+class TrainingState:
+    step: int
+    rows: list[list[float]]  # of the curves so far, COLUMNS; NaN where nothing is held out
+
+    @classmethod
+    def resume(
+        cls, path: Path, model: PairModel, optimizer: torch.optim.Optimizer
+    ) -> TrainingState:
+        if not path.is_file():
+            return cls(0, [])
+        content = load_state(read_content(path), path, model, optimizer)
+        return cls(content["step"], [list(map(float, row)) for row in content["rows"]])
+
+
+def model_of(options: TrainingOptions, extractor: LocalFeatureExtractor) -> PairModel:
+    # plugins may not have descriptor_size
+    noise = np.random.default_rng(0).integers(0, 256, (128, 128, 3), np.uint8)
+    size = extractor.extract(noise).descriptors.shape[1]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(options.seed)
+        head: SuperGlueNet | ProductHead
+        if isinstance(options, DescriptorOptions) and options.through == "products":
+            head = ProductHead()
+        elif options.matcher_weights is not None:
+            file = find_weights(options.matcher_weights)
+            head = superglue(read_weights(file), str(file.path))
+        else:
+            head = SuperGlueNet(encoder_sizes(size), options.layers)
+            begin_at_products(head)
+        if isinstance(head, SuperGlueNet) and head.descriptor_size != size:
+            raise OptionError(
+                f"matcher_weights={options.matcher_weights} are for descriptors of "
+                f"{head.descriptor_size} dimensions; {options.features.name} has {size}"
+            )
+        describer = describer_of(extractor) if isinstance(options, DescriptorOptions) else None
+        iterations, deep = options.sinkhorn_iterations, options.deep_supervision
+        return PairModel(head, describer, iterations=iterations, deep_supervision=deep)
+
+
+class Trainer:
+    def __init__(self, options: TrainingOptions) -> None:
+        self.options = options
+        choice = options.features
+        self.extractor = load_plugin(LOCAL_FEATURES, choice.name, choice.options)
+        self._frozen = FrozenFeatures(self.extractor, options.max_keypoints)
+        self._device = pick_device(options.device)
+        self.model = model_of(options, self.extractor).to(self._device)
+        trained = [p for p in self.model.parameters() if p.requires_grad]
+        self.optimizer = torch.optim.Adam(trained, lr=options.learning_rate)
+        self._held_out: dict[str, list[PreparedPair]] = {}
+        # last evaluation by held-out source
+        self.results: dict[str, HeldOutResult] = {}
+
+    def train(
+        self,
+        sources: Sequence[PairSource],
+        state: TrainingState,
+        work: Work = HERE,
+        *,
+        threads: int = 1,
+    ) -> Iterator[TrainingState]:
+        """Train on pairs drawn evenly from the sources; yield at evaluations."""
+        options, losses = self.options, []
+        steps = range(state.step, options.steps)
+        with ThreadPoolExecutor(threads) if threads > 1 else nullcontext() as pool:
+            prepared = ordered_map(
+                lambda step: self._pairs(sources, step), steps, pool, window=2 * threads
+            )
+            batches = work.track(prepared, len(steps), f"training {options.steps} steps")
+            for step, batch in zip(steps, batches, strict=True):
+                losses.append(self._step(step, batch))
+                if (step + 1) % options.check_every and step + 1 < options.steps:
+                    continue
+                row = [float(step + 1), self._rate(step), float(np.mean(losses))]
+                state = TrainingState(step + 1, [*state.rows, [*row, *self.evaluate()]])
+                losses = []
+                yield state
+
+    def hold_out(self, sources: Mapping[str, PairSource]) -> None:
+        """Draw the evaluation pairs of each source."""
+        self._held_out = {
+            name: [
+                self._frozen.prepare(source.draw(np.random.default_rng([0, number])))
+                for number in range(self.options.held_out_pairs)
+            ]
+            for name, source in sources.items()
+        }
+
+    def evaluate(self) -> list[float]:
+        """Return means over the held-out sources, COLUMNS from the fourth on; NaN without any."""
+        self.model.eval()
+        self.results = {
+            name: held_out_result(self.model, pairs) for name, pairs in self._held_out.items()
+        }
+        if not self.results:
+            return [float("nan")] * (len(COLUMNS) - 3)
+        rows = [(one.loss, one.precision, one.recall, *one.auc) for one in self.results.values()]
+        return [float(value) for value in np.mean(rows, axis=0)]
+
+    def _step(self, step: int, batch: Sequence[PreparedPair]) -> float:
+        options = self.options
+        for parameters in self.optimizer.param_groups:
+            parameters["lr"] = self._rate(step)
+        self.model.train()
+        self.optimizer.zero_grad(set_to_none=True)
+        with torch.autocast(
+            self._device.type, dtype=torch.bfloat16, enabled=options.half_precision
+        ):
+            loss = self.model(batch)
+        value = float(loss.detach())
+        if not np.isfinite(value):
+            raise OptionError(
+                f"the loss of step {step + 1} is {value}; begin again with a smaller learning_rate"
+            )
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.model.parameters(), _MAX_GRADIENT)
+        self.optimizer.step()
+        return value
+
+    def _rate(self, step: int) -> float:
+        half = self.options.steps / 2
+        return self.options.learning_rate * _LAST_RATE ** max(0.0, (step - half) / half)
+
+    def _pairs(self, sources: Sequence[PairSource], step: int) -> list[PreparedPair]:
+        found = []
+        for number in range(self.options.pairs_per_step):
+            rng = np.random.default_rng([self.options.seed, step, number])
+            source = sources[int(rng.integers(len(sources)))]
+            found.append(self._frozen.prepare(source.draw(rng)))
+        return found
+
 
 TASKS: dict[str, type[TrainingOptions]] = {
     "matcher": TrainingOptions,
@@ -35,11 +231,9 @@ TASKS: dict[str, type[TrainingOptions]] = {
 
 @dataclass(frozen=True)
 class TrainingData:
-    """The data of a training."""
-
     kaptures: Sequence[KaptureFolder] = ()  # with poses and depth
-    photographs: Sequence[Path] = ()  # folders of images, trained on under homographies
-    # kaptures that are only evaluated on; no folder of ``kaptures`` may be one
+    photographs: Sequence[Path] = ()  # folders of images, for homographies
+    # for evaluation only, disjoint from ``kaptures``
     held_out: Sequence[KaptureFolder] = ()
 
     def check(self) -> None:
@@ -64,22 +258,19 @@ def train(
 ) -> dict[str, float]:
     """Train a matcher, or descriptors with :class:`DescriptorOptions`, to the last step.
 
-    Written at each evaluation, beside each other: ``output``, of descriptors that are trained
-    through SuperGlue also ``X-superglue.safetensors``, the manifest ``X.json``, the curves
-    ``X.csv`` and ``X.state.pt``, from which the same call goes on; before, ``X.overlaps``. Returns
-    the last row of the curves by column.
-
-    Parameters
-    ----------
-    output : the file to write, ``X.safetensors``.
-    force : begin again where another training's files stand.
-    threads : that prepare pairs.
+    Each evaluation writes ``output`` (``X.safetensors``), for descriptors trained through SuperGlue
+    also ``X-superglue.safetensors``, the manifest ``X.json``, the curves ``X.csv`` and
+    ``X.state.pt``, from which the same call resumes; ``X.overlaps`` is written before. ``force``
+    replaces another training's files; ``threads`` prepare pairs. Returns the last row of the
+    curves.
     """
     if output.suffix != ".safetensors":
         raise OptionError(f"{output}: the file to write must end in .safetensors")
     data.check()
     files, trainer = _Files(output), Trainer(options)
-    files.begin(force=force)
+    resumes = not force and (output.exists() or files.manifest.exists())
+    if not resumes:
+        files.begin()
     posed = [
         PosedPairs(folder, options.pairs, work, files.overlaps / f"{number:03d}.txt")
         for number, folder in enumerate([*data.kaptures, *data.held_out])
@@ -94,7 +285,8 @@ def train(
         "data": {source.folder.name: source.counts() for source in sources},
         "held_out_data": {name: source.counts() for name, source in held_out.items()},
     }
-    files.claim(record, force=force)
+    if resumes:
+        files.check(record)
     state = TrainingState.resume(files.state, trainer.model, trainer.optimizer)
     if state.step < options.steps:
         trainer.hold_out(held_out)
@@ -105,21 +297,17 @@ def train(
 
 
 class _Files:
-    """The files of one training; ``overlaps`` is a folder, of measured overlaps of pairs."""
-
     def __init__(self, output: Path) -> None:
         self.output = output
         self.state, self.manifest = output.with_suffix(".state.pt"), output.with_suffix(".json")
         self.overlaps = output.with_suffix(".overlaps")
 
-    def begin(self, *, force: bool) -> None:
-        if force or not (self.output.exists() or self.manifest.exists()):
-            remove(self.state)
-            remove(self.overlaps)
+    def begin(self) -> None:
+        remove(self.state)
+        remove(self.overlaps)
 
-    def claim(self, record: Mapping[str, Any], *, force: bool) -> None:
-        if force or not (self.output.exists() or self.manifest.exists()):
-            return
+    def check(self, record: Mapping[str, Any]) -> None:
+        """Raise OutputError unless the files are of the same training."""
         try:
             known = json.loads(read_content(self.manifest)).get("training")
         except (DataError, ValueError, AttributeError):
@@ -147,6 +335,6 @@ class _Files:
         write_csv_table(self.output.with_suffix(".csv"), COLUMNS, rows)
         results = {name: asdict(result) for name, result in trainer.results.items()}
         write_json(self.manifest, {"training": record, "step": state.step, "held_out": results})
-        # with it the rest is there
+        # last: the state says that the rest is complete
         more = {"step": state.step, "rows": state.rows}
         write_bytes(self.state, state_bytes(model, trainer.optimizer, more))

@@ -109,11 +109,11 @@ MAPS: dict[str, tuple[Spoil, str]] = {
     "path upwards": (line(RECORDS, 3, UPWARDS), r"records_camera\.txt:3: .*'\.\.'"),
     "keypoint past the end": (
         line("reconstruction/observations.txt", 9, PAST),
-        r"observations\.txt: point \d+ of .*: keypoint 800, but there are 800 of type",
+        r"observations\.txt: point \d+, keypoint 800 of .* and 800 keypoints of type",
     ),
     "point past the end": (
         point_past,
-        r"observations\.txt: point (\d+) of .*: there are \1 points",
+        r"observations\.txt: point (\d+), keypoint .*: there are \1 points",
     ),
 }
 

@@ -13,11 +13,11 @@ import kapture.io.csv
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scored import evaluate_poses
 
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.evaluation.metrics import Threshold, thresholds_from_pairs
 from megloc_kapture.evaluation.pose_files import read_pose_file, write_pose_file
-from megloc_kapture.evaluation.scoring import evaluate_poses
 from megloc_kapture.geometry.poses import rotation_angles_deg, stack_poses
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scored import evaluate_poses
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.confidence import calibration_error, reliability, risk_by_score
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.evaluation.pose_files import write_pose_file, write_provenance
 from megloc_kapture.evaluation.report.reports import report_text, write_report
-from megloc_kapture.evaluation.scoring import evaluate_poses
 from megloc_kapture.io.dataset_tables import read_nowhere, write_nowhere
 from megloc_kapture.io.tables import QueryStatus
 from megloc_kapture.values import Failure, Pose, RigidTransform
@@ -86,7 +86,7 @@ def test_of_a_result() -> None:
     evaluation = evaluate_poses({"a": at(0.0)}, {"a": at(0.0)}, statuses={"a": status("a", None)})
     assert evaluation.confidence is None and "onfidence:" not in report_text(evaluation)
     assert "confidence" not in evaluation.to_pandas().columns
-    with pytest.raises(DataError, match="'a' is said to show nothing of the map, and has"):
+    with pytest.raises(DataError, match="'a' has a true pose, but is listed"):
         evaluate_poses({}, {"a": at(0.0)}, nowhere=["a"])
 
 

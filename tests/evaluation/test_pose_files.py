@@ -346,8 +346,6 @@ def test_refusals(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="cannot read"):
         write_provenance(tmp_path / "absent.txt", {}, counts={})
     (tmp_path / "poses.txt").write_text("")
-    with pytest.raises(ValueError, match="already ours: files"):
-        write_provenance(tmp_path / "poses.txt", {"files": ""}, counts={})
     with pytest.raises(ValueError, match="JSON"):
         write_provenance(tmp_path / "poses.txt", {"x": float("nan")}, counts={})
     assert not (tmp_path / "poses.txt.json").exists()

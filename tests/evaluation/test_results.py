@@ -269,7 +269,7 @@ def test_two_results_are_compared(world: Any, tmp_path: Path) -> None:
     table = comparison.to_pandas()
     assert (table.loc[lost, "fewer: outcome"] == "missing").all()
     comparison.html(tmp_path / "comparison.html")
-    assert "Is the difference real?" in (tmp_path / "comparison.html").read_text()
+    assert "The median position error is" in (tmp_path / "comparison.html").read_text()
     with pytest.raises(OptionError, match="two results are called 'all of them'"):
         all_of_them.compare(all_of_them)
     # those without a label are told apart

@@ -10,11 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
+from scored import evaluate_poses
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.reports import report_text
-from megloc_kapture.evaluation.scoring import Evaluation, evaluate_poses
+from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.evaluation.statistics import (
     _resampled_medians,
     compare,
@@ -145,7 +146,7 @@ def test_median_of_resamples_is_numpys() -> None:
             [("B", [0.1, 0.3], {"thresholds": [Threshold(position_m=2.0)]})],
             "A and B have different thresholds",
         ),
-        ([("B", [0.1, 0.3, 0.2], {})], "A and B count different queries"),
+        ([("B", [0.1, 0.3, 0.2], {})], "A and B have different queries"),
         (
             [("B", [0.1, 0.3], {"conditions": {"0000.jpg": "night"}})],
             "A and B have different conditions",

@@ -19,8 +19,18 @@ from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of, protocol_of
 from megloc_kapture.evaluation.report.reports import render_report, report_text, write_report
 from megloc_kapture.evaluation.results import Result
-from megloc_kapture.evaluation.without_truth import WithoutTruth, evaluate_without_truth
-from megloc_kapture.io.dataset_tables import ImageGroup, write_groups, write_names, write_protocol
+from megloc_kapture.evaluation.without_truth import (
+    WithoutTruth,
+    evaluate_without_truth,
+    inliers_quartiles,
+)
+from megloc_kapture.io.dataset_tables import (
+    ImageGroup,
+    Protocol,
+    write_groups,
+    write_names,
+    write_protocol,
+)
 from megloc_kapture.io.tables import QueryStatus, write_status
 from megloc_kapture.values import RigidTransform
 
@@ -64,20 +74,23 @@ def second() -> Result:
 
 @pytest.fixture
 def found(first: Result, second: Result) -> WithoutTruth:
-    options = {"conditions": CONDITIONS, "thresholds": THRESHOLDS}
-    return evaluate_without_truth([first, second], **options, statement="Nobody tells.")
+    groups = {image: ImageGroup(condition=name) for image, name in CONDITIONS.items()}
+    benchmark = Benchmark(protocol=Protocol(truth="Nobody tells."), groups=groups)
+    return evaluate_without_truth([first, second], benchmark, thresholds=THRESHOLDS)
 
 
 def test_counts_and_inliers(found: WithoutTruth) -> None:
-    day, night, whole = found.results[0].rows
+    day, night, whole = found.evaluations[0].rows
     assert (day.name, night.name, whole.name) == ("day", "night", "all")
     counts = (whole.num_queries, whole.num_localized, whole.num_fallback, whole.num_missing)
     assert counts == (4, 2, 1, 1)
-    assert whole.inliers_quartiles == tuple(np.quantile([100, 20], (0.25, 0.5, 0.75)))
-    assert night.inliers_quartiles is None
-    other = found.results[1].rows[-1]
-    assert (other.num_localized, other.num_missing, other.inliers_quartiles) == (3, 1, None)
-    assert [q.reason for q in found.results[0].queries] == ["", "", "dark", "no matches"]
+    quartiles = inliers_quartiles(found.evaluations[0], "all")
+    assert quartiles == tuple(np.quantile([100, 20], (0.25, 0.5, 0.75)))
+    assert inliers_quartiles(found.evaluations[0], "night") is None
+    other = found.evaluations[1].rows[-1]
+    assert (other.num_localized, other.num_missing) == (3, 1)
+    assert inliers_quartiles(found.evaluations[1], "all") is None
+    assert [q.reason for q in found.evaluations[0].queries] == ["", "", "dark", "no matches"]
 
 
 def test_agreement_of_two_results(found: WithoutTruth, first: Result) -> None:
@@ -120,7 +133,7 @@ def test_said_in_every_file(
     assert rows[3]["A to B: position_m"] == ""
     html = paths["report.html"].read_text()
     page = page_of(html)
-    assert "No recall: Nobody tells." in page.text and "Do they agree?" in page.text
+    assert "No recall: Nobody tells." in page.text and "only B for 1." in page.text
     again = render_report(found, map_poses=MAP, provenance={"preset": "classic"})
     assert again == html
 
@@ -132,9 +145,9 @@ def test_one_pose_file_alone_and_no_pose_at_all(
     text = report_text(found)
     assert "No true poses were given." in text
     assert "agree (%)" not in text
-    assert "Do they agree" not in page_of(render_report(found)).text
+    assert "both have a pose" not in page_of(render_report(found)).text
     found = evaluate_without_truth([Result("x", {}, ("a.jpg",))])
-    assert found.results[0].rows[0].num_missing == 1
+    assert found.evaluations[0].rows[0].num_missing == 1
     assert "From above" not in page_of(render_report(found)).text
 
 
@@ -160,9 +173,9 @@ def test_from_a_workspace(first: Result, tmp_path: Path, kaptures: Callable[...,
     found = results_without_truth([workspace / "localized"], rules)
     assert "visuallocalization.net keeps them" in found.statement
     # the challenge's list says which queries count
-    assert [row.num_queries for row in found.results[0].rows] == [2, 2, 4]
+    assert [row.num_queries for row in found.evaluations[0].rows] == [2, 2, 4]
     # without a list, all queries of the workspace do that are scored
     everything = results_without_truth(
         [workspace / "localized"], Benchmark(protocol=rules.protocol, groups=rules.groups)
     )
-    assert everything.results[0].rows[-1].num_queries == 5
+    assert everything.evaluations[0].rows[-1].num_queries == 5

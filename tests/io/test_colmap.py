@@ -27,11 +27,7 @@ from megloc_kapture.io.colmap import (
     triangulate,
     write_model,
 )
-from megloc_kapture.io.colmap_mapping import (
-    DatabaseFeatures,
-    connected_models,
-    write_feature_database,
-)
+from megloc_kapture.io.colmap_mapping import connected_models
 from megloc_kapture.values import Camera, RigidTransform
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
@@ -128,7 +124,6 @@ def test_neither_poses_nor_cameras_move_and_no_bit_depends_on_the_threads(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """With as many residuals as COLMAP's bundle adjustment shares between threads."""
-    import pycolmap
 
     rng = np.random.default_rng(2)
     count, num_points = 25, 1100
@@ -219,7 +214,7 @@ def test_keypoints_may_have_more_columns_and_images_none() -> None:
     assert 4 not in result.image_ids
 
 
-@pytest.mark.parametrize("row", [[60, 0], [0, 60], [-1, 0]])
+@pytest.mark.parametrize("row", [[60, 0], [0, 60]])
 def test_matches_past_the_keypoints_are_refused(row: list[int]) -> None:
     _, images, matches = scene(CAMERAS["PINHOLE"])
     matches[1, 2] = np.concatenate([matches[1, 2], [row]])
@@ -249,56 +244,6 @@ def test_colmap_says_nothing_and_leaves_nothing_behind(tmp_path: Path) -> None:
 
 CAMERA = Camera("SIMPLE_RADIAL", 1600, 1063, (1243.94, 800.0, 531.5, -0.10977))
 OTHER = Camera("PINHOLE", 64, 48, (50.0, 51.0, 32.0, 24.0))
-
-
-def features(name: str, camera: Camera, count: int) -> DatabaseFeatures:
-    rng = np.random.default_rng(count)
-    keypoints = rng.uniform(0, 48, (count, 2)).astype(np.float32)
-    return DatabaseFeatures(name, camera, keypoints, rng.integers(0, 256, (count, 128), np.uint8))
-
-
-IMAGES = [
-    features("db/7.jpg", CAMERA, 5),
-    features("db/3.jpg", OTHER, 0),
-    features("a.png", CAMERA, 3),
-]
-
-
-def test_colmap_reads_what_is_written(tmp_path: Path) -> None:
-    path = tmp_path / "new" / "some.db"
-    write_feature_database(path, iter(IMAGES))
-    assert [file.name for file in path.parent.iterdir()] == ["some.db"]
-    database = pycolmap.Database.open(str(path))
-    stored = {image.name: image for image in database.read_all_images()}
-    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
-    assert len(cameras) == 2
-    # ids in the order given
-    assert [stored[image.name].image_id for image in IMAGES] == [1, 2, 3]
-    for image in IMAGES:
-        camera = cameras[stored[image.name].camera_id]
-        assert camera.model.name == image.camera.model
-        assert (camera.width, camera.height) == (image.camera.width, image.camera.height)
-        assert tuple(camera.params) == image.camera.params
-        image_id = stored[image.name].image_id
-        keypoints = database.read_keypoints(image_id)
-        np.testing.assert_array_equal(keypoints[:, :2].reshape(-1, 2), image.keypoints_px)
-        descriptors = database.read_descriptors(image_id)
-        assert descriptors.type == pycolmap.FeatureExtractorType.SIFT
-        np.testing.assert_array_equal(descriptors.data.reshape(-1, 128), image.descriptors)
-    database.close()
-
-
-def test_the_same_features_give_the_same_bytes_and_nothing_is_written_over(tmp_path: Path) -> None:
-    path = tmp_path / "a.db"
-    for name in ("a.db", "b.db"):
-        write_feature_database(tmp_path / name, IMAGES)
-    before = path.read_bytes()
-    assert (tmp_path / "b.db").read_bytes() == before
-    with pytest.raises(OutputError, match=r"a\.db: is there already"):
-        write_feature_database(path, IMAGES[:1])
-    assert path.read_bytes() == before
-    with pytest.raises(OutputError, match="cannot be written"):
-        write_feature_database(path / "b.db", IMAGES)
 
 
 def test_a_disk_without_room_for_the_database_is_said_before_colmap_meets_it(

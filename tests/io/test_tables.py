@@ -28,7 +28,6 @@ from megloc_kapture.io.tables import (
     mask_counts_path,
     read_clusters,
     read_consistency,
-    read_mask_counts,
     read_refinement,
     read_status,
     write_clusters,
@@ -296,10 +295,8 @@ def test_a_broken_refinement_is_named_with_its_line(
 def test_counts_come_back(tmp_path: Path) -> None:
     counts = {"b/2.jpg": 0, 'a/"1".jpg': 1234}
     write_mask_counts(tmp_path, "rootsift", counts)
-    assert read_mask_counts(tmp_path, "rootsift") == counts
     rows = mask_counts_path(tmp_path, "rootsift").read_text().splitlines()
     assert rows == ["image,num_masked", '"a/""1"".jpg",1234', "b/2.jpg,0"]
-    assert read_mask_counts(tmp_path, "aliked-n16") == {}
 
 
 ROW = ConsistencyRow("DUC1", "rendering", 13, 2, 0.016, 0.25, 1.5, 0.024, 0.3, 11.5, "")

@@ -75,46 +75,6 @@ def test_it_is_the_networks_distance(files: tuple[Path, Path]) -> None:
     assert half == pytest.approx(plugin.distance(a, b, FULL), rel=0.1)
 
 
-def masks() -> list[np.ndarray]:
-    """A full one, one without the left, one without a patch."""
-    found = np.ones((3, 80, 96), bool)
-    found[1, :, :40] = False
-    found[2, 20:50, 30:70] = False
-    return list(found)
-
-
-def test_a_query_is_paid_for_once_per_mask(
-    files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[torch.Tensor] = []
-    described = Lpips.described
-
-    def counted(self: Lpips, image: torch.Tensor, valid: torch.Tensor) -> list[torch.Tensor]:
-        seen.append(image)
-        return described(self, image, valid)
-
-    monkeypatch.setattr(Lpips, "described", counted)
-    plugin = distance(files)
-    query, *views = pictures(4)
-    query[0] = 0  # another query than that of the other tests
-    for valid in masks():
-        for view in views:
-            plugin.distance(query.copy(), view, valid.copy())
-    assert len(seen) == 3 * (1 + 3)
-
-
-def test_what_is_kept_changes_nothing(files: tuple[Path, Path]) -> None:
-    plugin = distance(files)
-    query, *views = pictures(4)
-    # the same array with other pixels is another image
-    for shade in (0, 90):
-        query[:40] = shade
-        for valid in masks():
-            for view in views:
-                expected = by_network(files, query, view, valid)
-                assert plugin.distance(query, view, valid) == pytest.approx(expected, abs=1e-6)
-
-
 def test_where_nothing_can_be_told_it_is_infinite(files: tuple[Path, Path]) -> None:
     assert distance(files).distance(*pictures(), ~FULL) == np.inf
     assert distance(files).distance(*pictures(height=40), FULL[:40]) == np.inf

@@ -70,19 +70,6 @@ def test_shared_points_equal_to_sets(rows: list[tuple[int, int, int]], asked: li
     assert shared.tolist() == [[len(mine & other) for other in points] for mine in points]
 
 
-def test_shared_points_of_images_with_many() -> None:
-    rng = np.random.default_rng(0)
-    images, keypoints = np.repeat(np.arange(30), 500), np.tile(np.arange(500), 30)
-    points = rng.integers(0, 6000, len(images)) * 5000  # ids of many digits
-    names = tuple(f"{i:02}" for i in range(30))
-    xyz = np.zeros((0, 3))
-    index = MapIndex.build(xyz, names, images, keypoints, points)
-    sets = [set(points[images == i].tolist()) for i in range(30)]
-    asked = [3, 1, 29, 0, 17]
-    expected = [[len(sets[i] & sets[j]) for j in asked] for i in asked]
-    assert index.shared_points([names[i] for i in asked]).tolist() == expected
-
-
 def test_nothing_in_it_can_be_written_to() -> None:
     xyz = np.zeros((3, 3))
     index = MapIndex.build(xyz, ("a",), *(np.zeros(1, np.int64),) * 3)
@@ -137,20 +124,6 @@ def test_equal_to_a_greedy_loop_whatever_the_order(
     assert triples(resolve(matches)) == expected
     random.shuffle(matches)
     assert triples(resolve(matches)) == expected
-
-
-@pytest.mark.parametrize("num_points", [500, 3000, 100_000])
-def test_equal_on_as_many_matches_as_a_query_has(num_points: int) -> None:
-    rng = np.random.default_rng(num_points)
-    keypoints = rng.integers(0, 3000, 8000)
-    points = rng.integers(0, num_points, 8000)
-    again = rng.integers(0, 4000, 4000)  # pairs that several images agree on
-    keypoints[4000:], points[4000:] = keypoints[again], points[again]
-    scores = np.round(rng.normal(size=8000), 1)  # with ties, and of both signs
-    images = rng.integers(0, 20, 8000)
-    mine = resolve_conflicts(keypoints, points, scores, images)
-    columns = (column.tolist() for column in (keypoints, points, scores, images))
-    assert triples(mine) == greedy(list(zip(*columns, strict=True)))
 
 
 MAP = MapIndex.build(

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.localization.ranking import (
-    AlignedViewOptions,
     DistinctiveInliers,
     InlierCount,
+    PerceptualOptions,
     PerceptualRanker,
     aligned_view,
     query_at_size,
@@ -225,7 +225,7 @@ def test_an_aligned_view_is_what_the_query_would_see(scene: Scene) -> None:
     assert view.valid.mean() > 0.95
     difference = np.abs(view.image.astype(int) - scene.query)[view.valid]
     assert difference.mean() < 3
-    half = AlignedViewOptions(long_side=80)
+    half = PerceptualOptions(long_side=80)
     small = aligned_view(CAMERA, standing(RIGHT), ["2_0.jpg"], scene, half)
     assert small.image.shape == (60, 80, 3)
     reduced = query_at_size(scene.query, 80, 60)
@@ -233,7 +233,7 @@ def test_an_aligned_view_is_what_the_query_would_see(scene: Scene) -> None:
 
 
 def test_the_nearest_references_with_depth_are_taken(scene: Scene) -> None:
-    one = AlignedViewOptions(references=1)
+    one = PerceptualOptions(references=1)
     near = standing(RIGHT, 0.45)
     aligned_view(CAMERA, near, ["2_0.jpg", "2_1.jpg"], scene, one)
     assert scene.asked == ["2_1.jpg"]
@@ -250,7 +250,7 @@ def test_repeated_photographs_wait_until_the_others_are_taken() -> None:
         stands=lambda number: (0.9 if number == 9 else -0.5 + 0.001 * number, 0.5),
     )
     film = [f"2_{number}.jpg" for number in range(4)]
-    two = AlignedViewOptions(references=2)
+    two = PerceptualOptions(references=2)
     view = aligned_view(CAMERA, standing(RIGHT), [*film, "2_9.jpg"], room, two)
     assert room.asked == ["2_3.jpg", "2_9.jpg"]
     of_film = aligned_view(CAMERA, standing(RIGHT), film, room, two)

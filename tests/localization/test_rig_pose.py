@@ -10,7 +10,6 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import bearing_rays, project
@@ -246,36 +245,15 @@ def test_no_worse_a_minimum_than_colmaps(seed: int) -> None:
     assert cost(ours.cam_from_world) < 1.001 * cost(theirs)
 
 
-def test_the_covariance_is_that_of_repeated_estimates() -> None:
-    """Errors over their covariance follow chi-squared with six degrees of freedom."""
-    rng = np.random.default_rng(7)
-    truth, views = rig(30)
-    squared = []
-    for _ in range(150):
-        noise = rng.normal(size=(3, 30, 2))
-        noisy = [replace(v, points_px=v.points_px + n) for v, n in zip(views, noise, strict=True)]
-        pose = located(rig_pose(noisy))
-        off = truth @ pose.cam_from_world.inverse()
-        turn = Rotation.from_matrix(off.rotation_matrix()).as_rotvec()
-        error = np.concatenate([turn, off.translation])
-        squared.append(float(error @ np.linalg.solve(pose.covariance, error)))
-    assert 5.2 < np.mean(squared) < 7.2
-    assert (np.array(squared) < chi2.ppf(0.95, 6)).mean() > 0.9
-
-
 # ---------------------------------------------------------------------------------- the problem
 
 
-@pytest.mark.parametrize(
-    "pixels, points, covariances",
-    [((3, 3), (3, 3), None), ((3, 2), (4, 3), None), ((3, 2), (3, 2), None), ((3, 2), (3, 3), 5)],
-)
+@pytest.mark.parametrize("pixels, points", [((3, 3), (3, 3)), ((3, 2), (4, 3)), ((3, 2), (3, 2))])
 def test_arrays_that_do_not_belong_together_are_refused(
-    pixels: tuple[int, int], points: tuple[int, int], covariances: int | None
+    pixels: tuple[int, int], points: tuple[int, int]
 ) -> None:
-    known = None if covariances is None else np.zeros((3, covariances))
     with pytest.raises(DataError):
-        View(PINHOLE, AT_ORIGIN, np.zeros(pixels), np.zeros(points), known)
+        View(PINHOLE, AT_ORIGIN, np.zeros(pixels), np.zeros(points))
 
 
 def test_views_are_stacked_and_taken_apart() -> None:

@@ -20,7 +20,6 @@ from megloc_kapture.mapping.pairs import (
     PairsByCovisibilityOptions,
     PairsByPosesOptions,
     PairsBySequenceOptions,
-    each_once,
     exhaustive_pairs,
     pairs_by_covisibility,
     pairs_by_poses,
@@ -44,11 +43,6 @@ def test_unique_pairs(given_pairs: list[tuple[int, int]]) -> None:
     expected = sorted({(min(p), max(p)) for p in given_pairs if p[0] != p[1]})
     assert found.dtype == np.int64 and found.shape == (len(expected), 2)
     assert [tuple(p) for p in found.tolist()] == expected
-
-
-@given(st.lists(st.integers(-4, 4), max_size=30))
-def test_each_once(keys: list[int]) -> None:
-    assert each_once(np.array(keys, dtype=np.int64)).tolist() == sorted(set(keys))
 
 
 def camera_at(center: NDArray[np.float64], rotation: Rotation) -> RigidTransform:

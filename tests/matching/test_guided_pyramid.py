@@ -375,11 +375,3 @@ def test_the_identity_changes_nothing() -> None:
     assert not ImageVariant(1.0, 90).is_identity and not ImageVariant(0.5).is_identity
     # a small image keeps a pixel
     assert ImageVariant(0.1).of_image(np.zeros((2, 30, 3), np.uint8)).shape == (1, 3, 3)
-
-
-@pytest.mark.parametrize(
-    "wrong", [(1.0, 45), (1.0, 360), (1.0, -90), (0.0, 0), (-1.0, 0), (np.nan, 0), (np.inf, 0)]
-)
-def test_what_is_no_variant_is_refused(wrong: tuple[float, int]) -> None:
-    with pytest.raises(ValueError, match=r"rotation|scale"):
-        ImageVariant(*wrong)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -89,16 +88,6 @@ def test_most_matches_of_a_real_pair_are_right(
     assert (error < 2).mean() > 0.7
 
 
-def test_early_stopping_and_pruning_keep_most_matches(
-    weights: str, features: dict[str, ImageFeatures]
-) -> None:
-    a, b = features["0002.jpg"], features["0003.jpg"]
-    whole = {*map(tuple, matcher(weights).match(a, b)[0].tolist())}
-    pruned, _ = matcher(weights, width_confidence=0.95).match(a, b)
-    found = {*map(tuple, pruned.tolist())}
-    assert len(whole & found) > 0.8 * len(whole | found)
-
-
 def test_many_are_the_same_as_one_by_one(weights: str, features: dict[str, ImageFeatures]) -> None:
     one = matcher(weights)
     a = features["0003.jpg"]
@@ -125,17 +114,6 @@ def test_the_order_of_keypoints_does_not_matter(weights: str) -> None:
     back, back_scores = matcher(weights).match(b, a)
     assert {*map(tuple, back[:, ::-1].tolist())} == {*map(tuple, matches.tolist())}
     np.testing.assert_allclose(np.sort(scores), np.sort(back_scores), atol=1e-4)
-
-
-def test_half_precision_keeps_most_matches(
-    weights: str, features: dict[str, ImageFeatures]
-) -> None:
-    a, b = features["0002.jpg"], features["0003.jpg"]
-    exact = {*map(tuple, matcher(weights).match(a, b)[0].tolist())}
-    half, scores = matcher(weights, half_precision=True).match(a, b)
-    found = {*map(tuple, half.tolist())}
-    assert scores.dtype == np.float32
-    assert len(exact & found) > 0.9 * len(exact | found)
 
 
 def test_what_does_not_fit_is_named(weights: str, shared_data: Path) -> None:
@@ -172,14 +150,3 @@ def test_what_is_global_is_left_alone(weights: str) -> None:
     finally:
         torch.backends.cuda.enable_flash_sdp(before)
     assert KorniaLightGlue.default_conf == conf
-
-
-def test_it_travels_and_names_its_weights(weights: str) -> None:
-    one = matcher(weights)
-    image = random_image(30, seed=0)
-    expected = one.match(image, image)
-    other = pickle.loads(pickle.dumps(one))
-    assert len(pickle.dumps(one)) < 10_000
-    for ours, theirs in zip(other.match(image, image), expected, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
-    assert [*one.weights()] == ["xfeat-lighterglue.pt"]

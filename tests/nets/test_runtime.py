@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -57,3 +60,25 @@ def test_half_the_size_is_the_mean_of_four() -> None:
 def test_sizes(height: int, width: int, most: int, size: tuple[int, int]) -> None:
     image = np.zeros((height, width, 3), np.uint8)
     assert sized_tensor(image, most, CPU).shape == (1, 3, *size)
+
+
+@pytest.mark.parametrize("newer", [False, True])
+def test_tf32_is_off_only_during_inference(newer: bool) -> None:
+    """torch refuses to read its older settings once the newer ones were written."""
+    if newer and not hasattr(torch.backends.cuda.matmul, "fp32_precision"):
+        pytest.skip("this torch has the older settings only")
+    code = (
+        "import torch\n"
+        "from megloc_kapture.nets.runtime import _without_tf32\n"
+        "products = torch.backends.cuda.matmul\n"
+    )
+    code += (
+        "torch.backends.fp32_precision = 'tf32'\nread = lambda: products.fp32_precision == 'tf32'\n"
+        if newer
+        else "products.allow_tf32 = True\nread = lambda: products.allow_tf32\n"
+    )
+    code += (
+        "with _without_tf32():\n    assert getattr(products, 'fp32_precision', 'ieee') == 'ieee'\n"
+        "assert read()\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

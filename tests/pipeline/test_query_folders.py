@@ -167,25 +167,6 @@ def test_a_list_gives_each_image_its_camera(tmp_path: Path) -> None:
     assert photos.known_cameras() and photos.query("night/1.jpg").camera.params[0] == 50
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("", "no camera"),
-        ("a.jpg 64 48 50 50 32 24", "1: not a row"),
-        ("a.jpg PINHOLE 64 48 50 50 32", "1: camera model PINHOLE takes 4"),
-        ("a.jpg PINHOLE 64 48 fifty 50 32 24", "1: width, height and parameters are numbers"),
-        ("a.jpg PINHOLE 6.5 48 50 50 32 24", "1: image size 6.5x48"),
-        ("a.jpg PINHOLE 64 48 50 50 32 24\n" * 2, "2: 'a.jpg' is listed twice"),
-    ],
-)
-def test_a_wrong_list_of_cameras_is_refused_with_its_line(
-    text: str, said: str, tmp_path: Path
-) -> None:
-    (tmp_path / "cameras.txt").write_text(text)
-    with pytest.raises(DataError, match=f"cameras.txt.*{said}"):
-        read_cameras(tmp_path / "cameras.txt")
-
-
 def kapture_of(root: Path, sensors: dict[str, Sensor], images: dict[str, str]) -> KaptureFolder:
     """A kapture folder of images (name to sensor) without poses; the files are not written."""
     data = KaptureData(sensors=sensors)

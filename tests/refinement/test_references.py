@@ -25,12 +25,11 @@ from megloc_kapture.refinement.references import (
     Consistency,
     Displacement,
     HoldsOut,
-    PyramidKind,
     ReferenceImages,
     RenderingReference,
     judge_consistency,
-    prepared,
-    refine_held_out,
+    pyramid_of,
+    references_elsewhere,
     spread_names,
 )
 from megloc_kapture.refinement.rendering import Rendering
@@ -38,7 +37,6 @@ from megloc_kapture.values import Camera, RigidTransform
 
 SMALL_CAMERA = Camera("PINHOLE", 80, 60, (70.0, 70.0, 40.0, 30.0))
 HERE = RigidTransform.identity()
-KIND = PyramidKind(levels=2, max_side_px=640, appearance="normalised")
 Map = Mapping[str, RenderingReference]
 Verdict = Callable[[Map], Consistency]
 
@@ -62,30 +60,10 @@ def reference(seed: int) -> RenderingReference:
     return RenderingReference(image, SMALL_CAMERA, HERE, DepthView(SMALL_CAMERA, depth_m, HERE))
 
 
-def test_a_reference_is_prepared_once_and_any_other_content_anew() -> None:
+def test_an_image_must_fit_its_camera() -> None:
     one = reference(0)
-    first = prepared(one, KIND)
-    assert prepared(reference(0), KIND) is first
-    pixel = one.image.copy()
-    pixel[30, 40, 1] ^= 1
-    further = replace(one.depth, depth_m=one.depth.depth_m + np.float32(1e-3))
-    there = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1e-9))
-    wider = replace(SMALL_CAMERA, params=(69.0, 70.0, 40.0, 30.0))
-    others = [
-        replace(one, image=pixel),
-        replace(one, mask=np.ones((60, 80), bool)),
-        replace(one, depth=further),
-        replace(one, depth=replace(one.depth, image_from_depth=there)),
-        replace(one, depth=replace(one.depth, camera=wider)),
-        replace(one, camera=wider),
-        replace(one, cam_from_world=there),
-    ]
-    found = [prepared(each, KIND) for each in others]
-    found += [prepared(one, replace(KIND, levels=1))]
-    assert len({id(each) for each in (first, *found)}) == 9
-    assert prepared(one, KIND) is first
     with pytest.raises(DataError, match="does not fit a camera"):
-        prepared(replace(one, image=one.image[:50]), KIND)
+        pyramid_of(replace(one, image=one.image[:50]), RenderingOptions())
 
 
 def texture(width: int, height: int, seed: int) -> NDArray[np.uint8]:
@@ -307,14 +285,7 @@ def test_what_a_wall_hides_is_no_reference(corner: Map, new_scene: Callable[...,
     onwards = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -6.0))
     shifted = posed(behind, lambda _, each: onwards @ each)
     scene = scene_of({"0.png": corner["0.png"], **shifted}, new_scene)
-    asked: list[int] = []
-
-    def displace(query: object, references: object, given: object) -> None:
-        asked.append(len(references))  # type: ignore[arg-type]
-
-    poses = ReferenceImages(scene.poses)
-    assert refine_held_out("0.png", poses, scene, displace, max_references=4) is None
-    assert not asked
+    assert references_elsewhere(corner["0.png"], ReferenceImages(scene.poses), scene) == []
 
 
 def known(squared_distance: float, moved_px: float = 0.5) -> Displacement:

@@ -22,8 +22,8 @@ from scipy.spatial.transform import Rotation
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.report.gallery import depth_pictures
 from megloc_kapture.evaluation.report.queries import StoredInliers
-from megloc_kapture.evaluation.report.scene import render_view, scene_of
 from megloc_kapture.evaluation.results import ResultContext
+from megloc_kapture.evaluation.view import render_view, scene_of
 from megloc_kapture.geometry.cameras import project, scaled_camera
 from megloc_kapture.io.kapture import KaptureFolder, read_point_covariances, write_sensors
 from megloc_kapture.io.tables import read_depth_rows

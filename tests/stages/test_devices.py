@@ -32,7 +32,7 @@ from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS
 from megloc_kapture.stages import devices
 from megloc_kapture.stages import work as work_module
-from megloc_kapture.stages.devices import DeviceMemoryError, in_batches
+from megloc_kapture.stages.devices import DeviceMemoryError, in_batches, is_out_of_memory
 from megloc_kapture.stages.local_features import (
     ExtractLocalFeatures,
     extract_all,
@@ -285,6 +285,20 @@ def test_no_gpu() -> None:
     for device in ("cuda", "cuda:0", "cuda:3"):
         with pytest.raises(OptionError, match=f"device={device}: this machine has no GPU"):
             pick_device(device)
+
+
+@pytest.mark.parametrize(
+    ("message", "expected"),
+    [
+        ("CUDA error: out of memory", True),
+        ("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`", True),
+        ("cuDNN error: CUDNN_STATUS_ALLOC_FAILED", True),
+        ("[enforce fail at alloc_cpu.cpp] can't allocate memory: you tried to allocate", True),
+        ("CUDA error: device-side assert triggered", False),
+    ],
+)
+def test_every_library_runs_out_of_memory_in_its_own_words(message: str, expected: bool) -> None:
+    assert is_out_of_memory(RuntimeError(message)) == expected
 
 
 def test_a_localizer_is_told(world: Any) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import PluginError
-from megloc_kapture.evaluation.report.wording import consistency_sentence
+from megloc_kapture.evaluation.report.content import consistency_sentence
 from megloc_kapture.io.dataset_tables import ImageGroup
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder

@@ -21,12 +21,13 @@ from megloc_kapture.matching.networks import SuperGlue, SuperGlueOptions
 from megloc_kapture.nets.superglue import SuperGlueNet
 from megloc_kapture.stages.work import Work
 from megloc_kapture.training.pairs import PairOptions, PosedPairs, TrainingPair
-from megloc_kapture.training.train import TrainingData, train
-from megloc_kapture.training.trainer import (
+from megloc_kapture.training.train import (
     DescriptorOptions,
     Trainer,
+    TrainingData,
     TrainingOptions,
     TrainingState,
+    train,
 )
 from megloc_kapture.values import ImageFeatures
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.datasets.aachen import Layout
+from megloc_kapture.datasets.aachen.adapter import Layout
 from megloc_kapture.io.colmap_model import ColmapImage, ColmapModel
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera

@@ -15,11 +15,9 @@ from operator import xor
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.geometry.poses import earth_from_enu, geodetic
-from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.images import write_image
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform
@@ -35,7 +33,6 @@ from megloc_twins.frames import Frame, write_truth
 from megloc_twins.options import SyntheticDataset, TwinOptions, stream, write_lines
 from megloc_twins.portable import settled, settled_pose
 from megloc_twins.render import RenderedFrame, render_frames
-from megloc_twins.sparse_models import exact_tracks
 from megloc_twins.squares import build_place
 
 REFERENCE = "recording_2020-06-18_10-12-33"
@@ -45,13 +42,7 @@ DUSK = "recording_2021-03-22_18-41-05"
 _EXPOSURE_MS = {REFERENCE: 0.2457180023, WINTER: 1.9, DUSK: 10.0}
 _GREY = np.array([299, 587, 114])  # thousandths
 
-Drawn = tuple[NDArray[np.uint8], NDArray[np.float32]] | None
-
-# between the published calibrations of the distorted and the undistorted left camera
-_RECTIFICATION_DEG = 2.2
 _TAGS = "translation vector, rotation quaternion"
-# pixels of the patch whose grey values stand with a point
-_PATTERN = ((0, -2), (-1, -1), (1, -1), (-2, 0), (0, 0), (2, 0), (-1, 1), (0, 2))
 
 
 def _settled_earth_from_enu(
@@ -81,9 +72,6 @@ class FourSeasonsTwinOptions(TwinOptions):
     )
     width: int = Field(default=800, ge=64, description="image width in px")
     height: int = Field(default=400, ge=48, description="image height in px")
-    cloud_points: int = Field(
-        default=150, ge=0, description="pixels tried for each keyframe's point cloud"
-    )
 
     def drives(self) -> tuple[Drive, Drive, Drive]:
         """The recordings, the map's first."""
@@ -102,7 +90,7 @@ class FourSeasonsTwin(SyntheticDataset[FourSeasonsTwinOptions]):
     """
 
     Options = FourSeasonsTwinOptions
-    version = 2
+    version = 3
 
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
         options, drives = self.options, self.options.drives()
@@ -131,13 +119,10 @@ def _write_recording(
     folder, exposure_ms = root / drive.name, _EXPOSURE_MS[drive.name]
     published = drive.name != DUSK  # the poses of a challenge's test recording are withheld
     keyframes = [moment for moment in moments if moment.keyframe]
-    # the odometry sees depth by stereo and by motion
-    seeing = [frame for moment in keyframes for frame in moment.frames] if published else []
-    drawn = render_frames(
+    render_frames(
         options.world(),
         [frame for moment in moments for frame in moment.frames],
-        partial(_write_files, root),
-        with_depth=[frame.name for frame in seeing],
+        partial(_write_grey, root),
         build=winter_place if drive.season == "winter" else build_place,
         sky_seed=drive.sky_seed(options.seed),
         work=work,
@@ -151,27 +136,12 @@ def _write_recording(
     write_lines(folder / "GNSSPoses.txt", _gnss_lines(slam, keyframes))
     blank_lines = drive.name == REFERENCE
     write_lines(folder / "Transformations.txt", _transformation_lines(slam, blank_lines))
-    write_lines(folder / "result.txt", _result_lines(slam, moments))
     write_lines(folder / "septentrio.nmea", _nmea_lines(keyframes))
-    images = {name: result for name, result in drawn.items() if result is not None}
-    tracks = exact_tracks(
-        seeing,
-        {name: depth for name, (_, depth) in images.items()},
-        points_per_frame=options.cloud_points,
-        rng=stream(options.seed, "cloud", drive.name),
-    )
-    for index, moment in enumerate(keyframes):
-        left = moment.frames[0]
-        points = _cloud_of(tracks, 2 * index, left.cam_from_world)
-        lines = _keyframe_lines(slam, moment, points, images[left.name][0], exposure_ms)
-        write_lines(folder / "KeyFrameData" / f"KeyFrame_{moment.timestamp}.txt", lines)
 
 
-def _write_files(root: Path, frame: Frame, view: RenderedFrame) -> Drawn:
-    """Write the image, grey as the camera's; returned where it has depth, with that."""
+def _write_grey(root: Path, frame: Frame, view: RenderedFrame) -> None:
     grey = ((view.image @ _GREY + 500) // 1000).astype(np.uint8)
     write_image(root / frame.name, grey)
-    return None if view.depth_m is None else (grey, view.depth_m)
 
 
 def _on_earth(moments: Iterable[Moment]) -> Iterator[Frame]:
@@ -192,14 +162,12 @@ class SlamFrames:
     ----------
     s_from_as, w_from_gpsw, e_from_gpsw : as in ``Transformations.txt``.
     scale : metres per unit of the SLAM world.
-    odometry_from_as : the world of the keyframe files and ``result.txt``.
     """
 
     s_from_as: RigidTransform
     w_from_gpsw: RigidTransform
     e_from_gpsw: RigidTransform
     scale: float
-    odometry_from_as: RigidTransform
 
     @classmethod
     def drawn(cls, seed: int, recording: str) -> SlamFrames:
@@ -214,7 +182,6 @@ class SlamFrames:
             w_from_gpsw=_as_written(_random_transform(rng, np.pi, 2e-2, 0.4)),
             e_from_gpsw=_as_written(_settled_earth_from_enu(*place)),
             scale=round(float(rng.uniform(0.96, 0.97)), 6),
-            odometry_from_as=_random_transform(rng, np.pi, 0.1, 0.3),
         )
 
     def slam_from_cam(self, cam_from_world: RigidTransform) -> RigidTransform:
@@ -223,10 +190,6 @@ class SlamFrames:
         metric = self.s_from_as.inverse() @ s_from_world @ cam_from_world.inverse()
         x, y, z = (value / self.scale for value in metric.translation)
         return RigidTransform(metric.quat_wxyz, (x, y, z))
-
-    def odometry_from_cam(self, cam_from_world: RigidTransform) -> RigidTransform:
-        """A pose as the keyframe files have it."""
-        return self.odometry_from_as @ self.slam_from_cam(cam_from_world)
 
 
 def _transformation_lines(slam: SlamFrames, blank_lines: bool) -> list[str]:
@@ -255,66 +218,6 @@ def _gnss_lines(slam: SlamFrames, keyframes: Iterable[Moment]) -> list[str]:
         pose = _pose_fields(slam.slam_from_cam(moment.cam0_from_world), ",", 12)
         lines.append(f"{moment.timestamp},{pose},{slam.scale:.6f},2")
     return lines
-
-
-def _result_lines(slam: SlamFrames, moments: Iterable[Moment]) -> list[str]:
-    """The odometry's poses of all slam, level, of the unrectified camera."""
-    half = np.radians(_RECTIFICATION_DEG) / 2
-    w, y = settled((np.cos(half), np.sin(half))).tolist()
-    rectification = RigidTransform((w, 0.0, y, 0.0), (0.0, 0.0, 0.0))
-    lines = []
-    for moment in moments:
-        pose = slam.s_from_as @ slam.odometry_from_cam(moment.cam0_from_world) @ rectification
-        lines.append(f"{moment.timestamp / 1e9:.5f}   {_pose_fields(pose, ' ', 15)}")
-    return lines
-
-
-def _keyframe_lines(
-    slam: SlamFrames,
-    moment: Moment,
-    points: NDArray[np.float64],
-    image: NDArray[np.uint8],
-    exposure_ms: float,
-) -> list[str]:
-    """Of points float64 (P, 3): u and v in pixels, depth in metres; of a grey image (H, W)."""
-    camera = moment.frames[0].camera
-    fx, fy, cx, cy = camera.params
-    lines = [
-        "# timestamp",
-        f"{moment.timestamp}",
-        "",
-        "# fx, fy, cx, cy, width, height, npoints",
-        f"{fx:.12f},{fy:.12f},{cx:.12f},{cy:.12f},{camera.width},{camera.height},{len(points)}",
-        "",
-        f"# camToWorld: {_TAGS}",
-        _pose_fields(slam.odometry_from_cam(moment.cam0_from_world), ",", 12),
-        "",
-        "# Exposure time (ms)",
-        f"{exposure_ms:.6f}",
-        "",
-        "# Point Cloud Data : ",
-        "# u,v,idepth_scaled,idepth_hessian,maxRelBaseline,numGoodRes,status ",
-        "# color information ",
-    ]
-    bottom, right = (size - 1 for size in image.shape)
-    for u, v, depth_m in points.tolist():
-        inverse_depth = slam.scale / depth_m
-        lines.append(f"{u:.9f},{v:.9f},{inverse_depth:.12f},900000000.000000,0.050000,0,1")
-        patch = [
-            image[min(max(int(v) + dy, 0), bottom), min(max(int(u) + dx, 0), right)]
-            for dx, dy in _PATTERN
-        ]
-        lines.append("".join(f"{grey}," for grey in patch))
-    return [*lines, ""]
-
-
-def _cloud_of(
-    tracks: SparsePoints, image: int, cam_from_world: RigidTransform
-) -> NDArray[np.float64]:
-    """Points of the tracks in one image: u and v in pixels, depth in metres, float64 (P, 3)."""
-    seen = tracks.image_ids == image
-    depth = cam_from_world.apply(tracks.xyz[tracks.point_ids[seen]])[:, 2]
-    return np.column_stack([tracks.xy_px[seen].astype(np.float64), depth])
 
 
 def _nmea_lines(keyframes: Sequence[Moment]) -> list[str]:

@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from io import BytesIO
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.io import savemat
 
 from megloc_kapture.datasets.inloc import COLOURS, POINTS
 from megloc_kapture.datasets.official import GROUND_TRUTH
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, ImageGroup, write_groups
+from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.mat_file import write_mat_arrays
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, RigidTransform
 from megloc_twins.frames import (
@@ -187,7 +189,10 @@ def _write_files(root: Path, options: InLocTwinOptions, frame: Frame, view: Rend
     poses = floor.place.cam_from_place(frame), cam_from_scan(yaw, pitch)
     rng = stream(options.seed, "inloc", "laser", frame.name)
     points = scanned_points(floor, frame.camera, *poses, view.image, rng)
-    write_mat_arrays(root / f"{frame.name}.mat", {COLOURS: view.image, POINTS: points})
+    content = BytesIO()
+    savemat(content, {COLOURS: view.image, POINTS: points}, do_compression=True)
+    header = b"MATLAB 5.0 MAT-file".ljust(116)  # without SciPy's date
+    write_bytes(root / f"{frame.name}.mat", header + content.getvalue()[len(header) :])
 
 
 def scanned_points(

@@ -21,8 +21,13 @@ from numpy.typing import NDArray
 from megloc_kapture.datasets.formats.nvm import NvmModel
 from megloc_kapture.features.rootsift import ColmapSift
 from megloc_kapture.geometry.cameras import bearing_rays
-from megloc_kapture.io.colmap import MapImage, px_from_cam, triangulate
-from megloc_kapture.io.colmap_mapping import DatabaseFeatures, write_feature_database
+from megloc_kapture.io.colmap import (
+    MapImage,
+    colmap_camera,
+    load_pycolmap,
+    px_from_cam,
+    triangulate,
+)
 from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbourOptions, match_nearest
@@ -187,14 +192,23 @@ def sift_points(frames: Sequence[Frame], features: Features, depths_m: Depths) -
 
 
 def write_sift_database(path: Path, frames: Mapping[str, Frame], features: Features) -> None:
-    """Write COLMAP's database of the frames' features, under the names given, sorted by these.
-
-    Raises OutputError where it cannot be written.
-    """
-    found = ((name, frames[name].camera, features[frames[name].name]) for name in sorted(frames))
-    write_feature_database(
-        path, (DatabaseFeatures(n, cam, f.keypoints_px, f.descriptors) for n, cam, f in found)
-    )
+    """Write COLMAP's database of the frames' features, sorted by name; equal cameras are shared."""
+    pycolmap = load_pycolmap()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    camera_ids: dict[Camera, int] = {}
+    database = pycolmap.Database.open(str(path))
+    with pycolmap.DatabaseTransaction(database):
+        for name, frame in sorted(frames.items()):
+            if frame.camera not in camera_ids:
+                camera_ids[frame.camera] = database.write_camera(colmap_camera(frame.camera))
+            image = pycolmap.Image(name=name, camera_id=camera_ids[frame.camera])
+            image_id = database.write_image(image)
+            found = features[frame.name]
+            database.write_keypoints(image_id, np.ascontiguousarray(found.keypoints_px))
+            kind = pycolmap.FeatureExtractorType.SIFT
+            rows = pycolmap.FeatureDescriptors(kind, np.ascontiguousarray(found.descriptors))
+            database.write_descriptors(image_id, rows)
+    database.close()
 
 
 def nvm_model(names: Sequence[str], frames: Sequence[Frame], points: SparsePoints) -> NvmModel:

@@ -32,7 +32,7 @@ from megloc_twins.inloc import (
 from megloc_twins.rasterization import NO_SURFACE, depth_map, sample_grid, visible_surfaces
 from megloc_twins.surfaces import Surfaces
 
-from megloc_kapture.datasets.inloc.adapter import InLoc, InLocOptions
+from megloc_kapture.datasets.inloc.adapter import InLoc
 from megloc_kapture.datasets.official import write_official
 from megloc_kapture.io.dataset_tables import read_groups
 from megloc_kapture.io.images import read_depth_map, read_image_rgb
@@ -117,13 +117,11 @@ def test_scanned_points_are_seen_in_their_pixels(root: Path, imported: Path) -> 
     assert 0.02 < np.mean(missing) < 0.3
 
 
-def test_conditions_come_from_the_truth(root: Path, imported: Path) -> None:
+def test_conditions_come_from_the_truth(imported: Path) -> None:
     groups = read_groups(imported / "megloc")
     queries = {name: group for name, group in groups.items() if name.startswith("query/")}
     assert Counter(group.condition for group in queries.values()) == {"DUC1": 2, "DUC2": 3}
     assert {group.frame for group in queries.values()} == {""}
-    dataset = InLoc(InLocOptions(depth=False)).read(root)
-    assert any("queries taken on DUC1" in str(count) for count in dataset.summary)
     KaptureFolder(imported / "mapping").validate(deep=True)
     KaptureFolder(imported / "query").validate(deep=True)
 

@@ -1,26 +1,21 @@
-"""Aachen Day-Night, versions 1.0 and 1.1: a city by day, queried by day and at night."""
+"""Aachen Day-Night, versions 1.0 and 1.1: a city by day, queried by day and at night.
+
+The official layout has an NVM model in version 1.0 and a COLMAP model in version 1.1; kapture's
+downloader leaves kapture folders.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
-from megloc_kapture.datasets.aachen import (
-    ADDITIONAL_NIGHT,
-    DATABASE_FOLDER,
-    DAY,
-    NIGHT,
-    SEQUENCES_FOLDER,
-    AachenImages,
-    Layout,
-    Version,
-    from_kapture,
-)
-from megloc_kapture.datasets.kapture_form import KaptureForm
+from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm
+from megloc_kapture.datasets.kapture_form import KaptureForm, KaptureImage
 from megloc_kapture.datasets.official import (
     Count,
     DatasetCard,
@@ -31,18 +26,218 @@ from megloc_kapture.datasets.official import (
     read_ground_truth,
 )
 from megloc_kapture.datasets.reference_map import ReferenceModel, check_model_files
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.evaluation.protocols import protocol_of
+from megloc_kapture.io.camera_list import read_camera_rows
+from megloc_kapture.io.colmap_model import SparsePoints, colmap_model_files, read_colmap_model
 from megloc_kapture.io.dataset_tables import ImageGroup, World
-from megloc_kapture.values import Options
+from megloc_kapture.io.files import named
+from megloc_kapture.io.images import image_size
+from megloc_kapture.io.kapture import KaptureData, Sensor
+from megloc_kapture.values import Camera, Options, RigidTransform
 
+Version = Literal["1.0", "1.1"]
+Wanted = Literal["auto", "1.0", "1.1"]
+
+DAY, NIGHT = "day", "night"
+DATABASE_FOLDER, SEQUENCES_FOLDER, QUERY_FOLDER = "db", "sequences", "query"
+# v1.1's night list contains v1.0's queries and these
+ADDITIONAL_NIGHT = "query/night/nexus5x_additional_night/"
+
+# first timestamp of each list; map images start at 0
+_FIRST_TIMESTAMP = {DAY: 100_000, NIGHT: 200_000}
+_IMAGE_FOLDERS = ("images_upright", "images/images_upright")
+# archive and folder differ by an underscore; both occur
+_MODEL_FOLDERS = ("aachen_v_1_1", "aachen_v1_1")
+
+_NAME_OF_V1_1 = ("v1.1", "v1_1", "v11")
 _NUM_DATABASE, _NUM_SEQUENCES = 4328, 2369
 _NUM_DAY, _NUM_NIGHT = 824, {"1.0": 98, "1.1": 191}
 # of v1.1's map images and night queries
 _NUM_CAMERAS = 5234
 # visuallocalization.net recognises versions by these file names
 _POSE_FILE_STEMS = {"1.0": "Aachen", "1.1": "Aachen_v1_1"}
-_WRONG_IMAGE = "db/1228.jpg"
+
+
+@dataclass
+class AachenImages:
+    """The images of an import; ``conditions`` by query in list order, day first."""
+
+    version: Version
+    mapping: KaptureData = field(default_factory=KaptureData)
+    query: KaptureData = field(default_factory=KaptureData)
+    conditions: dict[str, str] = field(default_factory=dict)
+
+    def add_map_image(
+        self, name: str, position: int, camera_id: int, camera: Camera, pose: RigidTransform
+    ) -> None:
+        record = position, f"camera_{camera_id:05d}"
+        self.mapping.sensors[record[1]] = Sensor.from_camera(camera)
+        self.mapping.records_camera[record] = name
+        self.mapping.trajectories[record] = pose
+
+    def add_query(self, name: str, condition: str, position: int, camera: Camera) -> None:
+        record = _FIRST_TIMESTAMP[condition] + position, f"{condition}_{position:05d}"
+        self.query.sensors[record[1]] = Sensor.from_camera(camera)
+        self.query.records_camera[record] = name
+        self.conditions[name] = condition
+
+
+class Layout:
+    """Official files below ``root``; the feature database belongs to v1.0's model."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = Path(root)
+        models = self.root / "3D-models"
+        self.images = _first(self.root / name for name in _IMAGE_FOLDERS)
+        self.nvm = models / "aachen_cvpr2018_db.nvm"
+        self.database_intrinsics = models / "database_intrinsics.txt"
+        self.colmap_model = _first(models / name for name in _MODEL_FOLDERS)
+        self.feature_database = self.root / "aachen.db"
+
+    def query_list(self, condition: str) -> Path:
+        return self.root / "queries" / f"{condition}_time_queries_with_intrinsics.txt"
+
+    def absent(self) -> list[str]:
+        wanted = (self.images, self.query_list(DAY).parent, self.nvm.parent)
+        return [folder.name for folder in wanted if not folder.is_dir()]
+
+    def version(self, wanted: Wanted) -> Version:
+        """Return ``wanted``, or the latest version that has a model."""
+        if wanted == "auto":
+            wanted = "1.1" if self.colmap_model.is_dir() else "1.0"
+        model = self.nvm if wanted == "1.0" else self.colmap_model
+        if not model.exists():
+            raise DataError(
+                f"the model of Aachen Day-Night v{wanted} is missing: "
+                f"{model.relative_to(self.root)}",
+                path=self.root,
+            )
+        return wanted
+
+    def model_files(self, version: Version, *, with_points: bool) -> tuple[Path, ...]:
+        if version == "1.1":
+            return colmap_model_files(self.colmap_model, with_points=with_points)
+        files = (self.nvm, self.database_intrinsics)
+        return tuple(file for file in files if file.is_file())
+
+    def image_files(self) -> Iterator[Path]:
+        for folder in (DATABASE_FOLDER, SEQUENCES_FOLDER, QUERY_FOLDER):
+            yield from sorted(path for path in (self.images / folder).rglob("*") if path.is_file())
+
+    def read(self, version: Version, missing: Missing) -> tuple[AachenImages, int]:
+        """Read the existing images, and count v1.1's queries omitted from v1.0."""
+        images = AachenImages(version)
+        if version == "1.1":
+            model = read_colmap_model(self.colmap_model, with_points=False)
+            for position, image in enumerate(model.images):
+                if missing.require(self.images / image.name):
+                    camera = model.cameras[image.camera_id]
+                    pose = image.cam_from_world
+                    images.add_map_image(image.name, position, image.camera_id, camera, pose)
+        else:
+            self._add_nvm(images, missing)
+        return images, self._add_queries(images, missing)
+
+    def read_points(self, version: Version) -> tuple[tuple[str, ...], SparsePoints]:
+        """Return the names of all images of a version's model, and its points."""
+        if version == "1.1":
+            model = read_colmap_model(self.colmap_model)
+            return tuple(image.name for image in model.images), model.points
+        nvm = read_nvm(self.nvm, with_points=True)
+        return nvm.names, nvm.points
+
+    def _add_nvm(self, images: AachenImages, missing: Missing) -> None:
+        nvm = read_nvm(self.nvm, with_points=False)
+        listed = None
+        if missing.require(self.database_intrinsics):
+            listed = read_camera_rows(self.database_intrinsics)
+        for position, name in enumerate(nvm.names):
+            if listed is not None and name not in listed:
+                raise DataError(
+                    f"no line for {name!r}, an image of {self.nvm.name}",
+                    path=self.database_intrinsics,
+                )
+            if missing.require(self.images / name):
+                camera = self._centred(nvm, position) if listed is None else listed[name]
+                pose = nvm.cam_from_world(position)
+                images.add_map_image(name, position, position, camera, pose)
+
+    def _centred(self, nvm: NvmModel, position: int) -> Camera:
+        """Return the NVM's camera, which equals the published one, as far as is known."""
+        name = nvm.names[position]
+        width, height = image_size(self.images / name)
+        focal, k = float(nvm.focal_px[position]), float(nvm.k_colmap[position])
+        with named(self.nvm, about=f"image {name!r}"):
+            return Camera("SIMPLE_RADIAL", width, height, (focal, width / 2, height / 2, k))
+
+    def _add_queries(self, images: AachenImages, missing: Missing) -> int:
+        listed: dict[str, Path] = {}
+        left_out = 0
+        for condition in (DAY, NIGHT):
+            path = self.query_list(condition)
+            if not missing.require(path):
+                continue
+            for position, (name, camera) in enumerate(read_camera_rows(path).items()):
+                if listed.setdefault(name, path) != path:
+                    raise DataError(
+                        f"image {name!r} is also in {listed[name].name}: a query by day or at "
+                        "night?",
+                        path=path,
+                    )
+                if images.version == "1.0" and name.startswith(ADDITIONAL_NIGHT):
+                    left_out += 1
+                elif missing.require(self.images / name):
+                    images.add_query(name, condition, position, camera)
+        return left_out
+
+
+def _first(folders: Iterable[Path]) -> Path:
+    candidates = list(folders)
+    return next((folder for folder in candidates if folder.is_dir()), candidates[0])
+
+
+def from_kapture(
+    form: KaptureForm, wanted: Wanted, missing: Missing
+) -> tuple[AachenImages, dict[str, Path]]:
+    """Return the images of kapture folders in the official order, and the file of each."""
+    found = form.read(missing)
+    images = AachenImages(_version_of(form, wanted, found))
+    cameras: dict[str, int] = {}
+    for image in found:
+        if not image.is_query and image.cam_from_world is not None:
+            position = len(images.mapping.records_camera)
+            camera_id = cameras.setdefault(image.sensor_id, len(cameras))
+            images.add_map_image(
+                image.name, position, camera_id, image.camera, image.cam_from_world
+            )
+    for condition in (DAY, NIGHT):
+        queries = [i for i in found if i.is_query and condition in i.name.split("/")[:-1]]
+        for position, image in enumerate(queries):
+            images.add_query(image.name, condition, position, image.camera)
+    for image in found:
+        if image.is_query and image.name not in images.conditions:
+            raise DataError(
+                f"query {image.name!r} has neither {DAY}/ nor {NIGHT}/ in its name", path=form.root
+            )
+    return images, {image.name: image.file for image in found}
+
+
+def _version_of(form: KaptureForm, wanted: Wanted, images: Sequence[KaptureImage]) -> Version:
+    is_newer = any(
+        image.name.startswith((f"{SEQUENCES_FOLDER}/", ADDITIONAL_NIGHT)) for image in images
+    )
+    if wanted == "1.0" and is_newer:
+        raise OptionError(f"version=1.0 is wanted, and {form.root} is v1.1, whose poses are others")
+    if wanted != "auto":
+        return wanted
+    path = form.root.resolve()
+    folders = (path.name.lower(), path.parent.name.lower())
+    named = any(text in name for text in _NAME_OF_V1_1 for name in folders)
+    return "1.1" if is_newer or named else "1.0"
+
+
+# --------------------------------------------------------------------------------- adapter
 
 
 class AachenOptions(Options):
@@ -119,15 +314,26 @@ class Aachen:
             return self._dataset(images, lambda _: form.root, missing, remarks, image_files=files)
         layout = Layout(root)
         images, left_out = layout.read(layout.version(self.options.version), missing)
-        reference = None
+        remarks, reference = [], None
+        if images.version == "1.0" and not layout.database_intrinsics.is_file():
+            remarks.append(
+                f"Without {layout.database_intrinsics.name} the map images' principal points are "
+                "taken to be in the middle, and their sizes from the image files."
+            )
+        if left_out:
+            remarks.append(
+                f"{left_out} night queries of v1.1 ({ADDITIONAL_NIGHT}) are left out of v1.0."
+            )
         if self.options.reference_model:
+            database = layout.feature_database if images.version == "1.0" else None
             points = partial(layout.read_points, images.version)
-            reference = ReferenceModel(points, _descriptors(layout, images.version))
+            reference = ReferenceModel(points, database)
+            remarks += reference.remarks()
         return self._dataset(
             images,
             layout.query_list,
             missing,
-            self._remarks(layout, images.version, left_out),
+            remarks,
             links={"": layout.images},
             reference=reference,
         )
@@ -141,12 +347,6 @@ class Aachen:
         **more: Any,
     ) -> OfficialDataset:
         truth, _ = read_ground_truth(missing.root, images.query, World())  # names tell conditions
-        if _WRONG_IMAGE in images.mapping.records_camera.values():
-            wrong = (
-                f"{_WRONG_IMAGE} has a wrong pose in the published model; its maintainer says that "
-                "it may be dropped. It is imported as published."
-            )
-            remarks = [wrong, *remarks]
         conditions = images.conditions.items()
         return OfficialDataset(
             mapping=images.mapping,
@@ -163,37 +363,9 @@ class Aachen:
             **more,
         )
 
-    def _remarks(self, layout: Layout, version: Version, left_out: int) -> list[str]:
-        remarks = []
-        if version == "1.0" and not layout.database_intrinsics.is_file():
-            remarks.append(
-                f"Without {layout.database_intrinsics.name} the map images' principal points are "
-                "taken to be in the middle, and their sizes from the image files."
-            )
-        if left_out:
-            remarks.append(
-                f"{left_out} night queries of v1.1 ({ADDITIONAL_NIGHT}) are left out of v1.0."
-            )
-        if self.options.reference_model and _descriptors(layout, version) is None:
-            where = (
-                f"those of v1.0 are in {layout.feature_database.name}, which is not there"
-                if version == "1.0"
-                else "v1.1 publishes none"
-            )
-            remarks.append(
-                f"The reference model comes without descriptors: {where}. "
-                "With map = given they are extracted again from the images."
-            )
-        return remarks
-
 
 def _kapture_form(root: Path) -> KaptureForm | None:
     return KaptureForm.find(root) if Layout(root).absent() else None
-
-
-def _descriptors(layout: Layout, version: Version) -> Path | None:
-    there = version == "1.0" and layout.feature_database.is_file()
-    return layout.feature_database if there else None
 
 
 def _pose_file_names(images: AachenImages, lists: Callable[[str], Path]) -> dict[str, str]:

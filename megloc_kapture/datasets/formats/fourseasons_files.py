@@ -12,18 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from megloc_kapture.datasets.formats.text_lines import (
-    MAX_DISTANCE_M,
     Line,
     read_lines,
     read_rigid_matrix,
     shown,
 )
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import read_text
 from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -95,43 +90,27 @@ class GnssPose:
     fusion_quality: float | None
 
 
-def read_times(path: Path) -> list[int]:
-    """Read ``times.txt``: timestamps (ns) of all frames of a recording."""
-    return list(_by_timestamp(path, lambda line: None))
-
-
 def read_gnss_poses(path: Path) -> dict[int, GnssPose]:
     """Read ``GNSSPoses.txt`` by timestamp (ns).
 
     A row is ``timestamp tx ty tz qx qy qz qw [scale [fusion_quality [v3]]]``; published rows have
     10 fields, their header announces 11.
     """
-    counts: list[int] = []
 
     def parse(line: Line) -> GnssPose:
         fields = line.comma_fields
         form = "timestamp tx ty tz qx qy qz qw scale fusion_quality v3"
         line.expect(fields, range(8, 12), form)
-        counts.append(len(fields))
         scale = _scale(line, fields[8]) if len(fields) > 8 else None
         quality = line.number_of(fields[9], "fusion_quality") if fields[9:] else None
         return GnssPose(_transform(line, fields[1:8]), scale, quality)
 
-    poses = _by_timestamp(path, parse)
-    # a truncated number is still a number
-    if counts[-1] < max(counts) and not read_text(path).endswith("\n"):
-        raise DataError("the last row is incomplete: the file may be cut short", path=path)
-    return poses
+    return _by_timestamp(path, parse)
 
 
 def read_poses(path: Path) -> dict[int, RigidTransform]:
     """Read ``poses.txt`` (ECCV 2020 challenge): ``world_from_cam`` by timestamp (ns), metres."""
     return _by_timestamp(path, lambda line: _transform(line, line.comma_fields[1:]))
-
-
-def read_keyframe_accuracy(path: Path) -> set[int]:
-    """Read ``keyframe_accuracy.txt``: timestamps (ns) of keyframes known to better than 0.05 m."""
-    return {_timestamp(line, line.comma_fields[0]) for line in read_lines(path, comments=True)}
 
 
 def timestamp_of_name(stem: str) -> int | None:
@@ -160,8 +139,6 @@ def _timestamp(line: Line, text: str) -> int:
 def _transform(line: Line, fields: Sequence[str]) -> RigidTransform:
     line.expect(fields, 7, "tx ty tz qx qy qz qw")
     tx, ty, tz, qx, qy, qz, qw = line.numbers_of(fields, "pose")
-    if max(abs(tx), abs(ty), abs(tz)) > MAX_DISTANCE_M:
-        raise line.error(f"the translation {tx:g} {ty:g} {tz:g} leads beyond the earth")
     with line.named():
         return RigidTransform(unit_quaternion((qw, qx, qy, qz)), (tx, ty, tz))
 
@@ -208,64 +185,6 @@ def read_transformations(path: Path) -> Transformations:
         scale = _scale(row, row.text)
     s_from_as, w_from_gpsw, e_from_gpsw = transforms
     return Transformations(s_from_as, w_from_gpsw, e_from_gpsw, scale)
-
-
-@dataclass(frozen=True, eq=False)
-class Keyframe:
-    """A keyframe's file, written by the odometry, with the undistorted left camera.
-
-    ``world_from_cam`` is in the odometry's world and unit, not that of ``GNSSPoses.txt``; relative
-    motions are equal. ``points`` is float64 (P, 3): u and v in pixels, inverse depth.
-    """
-
-    timestamp: int
-    camera: Camera
-    world_from_cam: RigidTransform
-    points: NDArray[np.float64]
-
-
-def read_keyframe(path: Path) -> Keyframe:
-    """Read ``KeyFrame_<timestamp>.txt``; comment lines name its parts."""
-    lines = read_lines(path, blank=True)
-    timestamp_line = _part(lines, "timestamp", path)[0]
-    line = _part(lines, "fx", path)[0]
-    line.expect(line.comma_fields, 7, "fx, fy, cx, cy, width, height, npoints")
-    params = line.numbers_of(line.comma_fields[:4], "camera parameter")
-    width, height, num_points = (line.count_of(text, "size") for text in line.comma_fields[4:])
-    with line.named():
-        camera = Camera("PINHOLE", width, height, tuple(params))
-    # each point has a line of numbers and a line of colours
-    rows = _part(lines, "Point Cloud", path, may_be_empty=num_points == 0)[::2]
-    if len(rows) != num_points:
-        raise DataError(f"{len(rows)} points, {num_points} are announced", path=path)
-    points = []
-    for row in rows:
-        form = "u,v,idepth_scaled,idepth_hessian,maxRelBaseline,numGoodRes,status"
-        row.expect(row.comma_fields, 7, form)
-        points.append(row.numbers_of(row.comma_fields[:3], "u, v or depth"))
-    timestamp = _timestamp(timestamp_line, timestamp_line.text)
-    pose_line = _part(lines, "camToWorld", path)[0]
-    pose = _transform(pose_line, pose_line.comma_fields)
-    return Keyframe(timestamp, camera, pose, np.array(points, np.float64).reshape(-1, 3))
-
-
-def _part(
-    lines: Sequence[Line], title: str, path: Path, *, may_be_empty: bool = False
-) -> list[Line]:
-    part: list[Line] = []
-    begun = False
-    for line in lines:
-        if line.text.startswith("#"):
-            if part:
-                break
-            begun = begun or line.text[1:].lstrip().startswith(title)
-        elif begun and line.text:
-            part.append(line)
-        elif part:
-            break
-    if not part and not (begun and may_be_empty):
-        raise DataError(f"there is no '# {title}' with its values below", path=path)
-    return part
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,11 +22,10 @@ from megloc_kapture.errors import DataError, OptionError
 
 CAMERAS = ("cam0", "cam1")
 CALIBRATION_FOLDERS = ("calibration", "Calibration")
-GNSS_POSES, POSES, ACCURACY = "GNSSPoses.txt", "poses.txt", "keyframe_accuracy.txt"
-TRANSFORMATIONS, TIMES, KEYFRAMES = "Transformations.txt", "times.txt", "KeyFrameData"
+GNSS_POSES, POSES, TRANSFORMATIONS = "GNSSPoses.txt", "poses.txt", "Transformations.txt"
 
 _IMAGES = "undistorted_images"
-_MARKS = (_IMAGES, GNSS_POSES, POSES, TIMES)
+_MARKS = (_IMAGES, GNSS_POSES, POSES, "times.txt")
 _RELOCALIZATION_FOLDERS = (".", "RelocalizationFiles*", "*", "*/RelocalizationFiles*")
 # number of pairs by (source, target), from the challenges' pages
 _PUBLISHED_PAIRS = {
@@ -57,9 +56,6 @@ class Recording:
 
     def image_file(self, timestamp: int, camera: str) -> Path:
         return self.folder / _IMAGES / camera / f"{timestamp}.png"
-
-    def keyframe_file(self, timestamp: int) -> Path:
-        return self.folder / KEYFRAMES / f"KeyFrame_{timestamp}.txt"
 
     def times_on_disk(self, camera: str) -> list[int]:
         """Return the timestamps (ns) of a camera's images, sorted."""
@@ -111,7 +107,7 @@ def find_recordings(root: Path) -> dict[str, Recording]:
     }
     if not found:
         raise DataError(
-            f"no recording here, a folder with {_IMAGES}/ and {GNSS_POSES} or {TIMES} in it",
+            f"no recording here, a folder with {_IMAGES}/ or {GNSS_POSES} in it",
             path=root,
         )
     return found

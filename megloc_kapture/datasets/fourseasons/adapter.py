@@ -7,7 +7,6 @@ a nearby keyframe to each query.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,15 +14,11 @@ from pydantic import Field
 
 from megloc_kapture.datasets.formats.fourseasons_files import (
     StereoCalibration,
-    read_keyframe_accuracy,
-    read_times,
 )
 from megloc_kapture.datasets.fourseasons import (
-    ACCURACY,
     CAMERAS,
     GNSS_POSES,
     POSES,
-    TIMES,
     TRANSFORMATIONS,
     Recording,
     RelocalizationFile,
@@ -37,7 +32,6 @@ from megloc_kapture.datasets.fourseasons.images import (
     LocalFrame,
     challenge_tables,
     read_keyframe_poses,
-    write_depth_maps,
 )
 from megloc_kapture.datasets.official import (
     Count,
@@ -78,9 +72,6 @@ class FourSeasonsOptions(Options):
         "recording the keyframes that relocalization files ask for, or all where nothing tells",
     )
     stereo: bool = Field(default=True, description="take the right camera too")
-    depth: bool = Field(
-        default=False, description="the map keyframes' point clouds as sparse depth maps"
-    )
     min_fusion_quality: int = Field(
         default=1,
         ge=0,
@@ -101,7 +92,7 @@ class FourSeasons:
         "calibration.zip once",
         folders=("4Seasons",),
         layout="ROOT/calibration/ and ROOT/<recording>/{undistorted_images/,GNSSPoses.txt,"
-        "Transformations.txt,times.txt} of two recordings or more; relocalization files of a "
+        "Transformations.txt} of two recordings or more; relocalization files of a "
         "challenge in ROOT or the reference recording's folder",
     )
 
@@ -120,17 +111,12 @@ class FourSeasons:
         recordings = (*chosen.references, *chosen.queries)
         yield from dict.fromkeys(f for r in recordings for f in r.calibration_files(root))
         for recording in recordings:
-            for name in (GNSS_POSES, TRANSFORMATIONS, POSES, ACCURACY, TIMES):
+            for name in (GNSS_POSES, TRANSFORMATIONS, POSES):
                 if (recording.folder / name).is_file():
                     yield recording.folder / name
         for data in (dataset.mapping, dataset.query):
             for image in data.image_names():
                 yield chosen.recordings[image.partition("/")[0]].file_of(image)
-        if self.options.depth:
-            taken = {timestamp for timestamp, _ in dataset.mapping.records_depth}
-            for recording in chosen.references:
-                files = (recording.keyframe_file(timestamp) for timestamp in sorted(taken))
-                yield from (file for file in files if file.is_file())
         yield from ground_truth_files(root)
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
@@ -142,7 +128,7 @@ class FourSeasons:
         local = {name: frame.cams_from_local(of) for name, of in poses.items()}
         mapping = ImageRecords(suffixes, missing, self.options.stereo)
         for recording in chosen.references:
-            self._add_map(mapping, recording, root, poses[recording.name], local[recording.name])
+            self._add_map(mapping, recording, root, local[recording.name])
         query = ImageRecords(suffixes, missing, self.options.stereo)
         truth: dict[tuple[int, str], RigidTransform] = {}
         cars: dict[str, str] = {}
@@ -156,11 +142,11 @@ class FourSeasons:
         tables = challenge_tables(chosen.files, chosen.recordings, local, mapping.data, query.data)
         truth |= {(time, cars[name]): pose for (name, time), pose in tables.truth.items()}
         groups = _image_groups(chosen, mapping.data, query.data)
-        beside, beside_groups = read_ground_truth(root, query.data, frame.world())
-        for image in groups.keys() & beside_groups.keys():
-            condition = beside_groups[image].condition or groups[image].condition
+        truth_folder, truth_groups = read_ground_truth(root, query.data, frame.world())
+        for image in groups.keys() & truth_groups.keys():
+            condition = truth_groups[image].condition or groups[image].condition
             groups[image] = groups[image].model_copy(update={"condition": condition})
-        query_gt = _known_poses(query.data, truth, beside)
+        query_gt = _known_poses(query.data, truth, truth_folder)
         used = (*chosen.references, *chosen.queries)
         rules: dict[str, Any] = {"conditions": tuple(one.name for one in chosen.queries)}
         if not chosen.files:  # no challenge: write absolute poses in ECEF
@@ -178,9 +164,6 @@ class FourSeasons:
             summary=_summary(chosen, poses, mapping.data, query.data, query_gt),
             remarks=_remarks(poses, frame, tables, self.options.min_fusion_quality),
             missing=missing,
-            write_more=partial(write_depth_maps, mapping.depth_jobs)
-            if self.options.depth
-            else None,
         )
 
     def _select(self, root: Path, missing: Missing) -> Selection:
@@ -215,7 +198,6 @@ class FourSeasons:
         mapping: ImageRecords,
         recording: Recording,
         root: Path,
-        poses: KeyframePoses,
         cams_from_local: Mapping[int, RigidTransform],
     ) -> None:
         times: Iterable[int] = sorted(cams_from_local)
@@ -227,14 +209,6 @@ class FourSeasons:
         for timestamp, pose in cams_from_local.items():
             if timestamp in taken:
                 mapping.data.trajectories[timestamp, car] = pose
-        if self.options.depth:
-            scales = {t: s for t, s in poses.scales.items() if t in cams_from_local}
-            if not scales:
-                raise DataError(
-                    f"depth needs the scale of the keyframes, which is in {GNSS_POSES}",
-                    path=recording.folder,
-                )
-            mapping.add_depth(recording, calibration, scales)
 
     def _query_times(
         self,
@@ -255,14 +229,14 @@ class FourSeasons:
 def _known_poses(
     query: KaptureData,
     published: Mapping[tuple[int, str], RigidTransform],
-    beside: KaptureData | None,
+    truth_folder: KaptureData | None,
 ) -> KaptureData | None:
     """Return the queries with published poses, else with poses of ``ground_truth/``."""
     times = {timestamp for timestamp, _ in query.records_camera}
     poses = {key: pose for key, pose in published.items() if key[0] in times}
     known = with_poses(query, poses)
-    if beside is not None:
-        for (timestamp, device), pose in beside.trajectories.items():
+    if truth_folder is not None:
+        for (timestamp, device), pose in truth_folder.trajectories.items():
             if known.device_from_world(timestamp, device) is None:
                 poses[timestamp, device] = pose
     return with_poses(query, poses) if poses else None
@@ -305,14 +279,6 @@ def _summary(
                 good = poses[recording.name]
                 rows = len(good.scene_from_cam) + len(good.dropped)
                 counts.append(Count("  keyframes with a pose", len(good.scene_from_cam), rows))
-            if (recording.folder / TIMES).is_file():
-                listed = len(read_times(recording.folder / TIMES))
-                counts.append(Count(f"  frames in {TIMES}", listed))
-                on_disk = len(recording.times_on_disk(CAMERAS[0]))
-                counts.append(Count("  frames with a left image", on_disk))
-            if (recording.folder / ACCURACY).is_file():
-                accurate = read_keyframe_accuracy(recording.folder / ACCURACY)
-                counts.append(Count("  keyframes known to 0.05 m", len(accurate)))
     counts += [file.count() for file in chosen.files]
     counts.append(Count("images with a pose in the map", len(mapping.poses())))
     counts.append(Count("queries", len(query.records_camera)))
@@ -327,21 +293,21 @@ def _remarks(
     tables: ChallengeTables,
     min_fusion_quality: int,
 ) -> list[str]:
-    told = []
+    remarks = []
     for name, of in poses.items():
         if of.dropped:
-            told.append(
+            remarks.append(
                 f"{name}: {len(of.dropped)} keyframes are left out, their fusion quality is below "
                 f"{min_fusion_quality} (min_fusion_quality)."
             )
     if frame.earth_from_scene is None:
-        told.append(
-            f"The map's poses are those of {POSES}, whose frame is its own: of the queries only "
-            "poses in relocalization files are known."
+        remarks.append(
+            f"The map's poses are those of {POSES}, in a separate frame: only the query poses in "
+            "relocalization files are known."
         )
     if tables.lost:
-        told.append(
+        remarks.append(
             f"{tables.lost} pairs of relocalization files are left out: their reference has no "
             "pose or image, or their query no image. A challenge expects every pair."
         )
-    return told
+    return remarks

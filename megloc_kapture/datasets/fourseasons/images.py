@@ -1,4 +1,4 @@
-"""4Seasons as kapture: images, sparse depth, challenge pairs, keyframe poses.
+"""4Seasons as kapture: images, challenge pairs, keyframe poses.
 
 Poses are in the reference recording's scene (east-north-up), with an origin near its keyframes.
 ``ECEF_from_cam = e_from_gpsw * inv(w_from_gpsw) * s_from_as * scale * slam_from_cam``, with the
@@ -9,16 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.fourseasons_files import (
-    Keyframe,
     StereoCalibration,
     read_gnss_poses,
-    read_keyframe,
     read_poses,
     read_transformations,
 )
@@ -30,27 +26,13 @@ from megloc_kapture.datasets.fourseasons import (
     Recording,
     RelocalizationFile,
 )
-from megloc_kapture.datasets.kapture_folders import MAPPING
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import RelocalizationPair, SimilarityTransform, World
-from megloc_kapture.io.images import write_depth_map
 from megloc_kapture.io.kapture import KaptureData, Sensor
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import RigidTransform
 
-RIG, DEPTH = "car", "depth"
-DEPTH_FOLDER = "keyframe_depth"
-
-
-@dataclass(frozen=True)
-class DepthJob:
-    """A depth map to be written; ``scale`` is metres per SLAM unit."""
-
-    keyframe: Path
-    timestamp: int
-    scale: float
-    camera: Camera
-    name: str
+RIG = "car"
 
 
 @dataclass
@@ -61,7 +43,6 @@ class ImageRecords:
     missing: Missing
     stereo: bool
     data: KaptureData = field(default_factory=KaptureData)
-    depth_jobs: list[DepthJob] = field(default_factory=list)
 
     def add(
         self, recording: Recording, calibration: StereoCalibration, times: Iterable[int]
@@ -87,54 +68,6 @@ class ImageRecords:
                 if self.missing.require(recording.image_file(timestamp, name)):
                     self.data.records_camera[record] = image
         return car
-
-    def add_depth(
-        self, recording: Recording, calibration: StereoCalibration, scales: Mapping[int, float]
-    ) -> None:
-        """Add the keyframes' depth maps; ``scales`` are metres per SLAM unit by timestamp (ns)."""
-        suffix = self.suffixes[calibration]
-        sensor, camera = DEPTH + suffix, calibration.cam0
-        self.data.sensors[sensor] = Sensor.from_camera(camera, name=DEPTH, sensor_type="depth")
-        self.data.rigs[RIG + suffix][sensor] = RigidTransform.identity()
-        for timestamp, scale in scales.items():
-            file = recording.keyframe_file(timestamp)
-            if (timestamp, CAMERAS[0] + suffix) not in self.data.records_camera:
-                continue
-            if self.missing.require(file):
-                name = f"{DEPTH_FOLDER}/{recording.name}/{timestamp}.depth"
-                self.data.records_depth[timestamp, sensor] = name
-                self.depth_jobs.append(DepthJob(file, timestamp, scale, camera, name))
-
-
-def write_depth_maps(jobs: Iterable[DepthJob], output: Path) -> None:
-    for job in jobs:
-        keyframe = read_keyframe(job.keyframe)
-        size = (keyframe.camera.width, keyframe.camera.height)
-        if keyframe.timestamp != job.timestamp or size != (job.camera.width, job.camera.height):
-            raise DataError(
-                f"timestamp {keyframe.timestamp} and size {size[0]}x{size[1]} are not those of its "
-                f"name and the calibration, {job.camera.width}x{job.camera.height}",
-                path=job.keyframe,
-            )
-        file = output / MAPPING / "sensors" / "records_data" / job.name
-        write_depth_map(file, depth_map(keyframe, job.scale))
-
-
-def depth_map(keyframe: Keyframe, scale: float) -> NDArray[np.float32]:
-    """Return the depth along the optical axis, float32 (H, W), metres; 0 without a point.
-
-    ``scale`` is metres per unit of the keyframe's depths.
-    """
-    width, height = keyframe.camera.width, keyframe.camera.height
-    columns, rows, inverse = keyframe.points.T
-    with np.errstate(divide="ignore", over="ignore"):
-        depth = (scale / inverse).astype(np.float32)
-    good = (inverse > 0) & np.isfinite(depth) & (depth > 0)
-    good &= (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    nearest = np.full((height, width), np.inf, np.float32)
-    at = rows[good].astype(np.int64), columns[good].astype(np.int64)
-    np.minimum.at(nearest, at, depth[good])
-    return np.where(np.isfinite(nearest), nearest, np.float32(0))
 
 
 # a query may be matched with map images of this many keyframes before and after its reference
@@ -201,12 +134,11 @@ class KeyframePoses:
     """The poses of one recording's keyframes, by timestamp (ns).
 
     ``scene_from_cam`` is for the undistorted left camera, in metres; ``earth_from_scene`` goes to
-    ECEF; ``scales`` are metres per SLAM unit; ``dropped`` keyframes have poor GNSS fusion.
+    ECEF; ``dropped`` keyframes have poor GNSS fusion.
     """
 
     scene_from_cam: Mapping[int, RigidTransform]
     earth_from_scene: RigidTransform | None
-    scales: Mapping[int, float]
     dropped: Sequence[int] = ()
 
 
@@ -256,7 +188,7 @@ def read_keyframe_poses(
     plain = recording.folder / POSES
     if not on_earth and plain.is_file():
         poses = read_poses(plain)
-        return KeyframePoses(dict(sorted(poses.items())), None, _scales_beside(recording))
+        return KeyframePoses(dict(sorted(poses.items())), None)
     if not (recording.folder / GNSS_POSES).is_file():
         return None
     if not missing.require(recording.folder / TRANSFORMATIONS):
@@ -269,7 +201,6 @@ def _gnss_poses(recording: Recording, min_fusion_quality: int) -> KeyframePoses:
     transformations = read_transformations(recording.folder / TRANSFORMATIONS)
     scene_from_slam = transformations.w_from_gpsw.inverse() @ transformations.s_from_as
     poses: dict[int, RigidTransform] = {}
-    scales: dict[int, float] = {}
     dropped = []
     for timestamp, row in sorted(read_gnss_poses(path).items()):
         if row.fusion_quality is not None and row.fusion_quality < min_fusion_quality:
@@ -284,19 +215,10 @@ def _gnss_poses(recording: Recording, min_fusion_quality: int) -> KeyframePoses:
         x, y, z = (scale * value for value in row.slam_from_cam.translation)
         metric = RigidTransform(row.slam_from_cam.quat_wxyz, (x, y, z))
         poses[timestamp] = scene_from_slam @ metric
-        scales[timestamp] = scale
     if not poses:
         raise DataError(
             f"none of its {len(dropped)} poses has a fusion quality of {min_fusion_quality} or "
             "better; lower min_fusion_quality takes them",
             path=path,
         )
-    return KeyframePoses(poses, transformations.e_from_gpsw, scales, dropped)
-
-
-def _scales_beside(recording: Recording) -> dict[int, float]:
-    path = recording.folder / GNSS_POSES
-    if not path.is_file():
-        return {}
-    rows = read_gnss_poses(path)
-    return {timestamp: row.scale for timestamp, row in rows.items() if row.scale is not None}
+    return KeyframePoses(poses, transformations.e_from_gpsw, dropped)

@@ -51,8 +51,6 @@ _CUTOUT_FOCAL_SHARE = 3**0.5 / 2
 # the 277 scans of the paper's 9,972 cutouts, with the floors published by the authors
 _PUBLISHED_SCANS = {"DUC1": 50, "DUC2": 80, "CSE3": 7, "CSE4": 75, "CSE5": 65}
 _PUBLISHED_QUERIES = 356
-_EXIF_ORIENTATION = 0x0112
-_MANY_GIGABYTES = 5
 # points of a wrong image are off by a large part of its width
 _MAX_OFFSET = 0.03
 _CHECKED_EVERY = 8  # rows and columns
@@ -118,12 +116,12 @@ class InLoc:
                     map_.add(scan, missing)
         if self.options.depth and map_.groups and not (map_.depth_jobs or allow_missing):
             raise DataError(
-                f"no cutout has its points beside it (.jpg{POINTS_SUFFIX}); the download without "
+                f"no cutout has its points (.jpg{POINTS_SUFFIX}); the download without "
                 "them is imported with the option depth = false",
                 path=layout.cutouts,
             )
         names = [f"{QUERIES}/{name}" for name in layout.queries()]
-        query, turned = _queries(names, layout.query)
+        query = _queries(names, layout.query)
         truth, true_groups = read_ground_truth(root, query, World())
         groups = {image: true_groups.get(image, ImageGroup()) for image in names}
         records = Path("mapping") / "sensors" / "records_data"
@@ -136,7 +134,7 @@ class InLoc:
             names={image: last_part(image) for image in names},
             protocol=protocol_of(DATASET),
             summary=self._summary(map_, groups),
-            remarks=self._remarks(map_, groups, left_out, turned),
+            remarks=[f"Omitted, wrongly placed: scans {', '.join(left_out)}."] if left_out else [],
             missing=missing,
             write_more=lambda output: write_depth_maps(
                 map_.depth_jobs, self.options.depth_step, output / records
@@ -155,42 +153,7 @@ class InLoc:
         for floor in self.floors:
             scans = {g.location for g in map_.groups.values() if g.frame == floor}
             counts.append(Count(f"scans of {floor}", len(scans), _PUBLISHED_SCANS[floor]))
-        for condition in sorted({g.condition for g in groups.values()} - {""}):
-            taken = sum(g.condition == condition for g in groups.values())
-            counts.append(Count(f"queries taken on {condition}", taken))
         return counts
-
-    def _remarks(
-        self, map_: _Map, groups: Mapping[str, ImageGroup], left_out: list[str], turned: int
-    ) -> list[str]:
-        remarks = [
-            "Each floor is a coordinate frame of its own (frame in groups.csv): a pose that rests "
-            "on images of two floors means nothing.",
-        ]
-        if not any(group.condition for group in groups.values()):
-            remarks.append(
-                "The layout does not say on which floor a query was taken; the server reports "
-                "DUC1 and DUC2 apart, here all queries stand together."
-            )
-        step = self.options.depth_step
-        cameras = [depth_camera(job.camera, step) for job in map_.depth_jobs]
-        gigabytes = sum(4 * camera.width * camera.height for camera in cameras) / 1e9
-        if gigabytes > _MANY_GIGABYTES:
-            remarks.append(
-                f"The depth maps take {gigabytes:.0f} GB; with depth_step = {4 * step} it would "
-                "be a sixteenth."
-            )
-        if left_out:
-            remarks.append(
-                f"Left out, as the dataset's authors list them as wrongly placed: scans "
-                f"{', '.join(left_out)}."
-            )
-        if turned:
-            remarks.append(
-                f"{turned} queries have an EXIF orientation, which is ignored: cameras and poses "
-                "refer to the pixels as they are stored."
-            )
-        return remarks
 
 
 def _camera(path: Path, focal_share: float, *, longer: bool) -> Camera:
@@ -263,26 +226,14 @@ def _timestamp(scan: Scan, cutout: Cutout) -> int:
     )
 
 
-def _queries(names: list[str], folder: Path) -> tuple[KaptureData, int]:
-    data, turned = KaptureData(), 0
+def _queries(names: list[str], folder: Path) -> KaptureData:
+    data = KaptureData()
     for timestamp, name in enumerate(names):
-        path = folder / last_part(name)
-        camera = _camera(path, _FOCAL_SHARE, longer=True)
+        camera = _camera(folder / last_part(name), _FOCAL_SHARE, longer=True)
         sensor = f"iphone7_{camera.width}x{camera.height}"
         data.sensors[sensor] = Sensor.from_camera(camera, name=sensor)
         data.records_camera[timestamp, sensor] = name
-        turned += _is_turned(path)
-    return data, turned
-
-
-def _is_turned(path: Path) -> bool:
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            return image.getexif().get(_EXIF_ORIENTATION, 1) != 1
-    except Exception:  # pillow raises many types on broken metadata, which is optional
-        return False
+    return data
 
 
 # ----------------------------------------------------------------------------------- depth

@@ -73,14 +73,8 @@ def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
     """Read fx, fy, cx, cy in pixels from ``<camera>_intrinsics.txt``."""
     values: dict[str, float] = {}
     for line in read_lines(path):
-        if len(line.fields) != 2 or line.fields[0] not in INTRINSICS_KEYS:
-            raise line.error(
-                f"expected a line 'key value', key one of {', '.join(INTRINSICS_KEYS)}"
-            )
-        key, text = line.fields
-        if key in values:
-            raise line.error(f"{key} is given twice")
-        values[key] = line.number_of(text, key)
+        line.expect(line.fields, 2, "key value")
+        values[line.fields[0]] = line.number_of(line.fields[1], line.fields[0])
     if absent := [key for key in INTRINSICS_KEYS if key not in values]:
         raise DataError(f"{', '.join(absent)} missing", path=path)
     fx, fy, cx, cy = (values[key] for key in INTRINSICS_KEYS)

@@ -174,14 +174,13 @@ class RobotCar:
         selection = select(version, reference, queries, cameras=cameras, find=find, **chosen)
         model = None
         if self.options.reference_model:
-            there = layout.feature_database.is_file()
             points = partial(_read_points, layout, selection)
-            model = ReferenceModel(points, layout.feature_database if there else None)
+            model = ReferenceModel(points, layout.feature_database)
         return self._dataset(
             selection,
             read_car(layout, selection, missing),
             missing,
-            self._about_reference(layout),
+            [] if model is None else model.remarks(),
             reference_images=layout.num_reference_images(),
             links={"": layout.images},
             reference=model,
@@ -229,7 +228,7 @@ class RobotCar:
     ) -> OfficialDataset:
         car = car.with_rig_of(selection.reference)
         mapping, query = mapping_data(selection, car), car.data(selection.query_images)
-        beside, _ = read_ground_truth(missing.root, query, World())  # names tell conditions
+        published, _ = read_ground_truth(missing.root, query, World())  # names tell conditions
         groups = _image_groups(selection)
         others = "test images" if selection.version == 2 else "other queries"
         truth = (
@@ -240,7 +239,7 @@ class RobotCar:
         return OfficialDataset(
             mapping=mapping,
             query=query,
-            query_gt=query_truth(selection, query, beside),
+            query_gt=query_truth(selection, query, published),
             groups=groups,
             priors=_query_priors(selection, groups) if self.options.location_prior else {},
             names=_pose_file_names(selection),
@@ -250,16 +249,6 @@ class RobotCar:
             missing=missing,
             **more,
         )
-
-    def _about_reference(self, layout: Layout) -> list[str]:
-        database = layout.feature_database
-        if not self.options.reference_model or database.is_file():
-            return []
-        return [
-            "The reference model comes without descriptors: they are in "
-            f"{database.relative_to(layout.root)}, which is not there. With map = given they are "
-            "extracted again from the images."
-        ]
 
     def _check_version(self, version: int) -> None:
         if version == 1 and (self.options.train_as_map or self.options.queries != "all"):
@@ -305,8 +294,10 @@ def _query_priors(
     known = {groups[path].location for path in map_paths}
     priors = {}
     for image, path in selection.query_images.items():
-        own = tuple(_location(image.camera, p) for p in selection.queries.locations[image])
-        priors[path] = tuple(name for name in (*own, image.camera) if name in known) or own
+        locations = tuple(_location(image.camera, p) for p in selection.queries.locations[image])
+        priors[path] = (
+            tuple(name for name in (*locations, image.camera) if name in known) or locations
+        )
     return priors
 
 
@@ -347,24 +338,20 @@ def _summary(selection: Selection, reference_images: int) -> list[Count]:
 
 
 def _remarks(selection: Selection) -> list[str]:
-    said = [
-        "The rig is the one that the reference model's poses show, as extrinsics/ does not agree "
-        "well with them; where the model has fewer than ten moments of all cameras, it is that of "
-        "extrinsics/. Every map image has the model's pose, none goes through the rig."
-    ]
+    remarks = []
     unknown = sum(image not in selection.reference.locations for image in selection.map_images)
     if unknown:
         folder = Layout(Path()).individual_model("NNN")
-        said.append(
+        remarks.append(
             f"The location of {unknown} map images is not known: only the individual models tell "
             f"it ({folder}, extracted). All queries of their camera may be matched with them."
         )
     if selection.queries.unlisted:
-        said.append(
+        remarks.append(
             f"{selection.queries.unlisted} images of version 2's lists are in no list of "
             "queries_per_location and are left out."
         )
-    return said
+    return remarks
 
 
 def _location(camera: str, location: str | None) -> str:

@@ -152,9 +152,9 @@ def mapping_data(selection: Selection, car: Car) -> KaptureData:
 
 
 def query_truth(
-    selection: Selection, query: KaptureData, beside: KaptureData | None
+    selection: Selection, query: KaptureData, published: KaptureData | None
 ) -> KaptureData:
-    poses = {} if beside is None else dict(beside.trajectories)
+    poses = {} if published is None else dict(published.trajectories)
     for image, pose in selection.queries.train.items():
         if image in selection.query_images:
             poses[_record(image)] = pose

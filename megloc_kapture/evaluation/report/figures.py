@@ -1,4 +1,4 @@
-"""Figures of reports: error curves, errors against inliers, confidence, cameras from above."""
+"""Figures of reports as SVG."""
 
 from __future__ import annotations
 
@@ -20,22 +20,21 @@ from numpy.typing import NDArray
 
 from megloc_kapture.evaluation.confidence import Confidence
 from megloc_kapture.evaluation.report.map_view import top_view
-from megloc_kapture.evaluation.report.queries import ShownQuery
+from megloc_kapture.evaluation.report.queries import ShownQuery, frame_of_query
 from megloc_kapture.evaluation.results import Poses
 from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.geometry.poses import camera_centers, stack_poses
 from megloc_kapture.values import RigidTransform
 
 _INK, _MUTED, _MISS = "#1f2933", "#9aa5b1", "#c0262d"
-# Okabe and Ito's palette: told apart with any colour vision, in print too; then four more, for
-# RobotCar has nine conditions
+# Okabe and Ito's palette for any colour vision and print, and four more for RobotCar's conditions
 _PALETTE = (
     *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"),
     *("#7a5195", "#8c6d31", "#5f6b7a", "#9a1750"),
 )
-# above this many points a scatter is stored as pixels inside the SVG
+# larger scatter plots are pixels inside the SVG
 _RASTER_ABOVE = 3000
-# errors below these are drawn at them: a logarithmic axis has no zero
+# smaller errors are drawn at these, because a logarithmic axis has no zero
 _SMALLEST_POSITION_M, _SMALLEST_ANGLE_DEG = 1e-4, 1e-3
 
 _STYLE: dict[Any, Any] = {
@@ -51,7 +50,7 @@ _STYLE: dict[Any, Any] = {
     "legend.fontsize": 8,
     "legend.frameon": False,
     "svg.fonttype": "none",
-    "svg.hashsalt": "megloc",  # the same figure gives the same bytes
+    "svg.hashsalt": "megloc",  # reproducible bytes
     "text.parse_math": False,  # a "$" in the name of a condition is a dollar
 }
 
@@ -59,7 +58,7 @@ _STYLE: dict[Any, Any] = {
 @contextmanager
 def _figure(width: float, height: float) -> Iterator[Figure]:
     with matplotlib.rc_context(rc=matplotlib.rcParamsDefault), warnings.catch_warnings():
-        # names in scripts that matplotlib's font lacks
+        # names may have glyphs that matplotlib's font lacks
         warnings.filterwarnings("ignore", message="Glyph")
         matplotlib.rcParams.update(_STYLE)
         figure = Figure(figsize=(width, height))
@@ -78,7 +77,6 @@ def _label(name: str) -> str:
 
 
 def _plain_ticks(axes: Axes) -> None:
-    """Numbers as people write them (0.01, 100) on logarithmic axes, at powers of ten only."""
     for axis, scale in ((axes.xaxis, axes.get_xscale()), (axes.yaxis, axes.get_yscale())):
         if scale != "linear":
             axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -86,11 +84,7 @@ def _plain_ticks(axes: Axes) -> None:
 
 
 def error_curves(evaluations: Sequence[Evaluation]) -> bytes:
-    """Share of all queries at or below an error: position on the left, angle on the right.
-
-    One curve per condition of a single result, else one per result. Curves end below 100 % where
-    queries have no pose.
-    """
+    """Plot the share of queries at or below an error, per condition or per result."""
     first = evaluations[0]
     thresholds = first.thresholds
     angles = [t.angle_deg for t in thresholds if t.angle_deg is not None]
@@ -132,10 +126,7 @@ def error_curves(evaluations: Sequence[Evaluation]) -> bytes:
 
 
 def errors_against_inliers(evaluation: Evaluation) -> bytes | None:
-    """Position error of every pose against its inliers; None where no inliers are known.
-
-    Errors should fall to the right: many inliers and a large error are a wrong place.
-    """
+    """Plot position errors against inliers; None if no inliers are known."""
     known = [
         q for q in evaluation.queries if q.num_inliers is not None and np.isfinite(q.position_m)
     ]
@@ -166,17 +157,16 @@ def errors_against_inliers(evaluation: Evaluation) -> bytes | None:
 
 
 def confidence_curves(confidence: Confidence) -> bytes:
-    """The reliability diagram, and the risk against the coverage."""
     with _figure(10.5, 4.0) as figure:
         reliability, curve = figure.subplots(1, 2)
         reliability.plot([0, 100], [0, 100], color=_MUTED, linewidth=0.9, linestyle=":")
-        filled = [one for one in confidence.bins if one.num_poses]
-        mean = 100 * np.array([one.mean_confidence for one in filled])
-        share = 100 * np.array([one.share_right for one in filled])
+        filled = [b for b in confidence.bins if b.num_poses]
+        mean = 100 * np.array([b.mean_confidence for b in filled])
+        share = 100 * np.array([b.share_right for b in filled])
         reliability.plot(mean, share, "o-", color=_INK, markersize=5)
-        for x, y, one in zip(mean, share, filled, strict=True):
+        for x, y, b in zip(mean, share, filled, strict=True):
             where: dict[str, Any] = {"xytext": (0, 6), "textcoords": "offset points"}
-            reliability.annotate(str(one.num_poses), (x, y), ha="center", fontsize=7, **where)
+            reliability.annotate(str(b.num_poses), (x, y), ha="center", fontsize=7, **where)
         reliability.set(xlabel="confidence (%)", ylabel="right poses (%)")
         reliability.set(xlim=(-2, 104), ylim=(-2, 110))
         coverage, risk = 100 * np.array(confidence.coverage), 100 * np.array(confidence.risk)
@@ -189,32 +179,28 @@ def confidence_curves(confidence: Confidence) -> bytes:
 def views_from_above(
     queries: Sequence[ShownQuery], map_poses: Poses, frames: Mapping[str, str], unit: str
 ) -> dict[str, bytes]:
-    """Cameras of the map, truths and estimates from above: one figure per coordinate frame.
+    """Plot cameras of the map, truths and estimates from above, per coordinate frame.
 
-    Parameters
-    ----------
-    frames : image -> frame, where a dataset has several.
+    ``frames`` maps images to frames, if the dataset has several.
     """
 
-    def frame_of(query: ShownQuery) -> str:
-        known = (frames[image] for image in (query.image, *query.candidates) if image in frames)
-        return next(known, query.condition)
-
-    found = {}
+    figures = {}
     mapped = {name: frames.get(name, "") for name in map_poses}
     names = sorted(set(mapped.values())) or [""]
+    of_query = [frame_of_query(query, frames) for query in queries]
+    of_query = [frame if frame in names else names[0] for frame in of_query]
     for name in names:
-        own = [q for q in queries if (f if (f := frame_of(q)) in names else names[0]) == name]
+        here = [query for query, frame in zip(queries, of_query, strict=True) if frame == name]
         poses = [map_poses[image] for image, frame in mapped.items() if frame == name]
-        if any(query.estimated or query.truth for query in own):
-            found[name] = _from_above(own, poses, unit)
-    return found
+        if any(query.estimated or query.truth for query in here):
+            figures[name] = _from_above(here, poses, unit)
+    return figures
 
 
 def _from_above(queries: Sequence[ShownQuery], mapped: list[RigidTransform], unit: str) -> bytes:
     true = [query.truth for query in queries if query.truth is not None]
     posed = [query for query in queries if query.estimated is not None]
-    # an estimate that is far off must not shrink the map to a dot
+    # a wrong estimate must not shrink the map to a dot
     spanning = mapped + true or [query.estimated for query in posed if query.estimated]
     quats, translations = stack_poses(spanning)
     view = top_view(quats, camera_centers(quats, translations))
@@ -225,11 +211,10 @@ def _from_above(queries: Sequence[ShownQuery], mapped: list[RigidTransform], uni
     points = seen(spanning)
     low, high = points.min(axis=0), points.max(axis=0)
     size = max(float((high - low).max()), 1.0)
-    # a path straight ahead would leave a figure without height
+    # a straight path must not give a figure without height
     half = np.maximum((high - low) / 2, 0.12 * size) + 0.06 * size
     low, high = (low + high) / 2 - half, (low + high) / 2 + half
     number = len(mapped) + len(queries)
-    # in a crowd dots are smaller, and pixels
     shrink, raster = float(np.clip(np.sqrt(800 / number), 0.3, 1.0)), number > _RASTER_ABOVE
 
     def dots(poses: Sequence[RigidTransform | None], size: float, label: str, **look: Any) -> None:

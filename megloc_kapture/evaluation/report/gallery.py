@@ -1,4 +1,4 @@
-"""Pictures of a report: the worst queries beside what they match, masks, and depth."""
+"""Pictures of a report: the worst queries beside map images, masks, and depth."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.report.content import counted
 from megloc_kapture.evaluation.report.queries import (
     ShownQuery,
     query_facts,
     spread,
 )
-from megloc_kapture.evaluation.report.wording import counted
 from megloc_kapture.evaluation.results import Poses, ResultContext
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px
 from megloc_kapture.io.images import read_image_rgb
@@ -31,9 +31,9 @@ Points = NDArray[np.float64]
 
 _QUERY_BOX, _SMALL_BOX = (400, 300), (256, 256)
 _GAP_PX, _MAX_LINES = 6, 120
-# of the candidates, those looked at for the one with most matches
+# candidates that are searched for the one with most matches
 _CANDIDATES_COMPARED = 50
-# how far a match may be from its epipolar line and still agree
+# distance of a match from its epipolar line
 _MAX_ERROR_PX = 8.0
 AGREES, DISAGREES, UNKNOWN = "#12a150", "#e02424", "#f2b705"
 _NUM_IMAGES = 6  # of masks, and of depth
@@ -42,7 +42,7 @@ _SHADE = np.array([214.0, 32.0, 120.0])
 
 @dataclass(frozen=True)
 class Picture:
-    """An image of the page: its name, facts about it, and an ``<img>`` or ``<svg>`` element."""
+    """An ``<img>`` or ``<svg>`` element with its name and facts."""
 
     name: str
     facts: str
@@ -52,18 +52,17 @@ class Picture:
 def worst_pictures(
     queries: Sequence[ShownQuery], context: ResultContext, map_poses: Poses
 ) -> list[Picture]:
-    """Queries beside the candidate that they share most matches with, joined by the matches.
+    """Draw queries beside the candidate with most matches, else the map image nearest to the pose.
 
-    Without matches it is the map image nearest to the pose. What is missing or cannot be read is
-    left out: a report without a picture is better than none.
+    Images that are missing or broken are left out: a report without a picture is better than none.
     """
-    found = []
+    pictures = []
     readers = _open_matches(context)
     for query in queries:
         with contextlib.suppress(DataError):
             if context.queries is not None:
-                found.append(_beside(query, context, context.queries, map_poses, readers))
-    return found
+                pictures.append(_beside(query, context, context.queries, map_poses, readers))
+    return pictures
 
 
 # keypoints of queries, those of the map, and matches between them
@@ -77,7 +76,7 @@ def _open_matches(context: ResultContext) -> _Readers | None:
     with contextlib.suppress(DataError):
         drawn = set(queries.types("keypoints")) & set(mapping.types("keypoints"))
         if known := [name for name in queries.types("matches") if name in drawn]:
-            # those of a guided pyramid hold the others
+            # a guided pyramid includes the matches of its base type
             chosen = min(known, key=lambda name: (base_type(name) == name, name))
             return queries.keypoints(chosen), mapping.keypoints(chosen), queries.matches(chosen)
     return None
@@ -86,9 +85,9 @@ def _open_matches(context: ResultContext) -> _Readers | None:
 def _stored_matches(
     readers: _Readers | None, query: str, images: Sequence[str]
 ) -> dict[str, tuple[Points, Points]]:
-    found: dict[str, tuple[Points, Points]] = {}
+    matches: dict[str, tuple[Points, Points]] = {}
     if readers is None or query not in readers[0]:
-        return found
+        return matches
     keypoints = np.asarray(readers[0].read(query)[:, :2], np.float64)
     for image in images:
         if (query, image) in readers[2] and image in readers[1]:
@@ -96,8 +95,8 @@ def _stored_matches(
             map_keypoints = np.asarray(readers[1].read(image)[:, :2], np.float64)
             last = ids.max(axis=0, initial=-1)
             if len(ids) and last[0] < len(keypoints) and last[1] < len(map_keypoints):
-                found[image] = keypoints[ids[:, 0]], map_keypoints[ids[:, 1]]
-    return found
+                matches[image] = keypoints[ids[:, 0]], map_keypoints[ids[:, 1]]
+    return matches
 
 
 def _beside(
@@ -142,12 +141,12 @@ def fits_poses(
     map_camera: Camera,
     map_from_query: RigidTransform,
 ) -> NDArray[np.bool_]:
-    """Whether each match (M,) is within 8 pixels of its epipolar line in the query.
+    """Return a mask (M,) of matches within 8 pixels of their epipolar line in the query.
 
-    Where the two cameras have one centre every match fits.
+    If the cameras have the same centre, every match fits.
     """
     rays, map_rays = bearing_rays(query_camera, query_px), bearing_rays(map_camera, map_px)
-    # x_map^T [t] R x_query = 0: the plane of both centres and the map's ray, seen by the query
+    # x_map^T [t] R x_query = 0
     t = np.array(map_from_query.translation)
     normals = np.cross(map_rays, t) @ map_from_query.rotation_matrix()
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -156,8 +155,8 @@ def fits_poses(
 
 
 def mask_pictures(folders: Sequence[KaptureFolder]) -> list[Picture]:
-    """A few images that have a mask, with what it hides shaded."""
-    found = []
+    """Draw a few images with their masks shaded."""
+    pictures = []
     for folder in folders:
         masks = folder.root / "sensors" / "masks"
         names = [n for n in folder.read().image_names() if (masks / f"{n}.png").is_file()]
@@ -165,30 +164,30 @@ def mask_pictures(folders: Sequence[KaptureFolder]) -> list[Picture]:
             with contextlib.suppress(DataError):
                 small, _ = _read(folder, names[at], _SMALL_BOX)
                 mask = read_image_rgb(masks / f"{names[at]}.png")[:, :, 0]
-                shares = np.where(_sampled(mask, small.shape)[..., None] > 0, 0.0, 0.62)
+                shares = np.where(_nearest(mask, small)[..., None] > 0, 0.0, 0.62)
                 shaded = np.round(small + shares * (_SHADE - small)).astype(np.uint8)
                 facts = f"{100 * float(np.mean(mask == 0)):.1f} % masked"
-                found.append(Picture(names[at], facts, image_tag(shaded, names[at])))
-    return found
+                pictures.append(Picture(names[at], facts, image_tag(shaded, names[at])))
+    return pictures
 
 
 def depth_pictures(mapping: KaptureFolder | None) -> list[Picture]:
-    """A few map images beside their depth by stereo, yellow near to purple far."""
+    """Draw a few map images beside their depth by stereo."""
     import cv2
 
     from megloc_kapture.stages.scene import depth_records, read_depth
     from megloc_kapture.stages.stereo_depth import stereo_images
 
-    found: list[Picture] = []
+    pictures: list[Picture] = []
     with contextlib.suppress(DataError):
         names = [] if mapping is None else list(stereo_images(mapping))
         for at in spread(len(names), _NUM_IMAGES) if names else ():
             assert mapping is not None
             record = depth_records(mapping.read())[names[at]]
             small, _ = _read(mapping, names[at], _SMALL_BOX)
-            depth = _sampled(read_depth(mapping, record), small.shape)
+            depth = _nearest(read_depth(mapping, record), small)
             known = depth > 0
-            # of inverse depth, so that what is near keeps its shades
+            # inverse depth keeps the shades of near surfaces
             near = np.where(known, 1 / np.where(known, depth, 1), 0)
             low, high = np.quantile(near[known], (0.02, 0.98)) if known.any() else (0.0, 1.0)
             share = ((near - low) / max(high - low, 1e-12)).clip(0, 1)
@@ -196,12 +195,12 @@ def depth_pictures(mapping: KaptureFolder | None) -> list[Picture]:
             colors = cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[:, :, ::-1]
             shown = np.where(known[..., None], colors, np.uint8(46)).astype(np.uint8)
             facts = f"depth on {100 * float(known.mean()):.0f} % of the pixels"
-            found.append(Picture(names[at], facts, image_tag(np.hstack([small, shown]), names[at])))
-    return found
+            tag = image_tag(np.hstack([small, shown]), names[at])
+            pictures.append(Picture(names[at], facts, tag))
+    return pictures
 
 
 def image_tag(pixels: Pixels, name: str) -> Markup:
-    """``<img>`` of pixels (H, W, 3) RGB; ``name`` is read out where images are not shown."""
     height, width = pixels.shape[:2]
     return Markup('<img src="{}" width="{}" height="{}" alt="{}">').format(
         _jpeg(pixels), width, height, name
@@ -211,26 +210,26 @@ def image_tag(pixels: Pixels, name: str) -> Markup:
 def side_by_side(
     left: Pixels, right: Pixels, points: tuple[Points, Points], colors: list[str], name: str
 ) -> Markup:
-    """Two pictures in one ``<svg>``, matched pixels (M, 2) and (M, 2) joined by coloured lines."""
+    """Draw two images in one ``<svg>``, matched pixels (M, 2) and (M, 2) joined by lines."""
     shift = left.shape[1] + _GAP_PX
     width, height = shift + right.shape[1], max(left.shape[0], right.shape[0])
     parts = [f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(name)}">']
     for x, pixels in ((0, left), (shift, right)):
         size = f'width="{pixels.shape[1]}" height="{pixels.shape[0]}"'
         parts.append(f'<image x="{x}" {size} href="{_jpeg(pixels)}"/>')
-    # one path per colour: an element for every match would make the page three times longer
+    # one path per colour: an element per match makes the page three times longer
     for color in dict.fromkeys(colors):
         lines = "".join(
             f"M{x0:.1f} {y0:.1f}L{x1 + shift:.1f} {y1:.1f}"
-            for (x0, y0), (x1, y1), own in zip(*points, colors, strict=True)
-            if own == color
+            for (x0, y0), (x1, y1), c in zip(*points, colors, strict=True)
+            if c == color
         )
         parts.append(f'<path d="{lines}" stroke="{color}" stroke-width="0.9" fill="none"/>')
     return Markup("".join([*parts, "</svg>"]))
 
 
 def _read(folder: KaptureFolder, image: str, box: tuple[int, int]) -> tuple[Pixels, float]:
-    import cv2  # only a report with images waits for it
+    import cv2  # slow import
 
     pixels = read_image_rgb(folder.image_path(image))
     scale = min(box[0] / pixels.shape[1], box[1] / pixels.shape[0], 1.0)
@@ -238,13 +237,11 @@ def _read(folder: KaptureFolder, image: str, box: tuple[int, int]) -> tuple[Pixe
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8), scale
 
 
-def _sampled(values: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """The nearest values of a map (H, W) at a smaller size; between depths there is no surface."""
-    rows, columns = (
-        ((np.arange(size) + 0.5) * own / size).astype(np.int64)
-        for size, own in zip(shape, values.shape, strict=False)
-    )
-    return values[np.ix_(rows, columns)]
+def _nearest(values: NDArray[Any], pixels: Pixels) -> NDArray[Any]:
+    import cv2
+
+    size = pixels.shape[1], pixels.shape[0]
+    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT))
 
 
 def _jpeg(pixels: Pixels) -> str:

@@ -1,4 +1,4 @@
-"""Two directions of the world that span the ground, seen from above."""
+"""View of a map from above."""
 
 from __future__ import annotations
 
@@ -9,46 +9,41 @@ from numpy.typing import NDArray
 
 from megloc_kapture.geometry.poses import invert_quats, rotate
 
-# below this length of the mean "down" of unit vectors, cameras agree on no vertical
+# length of the mean "down" below which cameras agree on no vertical
 _MIN_AGREEMENT = 0.5
-# a vertical this close to a world axis is that axis: labels can then say x, y and z
+# a vertical this close to a world axis is snapped to it, for labels x, y and z
 _AXIS_COSINE = float(np.cos(np.deg2rad(15.0)))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TopView:
-    """Two directions of the world spanning the ground, seen from above.
-
-    Parameters
-    ----------
-    right, up : float64 (3,), what points right and up on the page; orthonormal.
-    labels : what to write at the two axes, without unit.
-    """
+    """Orthonormal directions (3,) of the world that are right and up on the page; axis labels."""
 
     right: NDArray[np.float64]
     up: NDArray[np.float64]
     labels: tuple[str, str]
 
     def project(self, centers: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points (N, 3) of the world on the page (N, 2)."""
         return np.stack([centers @ self.right, centers @ self.up], axis=1)
 
 
 def top_view(quats_wxyz: NDArray[np.float64], centers: NDArray[np.float64]) -> TopView:
     """Look down on cameras ``cam_from_world`` (N, 4) with centres (N, 3), N at least 1.
 
-    Vertical is the mean direction in which the cameras' images point down, for people hold
-    cameras upright; where the cameras do not agree on one, it is the direction in which their
-    centres spread least. A vertical close to a world axis is taken to be that axis.
+    Vertical is the mean downward direction of the images, or without agreement the direction in
+    which the centres spread least.
     """
     down = rotate(invert_quats(quats_wxyz), np.array([0.0, 1.0, 0.0])).mean(axis=0)
     length = float(np.linalg.norm(down))
     spread = centers - centers.mean(axis=0)
-    axes = np.linalg.svd(spread, full_matrices=True)[2] if len(centers) <= 3 else _axes(spread)
+    axes = np.linalg.eigh(spread.T @ spread)[1].T[::-1]
     upward = -down / length if length >= _MIN_AGREEMENT else _signed(axes[2])
     nearest = int(np.argmax(np.abs(upward)))
     if abs(upward[nearest]) >= _AXIS_COSINE:
-        return _along_axes(nearest, positive=bool(upward[nearest] > 0))
+        first, second = (nearest + 1) % 3, (nearest + 2) % 3
+        if upward[nearest] < 0:  # swapped, so that the page is not mirrored
+            first, second = second, first
+        return TopView(np.eye(3)[first], np.eye(3)[second], ("xyz"[first], "xyz"[second]))
     right = axes[0] - (axes[0] @ upward) * upward
     if np.linalg.norm(right) < 1e-6:  # the cameras stand on one vertical line
         right = np.eye(3)[int(np.argmin(np.abs(upward)))]
@@ -57,19 +52,5 @@ def top_view(quats_wxyz: NDArray[np.float64], centers: NDArray[np.float64]) -> T
     return TopView(right, np.cross(upward, right), ("along the map", "across the map"))
 
 
-def _axes(spread: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.linalg.eigh(spread.T @ spread)[1].T[::-1], dtype=np.float64)
-
-
 def _signed(direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same line with its largest component positive, for a reproducible page."""
     return direction if direction[int(np.argmax(np.abs(direction)))] > 0 else -direction
-
-
-def _along_axes(vertical: int, *, positive: bool) -> TopView:
-    first, second = ((1, 2), (2, 0), (0, 1))[vertical]
-    names = "xyz"
-    if not positive:  # seen from the other side: swap to keep the page right-handed
-        first, second = second, first
-    world = np.eye(3)
-    return TopView(world[first], world[second], (names[first], names[second]))

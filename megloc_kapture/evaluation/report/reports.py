@@ -6,7 +6,7 @@ import base64
 import contextlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, is_dataclass
 from itertools import groupby
 from pathlib import Path
 from textwrap import fill
@@ -18,35 +18,22 @@ from pydantic import BaseModel
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.pose_files import package_versions
-from megloc_kapture.evaluation.report import tables
+from megloc_kapture.evaluation.report import content
 from megloc_kapture.evaluation.report.queries import (
     ShownQuery,
     StoredInliers,
     shown_queries,
     worst_queries,
 )
-from megloc_kapture.evaluation.report.wording import (
-    CONFIDENT,
-    FEW,
-    INTERVALS,
-    agreement_sentence,
-    bounds,
-    comparison_sentences,
-    confidence_sentences,
-    consistency_sentence,
-    covariance_sentence,
-    criterion,
-    format_degrees,
-    format_interval,
-    format_metres,
-    format_percent,
-    method_sentence,
-    notes,
-)
 from megloc_kapture.evaluation.results import Poses, first_map_poses
-from megloc_kapture.evaluation.scoring import Evaluation
+from megloc_kapture.evaluation.scoring import Evaluation, Reported
 from megloc_kapture.evaluation.statistics import Comparison, MedianDifference, PairedTest
-from megloc_kapture.evaluation.without_truth import CAUTION, ResultWithoutTruth, WithoutTruth
+from megloc_kapture.evaluation.without_truth import (
+    CAUTION,
+    AgreementRow,
+    WithoutTruth,
+    inliers_quartiles,
+)
 from megloc_kapture.io.files import write_bytes, write_json
 from megloc_kapture.values import MIN_CONFIDENCE
 
@@ -61,31 +48,22 @@ AGREEMENT_TEXT = "agreement.txt"
 PER_QUERY_CSV = "per_query.csv"
 REPORT_HTML, VIEW_HTML = "report.html", "view.html"
 _WIDTH = 92
-# more rows than anybody reads; the CSV beside the report has them all
+# rows of queries; per_query.csv has them all
 _MAX_ROWS = 500
-
-AnyReported = Evaluation | Comparison | WithoutTruth
-_Results = Sequence[Evaluation] | Sequence[ResultWithoutTruth]
 
 
 def write_report(
     folder: Path | str,
-    reported: AnyReported,
+    reported: Reported,
     *,
     map_poses: Poses | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> dict[str, Path]:
-    """Write the files of a report, each atomically; returns name -> path.
+    """Write the files of a report and return name -> path.
 
-    With truth these are recall.json, recall.txt, per_query.csv and report.html; without truth
-    agreement.json and agreement.txt take the place of recall's. A single result has the 3D view
-    beside them, view.html.
-
-    Parameters
-    ----------
-    map_poses : ``cam_from_world`` of the map's images, for the view from above; by default those
-        of the first result that has a map.
-    provenance : options, preset, inputs: plain JSON data, shown at the end with the versions.
+    These are recall.json and recall.txt (without truth agreement.json and agreement.txt),
+    per_query.csv, report.html, and for a single result view.html. The map's poses are by default
+    those of the first result with a map; ``provenance`` is JSON data, shown at the end.
     """
     name = "agreement" if isinstance(reported, WithoutTruth) else "recall"
     view = _view(reported)
@@ -95,7 +73,7 @@ def write_report(
     texts = {f"{name}.txt": report_text(reported), REPORT_HTML: page}
     if view is not None:
         texts[VIEW_HTML] = view
-    # pandas reads back the very floats; what is infinite is an empty cell
+    # pandas writes floats that read back exactly; infinite ones become empty cells
     table = reported.to_pandas().replace([np.inf, -np.inf], np.nan)
     texts[PER_QUERY_CSV] = table.to_csv(lineterminator="\n")
     paths = {file: Path(folder) / file for file in (*texts, f"{name}.json")}
@@ -105,106 +83,124 @@ def write_report(
     return paths
 
 
-def report_text(reported: AnyReported) -> str:
-    parts = _text_without_truth(reported) if isinstance(reported, WithoutTruth) else _text(reported)
+def report_text(reported: Reported) -> str:
+    has_label = isinstance(reported, Evaluation) and reported.label
+    parts = [reported.evaluations[0].label] if has_label else []
+    for text, table in _facts(reported):
+        lines = [_wrapped(line) for line in text.splitlines()]
+        parts.append("\n".join(lines if table is None else [*lines, content.as_text(table)]))
     return "\n\n".join(parts) + "\n"
 
 
-def _text(reported: Evaluation | Comparison) -> list[str]:
-    several = isinstance(reported, Comparison)
-    evaluations = reported.evaluations if isinstance(reported, Comparison) else (reported,)
-    parts = [] if several or not evaluations[0].label else [evaluations[0].label]
-    thresholds = bounds(evaluations[0].thresholds)
-    parts.append(f"recall (%) at {thresholds}\n{_wrapped(criterion(evaluations[0]))}")
-    parts.append(tables.as_text(tables.recall_table(evaluations)))
+# text and table of a report, either may be empty; the page adds figures and pictures
+_Fact = tuple[str, "DataFrame | None"]
+
+
+def _facts(reported: Reported) -> list[_Fact]:
+    if isinstance(reported, WithoutTruth):
+        return _facts_without_truth(reported)
+    evaluations, several = reported.evaluations, isinstance(reported, Comparison)
+    facts: list[_Fact] = []
+    thresholds, criterion = evaluations[0].thresholds, content.criterion(evaluations[0])
+    facts.append((f"recall (%) at {content.bounds(thresholds)}\n{criterion}", None))
+    facts.append(("", content.recall_table(evaluations)))
     if by_center := [e.by_center for e in evaluations if e.by_center is not None]:
-        table = tables.as_text(tables.recall_table(by_center))
-        parts.append(f"the same by the distance of the camera centres\n{table}")
-    parts.append(f"{INTERVALS}\n{tables.as_text(tables.interval_table(evaluations))}")
+        text = "the same by the distance of the camera centres"
+        facts.append((text, content.recall_table(by_center)))
+    facts.append((content.INTERVALS, content.interval_table(evaluations)))
     for evaluation in evaluations:
         whose = f" of {evaluation.label}" if several else ""
-        if (confident := tables.confident_table(evaluation)) is not None:
-            parts.append(f"{CONFIDENT}{whose}\n{tables.as_text(confident)}")
+        if (confident := content.confident_table(evaluation)) is not None:
+            facts.append((f"{content.CONFIDENT}{whose}", confident))
         if (confidence := evaluation.confidence) is not None:
-            found = "; ".join(confidence_sentences(confidence, evaluation.thresholds[-1]))
-            parts.append(_wrapped(f"Confidence{whose}: {found}."))
+            sentences = content.confidence_sentences(confidence, thresholds[-1])
+            facts.append((f"Confidence{whose}: {'; '.join(sentences)}.", None))
         if evaluation.covariance is not None:
-            found = covariance_sentence(evaluation.covariance)
-            parts.append(_wrapped(f"Covariance{whose}: {found}."))
+            sentence = content.covariance_sentence(evaluation.covariance)
+            facts.append((f"Covariance{whose}: {sentence}.", None))
     if isinstance(reported, Comparison):
-        parts.append("\n".join(_wrapped(text) for text, _ in comparison_sentences(reported)))
-        parts.append(_wrapped(method_sentence(reported)))
+        sentences = content.comparison_sentences(reported)
+        facts += [("\n".join(sentences), None), (content.method_sentence(reported), None)]
     for evaluation in evaluations:
         on = f" on {evaluation.label}" if several else ""
-        parts += [_wrapped(f"Note{on}: {note}.") for note in notes(evaluation)]
-    return parts
+        facts += [(f"Note{on}: {note}.", None) for note in content.notes(evaluation)]
+    return facts
 
 
-def _text_without_truth(found: WithoutTruth) -> list[str]:
-    parts = [f"{_wrapped(f'No recall: {found.statement}')}\n{_wrapped(CAUTION)}"]
-    for result in found.results:
-        parts.append(f"{result.label}\n{tables.as_text(tables.result_table(result))}")
-    for _, group in groupby(found.agreement, key=lambda row: (row.first, row.second)):
+def _facts_without_truth(reported: WithoutTruth) -> list[_Fact]:
+    facts: list[_Fact] = [(f"No recall: {reported.statement}\n{CAUTION}", None)]
+    facts += [(e.label, content.result_table(e)) for e in reported.evaluations]
+    for _, group in groupby(reported.agreement, key=lambda row: (row.first, row.second)):
         rows = list(group)
-        what = (
+        heading = (
             "% of all queries where both have a pose and the two are at most "
-            f"{bounds(found.thresholds)} apart"
+            f"{content.bounds(reported.thresholds)} apart"
         )
-        table = tables.as_text(tables.agreement_table(found, rows))
-        parts.append(f"{_wrapped(what)}\n{table}\n{agreement_sentence(rows[-1], found)}")
-    return parts
+        facts.append((heading, content.agreement_table(reported, rows)))
+        facts.append((content.agreement_sentence(rows[-1], reported), None))
+    return facts
 
 
 def _wrapped(text: str) -> str:
     return fill(text, _WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
-def report_data(reported: AnyReported) -> dict[str, Any]:
+def report_data(reported: Reported) -> dict[str, Any]:
     if isinstance(reported, Evaluation):
         return _recall_data(reported)
+    labels = [evaluation.label for evaluation in reported.evaluations]
+
+    def named(row: AgreementRow | PairedTest | MedianDifference) -> dict[str, Any]:
+        return {**asdict(row), "first": labels[row.first], "second": labels[row.second]}
+
     if isinstance(reported, WithoutTruth):
-        labels = [result.label for result in reported.results]
         return {
             "statement": reported.statement,
             "caution": CAUTION,
             "results": [
-                {"label": result.label, "rows": [asdict(row) for row in result.rows]}
-                for result in reported.results
+                {"label": evaluation.label, "rows": _counts(evaluation)}
+                for evaluation in reported.evaluations
             ],
-            "agreement": [
-                {**asdict(row), "first": labels[row.first], "second": labels[row.second]}
-                for row in reported.agreement
-            ],
+            "agreement": [named(row) for row in reported.agreement],
         }
-    labels = [evaluation.label for evaluation in reported.evaluations]
-
-    def named(test: PairedTest | MedianDifference) -> dict[str, Any]:
-        pair = {"first": labels[test.first], "second": labels[test.second]}
-        return {**asdict(test), **pair, "real": test.is_real}
-
+    assert isinstance(reported, Comparison)
     return {
         "results": [_recall_data(evaluation) for evaluation in reported.evaluations],
         "comparison": {
-            "method": method_sentence(reported),
-            "sentences": [sentence for sentence, _ in comparison_sentences(reported)],
-            "tests": [named(test) for test in reported.tests],
-            "medians": [named(median) for median in reported.medians],
+            "method": content.method_sentence(reported),
+            "sentences": content.comparison_sentences(reported),
+            "tests": [{**named(test), "real": test.is_real} for test in reported.tests],
+            "medians": [{**named(median), "real": median.is_real} for median in reported.medians],
         },
     }
 
 
+def _counts(evaluation: Evaluation) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": row.name,
+            "num_queries": row.num_queries,
+            "num_localized": row.num_localized,
+            "num_fallback": row.num_fallback,
+            "num_missing": row.num_missing,
+            "inliers_quartiles": inliers_quartiles(evaluation, row.name),
+        }
+        for row in evaluation.rows
+    ]
+
+
 def _recall_data(evaluation: Evaluation) -> dict[str, Any]:
-    confidence, by_center = evaluation.confidence, evaluation.by_center
-    covariance = evaluation.covariance
+    confidence, covariance = evaluation.confidence, evaluation.covariance
+    by_center = evaluation.by_center
     return {
         "label": evaluation.label,
-        "criterion": criterion(evaluation),
+        "criterion": content.criterion(evaluation),
         "thresholds": evaluation.thresholds,
         "rows": evaluation.rows,
-        "notes": notes(evaluation),
-        **({} if confidence is None else {"confidence": asdict(confidence)}),
+        "notes": content.notes(evaluation),
+        **({} if confidence is None else {"confidence": confidence}),
         "rows_above_min_confidence": evaluation.rows_above(MIN_CONFIDENCE),
-        **({} if covariance is None else {"covariance": asdict(covariance)}),
+        **({} if covariance is None else {"covariance": covariance}),
         "without_truth": evaluation.without_truth,
         "not_scored": evaluation.not_scored,
         **({} if by_center is None else {"rows_by_center": by_center.rows}),
@@ -212,9 +208,11 @@ def _recall_data(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def plain(data: Any) -> Any:
-    """Data for JSON: models as mappings, and None for numbers that are not finite."""
+    """Convert data for JSON; numbers that are not finite become None."""
     if isinstance(data, BaseModel):
         return data.model_dump(mode="json")
+    if is_dataclass(data) and not isinstance(data, type):
+        return plain(asdict(data))
     if isinstance(data, Mapping):
         return {key: plain(value) for key, value in data.items()}
     if isinstance(data, list | tuple):
@@ -224,12 +222,15 @@ def plain(data: Any) -> Any:
 
 @dataclass
 class Section:
-    """A card of the page: paragraphs, then tables and figures in their order, then pictures."""
+    """A card of the page."""
 
     heading: str
     paragraphs: list[str] = field(default_factory=list)
     body: list[Markup] = field(default_factory=list)
     pictures: Sequence[Picture] = ()
+
+    def text(self, text: str) -> None:
+        self.body.append(Markup("<p>{}</p>").format(text))
 
     def table(self, frame: DataFrame | None) -> None:
         if frame is not None:
@@ -246,28 +247,27 @@ class Section:
 
 
 def render_report(
-    reported: AnyReported,
+    reported: Reported,
     *,
     map_poses: Poses | None = None,
     provenance: Mapping[str, Any] | None = None,
     has_view: bool = False,
 ) -> str:
-    """Render the page alone; it is self-contained, and the same arguments give the same text."""
-    results = _results(reported)
+    """Render the page; it is self-contained and deterministic."""
+    evaluations = reported.evaluations
     if map_poses is None:
-        map_poses = first_map_poses(result.context for result in results)
-    if isinstance(reported, WithoutTruth):
-        sections = _sections_without_truth(reported)
-    else:
-        sections = _sections(reported)
-    for result in results:
-        sections += _sections_of(result, map_poses, several=len(results) > 1)
-    # only a report with images waits for what reads them
+        map_poses = first_map_poses(evaluation.context for evaluation in evaluations)
+    sections = [_summary(reported)]
+    if not isinstance(reported, WithoutTruth):
+        sections.append(_error_curves(evaluations))
+    for evaluation in evaluations:
+        sections += _sections_of(evaluation, map_poses, several=len(evaluations) > 1)
+    # slow import
     from megloc_kapture.evaluation.report.gallery import depth_pictures, mask_pictures
 
-    context, shown = results[0].context, "What masks hide is shaded."
+    context, shaded = evaluations[0].context, "Masked regions are shaded."
     sections += [
-        Section("Masks", [shown], pictures=mask_pictures(context.masked)),
+        Section("Masks", [shaded], pictures=mask_pictures(context.masked)),
         Section(
             "Depth of map images by stereo",
             ["Yellow is near, purple is far, dark is unknown."],
@@ -276,7 +276,7 @@ def render_report(
     ]
     values = dict(provenance or {})
     return template("report.html").render(
-        title=" and ".join(result.label for result in results) or "Evaluation",
+        title=" and ".join(evaluation.label for evaluation in evaluations) or "Evaluation",
         numbers=_numbers(reported) if isinstance(reported, Evaluation) else [],
         view=VIEW_HTML if has_view else "",
         steps=values.pop("steps", []),
@@ -287,8 +287,7 @@ def render_report(
 
 
 def template(name: str) -> Template:
-    """A template of pages; values are escaped, and a missing value is an error."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined  # only a page waits for it
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # slow import
 
     environment = Environment(
         loader=PackageLoader("megloc_kapture.evaluation.report"),
@@ -300,158 +299,112 @@ def template(name: str) -> Template:
     return environment.get_template(name)
 
 
-def _results(reported: AnyReported) -> _Results:
-    if isinstance(reported, Evaluation):
-        return (reported,)
-    return reported.results if isinstance(reported, WithoutTruth) else reported.evaluations
-
-
 def _numbers(evaluation: Evaluation) -> list[tuple[str, str, str]]:
     overall = evaluation.row()
-    shown = [
+    numbers = [
         (
-            f"{format_percent(at.recall)} %",
+            f"{content.format_percent(at.recall)} %",
             f"within {at.threshold}",
-            f"95 % interval {format_interval(at)}",
+            f"95 % interval {content.format_interval(at)}",
         )
         for at in overall.recall
     ]
     if not np.isfinite(overall.median_position_m):
-        return [*shown, ("none", "median", "most queries lack a pose")]
-    degrees = f"{format_degrees(overall.median_angle_deg)} deg"
-    return [*shown, (f"{format_metres(overall.median_position_m)} m", "median", degrees)]
+        return [*numbers, ("none", "median", "most queries lack a pose")]
+    degrees = f"{content.format_degrees(overall.median_angle_deg)} deg"
+    metres = f"{content.format_metres(overall.median_position_m)} m"
+    return [*numbers, (metres, "median", degrees)]
 
 
-def _sections(reported: Evaluation | Comparison) -> list[Section]:
+def _summary(reported: Reported) -> Section:
+    section = Section("Summary" if isinstance(reported, WithoutTruth) else "Recall")
+    for text, table in _facts(reported):
+        for line in text.splitlines():
+            section.text(line)
+        section.table(table)
+    return section
+
+
+def _error_curves(evaluations: Sequence[Evaluation]) -> Section:
     from megloc_kapture.evaluation.report import figures  # loads matplotlib
 
-    several = isinstance(reported, Comparison)
-    evaluations = reported.evaluations if isinstance(reported, Comparison) else (reported,)
-    overall = evaluations[0].row()
-    head = f"{overall.num_queries} queries. {criterion(evaluations[0])}"
-    sections = [Section("", [head])]
-    if isinstance(reported, Comparison):
-        sentences = comparison_sentences(reported)
-        item = Markup('<li class="{}">{}</li>')
-        items = (item.format("real" if real else "", text) for text, real in sentences)
-        listed = Markup('<ul class="said">{}</ul>').format(Markup("").join(items))
-        real = Section("Is the difference real?", [method_sentence(reported)], [listed])
-        sections.append(real)
-    recall = Section("Recall", [f"At {bounds(evaluations[0].thresholds)}."])
-    recall.table(tables.recall_table(evaluations))
-    if by_center := [e.by_center for e in evaluations if e.by_center is not None]:
-        recall.body.append(Markup("<p>The same by the distance of the camera centres:</p>"))
-        recall.table(tables.recall_table(by_center))
-    recall.body.append(Markup("<p>{}:</p>").format(INTERVALS))
-    recall.table(tables.interval_table(evaluations))
-    for evaluation in evaluations:
-        on = f"{evaluation.label}: " if several else ""
-        note = Markup('<p class="note">{}</p>')
-        recall.body += [note.format(_sentence(on + text)) for text in notes(evaluation)]
-    curves = (
+    explanation = (
         "Share of all queries at or below an error, each error by itself; queries without a pose "
         "keep the curves below 100 %. Dotted: the thresholds."
     )
-    errors = Section("How large the errors are", [curves])
-    errors.figure(figures.error_curves(evaluations))
-    return [*sections, recall, errors]
+    section = Section("How large the errors are", [explanation])
+    section.figure(figures.error_curves(evaluations))
+    return section
 
 
-def _sections_without_truth(found: WithoutTruth) -> list[Section]:
-    sections = [Section("", [f"No recall: {found.statement} {CAUTION}"])]
-    for result in found.results:
-        sections.append(Section(result.label))
-        sections[-1].table(tables.result_table(result))
-    if found.agreement:
-        what = (
-            "Share of all queries where both results have a pose and the two are at most "
-            f"{bounds(found.thresholds)} apart."
-        )
-        whole = [agreement_sentence(row, found) for row in found.agreement if row.name == "all"]
-        sections.append(Section("Do they agree?", [what, *whole]))
-        sections[-1].table(tables.agreement_table(found, found.agreement))
-    return sections
-
-
-def _sections_of(
-    result: Evaluation | ResultWithoutTruth, map_poses: Poses, *, several: bool
-) -> list[Section]:
+def _sections_of(evaluation: Evaluation, map_poses: Poses, *, several: bool) -> list[Section]:
     from megloc_kapture.evaluation.report import figures, gallery
 
-    whose = f"{result.label}: " if several else ""
-    context, queries = result.context, shown_queries(result)
-    evaluation = result if isinstance(result, Evaluation) else None
-    views = figures.views_from_above(queries, map_poses, context.frames, context.unit)
+    whose = f"{evaluation.label}: " if several else ""
+    context, queries = evaluation.context, shown_queries(evaluation)
     above = Section(f"{whose}From above")
-    if evaluation is not None:
+    if evaluation.truth:
         above.paragraphs.append("Red lines lead from the true camera centre to the estimate.")
+    views = figures.views_from_above(queries, map_poses, context.frames, context.unit)
     for frame, svg in views.items():
         above.body += [Markup("<h3>{}</h3>").format(frame)] if frame else []
         above.figure(svg)
-    found = [above]
-    if evaluation is not None:
+    sections = [above]
+    if evaluation.truth:
         inliers = Section(
             f"{whose}Error against inliers",
             ["Errors should fall to the right: many inliers with a large error are a wrong place."],
         )
         inliers.figure(figures.errors_against_inliers(evaluation))
-        found += [inliers, _confidence(evaluation, whose)]
-    refined = Section(f"{whose}What refinement changed", ["Of accepted poses; medians."])
-    refined.paragraphs += [_sentence(consistency_sentence(row)) for row in context.consistency]
-    refined.table(tables.refinement_table(result))
-    which = "estimated" if evaluation is None else "true"
+        sections += [inliers, _confidence(evaluation, whose)]
+    refined = Section(f"{whose}Changes by refinement", ["Of accepted poses; medians."])
+    refined.paragraphs += [
+        _sentence(content.consistency_sentence(row)) for row in context.consistency
+    ]
+    refined.table(content.refinement_table(evaluation))
+    which = "true" if evaluation.truth else "estimated"
     lines = (
         f"Left the query, right the candidate with most matches. Green matches agree with the "
         f"{which} pose, red ones are more than 8 pixels off their epipolar line."
     )
     pictures = gallery.worst_pictures(worst_queries(queries), context, map_poses)
-    found += [refined, Section(f"{whose}The worst queries", [lines], pictures=pictures)]
-    if evaluation is not None and not several:
-        found.append(_query_list(evaluation, queries))
-    return found
+    sections += [refined, Section(f"{whose}The worst queries", [lines], pictures=pictures)]
+    if evaluation.truth and not several:
+        sections.append(_query_list(evaluation, queries))
+    return sections
 
 
 def _query_list(evaluation: Evaluation, queries: Sequence[ShownQuery]) -> Section:
     section = Section("Queries, the worst first")
     if len(queries) > _MAX_ROWS:
         section.paragraphs.append(f"The worst {_MAX_ROWS} of {len(queries)}.")
-    section.table(tables.query_table(evaluation, queries[:_MAX_ROWS]))
+    section.table(content.query_table(evaluation, queries[:_MAX_ROWS]))
     return section
 
 
 def _confidence(evaluation: Evaluation, whose: str) -> Section:
     from megloc_kapture.evaluation.report import figures
 
-    section = Section(f"{whose}Confidence")
-    confidence = evaluation.confidence
-    if confidence is not None:
-        sentences = confidence_sentences(confidence, evaluation.thresholds[-1])
-        section.paragraphs += map(_sentence, sentences)
-    if evaluation.covariance is not None:
-        section.paragraphs.append(_sentence(covariance_sentence(evaluation.covariance)))
-    if (confident := tables.confident_table(evaluation)) is not None:
-        section.body.append(Markup("<p>{}:</p>").format(CONFIDENT))
-        section.table(confident)
-    if confidence is not None and confidence.num_poses >= FEW:
-        explained = (
-            "Left: where confidences can be trusted, the dots are on the dotted line. Right: poses "
-            "are accepted from the most confident on."
-        )
-        section.body.append(Markup("<p>{}</p>").format(explained))
+    explanation = (
+        "Left: where confidences can be trusted, the dots are on the dotted line. Right: poses are "
+        "accepted from the most confident on."
+    )
+    section, confidence = Section(f"{whose}Confidence", [explanation]), evaluation.confidence
+    if confidence is not None and confidence.num_poses >= content.FEW:
         section.figure(figures.confidence_curves(confidence))
     return section
 
 
-def _view(reported: AnyReported) -> str | None:
-    from megloc_kapture.evaluation.report.scene import render_view, scene_of
+def _view(reported: Reported) -> str | None:
+    from megloc_kapture.evaluation.view import render_view, scene_of
 
-    results = _results(reported)
-    if len(results) > 1:
+    if len(reported.evaluations) > 1:
         return None
-    # a report without a view is better than none; `megloc view` says what is broken
+    (evaluation,) = reported.evaluations
+    # a report without a view is better than none; `megloc view` reports what is broken
     with contextlib.suppress(DataError):
-        stored = StoredInliers(results[0].context)
-        scene = scene_of(results[0].label or "Evaluation", stored, shown_queries(results[0]))
+        inliers = StoredInliers(evaluation.context)
+        scene = scene_of(evaluation.label or "Evaluation", inliers, shown_queries(evaluation))
         return None if scene is None else render_view(scene)
     return None
 

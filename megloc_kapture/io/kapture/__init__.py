@@ -5,6 +5,7 @@ from megloc_kapture.io.kapture.features import (
     FeatureKind,
     FeatureReader,
     FeatureWriter,
+    KaptureVectors,
     feature_folder,
 )
 from megloc_kapture.io.kapture.folder import KaptureFolder
@@ -16,15 +17,15 @@ from megloc_kapture.io.kapture.matches import (
     read_pairs,
     write_pairs,
 )
-from megloc_kapture.io.kapture.observations import Observations, write_observations
 from megloc_kapture.io.kapture.points import (
+    Observations,
     read_point_covariances,
+    write_observations,
     write_ply,
     write_point_covariances,
     write_points3d,
 )
 from megloc_kapture.io.kapture.sensors import unit_quaternion, write_sensors
-from megloc_kapture.io.kapture.vectors import KaptureVectors
 
 __all__ = [
     "FeatureConfig",

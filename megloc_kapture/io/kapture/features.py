@@ -8,18 +8,26 @@ Arrays are raw, little-endian, row-major, without a header.
 
 from __future__ import annotations
 
+import os
 import re
+import tarfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError, OutputError
-from megloc_kapture.io.files import check_component, named, reading, write_bytes
-from megloc_kapture.io.kapture.blobs import BlobSource, BlobWriter, FolderBlobs, TarBlobs
+from megloc_kapture.io.files import (
+    check_component,
+    check_relative,
+    named,
+    reading,
+    safe_join,
+    write_bytes,
+)
 from megloc_kapture.io.kapture.format import check_columns, check_field, format_table, read_rows
 
 FeatureKind = Literal["keypoints", "descriptors", "global_features", "matches"]
@@ -41,6 +49,8 @@ DTYPES: dict[str, np.dtype[Any]] = {
     name: np.dtype(code)
     for name, code in (("float32", "<f4"), ("float64", "<f8"), ("int32", "<i4"), ("uint8", "u1"))
 }
+_ROWS_AT_ONCE = 256  # a chunk fits the processor's cache
+_ROUNDING = 4e-7  # rows whose squared length is one up to this stay unchanged
 
 
 @dataclass(frozen=True)
@@ -126,11 +136,113 @@ def format_config(kind: ArrayKind, config: FeatureConfig) -> bytes:
     return format_table(CONFIG_HEADER[kind], [row])
 
 
+# ------------------------------------------------------------------------------------ files
+
+
+class FolderBlobs:
+    """Blobs as files below ``folder`` with the given suffix."""
+
+    def __init__(self, folder: Path, suffix: str) -> None:
+        self._folder, self._suffix = folder, suffix
+
+    def names(self) -> list[str]:
+        found = []
+        for folder, _, files in os.walk(self._folder):
+            below = folder[len(str(self._folder)) :].lstrip("/")
+            prefix = f"{below}/" if below else ""
+            found += [prefix + name for name in files if name.endswith(self._suffix)]
+        return sorted(found)
+
+    def __contains__(self, name: str) -> bool:
+        try:
+            return os.path.isfile(f"{self._folder}/{check_relative(name)}")
+        except DataError:
+            return False
+
+    def size(self, name: str) -> int:
+        path = safe_join(self._folder, name)
+        with reading(path):
+            return path.stat().st_size
+
+    def read(self, name: str) -> bytes:
+        path = f"{self._folder}/{check_relative(name)}"  # much faster than a Path
+        with reading(path), open(path, "rb", buffering=0) as file:
+            return file.readall()
+
+    def where(self, name: str) -> str:
+        return str(self._folder / name)
+
+
+class TarBlobs:
+    """Blobs in an uncompressed tar, kapture's form for large sets; thread-safe."""
+
+    def __init__(self, path: Path, suffix: str) -> None:
+        self._path = path
+        self._index: dict[str, tuple[int, int]] = {}
+        if path.stat().st_size == 0:
+            return  # kapture creates an empty tar by touch
+        try:
+            with named(path), tarfile.open(path, "r:") as tar:
+                for member in tar:
+                    if member.isreg() and member.name.endswith(suffix):
+                        name = check_relative(member.name.removeprefix("./"))
+                        self._index[name] = (member.offset_data, member.size)
+        except (tarfile.TarError, OSError, ValueError) as error:
+            raise DataError(f"not a readable uncompressed tar ({error})", path=path) from error
+
+    def names(self) -> list[str]:
+        return sorted(self._index)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._index
+
+    def size(self, name: str) -> int:
+        return self._index[name][1]
+
+    def read(self, name: str) -> bytes:
+        offset, size = self._index[name]
+        with reading(self._path), open(self._path, "rb", buffering=0) as file:
+            content = os.pread(file.fileno(), size, offset)
+        if len(content) < size:
+            raise DataError(f"truncated at member {name!r}", path=self._path)
+        return content
+
+    def where(self, name: str) -> str:
+        return f"{self._path}[{name}]"
+
+
+BlobSource: TypeAlias = FolderBlobs | TarBlobs
+
+
+class BlobWriter:
+    """Atomic writer of blobs below a folder; a context manager."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def has(self, name: str) -> bool:
+        return safe_join(self._folder, name).is_file()
+
+    def put(self, name: str, content: bytes) -> Path:
+        path = safe_join(self._folder, name)
+        write_bytes(path, content)
+        return path
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
 def blob_sources(folder: Path, kind: FeatureKind) -> list[BlobSource]:
     """Return the tar of a type's folder, if any, and its loose files."""
     files = FolderBlobs(folder, SUFFIX[kind])
     tar = folder / f"{kind}.tar"
     return [TarBlobs(tar, SUFFIX[kind]), files] if tar.is_file() else [files]
+
+
+# --------------------------------------------------------------------------------- reading
 
 
 class FeatureReader:
@@ -204,6 +316,50 @@ class FeatureReader:
         raise DataError(f"no {self.kind} of type {self.type_name!r} for image {image!r}")
 
 
+class KaptureVectors:
+    """Global features of images as blocks of unit rows, without a cache; zero rows stay zero."""
+
+    def __init__(self, reader: FeatureReader, images: Sequence[str]) -> None:
+        self._reader = reader
+        self._images = images
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    @property
+    def dimension(self) -> int:
+        return self._reader.config.dsize
+
+    def part(self, start: int, stop: int) -> KaptureVectors:
+        return KaptureVectors(self._reader, self._images[start:stop])
+
+    def read(
+        self, start: int, stop: int, out: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
+        """Read unit rows of the images ``start`` to ``stop``, (stop - start, D), into ``out``."""
+        images = self._images[start:stop]
+        rows = np.empty((len(images), self.dimension), np.float32) if out is None else out
+        for begin in range(0, len(images), _ROWS_AT_ONCE):
+            chunk = rows[begin : begin + _ROWS_AT_ONCE]
+            some = images[begin : begin + _ROWS_AT_ONCE]
+            with np.errstate(over="ignore"):  # overflow of float32 is refused below
+                for row, image in zip(chunk, some, strict=True):
+                    row[:] = self._reader.read_unchecked(image)
+            with np.errstate(over="ignore", invalid="ignore"):
+                squared = np.vecdot(chunk, chunk).astype(np.float64)
+            for k in np.flatnonzero(~((squared > 1e-24) & (squared < 1e30))).tolist():
+                squared[k] = np.square(chunk[k], dtype=np.float64).sum()
+                if not np.isfinite(squared[k]):
+                    raise DataError("not all values are finite", path=self._reader.where(some[k]))
+            scaled = np.flatnonzero((squared > 0) & (np.abs(squared - 1) > _ROUNDING))
+            if len(scaled):
+                chunk[scaled] /= np.sqrt(squared[scaled])[:, None]
+        return rows
+
+
+# --------------------------------------------------------------------------------- writing
+
+
 class FeatureWriter(BlobWriter):
     """Writer for the features of one kind and type, a context manager; files are atomic.
 
@@ -234,15 +390,9 @@ class FeatureWriter(BlobWriter):
 
     def write(self, image: str, array: ArrayLike) -> tuple[Path, Path]:
         """Write an image's array, (N, dsize) or (dsize,); return the configuration and its file."""
-        given = np.asarray(array)
-        shape = given.shape
-        dsize = self.config.dsize
-        if self.kind == "global_features":
-            if shape not in ((dsize,), (1, dsize)):
-                raise ValueError(f"expected shape ({dsize},), got {shape}")
-        elif len(shape) != 2 or shape[1] != dsize:
-            raise ValueError(f"expected shape (N, {dsize}), got {shape}")
-        if not np.can_cast(given.dtype, self.config.dtype, casting="same_kind"):
-            raise ValueError(f"cannot store {given.dtype} as {self.config.dtype.name}")
-        content = np.ascontiguousarray(given, dtype=self.config.dtype).tobytes()
+        rows = np.ascontiguousarray(array, dtype=self.config.dtype)
+        size = self.config.dsize
+        if rows.shape[-1:] != (size,) or (self.kind == "global_features" and rows.size != size):
+            raise ValueError(f"expected rows of {size} numbers, got {rows.shape}")
+        content = rows.tobytes()
         return self._path, self.put(check_field(image) + SUFFIX[self.kind], content)

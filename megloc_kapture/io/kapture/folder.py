@@ -22,8 +22,7 @@ from megloc_kapture.io.kapture.features import (
 )
 from megloc_kapture.io.kapture.format import KaptureData
 from megloc_kapture.io.kapture.matches import MatchesReader
-from megloc_kapture.io.kapture.observations import Observations, read_observations
-from megloc_kapture.io.kapture.points import read_points3d
+from megloc_kapture.io.kapture.points import Observations, read_observations, read_points3d
 from megloc_kapture.io.kapture.sensors import read_kapture_data
 
 _ARRAY_KINDS: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_features")
@@ -225,21 +224,16 @@ class KaptureFolder:
             for index, image in enumerate(observations.image_names):
                 if image in keypoints:
                     limit[index] = keypoints.length(image)
-        past_points = observations.point_ids >= num_points
-        wrong = past_points | (observations.keypoint_ids >= limit[observations.image_ids])
-        if not wrong.any():
-            return
-        first = int(np.flatnonzero(wrong)[0])
-        point = int(observations.point_ids[first])
-        index = int(observations.image_ids[first])
-        image = observations.image_names[index]
-        keypoint = int(observations.keypoint_ids[first])
-        problem = (
-            f"there are {num_points} points"
-            if past_points[first]
-            else f"keypoint {keypoint}, but there are {limit[index]} of type {keypoints_type!r}"
-        )
-        raise DataError(f"point {point} of {image!r}: {problem}", path=path)
+        wrong = observations.point_ids >= num_points
+        wrong |= observations.keypoint_ids >= limit[observations.image_ids]
+        for first in np.flatnonzero(wrong)[:1].tolist():
+            image = observations.image_ids[first]
+            raise DataError(
+                f"point {observations.point_ids[first]}, keypoint "
+                f"{observations.keypoint_ids[first]} of {observations.image_names[image]!r}: there "
+                f"are {num_points} points and {limit[image]} keypoints of type {keypoints_type!r}",
+                path=path,
+            )
 
     def _check_images(self) -> None:
         data = self.read()

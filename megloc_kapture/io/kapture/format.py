@@ -24,7 +24,6 @@ UNKNOWN_CAMERA = "UNKNOWN_CAMERA"
 FORMAT_VERSION = "1.1"
 FORMAT_LINE = f"# kapture format: {FORMAT_VERSION}"
 _READ_VERSIONS = ("1.0", FORMAT_VERSION)  # the tables are the same in both
-BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 
 # stricter than float(), which takes "1_0", "nan" and digits of other scripts
 FLOAT_PATTERN = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
@@ -43,9 +42,7 @@ class Sensor:
     def camera(self) -> Camera:
         if self.sensor_type not in CAMERA_SENSOR_TYPES:
             raise DataError(f"a sensor of type {self.sensor_type!r} has no camera model")
-        if not self.params:
-            raise DataError("camera without a model")
-        model = self.params[0]
+        model = self.params[0] if self.params else ""
         if model == UNKNOWN_CAMERA:
             raise DataError("camera is not calibrated (UNKNOWN_CAMERA); give it intrinsics first")
         if model not in CAMERA_MODEL_NUM_PARAMS:
@@ -127,26 +124,18 @@ class KaptureData:
 
     def device_from_world(self, timestamp: int, device_id: str) -> RigidTransform | None:
         """Return the pose of a sensor or rig at a time, directly or through rigs; None without."""
-        return self._device_from_world(timestamp, device_id, frozenset())
+        if (timestamp, device_id) in self.trajectories:
+            return self.trajectories[timestamp, device_id]
+        for rig_id in self._parents().get(device_id, ()):
+            rig_from_world = self.device_from_world(timestamp, rig_id)
+            if rig_from_world is not None:
+                return self.rigs[rig_id][device_id] @ rig_from_world
+        return None
 
     def poses(self) -> dict[str, RigidTransform]:
         """Return ``cam_from_world`` of every image that has one, sorted by image name."""
         poses = {image: self.cam_from_world(image) for image in self.image_names()}
         return {image: pose for image, pose in poses.items() if pose is not None}
-
-    def _device_from_world(
-        self, timestamp: int, device_id: str, seen: frozenset[str]
-    ) -> RigidTransform | None:
-        own = self.trajectories.get((timestamp, device_id))
-        if own is not None:
-            return own
-        for rig_id in self._parents().get(device_id, ()):
-            if rig_id in seen:
-                raise DataError(f"rig {rig_id!r} contains itself")
-            rig_from_world = self._device_from_world(timestamp, rig_id, seen | {rig_id})
-            if rig_from_world is not None:
-                return self.rigs[rig_id][device_id] @ rig_from_world
-        return None
 
     def _parents(self) -> dict[str, list[str]]:
         if self._num_rigs != len(self.rigs):

@@ -16,8 +16,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import check_relative, output_error, write_bytes
-from megloc_kapture.io.kapture.blobs import BlobSource, BlobWriter
-from megloc_kapture.io.kapture.features import SUFFIX, blob_sources, feature_folder
+from megloc_kapture.io.kapture.features import (
+    SUFFIX,
+    BlobSource,
+    BlobWriter,
+    blob_sources,
+    feature_folder,
+)
 from megloc_kapture.io.kapture.format import (
     check_columns,
     check_field,

@@ -202,8 +202,8 @@ def write_sensors(root: Path, data: KaptureData) -> None:
         "sensors": _sensor_rows(data),
         "rigs": _rig_rows(data),
         "trajectories": _trajectory_rows(data),
-        "records_camera": _record_rows(data, data.records_camera, "camera"),
-        "records_depth": _record_rows(data, data.records_depth, "depth"),
+        "records_camera": _record_rows(data.records_camera),
+        "records_depth": _record_rows(data.records_depth),
     }
     for name, rows in tables.items():
         path = Path(root) / "sensors" / f"{name}.txt"
@@ -223,38 +223,25 @@ def _sensor_rows(data: KaptureData) -> list[list[str]]:
 
 
 def _rig_rows(data: KaptureData) -> list[list[str]]:
-    rows = []
-    for rig_id, members in sorted(data.rigs.items()):
-        for sensor_id, pose in sorted(members.items()):
-            if sensor_id not in data.sensors and sensor_id not in data.rigs:
-                raise DataError(f"rig {rig_id!r} holds the unknown sensor {sensor_id!r}")
-            rows.append([rig_id, sensor_id, *_pose_fields(pose, f"rig {rig_id!r}")])
-    return rows
+    return [
+        [rig_id, sensor_id, *_pose_fields(pose, f"rig {rig_id!r}")]
+        for rig_id, members in sorted(data.rigs.items())
+        for sensor_id, pose in sorted(members.items())
+    ]
 
 
 def _trajectory_rows(data: KaptureData) -> list[list[str]]:
-    rows = []
-    for (timestamp, device_id), pose in sorted(data.trajectories.items()):
-        # a rig without sensors has no row in rigs.txt, so readers would not know it
-        if device_id not in data.sensors and not data.rigs.get(device_id):
-            raise DataError(f"trajectories name the unknown device {device_id!r}")
-        where = f"trajectory of {device_id!r} at {timestamp}"
-        rows.append([str(int(timestamp)), device_id, *_pose_fields(pose, where)])
-    return rows
+    return [
+        [str(int(time)), device, *_pose_fields(pose, f"trajectory of {device!r} at {time}")]
+        for (time, device), pose in sorted(data.trajectories.items())
+    ]
 
 
-def _record_rows(
-    data: KaptureData, records: dict[tuple[int, str], str], sensor_type: str
-) -> list[list[str]]:
-    if len(set(records.values())) < len(records):
-        raise DataError(f"two {sensor_type} records have the same path")
-    rows = []
-    for (timestamp, sensor_id), name in sorted(records.items()):
-        sensor = data.sensors.get(sensor_id)
-        if sensor is None or sensor.sensor_type != sensor_type:
-            raise DataError(f"{name!r} is recorded by {sensor_id!r}, not a {sensor_type} sensor")
-        rows.append([str(int(timestamp)), sensor_id, check_relative(name)])
-    return rows
+def _record_rows(records: dict[tuple[int, str], str]) -> list[list[str]]:
+    return [
+        [str(int(time)), sensor_id, check_relative(name)]
+        for (time, sensor_id), name in sorted(records.items())
+    ]
 
 
 def _pose_fields(pose: RigidTransform, where: str) -> list[str]:

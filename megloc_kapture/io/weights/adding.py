@@ -48,7 +48,7 @@ def fetch(url: str, path: Path, *, sha256: str | None = None, progress: Any = No
     except requests.exceptions.RequestException as error:
         raise TransferError(f"{url}: the transfer broke: {error}") from error
     except ValueError as error:  # pooch: wrong sha256
-        raise DataError(f"what came is not the published file: {error}", path=url) from error
+        raise DataError(f"the download is not the published file: {error}", path=url) from error
     except OSError as error:
         raise output_error(path, error) from error
 
@@ -74,7 +74,7 @@ def add_weights(
     if path.exists() and not force:
         if sha256_of(describe(weights.name, path)) == sha256:
             return describe(weights.name, path)
-        raise OutputError(f"{path}: a different file stands there; -f replaces it")
+        raise OutputError(f"{path}: a different file exists; -f replaces it")
     with open(source, "rb") as content, atomic_write(path) as copy:
         shutil.copyfileobj(content, copy)
     return describe(weights.name, path)
@@ -98,7 +98,7 @@ def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:
     if output.suffix != ".safetensors":
         raise OptionError(f"{output}: the file to write must end in .safetensors")
     if output.exists() and not force:
-        raise OutputError(f"{output}: stands there; -f replaces it")
+        raise OutputError(f"{output}: exists; -f replaces it")
     if not source.is_file():
         raise DataError("no such file", path=source)
     file = describe(source.name, source)

@@ -190,9 +190,6 @@ def test_summary_and_remarks(root11: Path) -> None:
     # a query keeps its record whichever version is read
     for dataset in (old, new):
         assert dataset.query.record_of(NIGHT[0]) == (200_001, "night_00001")
-    assert any("db/1228.jpg has a wrong pose" in remark for remark in new.remarks)
-    (root11 / "images_upright/db/1228.jpg").unlink()
-    assert not any("db/1228.jpg" in remark for remark in read(root11).remarks)
 
 
 def test_missing_files_are_refused_or_passed_over(root11: Path, tmp_path: Path) -> None:
@@ -237,7 +234,7 @@ def test_missing_lists(root: Path, tmp_path: Path) -> None:
     ("change", "where", "match"),
     [
         (edit(LIST, "db/7.jpg", "db/8.jpg"), LIST, "no line for 'db/7.jpg'"),
-        (edit(LIST, " 10.5 ", " nan "), f"{LIST}:2", "'nan' is not a finite number"),
+        (edit(LIST, " 10.5 ", " nan "), f"{LIST}:2", "parameters must be finite"),
         (edit(MODEL, "\n2\n", "\n3\n"), MODEL, "ends before its last point"),
         (edit(DAY_LIST, DAY[2], DAY[0]), f"{DAY_LIST}:3", "is listed twice"),
         (edit(NIGHT_LIST, NIGHT[0], DAY[1]), NIGHT_LIST, "is also in day_time_queries"),

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 from megloc_kapture.datasets import robotcar
-from megloc_kapture.datasets.aachen import read_query_list
 from megloc_kapture.datasets.formats import fourseasons_files
 from megloc_kapture.datasets.formats.text_lines import read_rigid_matrix
 from megloc_kapture.datasets.inloc import read_transformation, read_wrong_scans
 from megloc_kapture.errors import DataError
+from megloc_kapture.io.camera_list import read_camera_rows
 
 TIME = 1602074877390449152
 POSE = "-0.06,0.05,-0.15,0,0.6,0,0.8"
@@ -24,19 +24,14 @@ TEXTS: dict[Callable[[Path], Any], str] = {
     read_rigid_matrix: MATRIX,
     fourseasons_files.read_gnss_poses: f"# header\n{TIME},{POSE},0.96,2\n{TIME + 1},{POSE},1,2,5\n",
     fourseasons_files.read_poses: f"{TIME},{POSE}\n{TIME + 1},{POSE}\n".replace(",", " "),
-    fourseasons_files.read_keyframe_accuracy: f"{TIME}\n{TIME + 1}\n",
-    fourseasons_files.read_times: f"{TIME} 1602074877.39 0.25\r\n{TIME + 1} 1602074877.39 0.25\r\n",
     fourseasons_files.read_relocalization: f"{TIME} 1\n{TIME} 2 {POSE.replace(',', ' ')}\n",
     fourseasons_files.read_transformations: f"# transform_S_AS: t, q\n{POSE}\n"
     f"# transform_w_gpsw: t\n{POSE}\n\n# transform_e_gpsw: t, q\n{POSE}\n# GNSS scale\n0.96\n",
-    fourseasons_files.read_keyframe: f"# timestamp\n{TIME}\n\n# fx, fy\n1,1,1,1,8,4,1\n\n"
-    f"# camToWorld:\n{POSE}\n\n# Exposure\n0.25\n\n# Point Cloud\n# u,v\n1.0,2.0,0.5,9,0,0,1\n"
-    "1,2,3,4,5,6,7,8,\n",
     robotcar.read_intrinsics: "fx 400.0\nfy 400.0\ncx 508.2\ncy 498.187378\n",
     robotcar.read_query_location: "dawn/left/1418721355075498.jpg\ndawn/rear/14.jpg\n",
     robotcar.read_test_list: "rear/1418721355075498.png\nrear/1418721354984638.png\n",
     robotcar.read_train_poses: "dawn/rear/1.png 1 0 0 10.0 0 1 0 0.0 0 0 1 -2.0 0 0 0 1\n",
-    read_query_list: "query/day/a.jpg SIMPLE_RADIAL 1600 1200 1469.2 800 600 -0.0353\r\n"
+    read_camera_rows: "query/day/a.jpg SIMPLE_RADIAL 1600 1200 1469.2 800 600 -0.0353\r\n"
     "query/b.jpg PINHOLE 768 1024 971.838 384 512 -0.00177789",
     read_transformation: f"Before general icp:\n{MATRIX}\nAfter general icp:\n{MATRIX}",
     read_wrong_scans: "known wrong:\n\n008\nDUC_scan_12.ptx 31\r\n2017\n",
@@ -66,7 +61,7 @@ def test_what_is_no_such_file(tmp_path: Path, reader: Callable[[Path], Any]) -> 
     path = tmp_path / "file.txt"
     for content in (b"", b"\n\r\n  \n", b"\xef\xbb\xbf"):
         path.write_bytes(content)
-        if reader in (fourseasons_files.read_keyframe_accuracy, read_wrong_scans):
+        if reader is read_wrong_scans:
             assert not reader(path)
         else:
             with pytest.raises(DataError, match=r"file\.txt\b"):

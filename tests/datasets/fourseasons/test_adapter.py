@@ -271,8 +271,7 @@ def test_input_files(root: Path) -> None:
     )
     assert {str(file.relative_to(root)) for file in files} == {
         *(f"calibration/undistorted_calib_{part}.txt" for part in ("0", "1", "stereo")),
-        *(f"{DAY}/{name}.txt" for name in ("GNSSPoses", "Transformations", "times")),
-        f"{SNOW}/times.txt",
+        *(f"{DAY}/{name}.txt" for name in ("GNSSPoses", "Transformations")),
         *(image(recording, time, f"cam{camera}") for recording, time, camera in shots),
     }
 
@@ -295,7 +294,7 @@ def test_all_poses_of_the_sample_as_kaptures_importer_has_them(sample: Path) -> 
     poses = read_keyframe_poses(
         Recording("a_map", folder), min_fusion_quality=1, on_earth=False, missing=Missing(sample)
     )
-    assert poses is not None and set(poses.scales.values()) == {0.962356}
+    assert poses is not None
     frame = LocalFrame.around(poses)
     theirs = import_4seasons_trajectory(
         str(folder / "GNSSPoses.txt"), str(folder / "Transformations.txt")

@@ -1,4 +1,4 @@
-"""4Seasons' challenges and depth maps: pairs, priors, true poses, point clouds."""
+"""4Seasons' challenges: pairs, priors and true poses."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fourseasons_files import (
-    CAMERA,
     DAY,
     RAIN,
     ROWS,
@@ -26,13 +25,9 @@ from fourseasons_files import (
 )
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.fourseasons.adapter import FourSeasons, FourSeasonsOptions
 from megloc_kapture.datasets.official import write_official
 from megloc_kapture.errors import DataError
 from megloc_kapture.io import dataset_tables as tables
-from megloc_kapture.io.images import read_depth_map
-from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.values import RigidTransform
 
 
 @pytest.fixture
@@ -103,7 +98,6 @@ def test_pairs_with_poses_in_the_frame_of_poses_txt(root: Path) -> None:
     (root / DAY / "GNSSPoses.txt").unlink()
     (root / DAY / "Transformations.txt").unlink()
     write(root / DAY / "poses.txt", f"# ts t q\n{A} 100.5 7 3 0 0 0 1\n{B} 101.5 7 3 0 0 0.6 0.8\n")
-    write(root / DAY / "keyframe_accuracy.txt", f"{A}\n")
     folder = root / DAY / "RelocalizationFilesVal"
     write(folder / f"relocalizationFile_{SNOW}.txt", f"{A} {B + 5} 1 2 3 0 0 0.6 0.8\n")
     dataset = read(root)
@@ -115,8 +109,7 @@ def test_pairs_with_poses_in_the_frame_of_poses_txt(root: Path) -> None:
     # x_query = R (x_world - (100.5, 7, 3)) + (1, 2, 3)
     at = np.array([[101.0, 8.0, 5.0]])
     np.testing.assert_allclose(known.apply(at)[0], turn @ [0.5, 1, 2] + [1, 2, 3], atol=1e-12)
-    assert "poses.txt, whose frame is its own" in dataset.remarks[0]
-    assert any("0.05 m" in count.what and count.found == 1 for count in dataset.summary)
+    assert "poses.txt, in a separate frame" in dataset.remarks[0]
 
 
 def test_truth_of_a_pair_counts_before_the_recordings_own(root: Path) -> None:
@@ -151,51 +144,3 @@ def test_published_numbers_of_pairs(root: Path) -> None:
     write(root / name, f"{A} {A + 5}\n")
     count = next(count for count in read(root).summary if name in count.what)
     assert (count.found, count.published) == (1, 113)
-
-
-def keyframe_text(timestamp: int, points: str, count: int, size: str = "8,4") -> str:
-    return (
-        f"# timestamp\n{timestamp}\n\n# fx, fy, cx, cy, width, height, npoints\n"
-        f"5,5,4.25,1.75,{size},{count}\n\n# camToWorld: t, q\n0,0,0,0,0,0,1\n\n"
-        "# Exposure time (ms)\n0.25\n\n# Point Cloud Data : \n# u,v\n# color information \n"
-        + points
-    )
-
-
-def test_depth_of_keyframes(root: Path, tmp_path: Path) -> None:
-    folder = root / DAY / "KeyFrameData"
-    points = "".join(
-        f"{u},{v},{inverse},9,0,0,1\n1,2,3,4,5,6,7,8,\n"
-        for u, v, inverse in [(3, 1, 0.25), (3.5, 1.5, 0.1), (0, 0, 0), (8, 0, 1), (7, 3, 0.5)]
-    )
-    write(folder / f"KeyFrame_{A}.txt", keyframe_text(A, points, 5))
-    write(folder / f"KeyFrame_{B}.txt", keyframe_text(B, "", 0))
-    before = sorted(root.rglob("*"))
-    dataset = read(root, depth=True)
-    write_official(dataset, tmp_path / "out")
-    assert sorted(root.rglob("*")) == before  # the links to the data are not written through
-    mapping = KaptureFolder(tmp_path / "out/mapping").read()
-    name = mapping.records_depth[A, "depth"]
-    assert name == f"keyframe_depth/{DAY}/{A}.depth"
-    assert mapping.rigs["car"]["depth"] == RigidTransform.identity()
-    assert mapping.sensors["depth"].camera() == CAMERA
-    records = tmp_path / "out/mapping/sensors/records_data"
-    expected = np.zeros((4, 8), np.float32)
-    # the row's scale is 0.5; of two points in a pixel the nearer one
-    expected[1, 3], expected[3, 7] = 0.5 / 0.25, 0.5 / 0.5
-    np.testing.assert_array_equal(read_depth_map(records / name, width=8, height=4), expected)
-    other = read_depth_map(records / mapping.records_depth[B, "depth"], width=8, height=4)
-    assert not other.any()
-    files = set(FourSeasons(FourSeasonsOptions(depth=True)).input_files(root))
-    assert folder / f"KeyFrame_{A}.txt" in files
-    (folder / f"KeyFrame_{B}.txt").unlink()
-    assert missing_of(read(root, depth=True)) == [folder / f"KeyFrame_{B}.txt"]
-
-
-@pytest.mark.parametrize(("time", "size"), [(B, "8,4"), (A, "9,4")])
-def test_a_keyframe_of_something_else(root: Path, tmp_path: Path, time: int, size: str) -> None:
-    for timestamp in (A, B):
-        file = root / DAY / f"KeyFrameData/KeyFrame_{timestamp}.txt"
-        write(file, keyframe_text(time, "", 0, size))
-    with pytest.raises(DataError, match=r"KeyFrame_\d+\.txt: timestamp .* are not those of its"):
-        write_official(read(root, depth=True), tmp_path / "out")

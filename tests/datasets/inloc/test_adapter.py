@@ -125,7 +125,6 @@ def test_queries_as_they_are_stored(downloaded: Path, tmp_path: Path) -> None:
     turned = query.read().camera_of(names[1])
     assert (turned.width, turned.height) == (64, 48)
     assert len(query.read().sensors) == 2
-    assert any("1 queries have an EXIF orientation" in remark for remark in dataset.remarks)
     listed = list(read_names(tmp_path / "out" / "megloc").items())
     assert listed == [(name, name.split("/")[-1]) for name in names]
     for name in names:
@@ -253,20 +252,12 @@ def test_broken_points_name_their_file(root: Path, tmp_path: Path) -> None:
     imported(root, tmp_path / "d")
 
 
-@pytest.mark.parametrize(
-    ("name", "match"),
-    [
-        ("DUC_cutout_024_0.jpg", "is not named <BUILDING>_cutout"),
-        ("DUC_cutout_025_0_0.jpg", "scan 025, but lies in DUC1, scan 024"),
-        ("cse_cutout_024_0_0.jpg", "cutout of cse, scan 024, but lies"),
-    ],
-)
-def test_images_that_lie_elsewhere_are_refused(root: Path, name: str, match: str) -> None:
+def test_images_of_other_names_are_refused(root: Path) -> None:
+    name = "DUC_cutout_024_0.jpg"
     folder = root / "database/cutouts/DUC1/024"
     (folder / "DUC_cutout_024_0_0.jpg").rename(folder / name)
-    with pytest.raises(DataError, match=match) as caught:
+    with pytest.raises(DataError, match=rf"{name}: .*is not named <BUILDING>_cutout"):
         read(root)
-    assert str(caught.value).startswith(str(folder / name))
 
 
 def test_broken_files_are_refused(root: Path) -> None:
@@ -279,9 +270,6 @@ def test_broken_files_are_refused(root: Path) -> None:
     query = root / "query" / "iphone7" / "IMG_0804.JPG"
     query.write_bytes(b"\xff\xd8 no image")
     with pytest.raises(DataError, match=r"IMG_0804\.JPG: not an image"):
-        read(root)
-    query.rename(query.with_name("IMG 0804.JPG"))
-    with pytest.raises(DataError, match="no blanks, commas"):
         read(root)
 
 
@@ -316,10 +304,3 @@ def test_input_files_are_all_that_is_read(root: Path) -> None:
     for path in more:
         path.write_text("image, condition, frame, location, scored\n")
     assert set(InLoc().input_files(root)) == {*read_so, *more}
-
-
-def test_large_depth_maps_are_announced(downloaded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert not any("depth maps take" in remark for remark in read(downloaded).remarks)
-    monkeypatch.setattr("megloc_kapture.datasets.inloc.adapter._MANY_GIGABYTES", 1e-9)
-    assert any("depth_step = 8" in remark for remark in read(downloaded, depth_step=2).remarks)
-    assert not any("depth maps take" in remark for remark in read(downloaded, depth=False).remarks)

@@ -48,13 +48,12 @@ def test_names_say_what_they_show() -> None:
     "name",
     [
         *(f"DUC_cutout_{n}.jpg" for n in ("24_0_0", "024_0", "024_360_0", "024_0_91", "024_-30_0")),
-        *(f"DUC_cutout_{n}.jpg" for n in ("024_030_0", "024_0_-0", "٠٢٤_0_0")),
         *("DUC_cutout_024_0_0.png", "DUC_cutout_024_0_0.jpg.mat", "DUC_cutout_024_0_0.jpg\n"),
         *("DUC_scan_024_0_0.jpg", "a/DUC_cutout_024_0_0.jpg", ""),
     ],
 )
 def test_other_names_are_refused(name: str) -> None:
-    with pytest.raises(DataError, match="is not named|superfluous"):
+    with pytest.raises(DataError, match="is not named"):
         parse_cutout_name(name)
 
 
@@ -69,9 +68,8 @@ def test_the_second_matrix_counts(path: Path) -> None:
     ("old", "new", "match"),
     [
         ("  0  0  1  -1e-1\n", "", "7 rows of four numbers"),
-        ("0 0 1 0\n", "0 0 1 0\n\n", ":2: the rows of a matrix do not follow"),
         ("  0  0  0  1\n", "  0  0  0  1\n1 0 0 0\n", "9 rows of four numbers"),
-        ("  0  0  0  1\n", "  0  0  0  2\n", ":11: the last row of the matrix is 0 0 0 2"),
+        ("  0  0  0  1\n", "  0  0  0  2\n", ":11: the last row of the matrix is not"),
         ("  1  0  0  2.0", "  1.1  0  0  2.0", ":11: .* not a rotation matrix"),
         ("5.0", "nan", "not a finite number"),
         ("5.0", "1e999", "not a finite number"),

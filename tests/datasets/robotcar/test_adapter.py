@@ -9,14 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hostile import EDITS, Edit, changed
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from robotcar_files import CAMERAS, QUERIES, REFERENCE, TEST, TRAIN, put, ts, write_layout
 
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
-from megloc_kapture.errors import DataError, MeglocError, OptionError, PluginError
+from megloc_kapture.errors import DataError, OptionError, PluginError
 from megloc_kapture.io.dataset_tables import read_groups, read_names, read_priors, read_protocol
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
@@ -245,7 +242,7 @@ def test_stray_files_do_not_matter(root: Path) -> None:
 
 def test_every_file_that_counts_is_an_input(root: Path) -> None:
     adapter, database = RobotCar(RobotCarOptions(reference_model=True)), "overcast-reference.db"
-    assert any(f"{database}, which is not" in remark for remark in adapter.read(root).remarks)
+    assert any("without descriptors" in remark for remark in adapter.read(root).remarks)
     found = set(RobotCar().input_files(root))
     assert found == {path for path in root.rglob("*") if path.is_file()}
     put(root / "3D-models" / database, "")
@@ -370,38 +367,3 @@ def test_images_that_are_none_and_a_camera_without_any(root: Path) -> None:
     (root / "images").mkdir()
     sensors = RobotCar().read(root, allow_missing=True).mapping.sensors
     assert sensors["rear"].camera() == Camera("PINHOLE", 1024, 1024, (10.5, 10.0, 4.25, 3.5))
-
-
-TEXTS = [
-    "intrinsics/rear_intrinsics.txt",
-    "extrinsics/left_extrinsics.txt",
-    NVM,
-    "3D-models/individual/colmap_reconstructions/001_aligned/images.txt",
-    f"{LISTS}/queries_location_001.txt",
-    TRAIN_LIST,
-    TEST_LIST,
-]
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.sampled_from(TEXTS), EDITS, st.booleans())
-def test_mutated_layouts_are_imported_or_refused(
-    downloaded: Path, tmp_path: Path, file: str, edits: list[Edit], allow_missing: bool
-) -> None:
-    root, out = tmp_path / "mutated", tmp_path / "out"
-    if not root.exists():
-        shutil.copytree(downloaded, root)
-    original = (downloaded / file).read_bytes()
-    (root / file).write_bytes(changed(original, edits))
-    shutil.rmtree(out, ignore_errors=True)
-    try:
-        dataset = RobotCar().read(root, allow_missing=allow_missing)
-        write_official(dataset, out, allow_missing=True)
-    except MeglocError as error:
-        assert "\n" not in str(error)
-    else:
-        KaptureFolder(out / "mapping").validate()
-        assert set(read_names(out / "megloc")) <= set(dataset.query.image_names())
-    finally:
-        (root / file).write_bytes(original)
-    assert sorted(p.name for p in tmp_path.iterdir()) in (["mutated"], ["mutated", "out"])

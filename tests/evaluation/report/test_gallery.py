@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scored import evaluate_poses
 
 from megloc_kapture.evaluation.report.gallery import (
     AGREES,
@@ -20,7 +21,6 @@ from megloc_kapture.evaluation.report.gallery import (
 from megloc_kapture.evaluation.report.queries import ShownQuery, shown_queries
 from megloc_kapture.evaluation.report.reports import render_report
 from megloc_kapture.evaluation.results import ResultContext, context_of
-from megloc_kapture.evaluation.scoring import evaluate_poses
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.dataset_tables import Protocol, write_protocol
 from megloc_kapture.io.images import write_image
@@ -135,4 +135,4 @@ def test_masked_images_are_shaded(run: Run) -> None:
     found = context_of(run.workspace / "localized")
     evaluation = evaluate_poses({}, {QUERY: POSES[QUERY]})
     page = render_report(replace(evaluation, context=found))
-    assert "What masks hide is shaded." in page and "25.0 % masked" in page
+    assert "Masked regions are shaded." in page and "25.0 % masked" in page

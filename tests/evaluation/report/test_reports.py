@@ -12,21 +12,22 @@ from typing import Any
 import matplotlib
 import numpy as np
 import pytest
+from scored import evaluate_poses
 
 from megloc_kapture.errors import OutputError
 from megloc_kapture.evaluation.metrics import Threshold
-from megloc_kapture.evaluation.report.queries import shown_queries, worst_queries
-from megloc_kapture.evaluation.report.reports import render_report, report_text, write_report
-from megloc_kapture.evaluation.report.tables import refinement_table
-from megloc_kapture.evaluation.report.wording import (
+from megloc_kapture.evaluation.report.content import (
     format_degrees,
     format_metres,
     format_percent,
     median_sentence,
+    refinement_table,
     threshold_sentence,
 )
+from megloc_kapture.evaluation.report.queries import shown_queries, worst_queries
+from megloc_kapture.evaluation.report.reports import render_report, report_text, write_report
 from megloc_kapture.evaluation.results import ResultContext
-from megloc_kapture.evaluation.scoring import Evaluation, evaluate_poses
+from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.evaluation.statistics import MedianDifference, compare
 from megloc_kapture.io.tables import QueryStatus
 from megloc_kapture.values import RefinementRow, RigidTransform

@@ -16,17 +16,18 @@ import numpy as np
 import pycolmap
 import pytest
 from kapture.io.csv import kapture_from_dir
+from scored import evaluate_poses
 
-from megloc_kapture.evaluation.report import scene as scenes
+from megloc_kapture.evaluation import view as scenes
 from megloc_kapture.evaluation.report.queries import (
     ShownQuery,
     StoredInliers,
     legend,
     shown_queries,
 )
-from megloc_kapture.evaluation.report.scene import Scene, corner_rays, render_view, scene_of
 from megloc_kapture.evaluation.results import ResultContext
-from megloc_kapture.evaluation.scoring import Evaluation, evaluate_poses
+from megloc_kapture.evaluation.scoring import Evaluation
+from megloc_kapture.evaluation.view import Scene, corner_rays, render_view, scene_of
 from megloc_kapture.io.dataset_tables import ImageGroup, write_groups
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder

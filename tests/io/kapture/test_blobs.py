@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture.blobs import TarBlobs
+from megloc_kapture.io.kapture.features import TarBlobs
 
 CONTENTS = {"a.kpt": b"x" * 1000, "deep/er/b.kpt": b"", "é ü.kpt": b"y" * 512}
 

@@ -92,7 +92,7 @@ REFUSED = {
         "x, ": "at least 3 columns",
         ", n, camera, PINHOLE, 640, 480, 500, 500, 320, 240": "is empty or listed twice",
         "cam, n, gnss": "'cam' is empty or listed twice",
-        "x, n, camera": "without a model",
+        "x, n, camera": "unknown camera model ''",
         "x, n, camera, PINHOLLOW, 640, 480, 1, 1, 1, 1": "unknown camera model 'PINHOLLOW'",
         "x, n, camera, PINHOLE, 640, 480, 500, 320, 240": "takes 6 parameters .* got 5",
         "x, n, camera, PINHOLE, 640, 480, nan, 500, 320, 240": "'nan' is not finite",
@@ -254,13 +254,8 @@ NOT_WRITTEN: dict[str, dict[str, Any]] = {
     "comment": {"sensors": {"#a": RAW}},
     "model": {"sensors": {"cam": Sensor("", "camera", ("PINHOLE", "4", "3"))}},
     "path": {"records_camera": {(0, "cam"): "../a.jpg"}},
-    "same image": {"records_camera": {(0, "cam"): "a.jpg", (1, "cam"): "a.jpg"}},
-    "no sensor": {"records_camera": {(0, "x"): "a.jpg"}},
-    "no device": {"trajectories": {(0, "x"): POSE}},
     "nan": {"trajectories": {(0, "cam"): NO_NUMBER}},
     "quaternion": {"trajectories": {(0, "cam"): RigidTransform((1, 1, 0, 0), (0, 0, 0))}},
-    "empty rig": {"rigs": {"rig": {}}, "trajectories": {(0, "rig"): POSE}},
-    "rig member": {"rigs": {"rig": {"x": POSE}}},
 }
 
 
@@ -340,11 +335,8 @@ def test_cameras_are_found_by_image() -> None:
         data.camera_of("r2.jpg")
 
 
-def test_two_records_of_an_image_and_rigs_that_contain_themselves_are_refused() -> None:
+def test_two_records_of_an_image_are_refused() -> None:
     data = two_cameras_on_nested_rigs()
-    data.rigs["head"]["car"] = RigidTransform.identity()
-    with pytest.raises(DataError, match="contains itself"):
-        data.cam_from_world("l3.jpg")
     data.records_camera[9, "left"] = "l1.jpg"
     with pytest.raises(DataError, match="two records"):
         data.record_of("l1.jpg")

@@ -92,7 +92,7 @@ def test_a_whole_file(server: Server, place: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "kind", "message"),
     [
-        ({"content": b"another"}, DataError, "what came is not the published file: .*" + SHA256),
+        ({"content": b"another"}, DataError, "the download is not the published file: .*" + SHA256),
         ({"break_after": 1000}, TransferError, "the transfer broke"),
         ({"status": 404}, TransferError, "the server answers 404"),
         ({"address": "http://127.0.0.1:9"}, TransferError, "the transfer broke"),

@@ -240,7 +240,7 @@ def test_add_does_not_replace_without_being_asked(folder: Path, tmp_path: Path) 
     place = write(folder / "vgg16_netvlad.pth", 1.0)
     before = place.read_bytes()
     source = write(tmp_path / "vgg16_netvlad.pth", 2.0)
-    with pytest.raises(OutputError, match="a different file stands there; -f replaces it"):
+    with pytest.raises(OutputError, match="a different file exists; -f replaces it"):
         add_weights(source)
     assert place.read_bytes() == before
     add_weights(source, force=True)
@@ -277,7 +277,7 @@ def test_convert_views_of_one_memory_and_refuses(tmp_path: Path) -> None:
     refusals: list[tuple[Path, Path, type[MeglocError], str]] = [
         (source, tmp_path / "x.npz", OptionError, "must end in .safetensors"),
         (tmp_path / "y.pth", tmp_path / "y.safetensors", DataError, "no such file"),
-        (source, place, OutputError, "stands there; -f replaces it"),
+        (source, place, OutputError, "exists; -f replaces it"),
     ]
     for wrong, target, kind, message in refusals:
         with pytest.raises(kind, match=message):

@@ -1,0 +1,424 @@
+"""Numbers, sentences and tables of reports; recall as in papers: ``89.8 / 96.1 / 99.4``."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from megloc_kapture.evaluation.confidence import Confidence
+from megloc_kapture.evaluation.metrics import RecallAt, RecallRow, Threshold, pose_errors
+from megloc_kapture.evaluation.scoring import CovarianceCheck, Evaluation
+from megloc_kapture.evaluation.statistics import (
+    NUM_RESAMPLES,
+    SIGNIFICANCE,
+    Comparison,
+    MedianDifference,
+    PairedTest,
+)
+from megloc_kapture.evaluation.without_truth import (
+    AgreementRow,
+    WithoutTruth,
+    inliers_quartiles,
+)
+from megloc_kapture.io.tables import ConsistencyRow
+from megloc_kapture.values import MIN_CONFIDENCE
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+    from megloc_kapture.evaluation.report.queries import ShownQuery
+
+INTERVALS = "95 % confidence intervals of recall, queries taken as independent (%)"
+CONFIDENT = f"Recall if poses with a confidence below {MIN_CONFIDENCE:g} are misses (%)"
+# fewer queries are an example, not a measurement
+FEW = 10
+_NAMES_SHOWN = 5
+_FALLBACK_POSES = {
+    "retrieval": "of the best retrieved image",
+    "rig": "that another camera of the rig gives them",
+}
+_MAX_WIDTH = 30
+_REASONS_SHOWN = 3
+_NUMBER = re.compile(r"-?\d+(\.\d+)?")
+
+
+def format_percent(share: float) -> str:
+    return f"{100.0 * share:.1f}"
+
+
+def format_metres(position_m: float) -> str:
+    return f"{position_m:.4f}" if position_m < 1 else f"{position_m:.2f}"
+
+
+def format_degrees(angle_deg: float) -> str:
+    return f"{angle_deg:.3f}" if angle_deg < 1 else f"{angle_deg:.2f}"
+
+
+def format_median(position_m: float, angle_deg: float) -> str:
+    if not math.isfinite(position_m):
+        return "inf"
+    return f"{format_metres(position_m)}, {format_degrees(angle_deg)}"
+
+
+def format_interval(at: RecallAt) -> str:
+    return f"{format_percent(at.low)}-{format_percent(at.high)}"
+
+
+def counted(number: int, one: str, many: str = "") -> str:
+    return f"{number} {one if number == 1 else many or f'{one}s'}"
+
+
+def bounds(thresholds: Sequence[Threshold]) -> str:
+    return " / ".join(str(threshold) for threshold in thresholds)
+
+
+def criterion(evaluation: Evaluation) -> str:
+    """Return the rule by which recall is counted."""
+    with_angles = any(threshold.angle_deg is not None for threshold in evaluation.thresholds)
+    errors = "Both errors" if with_angles else "Position error"
+    if evaluation.by_center is not None:
+        errors = "Error of the translation relative to the given reference"
+    return f"{errors} at or below (<=) the threshold; a query without a pose counts as a miss."
+
+
+def notes(evaluation: Evaluation) -> list[str]:
+    row = evaluation.row()
+    sentences = [evaluation.alignment] if evaluation.alignment else []
+    if row.num_queries < FEW:
+        sentences.append(
+            f"too few queries ({row.num_queries}) to compare recall by: the intervals are wide"
+        )
+    kinds = {query.fallback for query in evaluation.queries} - {"none"}
+    if row.num_fallback:
+        whose = " or the one ".join(_FALLBACK_POSES[kind] for kind in sorted(kinds))
+        without = counted(row.num_fallback, "query", "queries")
+        sentences.append(
+            f"{without} could not be localized and got the pose {whose} instead; recall and the "
+            "median of all count it like any pose"
+        )
+    if row.num_missing == row.num_queries:
+        sentences.append("no query has a pose")
+    missing = evaluation.without_truth
+    if missing:
+        shown = ", ".join(missing[:_NAMES_SHOWN]) + (", ..." if missing[_NAMES_SHOWN:] else "")
+        lack = counted(
+            len(missing), "image has no true pose and is", "images have no true pose and are"
+        )
+        sentences.append(f"{lack} not counted: {shown}")
+        if evaluation.truth_known_by:
+            sentences.append(evaluation.truth_known_by.rstrip("."))
+        if not evaluation.estimated and row.num_missing == row.num_queries:
+            sentences.append("no estimated image is in the ground truth; the names may not agree")
+    if number := len(evaluation.not_scored):
+        ignored = counted(number, "image with a true pose is", "images with a true pose are")
+        sentences.append(f"{ignored} not scored by this benchmark")
+    return sentences
+
+
+def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[str]:
+    sentences = []
+    if confidence.num_poses:
+        share = format_percent(confidence.num_wrong / confidence.num_poses)
+        interval = f"{100 * confidence.wrong_low:.1f}-{100 * confidence.wrong_high:.1f}"
+        sentences.append(
+            f"of {counted(confidence.num_poses, 'pose')} with a confidence "
+            f"{counted(confidence.num_wrong, 'is', 'are')} wrong (beyond {coarsest}): {share} % "
+            f"({interval})"
+        )
+    if confidence.num_wrong:
+        by_inliers = confidence.area_by_inliers
+        than = "" if by_inliers is None else f", by the number of inliers {by_inliers:.4f}"
+        sentences.append(
+            f"calibration error {confidence.calibration_error:.3f}; area under risk against "
+            f"coverage {confidence.area:.4f}{than}, at best {confidence.least_area:.4f}"
+        )
+    if confidence.num_nowhere:
+        sentences.append(
+            f"{counted(confidence.num_nowhere, 'query shows', 'queries show')} nothing of the map: "
+            f"{confidence.num_nowhere_refused} refused, "
+            f"{confidence.num_nowhere - confidence.num_nowhere_refused} given a pose"
+        )
+    return sentences
+
+
+def covariance_sentence(check: CovarianceCheck) -> str:
+    return (
+        f"{check.num_within} of {counted(check.num_poses, 'error lies', 'errors lie')} within the "
+        "claimed 95 % region"
+    )
+
+
+def consistency_sentence(row: ConsistencyRow) -> str:
+    frame = f" in {row.frame}" if row.frame else ""
+    if row.reason:
+        return f"{row.method}{frame} is not used: {row.reason}"
+    return (
+        f"{row.method}{frame} is used; {row.images} map images held out move by "
+        f"{format_movement(row.moved_m, row.turned_deg)}, {row.moved_px:.1f} px (medians; claimed "
+        f"to {format_movement(row.claimed_m, row.claimed_deg)})"
+    )
+
+
+def format_movement(metres: float, degrees: float) -> str:
+    return f"{format_metres(metres)} m, {format_degrees(degrees)} deg"
+
+
+def agreement_sentence(row: AgreementRow, found: WithoutTruth) -> str:
+    if not row.num_only_first and not row.num_only_second:
+        return "The same queries have a pose in both."
+    first, second = found.evaluations[row.first].label, found.evaluations[row.second].label
+    return (
+        f"Only {first} has a pose for {counted(row.num_only_first, 'query', 'queries')}, "
+        f"only {second} for {row.num_only_second}."
+    )
+
+
+def threshold_sentence(test: PairedTest, labels: Sequence[str]) -> str:
+    first, second = labels[test.first], labels[test.second]
+    where = f"At {test.threshold}"
+    only_first, only_second = len(test.only_first), len(test.only_second)
+    if not only_first and not only_second:
+        if not test.both:
+            return f"{where} neither {first} nor {second} finds a query."
+        return f"{where} {first} and {second} find the same {_queries(test.both)}."
+    return (
+        f"{where} {first} finds {_queries(only_first)} that {second} misses and {second} finds "
+        f"{only_second or 'none'} that {first} misses: {_verdict(test)}."
+    )
+
+
+def median_sentence(difference: MedianDifference, labels: Sequence[str]) -> str:
+    pair = (labels[difference.first], labels[difference.second])
+    medians = (difference.first_m, difference.second_m)
+    lost = [label for label, value in zip(pair, medians, strict=True) if math.isinf(value)]
+    if lost:
+        return f"Most queries of {' and of '.join(lost)} have no pose, so there is no median."
+    both = (
+        f"The median position error is {format_metres(medians[0])} m for {pair[0]} and "
+        f"{format_metres(medians[1])} m for {pair[1]}: {_signed(medians[0] - medians[1])} m"
+    )
+    if math.isnan(difference.low_m):
+        return f"{both}; too few queries to tell it from chance."
+    verdict = "the difference is real" if difference.is_real else "the difference could be chance"
+    interval = f"{_signed(difference.low_m)} to {_signed(difference.high_m)}"
+    return f"{both}, 95 % interval {interval} m; {verdict}."
+
+
+def comparison_sentences(comparison: Comparison) -> list[str]:
+    labels = [evaluation.label for evaluation in comparison.evaluations]
+    tests = [threshold_sentence(test, labels) for test in comparison.tests]
+    return tests + [median_sentence(median, labels) for median in comparison.medians]
+
+
+def method_sentence(comparison: Comparison) -> str:
+    number = len(comparison.tests)
+    holm = f", after Holm's correction for {number} tests" if number > 1 else ""
+    return (
+        "Exact McNemar test on the same queries, taken as independent, two-sided; real: p at or "
+        f"below {SIGNIFICANCE:g}{holm}. Intervals of medians: {NUM_RESAMPLES} resamples of the "
+        "queries."
+    )
+
+
+def _verdict(test: PairedTest) -> str:
+    p = "p < 0.001" if test.p_adjusted < 0.001 else f"p = {test.p_adjusted:.2g}"
+    if test.is_real:
+        return f"the difference is real ({p})"
+    # even the most uneven split of so few queries would not be significant
+    if 2.0 * 0.5 ** (len(test.only_first) + len(test.only_second)) > SIGNIFICANCE:
+        return f"too few queries differ to tell it from chance ({p})"
+    return f"the difference could be chance ({p})"
+
+
+def _queries(number: int) -> str:
+    return "no query" if number == 0 else counted(number, "query", "queries")
+
+
+def _signed(metres: float) -> str:
+    if math.isinf(metres):
+        return "-inf" if metres < 0 else "+inf"
+    return f"{'-' if metres < 0 else '+'}{format_metres(abs(metres))}"
+
+
+def recall_table(evaluations: Sequence[Evaluation]) -> DataFrame:
+    """Return recall and medians; several results are below each other in each condition."""
+    return _frame(
+        {
+            **label,
+            "queries": row.num_queries,
+            "localized": _localized(row),
+            "recall (%)": _joined(row.recall),
+            "median (m, deg)": format_median(row.median_position_m, row.median_angle_deg),
+            "median of localized": format_median(
+                row.median_localized_position_m, row.median_localized_angle_deg
+            )
+            if row.num_localized
+            else "-",
+        }
+        for label, row in _rows(evaluations)
+    )
+
+
+def interval_table(evaluations: Sequence[Evaluation]) -> DataFrame:
+    """Return the confidence intervals of recall, one column per threshold."""
+    return _frame(
+        {**label, **{str(at.threshold): format_interval(at) for at in row.recall}}
+        for label, row in _rows(evaluations)
+    )
+
+
+def _rows(evaluations: Sequence[Evaluation]) -> Iterator[tuple[dict[str, str], RecallRow]]:
+    for group in zip(*(evaluation.rows for evaluation in evaluations), strict=True):
+        for evaluation, row in zip(evaluations, group, strict=True):
+            result = {"result": _shortened(evaluation.label)} if evaluations[1:] else {}
+            yield {**_condition(row.name), **result}, row
+
+
+def confident_table(evaluation: Evaluation) -> DataFrame | None:
+    """Return recall that counts doubtful poses as misses; None without confidences."""
+    rows = [
+        {
+            **_condition(row.name),
+            "queries": row.num_queries,
+            "accepted": row.num_localized,
+            "recall (%)": _joined(row.recall),
+        }
+        for row in evaluation.rows_above(MIN_CONFIDENCE)
+    ]
+    return _frame(rows) if rows else None
+
+
+def result_table(evaluation: Evaluation) -> DataFrame:
+    """Return localized share and inliers of a result without truth."""
+
+    def inliers(name: str) -> str:
+        quartiles = inliers_quartiles(evaluation, name)
+        return " / ".join(f"{value:.0f}" for value in quartiles or ()) or "-"
+
+    return _frame(
+        {
+            **_condition(row.name),
+            "queries": row.num_queries,
+            "localized": _localized(row),
+            "%": format_percent(row.num_localized / max(row.num_queries, 1)),
+            "inliers, quartiles": inliers(row.name),
+        }
+        for row in evaluation.rows
+    )
+
+
+def agreement_table(found: WithoutTruth, rows: Iterable[AgreementRow]) -> DataFrame:
+    """Return the share of queries whose poses in two results agree."""
+    return _frame(
+        {
+            "first": _shortened(found.evaluations[row.first].label),
+            "second": _shortened(found.evaluations[row.second].label),
+            **_condition(row.name),
+            "queries": row.num_queries,
+            "both have a pose": row.num_both,
+            "agree (%)": _joined(row.within),
+            "median (m, deg)": format_median(row.median_m, row.median_deg).replace("inf", "-"),
+        }
+        for row in rows
+    )
+
+
+def query_table(evaluation: Evaluation, queries: Sequence[ShownQuery]) -> DataFrame:
+    """Return one row per query, without columns that are empty."""
+    centers = evaluation.by_center
+    of_center = {} if centers is None else {q.image: q.position_m for q in centers.queries}
+
+    def number(value: float | None, form: Any) -> str:
+        return form(value) if value is not None and np.isfinite(value) else ""
+
+    frame = _frame(
+        {
+            "image": query.name,
+            "condition": query.condition,
+            "outcome": query.outcome,
+            "position (m)" if centers is None else "relative (m)": number(
+                query.position_m, format_metres
+            ),
+            "centre (m)": number(of_center.get(query.name), format_metres),
+            "angle (deg)": number(query.angle_deg, format_degrees),
+            "inliers": number(query.num_inliers, str),
+            "matches": number(query.num_matches, str),
+            "confidence": number(query.confidence, "{:.2f}".format),
+            "reason": query.reason,
+        }
+        for query in queries
+    )
+    return frame.loc[:, (frame != "").any()]
+
+
+def refinement_table(evaluation: Evaluation) -> DataFrame | None:
+    """Return the steps of pose refinement over all queries; None if nothing was refined."""
+    estimated, truth = evaluation.estimated, evaluation.truth
+    steps: dict[str, list[tuple[Any, Any]]] = {}
+    for image, rows in sorted(evaluation.context.refinements.items()):
+        if image in estimated:
+            # each step ends with the pose that the next begins with
+            ends = [*(row.before for row in rows[1:]), estimated[image]]
+            for row, after in zip(rows, ends, strict=True):
+                steps.setdefault(row.method, []).append((row, after))
+    table = []
+    for method, refined in steps.items():
+        accepted = [(row, after) for row, after in refined if row.accepted]
+        reasons = Counter(_NUMBER.sub("…", row.reason) for row, _ in refined if not row.accepted)
+        listed = (f"{count} x {reason}" for reason, count in reasons.most_common(_REASONS_SHOWN))
+        moved = [(row.moved_m, row.turned_deg) for row, _ in accepted]
+        line: dict[str, Any] = {"step": method, "queries": len(refined), "accepted": len(accepted)}
+        line |= {"moved by (median)": _medians(moved)}
+        if truth:
+            names = [row.image for row, _ in accepted if row.image in truth]
+            old, new = {r.image: r.before for r, _ in accepted}, {r.image: p for r, p in accepted}
+            for heading, poses in (("error before", old), ("error after", new)):
+                errors = pose_errors(poses, truth, names)
+                line[heading] = _medians(zip(errors.position_m, errors.angle_deg, strict=True))
+        table.append({**line, "why other poses stay": "; ".join(listed)})
+    return _frame(table) if table else None
+
+
+def as_text(frame: DataFrame) -> str:
+    """Format a table with left-aligned columns, two blanks apart."""
+    cells = frame.astype(str)
+    form: dict[Any, Any] = {
+        name: f"{{:<{max([len(str(name)), *column.str.len()]) + 1}}}".format
+        for name, column in cells.items()
+    }
+    text = cells.to_string(index=False, justify="left", formatters=form)
+    return "\n".join(line.rstrip() for line in text.split("\n"))
+
+
+def _frame(rows: Iterable[dict[str, Any]]) -> DataFrame:
+    import pandas as pd  # slow import
+
+    return pd.DataFrame(list(rows))
+
+
+def _condition(name: str) -> dict[str, str]:
+    return {"condition": _shortened(name or "(no condition)")}
+
+
+def _localized(row: RecallRow) -> str:
+    guessed = f" (+{row.num_fallback})" if row.num_fallback else ""
+    return f"{row.num_localized}{guessed}"
+
+
+def _joined(recall: Sequence[RecallAt]) -> str:
+    return " / ".join(format_percent(at.recall) for at in recall)
+
+
+def _medians(pairs: Iterable[tuple[float, float]]) -> str:
+    values = np.array(list(pairs))
+    return format_movement(*np.median(values, axis=0).tolist()) if len(values) else ""
+
+
+def _shortened(name: str) -> str:
+    half = (_MAX_WIDTH - 3) // 2
+    return name if len(name) <= _MAX_WIDTH else f"{name[:half]}...{name[-half:]}"
