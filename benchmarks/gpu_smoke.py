@@ -40,8 +40,7 @@ from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.preprocessing.deeplab import DeepLab
 from megloc_kapture.stages.devices import DeviceMemoryError, in_batches
 from megloc_kapture.stages.work import Work
-from megloc_kapture.training.train import TrainingData, train
-from megloc_kapture.training.trainer import TrainingOptions
+from megloc_kapture.training.train import TrainingData, TrainingOptions, train
 from megloc_kapture.values import ImageFeatures, LocalFeatures
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "rendering"))
@@ -111,13 +110,12 @@ def tf32(device: str, _: Path) -> None:
     """Compute in float32 whatever the host has set, and leave what it has set."""
     products = torch.backends.cuda.matmul
     before = SuperPoint(SuperPoint.Options(device="cpu")).extract(image_of())
-    for name, value in (("fp32_precision", "tf32"), ("allow_tf32", True)):
-        if not hasattr(products, name) or (value is True and hasattr(products, "fp32_precision")):
-            continue
-        setattr(products, name, value)
-        found = made(SuperPoint, {}, device).extract(image_of())
-        expect(same_features(before, found, False) > 0.98, "keypoints differ from float32's")
-        expect(getattr(products, name) == value, f"{name} was changed")
+    newer = hasattr(products, "fp32_precision")
+    name, value = ("fp32_precision", "tf32") if newer else ("allow_tf32", True)
+    setattr(products, name, value)
+    found = made(SuperPoint, {}, device).extract(image_of())
+    expect(same_features(before, found, False) > 0.98, "keypoints differ from float32's")
+    expect(getattr(products, name) == value, f"{name} was changed")
 
 
 def extraction(name: str) -> Callable[[str, Path], None]:
@@ -293,7 +291,9 @@ def evaluation(executor: str) -> Callable[[str, Path], None]:
         )
         expect(len(true) > 0, "the processor localizes nothing")
         expect(len(set(poses) ^ set(true)) <= 1, f"{len(poses)} localized, not {len(true)}")
-        away = [np.linalg.norm(poses[n].center() - true[n].center()) for n in set(poses) & set(true)]
+        away = [
+            np.linalg.norm(poses[n].center() - true[n].center()) for n in set(poses) & set(true)
+        ]
         expect(float(np.median(away)) < 0.05, f"poses are {np.median(away):.3f} m away")
 
     return step
@@ -350,9 +350,7 @@ def run_step(name: str, device: str, place: Path) -> tuple[bool, str]:
     command = [sys.executable, __file__, "--step", name, "--device", device, "--folder", str(place)]
     environment = {**os.environ, "MEGLOC_WEIGHTS": str(place / "weights")}
     try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, env=environment, timeout=300
-        )
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300)
     except subprocess.TimeoutExpired:
         return False, "it took more than 300 s"
     lines = done.stderr.strip().splitlines()
@@ -377,7 +375,9 @@ def main() -> None:
             place / "weights" / UNVERIFIED, sizes=SMALL, names=[*_WRITERS, *FREE_NETWORKS]
         )
         write_scene(place / "scene", with_depth=True)
-        print(f"{'weights and scene':20s} written  {time.perf_counter() - began:6.1f} s", flush=True)
+        print(
+            f"{'weights and scene':20s} written  {time.perf_counter() - began:6.1f} s", flush=True
+        )
         for name in options.step or STEPS:
             start = time.perf_counter()
             succeeded, words = run_step(name, options.device, place)

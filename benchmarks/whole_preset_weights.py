@@ -236,7 +236,9 @@ def _lightglue(path: Path, _: Sizes) -> None:
         head.final_proj.weight.copy_((_SHARPNESS**0.5 * 4) * turned)
         head.final_proj.bias.zero_()
         head.matchability.bias.fill_(3.0)
-    state = {key: value for key, value in net.state_dict().items() if key != "confidence_thresholds"}
+    state = {
+        key: value for key, value in net.state_dict().items() if key != "confidence_thresholds"
+    }
     torch.save(state, path)
 
 
