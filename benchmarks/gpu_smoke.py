@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -47,18 +48,19 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "rendering")
 from corner import write_scene  # type: ignore[import-not-found]  # noqa: E402
 
 Image = NDArray[np.uint8]
+HEIGHT, WIDTH = 160, 224
 SMALL = Sizes(clusters=4, whitened=32, hidden=8)
 EXTRACTORS: dict[str, tuple[Any, dict[str, Any]]] = {
     "superpoint": (SuperPoint, {}),
     "aslfeat": (AslFeat, {}),
     "aliked": (Aliked, {"threshold": 0.0}),
-    "r2d2": (R2D2, {"min_size": 200, "max_size": 256}),
+    "r2d2": (R2D2, {"min_size": 160, "max_size": 224}),
     "xfeat": (XFeat, {}),
     "disk": (Disk, {}),
 }
 GLOBAL: dict[str, tuple[Any, dict[str, Any]]] = {
     "netvlad": (global_networks.NetVlad, {}),
-    "openibl": (global_networks.OpenIbl, {"max_size_px": 240}),
+    "openibl": (global_networks.OpenIbl, {"max_size_px": 224}),
     "apgem": (global_networks.ApGem, {}),
     "delg": (global_networks.Delg, {}),
     "megaloc": (global_networks.MegaLoc, {"size_px": 224}),
@@ -79,7 +81,7 @@ def expect(true: bool | np.bool_, words: str) -> None:
         raise Failed(words)
 
 
-def image_of(seed: int = 0, height: int = 240, width: int = 320) -> Image:
+def image_of(seed: int = 0, height: int = HEIGHT, width: int = WIDTH) -> Image:
     coarse = np.random.default_rng(seed).integers(0, 256, (height // 8, width // 8, 3), np.uint8)
     return coarse.repeat(8, axis=0).repeat(8, axis=1)
 
@@ -121,7 +123,7 @@ def tf32(device: str, _: Path) -> None:
 def extraction(name: str) -> Callable[[str, Path], None]:
     def step(device: str, _: Path) -> None:
         kind, options = EXTRACTORS[name]
-        image, flat = image_of(), np.full((240, 320, 3), 128, np.uint8)
+        image, flat = image_of(), np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
         mask = np.ones(image.shape[:2], bool)
         mask[:, :100] = False
         expected = made(kind, options, "cpu").extract_many([image], [mask])[0]
@@ -185,7 +187,7 @@ def labels(device: str, _: Path) -> None:
 
 
 def image_distance(device: str, _: Path) -> None:
-    valid = np.ones((240, 320), bool)
+    valid = np.ones((HEIGHT, WIDTH), bool)
     valid[:, :100] = False
     expected = made(LpipsDistance, {}, "cpu").distance(image_of(0), image_of(1), valid)
     for half in (False, True):
@@ -250,10 +252,8 @@ def training(device: str, place: Path) -> None:
             yield item
 
     whole = train(options, data, place / "whole" / "x.safetensors")
-    try:
+    with suppress(KeyboardInterrupt):
         train(options, data, place / "parts" / "x.safetensors", work=Work(track=track))
-    except KeyboardInterrupt:
-        pass
     resumed = train(options, data, place / "parts" / "x.safetensors")
     for key, value in whole.items():
         expect(abs(resumed[key] - value) < 1e-2 * max(abs(value), 1), f"{key}: {resumed[key]}")

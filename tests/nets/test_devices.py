@@ -76,8 +76,9 @@ def image() -> NDArray[np.uint8]:
 
 
 def forget() -> None:
-    for kept in (runtime.pick_device, runtime._made, lpips._network, lpips._features_kept):
-        kept.cache_clear()
+    for kept in (*vars(runtime).values(), *vars(lpips).values()):
+        if hasattr(kept, "cache_clear"):
+            kept.cache_clear()
 
 
 def on_both(
@@ -116,7 +117,6 @@ def test_local_features(
         apart = np.linalg.norm(one.keypoints_px[:, None, :2] - other.keypoints_px[:, :2], axis=2)
         near = apart.min(axis=1) < (1.0 if half else 0.01)
         cosine = (one.descriptors * other.descriptors[apart.argmin(axis=1)]).sum(axis=1)
-        print(name, half, len(one.scores), near.mean(), np.median(cosine[near]), cosine[near].min())
         assert near.mean() > (0.5 if half else 0.99)
         assert np.median(cosine[near]) > (0.95 if half else 0.9999)
 
@@ -134,7 +134,6 @@ def test_global_features(
         kind, options, half, lambda p: p.describe_many([image, image[::-1].copy()])
     )
     cosine = (cpu * found).sum(axis=1)
-    print(name, half, cosine)
     assert cosine.min() > (0.95 if half else 0.99999)
 
 
@@ -154,9 +153,9 @@ def test_matches(name: str, half: bool, weights: Callable[..., None]) -> None:
     a, less, none = features(60), features(1), features(0)
     order = rng.permutation(60)[:40]
     b = ImageFeatures(a.keypoints_px[order], a.descriptors[order], WIDTH, HEIGHT)
-    cpu, found = on_both(MATCHERS[name], {}, half, lambda p: p.match_many(a, [b, less, none]))
+    options = {"sinkhorn_iterations": 20} if name == "superglue_outdoor" else {}
+    cpu, found = on_both(MATCHERS[name], options, half, lambda p: p.match_many(a, [b, less, none]))
     pairs = [set(map(tuple, matches.tolist())) for matches, _ in (cpu[0], found[0])]
-    print(name, half, len(pairs[0]), len(pairs[0] & pairs[1]))
     assert len(pairs[0]) > 20
     assert len(pairs[0] & pairs[1]) >= (0.9 if half else 1.0) * len(pairs[0] | pairs[1])
     assert len(found[2][0]) == 0
