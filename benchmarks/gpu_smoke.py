@@ -243,7 +243,7 @@ def training(device: str, place: Path) -> None:
          "pairs": {"max_size_px": 200}}
     )  # fmt: skip
     folder = KaptureFolder(place / "scene" / "mapping")
-    data = TrainingData([folder], [], [folder])
+    data = TrainingData([folder], [], [])
 
     def track(items: Iterable[Any], total: int, label: str) -> Iterator[Any]:
         for number, item in enumerate(items):
