@@ -386,10 +386,10 @@ def test_a_map_that_contradicts_itself_is_not_localized_in_silently(
     np.savetxt(path, table, delimiter=", ", header="X, Y, Z, R, G, B")
     command = queries_of(foreign, tmp_path / "localized")
     text = megloc(*command).refused("the points do not fit the keypoints")
-    assert "points read as (x, z, y)" in text and "--force" in text
+    assert "--force" in text
     assert not (tmp_path / "localized").exists()
     out = megloc("info", foreign / "map").out
-    assert re.search(r"FAULT +the points do not fit .* with points read as \(x, z, y\)", out)
+    assert re.search(r"FAULT +the points do not fit", out)
     # who insists gets poses that are right in that world, or reasons
     assert megloc(*command, "-f").status == 0
     assert len(read_status(tmp_path / "localized" / "status.csv")) == 4
