@@ -83,6 +83,9 @@ lint: $(STAMP)
 	@for folder in megloc_kapture twins/megloc_twins tests twins/tests; do \
 		find $$folder -name '*.py' | xargs cat | wc -l | tr '\n' ' '; \
 		echo "lines in $$(find $$folder -name '*.py' | wc -l) files of $$folder"; done
+	@echo "$$(grep -rhE '^ *class ' megloc_kapture --include='*.py' | wc -l) classes," \
+		"$$(grep -rhE '^ +raise\b' megloc_kapture --include='*.py' | wc -l) raise," \
+		"$$($(BIN)/megloc options | grep -c '^[^ ]* = ') options of megloc_kapture"
 
 docs: $(STAMP)
 	@$(BIN)/python scripts/api_reference.py build/docs

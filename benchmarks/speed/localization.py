@@ -92,6 +92,7 @@ NUM_KEYPOINTS = 4096
 MAX_VIEWS = 4  # images that say the same
 MAX_ERROR_M = 0.05
 OPTIONS = AbsolutePoseOptions()
+RANSAC = OPTIONS.for_poselib()
 KEYPOINTS_TYPE = "synthetic"
 TOOL = "kapture_pycolmap_localize"
 METHODS = ("ours", "poselib", "pycolmap", "kapture-localization")
@@ -236,7 +237,7 @@ def bare_poselib(px: NDArray[np.float64], xyz: NDArray[np.float64]) -> tuple[int
         "height": CAMERA.height,
         "params": list(CAMERA.params),
     }
-    pose, found = poselib.estimate_absolute_pose(px, xyz, camera, OPTIONS.for_poselib(), {})
+    pose, found = poselib.estimate_absolute_pose(px, xyz, camera, RANSAC, {})
     return found["num_inliers"], np.asarray(-pose.R.T @ pose.t)
 
 
@@ -248,9 +249,9 @@ def bare_pycolmap(px: NDArray[np.float64], xyz: NDArray[np.float64]) -> tuple[in
     )
     ransac = {
         "max_error": OPTIONS.max_error_px,
-        "min_num_trials": OPTIONS.min_iterations,
-        "max_num_trials": OPTIONS.max_iterations,
-        "confidence": OPTIONS.confidence,
+        "min_num_trials": RANSAC["min_iterations"],
+        "max_num_trials": RANSAC["max_iterations"],
+        "confidence": RANSAC["success_prob"],
     }
     found = pycolmap.estimate_and_refine_absolute_pose(px, xyz, camera, {"ransac": ransac})
     if found is None:

@@ -40,6 +40,7 @@ CAMERAS = {
     "OPENCV": Camera("OPENCV", 1600, 1200, (1200.0, 1210.0, 805.0, 599.0, -0.1, 0.02, 1e-3, -1e-3)),
 }
 OPTIONS = AbsolutePoseOptions()
+RANSAC = OPTIONS.for_poselib()
 
 
 def problem(
@@ -76,7 +77,7 @@ def bare_poselib(camera: Camera) -> Solver:
 
     def solve(undistorted: Array, world: Array) -> RigidTransform | None:
         pose, _ = poselib.estimate_absolute_pose(
-            undistorted, world, pinhole, OPTIONS.for_poselib(), {"loss_type": "CAUCHY"}
+            undistorted, world, pinhole, RANSAC, {"loss_type": "CAUCHY"}
         )
         return RigidTransform.from_matrix(pose.R, pose.t)
 
@@ -91,8 +92,8 @@ def with_pycolmap(camera: Camera) -> Solver:
     )
     estimation = pycolmap.AbsolutePoseEstimationOptions()
     estimation.ransac.max_error = OPTIONS.max_error_px
-    estimation.ransac.confidence = OPTIONS.confidence
-    estimation.ransac.max_num_trials = OPTIONS.max_iterations
+    estimation.ransac.confidence = RANSAC["success_prob"]
+    estimation.ransac.max_num_trials = RANSAC["max_iterations"]
     estimation.ransac.min_inlier_ratio = 0.01
     estimation.ransac.random_seed = OPTIONS.seed
 
@@ -119,9 +120,9 @@ def with_opencv(camera: Camera) -> Solver:
             pixels,
             intrinsics,
             coefficients,
-            iterationsCount=OPTIONS.max_iterations,
+            iterationsCount=RANSAC["max_iterations"],
             reprojectionError=OPTIONS.max_error_px,
-            confidence=OPTIONS.confidence,
+            confidence=RANSAC["success_prob"],
             flags=cv2.SOLVEPNP_AP3P,
         )
         if not done:

@@ -132,3 +132,15 @@ def in_image(camera: Camera, px: NDArray[np.floating[Any]]) -> NDArray[np.bool_]
     """Return the mask (N,) of pixels (N, 2) inside the camera's image; NaN is outside."""
     with np.errstate(invalid="ignore"):
         return np.asarray(((px >= 0) & (px < (camera.width, camera.height))).all(axis=1))
+
+
+# noise of a Kinect's depth at z, a + b z + c z^2 of 0.0012 + 0.0019 (z - 0.4)^2
+STRUCTURED_LIGHT = (0.001504, -0.00152, 0.0019)
+
+
+def depth_noise(
+    depth: NDArray[np.float64], noise: tuple[float, float, float]
+) -> NDArray[np.float64]:
+    """Return the standard deviation of a sensor's depth, a + b z + c z^2."""
+    a, b, c = noise
+    return a + depth * (b + depth * c)

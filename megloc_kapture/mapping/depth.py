@@ -12,7 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from megloc_kapture.geometry.cameras import bearing_rays, focal_px, px_from_cam
+from megloc_kapture.geometry.cameras import (
+    STRUCTURED_LIGHT,
+    bearing_rays,
+    depth_noise,
+    focal_px,
+    px_from_cam,
+)
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
@@ -31,8 +37,6 @@ _KEYPOINT_NOISE_PX = 2.0
 # a point agrees with any depth this near: allows for edges and registration of image and depth
 _WINDOW_PX = 3
 _SAME_CENTRE_M = 1e-9  # an offset that is left over from composing transforms
-# coefficients of z^0, z^1, z^2 of 0.0012 + 0.0019 (z - 0.4)^2
-STRUCTURED_LIGHT = (0.001504, -0.00152, 0.0019)
 
 
 def lift_keypoints(
@@ -168,12 +172,6 @@ class DepthVerificationOptions(Options):
         if not np.isfinite(noise).all() or lowest <= 0 or c < 0 or (c == 0 and b < 0):
             raise ValueError("noise is not positive at every depth")
         return noise
-
-
-def depth_noise(depth: Floats, noise: tuple[float, float, float]) -> Floats:
-    """Return the standard deviation of a sensor's depth, a + b z + c z^2."""
-    a, b, c = noise
-    return a + depth * (b + depth * c)
 
 
 def contradicted_by_depth(

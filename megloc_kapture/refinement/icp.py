@@ -15,9 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from megloc_kapture.geometry.cameras import focal_px, in_image, px_from_cam
+from megloc_kapture.geometry.cameras import (
+    STRUCTURED_LIGHT,
+    depth_noise,
+    focal_px,
+    in_image,
+    px_from_cam,
+)
 from megloc_kapture.geometry.poses import rotation_angles_deg
-from megloc_kapture.mapping.depth import STRUCTURED_LIGHT, depth_noise
 from megloc_kapture.plugins import DepthView, PoseRefinement, RankingScene
 from megloc_kapture.refinement.icp_surface import (
     NORMAL_NEIGHBOURS,

@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.geometry.cameras import depth_noise
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.files import link_images, write_json_model
 from megloc_kapture.io.kapture import (
@@ -34,7 +35,6 @@ from megloc_kapture.mapping.depth import (
     DepthVerificationOptions,
     compare_with_depth,
     contradicted_by_depth,
-    depth_noise,
 )
 from megloc_kapture.mapping.uncertainty import (
     ObservedPoints,

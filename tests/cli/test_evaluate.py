@@ -141,14 +141,6 @@ def test_without_truth(megloc: Any, runs: Path) -> None:
     assert (out / "agreement.txt").read_text() == done.out.removesuffix("\n")
 
 
-def test_the_same_bytes_twice(megloc: Any, runs: Path, contents: Any) -> None:
-    for truth in (("--gt", runs / "a/query_gt"), ()):
-        for place in ("one", "two"):
-            command = results(runs, "a", "b")
-            assert megloc(*command, *truth, "-o", runs / place, "-f").status == 0
-        assert contents(runs / "one") == contents(runs / "two")
-
-
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

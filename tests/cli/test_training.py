@@ -109,14 +109,6 @@ def pose_text(mapping: Path) -> str:
     return "--pose=" + ",".join(f"{value:.9f}" for value in (*pose.quat_wxyz, *pose.translation))
 
 
-def test_the_same_bytes_twice(megloc: Any, mapping: Path, field: Path, tmp_path: Path) -> None:
-    done = megloc("train-field", "-i", mapping, "-o", tmp_path / "again", *QUICK)
-    assert done.status == 0 and "PSNR of 0 held-out images" in done.out
-    assert "step 1 of 6" in done.err
-    assert same_field(tmp_path / "again", field)
-    assert len(json.loads((field / "field.json").read_text())["images"]) == 7
-
-
 def test_an_interrupted_training_goes_on(
     megloc: Any, mapping: Path, field: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from megloc_kapture.geometry.cameras import depth_noise
 from megloc_kapture.mapping import depth as module
 from megloc_kapture.mapping.depth import (
     DepthVerificationOptions,
     contradicted_by_depth,
-    depth_noise,
     lift_keypoints,
 )
 from megloc_kapture.values import Camera, RigidTransform

@@ -139,7 +139,7 @@ def network(seed: int = 0) -> SuperGlueNet:
 
 
 @torch.inference_mode()
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_matches_are_transformers(seed: int) -> None:
     a = random_image(150, seed)
     b = seen_again(a, 110, 40, seed)
@@ -156,6 +156,7 @@ def test_matches_are_transformers(seed: int) -> None:
     assert (other_scores - scores).abs().max() > 0.05
 
 
+@pytest.mark.slow
 @torch.inference_mode()
 def test_pairs_of_any_sizes_together_are_each_alone() -> None:
     net = network()

@@ -142,12 +142,6 @@ def test_a_worker_that_differs_is_refused(
         pytest.fail("it was not refused")
 
 
-def test_a_worker_that_was_killed_costs_no_result(tmp_path: Path) -> None:
-    with open_executor("dask", 2) as executor:
-        places = [tmp_path / str(number) for number in range(3)]
-        assert list(ordered_map(_die_once, places, executor)) == ["done"] * 3
-
-
 def test_what_cannot_be_used_is_refused(cluster: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dask_executor, "_CONNECT_S", 1.0)
     with (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -146,29 +146,6 @@ def test_the_vocabulary_knows_nothing_of_the_queries(
     alone, both = folder_bytes(tmp_path / PLACE), folder_bytes(world.features_dir / PLACE)
     assert set(both) - set(alone) == {f"global_features/{q}.gfeat" for q in world.query_poses}
     assert all(both[name] == content for name, content in alone.items())
-
-
-@pytest.mark.parametrize(("options", "dimensions"), [(VLAD, 1024), (WHITENED, 3)])
-def test_workers_write_the_same_bytes(
-    world: Any,
-    two_processes: Executor,
-    tmp_path: Path,
-    folder_bytes: Any,
-    options: VladOptions,
-    dimensions: int,
-) -> None:
-    folders = [world.query(), world.mapping()]
-    for name, work in (("one", Work()), ("two", Work(two_processes))):
-        with single_threaded():
-            counts = extract_vlad(
-                world.mapping(), folders, "rootsift", tmp_path / name, options, work=work
-            )
-        assert counts == {"images": 7, "clusters": 8, "dimensions": dimensions}
-    written = folder_bytes(tmp_path / "one")
-    assert written == folder_bytes(tmp_path / "two")
-    # vectors, their header, settings, vocabulary; with whitening its mean and projection
-    assert len(written) == 7 + 3 + (2 if options is WHITENED else 0)
-    assert_described_by(tmp_path / "two", folders, options)
 
 
 @pytest.mark.parametrize(

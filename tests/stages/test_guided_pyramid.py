@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Collection, Iterator
-from concurrent.futures import Executor
 from dataclasses import replace
 from itertools import combinations, product
 from pathlib import Path
@@ -337,27 +336,6 @@ def test_kaptures_own_reader_opens_the_type(scene: Scene) -> None:
 
 
 # ---------------------------------------------------------------------------- when it runs
-
-
-@pytest.mark.parametrize("kind", ["turned", "mapping"])
-def test_workers_write_the_same_bytes_and_extract_an_image_once(
-    scene: Scene, kind: str, two_processes: Executor, tmp_path: Path, folder_bytes: Any
-) -> None:
-    there, counting = tmp_path / "there", Upright()
-    counts = scene.retry(kind, there, work=Work(two_processes))
-    assert counts["pairs_gained"] > 0
-    written = folder_bytes(there)
-    assert written == folder_bytes(scene.root / f"{kind}_all")
-    images = 2 if kind == "turned" else len(MAP_IMAGES)
-    # two configurations and the table
-    assert len(written) == 2 * images + 2 + len(scene.pairs(kind)) + 1
-    counts = scene.retry(kind, tmp_path / "here", extractor=counting)
-    if kind == "turned":
-        assert counts["pairs_tried"] >= 4
-        assert counting.calls == 2 * 5 == 5 * counts["images_extracted_again"]
-    else:
-        # two images as the first of a pair, one as the second, of which only scales are new
-        assert counting.calls == 5 + 5 + 3
 
 
 def test_the_mask_goes_with_the_image(

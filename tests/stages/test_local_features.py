@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import mask_counts_path
 from megloc_kapture.stages.local_features import extract_local_features
-from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, LocalFeatures
 
 Image = NDArray[np.uint8]
@@ -52,17 +50,6 @@ def test_kapture_reads_it(world: Any, tmp_path: Path) -> None:
     assert (keypoints.type_name, keypoints.dtype, keypoints.dsize) == ("rootsift", np.float32, 2)
     found = theirs.descriptors["rootsift"]
     assert (found.dsize, found.keypoints_type, found.metric_type) == (128, "rootsift", "L2")
-
-
-def test_workers_write_the_same_bytes(
-    images_only: Any, world: Any, two_processes: Executor, tmp_path: Path, folder_bytes: Any
-) -> None:
-    folders = [images_only.mapping(), images_only.query()]
-    counts = extract_local_features(folders, EXTRACTOR, tmp_path, work=Work(two_processes))
-    assert counts["images"] == 7
-    ours = folder_bytes(tmp_path / "local_features")
-    assert len(ours) == 2 * 7 + 2
-    assert ours == folder_bytes(world.features_dir / "local_features")
 
 
 def test_masks_beside_the_images_are_obeyed(small_kapture: Any, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -48,29 +47,6 @@ def run(world: Any, kind: str, verification: Any, output: Path, **more: Any) -> 
             first, world.mapping(), pairs, "rootsift", NearestNeighbours(), verification, output,
             **more,
         )  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("kind", "verification"),
-    [("mapping", KnownPoseOptions()), ("query", TwoViewOptions()), ("query", NoVerification())],
-    ids=["poses", "two-view", "none"],
-)
-def test_workers_write_the_same_bytes(
-    world: Any,
-    two_processes: Executor,
-    tmp_path: Path,
-    folder_bytes: Any,
-    kind: str,
-    verification: Any,
-) -> None:
-    here = run(world, kind, verification, tmp_path / "here")
-    there = run(world, kind, verification, tmp_path / "there", work=Work(two_processes))
-    assert here == there
-    assert here["pairs"] == here["pairs_with_matches"] == 10
-    assert here["matches"] > 2000
-    written = folder_bytes(tmp_path / "here")
-    assert len(written) == 11  # of ten pairs, and the table of their numbers
-    assert written == folder_bytes(tmp_path / "there")
 
 
 def test_all_of_the_matchers_matches_are_kept_or_those_that_are_verified(

@@ -99,7 +99,8 @@ def interrupted_after(step: int) -> Work:
 
 
 # of descriptors the matcher is a part
-@pytest.mark.parametrize("task", [pytest.param("matcher", marks=pytest.mark.slow), "descriptor"])
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["matcher", "descriptor"])
 def test_interrupted_and_resumed_is_uninterrupted(
     task: str,
     files: dict[str, str],
