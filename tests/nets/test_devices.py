@@ -45,9 +45,8 @@ GLOBAL: dict[str, tuple[Any, dict[str, Any]]] = {
     "openibl": (global_networks.OpenIbl, {"max_size_px": 128}),
     "apgem-resnet101-lm18": (global_networks.ApGem, {}),
     "delg-r101-gldv2clean": (global_networks.Delg, {"scales": [1.0]}),
-    "megaloc": (global_networks.MegaLoc, {"size_px": 126}),
 }
-HEAVY = {"apgem-resnet101-lm18", "delg-r101-gldv2clean", "megaloc"}
+HEAVY = {"apgem-resnet101-lm18", "delg-r101-gldv2clean"}
 MATCHERS = {"superglue_outdoor": SuperGlue, "superpoint_lightglue": LightGlue}
 
 
@@ -162,11 +161,11 @@ def test_matches(name: str, half: bool, weights: Callable[..., None]) -> None:
 
 
 @SLOW
-@both_precisions
-def test_labels(half: bool, weights: Callable[..., None], image: NDArray[np.uint8]) -> None:
+def test_labels(weights: Callable[..., None], image: NDArray[np.uint8]) -> None:
+    """In full precision only: activations of random weights exceed float16."""
     weights("deeplabv3plus-resnet101")
-    cpu, found = on_both(DeepLab, {}, half, lambda p: p.segment(image))
-    assert (cpu == found).mean() > (0.95 if half else 0.999)
+    cpu, found = on_both(DeepLab, {}, False, lambda p: p.segment(image))
+    assert (cpu == found).mean() > 0.999
 
 
 @both_precisions
