@@ -6,38 +6,19 @@ import hashlib
 import sys
 from contextlib import suppress
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
 from megloc_kapture.errors import MeglocError, PluginError, missing_extra, suggestion
+from megloc_kapture.plugin_names import entry_points
+from megloc_kapture.plugin_names import plugin_names as plugin_names
 from megloc_kapture.plugins import PROTOCOLS
 from megloc_kapture.values import Options
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-
-def entry_points(**of: str) -> metadata.EntryPoints:
-    """Return the entry points on the search path, cached: reading takes 10 ms."""
-    return _selected(tuple(sys.path), *sorted(of.items()))
-
-
-@cache
-def _selected(search_path: tuple[str, ...], *of: tuple[str, str]) -> Any:
-    return _entry_points_on(search_path).select(**dict(of))
-
-
-@cache
-def _entry_points_on(_search_path: tuple[str, ...]) -> Any:
-    """Any: Python 3.11 has another return type with the same selection."""
-    return metadata.entry_points()
-
-
-def plugin_names(group: str) -> list[str]:
-    return sorted({entry.name for entry in entry_points(group=group)})
 
 
 def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) -> Any:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from megloc_kapture.plugin_names import STAGES as STAGES
 from megloc_kapture.values import Camera, ImageFeatures, LocalFeatures, Options, RigidTransform
 
 LOCAL_FEATURES = "megloc_kapture.local_features"
@@ -29,7 +30,6 @@ IMAGE_DISTANCES = "megloc_kapture.image_distances"
 POSE_REFINERS = "megloc_kapture.pose_refiners"
 DATASETS = "megloc_kapture.datasets"
 RENDERED_DATASETS = "megloc_kapture.rendered_datasets"
-STAGES = "megloc_kapture.stages"
 
 
 class PluginChoice(Options):

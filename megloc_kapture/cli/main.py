@@ -13,7 +13,6 @@ import sys
 import traceback
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Protocol
 
 from megloc_kapture.errors import MeglocError, OptionError, missing_extra, suggestion
@@ -112,9 +111,9 @@ def _parser(given: Sequence[str]) -> Any:
 
     import tyro
 
-    # not by plugin_loading, whose imports take longer than the help
-    entries = entry_points(group="megloc_kapture.stages")
-    stages = sorted({entry.name.replace("_", "-") for entry in entries})
+    from megloc_kapture.plugin_names import STAGES, plugin_names
+
+    stages = [name.replace("_", "-") for name in plugin_names(STAGES)]
     if given and not given[0].startswith("-") and given[0] not in [*COMMANDS, *stages]:
         known = suggestion(given[0], [*COMMANDS, *stages], listed="commands: ")
         raise OptionError(f"unknown command {given[0]!r}; {known}")

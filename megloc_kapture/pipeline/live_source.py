@@ -68,15 +68,18 @@ class MapMatching:
     def rerank(self, matches: Sequence[Sequence[VerifiedMatches]]) -> list[int]:
         """Return the rows of the images that stay, best first; all if reranking is off."""
         how = self.options.reranking
-        names = [local.name for local in self.types]
-        # a foreign map may lack the types of the preset
-        counted_types = how.types_named(names) or names
         numbers = [
             [counted(pair, how.by) for pair in of_type]
-            for name, of_type in zip(names, matches, strict=True)
-            if name in counted_types
+            for local, of_type in zip(self.types, matches, strict=True)
+            if local.name in self._counted_types
         ]
         return rerank(numbers, how)[0]
+
+    @cached_property
+    def _counted_types(self) -> Sequence[str]:
+        names = [local.name for local in self.types]
+        # a foreign map may lack the types of the preset
+        return self.options.reranking.types_named(names) or names
 
     def _permitted(self, query: Query) -> list[str]:
         if query.prior is None:

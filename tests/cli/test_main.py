@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 import megloc_kapture
-from megloc_kapture import plugin_loading
 from megloc_kapture.cli.common import Console
 from megloc_kapture.cli.info import shown
 from megloc_kapture.cli.main import COMMANDS, command_class, main
@@ -61,7 +60,7 @@ def test_a_rendered_dataset_is_refused_in_one_line(
         "nothing renders 'venice'; known: 4seasons, aachen"
     )
     megloc("synth", "aachen", "-o", out, "--set", "width=3").refused("'aachen' .* width: .* 64")
-    monkeypatch.setattr(plugin_loading, "entry_points", lambda group: EntryPoints())
+    monkeypatch.setattr("megloc_kapture.plugin_names.entry_points", lambda group: EntryPoints())
     megloc("synth", "aachen", "-o", out).refused("pip install megloc-twins")
     monkeypatch.undo()
     assert not out.exists()

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from megloc_kapture import plugin_loading
 from megloc_kapture.datasets.official import Count, DatasetCard, Missing, OfficialDataset
 from megloc_kapture.errors import DataError, OptionError, PluginError
 from megloc_kapture.io.dataset_tables import Protocol, read_protocol
@@ -122,7 +121,7 @@ def test_without_the_twins_one_line_says_what_to_install(
 ) -> None:
     others = {group: entry_points(group=group) for group in (DATASETS, RENDERED_DATASETS)}
     others[RENDERED_DATASETS] = EntryPoints()
-    monkeypatch.setattr(plugin_loading, "entry_points", lambda group: others[group])
+    monkeypatch.setattr("megloc_kapture.plugin_names.entry_points", lambda group: others[group])
     for name in ("synthetic", "synthetic-aachen"):
         with pytest.raises(OptionError, match="pip install megloc-twins"):
             choose_dataset(name, None)
