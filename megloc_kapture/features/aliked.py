@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.network import Images, LocalNetwork, LocalNetworkOptions, Masks
-from megloc_kapture.nets.runtime import image_tensor, inference, load_strictly
+from megloc_kapture.nets.runtime import image_tensor, in_fast_layout, inference, load_strictly
 from megloc_kapture.nets.score_maps import (
     corners_around,
     deform_conv2d,
@@ -127,7 +127,7 @@ class AlikedNet(nn.Module):
         top, left = extra_y // 2, extra_x // 2
         margins = (left, extra_x - left, top, extra_y - top)
         padded = functional.pad(images, margins, mode="replicate")
-        level1 = self.block1(padded.contiguous(memory_format=torch.channels_last))
+        level1 = self.block1(in_fast_layout(padded))
         level2 = self.block2(functional.avg_pool2d(level1, 2))
         level3 = self.block3(functional.avg_pool2d(level2, 4))
         level4 = self.block4(functional.avg_pool2d(level3, 4))

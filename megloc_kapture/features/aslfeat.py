@@ -27,7 +27,7 @@ from megloc_kapture.features.network import (
     Masks,
     in_image_px,
 )
-from megloc_kapture.nets.runtime import inference, load_strictly
+from megloc_kapture.nets.runtime import in_fast_layout, inference, load_strictly
 from megloc_kapture.nets.score_maps import (
     conv_same,
     deform_conv2d,
@@ -158,7 +158,7 @@ class AslFeatNet(nn.Module):
         for image in torch.split(images, 1):
             variance, mean = torch.var_mean(image, correction=0)
             normalised.append((image - mean) * torch.rsqrt(variance + 1e-5))
-        x = torch.cat(normalised).contiguous(memory_format=torch.channels_last)
+        x = in_fast_layout(torch.cat(normalised))
         scores = images.new_zeros(len(images), height, width)
         x = self.conv0.normalised(x)
         for scored, strided in (("conv1", self.conv2), ("conv3", self.conv4)):

@@ -25,7 +25,7 @@ from megloc_kapture.features.network import (
     Masks,
     in_image_px,
 )
-from megloc_kapture.nets.runtime import image_tensor, inference, load_strictly
+from megloc_kapture.nets.runtime import image_tensor, in_fast_layout, inference, load_strictly
 from megloc_kapture.nets.score_maps import window_maximum
 from megloc_kapture.nets.trunks import imagenet_normalised
 from megloc_kapture.values import LocalFeatures
@@ -84,7 +84,7 @@ class R2D2(LocalNetwork[R2D2Options]):
                 max_size=options.max_size,
             )
             for level in levels:
-                maps = network(level.contiguous(memory_format=torch.channels_last))
+                maps = network(in_fast_layout(level))
                 scale = np.float32(_PATCH_PX * max(images[0].shape[:2]) / max(level.shape[-2:]))
                 told = maps.features, maps.reliability[:, 0], maps.repeatability[:, 0]
                 for own, features, reliability, repeatability in zip(found, *told, strict=True):

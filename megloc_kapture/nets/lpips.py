@@ -9,7 +9,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from megloc_kapture.nets.runtime import load_strictly
+from megloc_kapture.nets.runtime import in_fast_layout, load_strictly
 from megloc_kapture.nets.trunks import Vgg16Features
 
 Trunk = Literal["alex", "vgg", "squeeze"]
@@ -106,7 +106,7 @@ class Lpips(nn.Module):
     def described(self, image: torch.Tensor, valid: torch.Tensor) -> list[torch.Tensor]:
         """Return unit features of the valid pixels, per layer (B, C, h, w); see :meth:`forward`."""
         # channels last: the same convolutions and lengths, faster on a CPU
-        x = (self._normalised(image) * valid).contiguous(memory_format=torch.channels_last)
+        x = in_fast_layout(self._normalised(image) * valid)
         found = []
         for number, layer in enumerate(self.features):
             x = layer(x)

@@ -51,37 +51,48 @@ def pick_device(device: Device) -> torch.device:
 def inference(device: torch.device, half_precision: bool = False) -> Iterator[None]:
     """Disable gradients; half precision is float16 on a GPU, bfloat16 on a CPU, and never TF32."""
     half = torch.float16 if device.type == "cuda" else torch.bfloat16
-    exact = _without_tf32() if device.type == "cuda" else nullcontext()
     autocast = torch.autocast(device.type, dtype=half, enabled=half_precision)
-    with exact, torch.inference_mode(), autocast:
+    # TF32 is a setting of the process, so only one thread computes at a time
+    alone = _computing if device.type == "cuda" else nullcontext()
+    with alone, without_tf32(device), torch.inference_mode(), autocast:
         yield
 
 
 @contextmanager
-def _without_tf32() -> Iterator[None]:
-    """TF32 is a setting of the process, so only one thread computes at a time."""
-    with _computing:
-        products: Any = torch.backends.cuda.matmul
-        convolutions: Any = torch.backends.cudnn
-        name: str = "allow_tf32"
-        exact: Any = False
-        if hasattr(products, "fp32_precision"):  # torch 2.9 refuses a mix with the older settings
-            convolutions, name, exact = convolutions.conv, "fp32_precision", "ieee"
-        settings = products, convolutions
-        before = [getattr(setting, name) for setting in settings]
-        for setting in settings:
-            setattr(setting, name, exact)
-        try:
-            yield
-        finally:
-            for setting, value in zip(settings, before, strict=True):
-                setattr(setting, name, value)
+def without_tf32(device: torch.device) -> Iterator[None]:
+    """Compute products and convolutions of float32 in full precision, in all threads."""
+    if device.type == "cpu":
+        yield
+        return
+    products: Any = torch.backends.cuda.matmul
+    convolutions: Any = torch.backends.cudnn
+    name: str = "allow_tf32"
+    exact: Any = False
+    if hasattr(products, "fp32_precision"):  # torch 2.9 refuses a mix with the older settings
+        convolutions, name, exact = convolutions.conv, "fp32_precision", "ieee"
+    settings = products, convolutions
+    before = [getattr(setting, name) for setting in settings]
+    for setting in settings:
+        setattr(setting, name, exact)
+    try:
+        yield
+    finally:
+        for setting, value in zip(settings, before, strict=True):
+            setattr(setting, name, value)
 
 
 def image_tensor(image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
     """Convert an RGB image, uint8 (H, W, 3), to float32 (1, 3, H, W) in [0, 1]."""
-    planes = torch.from_numpy(np.array(image.transpose(2, 0, 1), order="C"))
-    return planes.to(device)[None].float() / 255.0
+    pixels = torch.from_numpy(np.array(image, order="C")).to(device)
+    return pixels.permute(2, 0, 1)[None].contiguous().float() / 255.0
+
+
+def in_fast_layout(batch: torch.Tensor) -> torch.Tensor:
+    """Return images (N, C, H, W) in the memory layout of networks with ``channels_last``."""
+    on_cpu = batch.device.type == "cpu"
+    return batch.contiguous(
+        memory_format=torch.channels_last if on_cpu else torch.contiguous_format
+    )
 
 
 def sized_tensor(
@@ -179,7 +190,7 @@ class Checkpointed(Generic[AnyOptions]):
         ----------
         load : builds it from a checkpoint's tensors, the file's name and the arguments.
         file : replaces the option's checkpoint.
-        channels_last : faster so on a CPU.
+        channels_last : layout of the weights on a CPU, where it is faster; see in_fast_layout.
         """
         wanted: Any = self.options
         device = pick_device(wanted.device)

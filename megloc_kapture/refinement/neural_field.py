@@ -7,8 +7,10 @@ appearance of a held-out image is fitted on its left half, and the error measure
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
+from threading import Lock
 from typing import Literal
 
 import cv2
@@ -28,8 +30,8 @@ Kind = Literal["triplane", "nerfw"]
 FieldModule = NerfW | TriPlane
 Lights = Literal["image", "folder"]
 Floats = NDArray[np.float32]
-# rays rendered at once: fastest on a CPU while their samples fit its cache
-_CHUNK, _CPU_CHUNK = 8192, 512
+# rays rendered at once: on a GPU two gigabytes, on a CPU their samples fit its cache
+_CHUNK, _CPU_CHUNK = 4096, 512
 # fit of an appearance: Adam's rate, steps, rays per step, and rays to draw from
 _FIT_RATE, _FIT_STEPS, _FIT_RAYS, _FIT_OF = 0.1, 20, 512, 2048
 
@@ -95,6 +97,8 @@ class NeuralField:
     ) -> None:
         self.module, self.frame, self.images = module, frame, tuple(images)
         self.device = next(module.parameters()).device
+        # threads share the field, and the memory of a GPU holds the samples of one chunk
+        self._rendering = Lock() if self.device.type == "cuda" else nullcontext()
         self.light_rows = torch.tensor(light_rows, device=self.device)
 
     def rays(self, camera: Camera, cam_from_world: RigidTransform) -> Rays:
@@ -136,7 +140,8 @@ class NeuralField:
             part = select(rays, slice(start, start + size))
             if appearance is not None:
                 part = replace(part, appearance=appearance.expand(len(part.origins), -1))
-            parts.append(self.module.render(part))
+            with self._rendering:
+                parts.append(self.module.render(part))
         names = ("rgb", "depth", "opacity", "beta", "weights")
         joined = {name: torch.cat([getattr(one, name) for one in parts]) for name in names}
         return replace(parts[0], coarse_rgb=None, **joined)

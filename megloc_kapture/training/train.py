@@ -23,7 +23,13 @@ from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.files import read_content, remove, write_bytes, write_json
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.weights import find_weights, read_weights
-from megloc_kapture.nets.runtime import NetworkOptions, load_state, pick_device, state_bytes
+from megloc_kapture.nets.runtime import (
+    NetworkOptions,
+    load_state,
+    pick_device,
+    state_bytes,
+    without_tf32,
+)
 from megloc_kapture.nets.superglue import SuperGlueNet, superglue
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES, LocalFeatureExtractor, PluginChoice
@@ -155,7 +161,9 @@ class Trainer:
         """Train on pairs drawn evenly from the sources; yield at evaluations."""
         options, losses = self.options, []
         steps = range(state.step, options.steps)
-        with ThreadPoolExecutor(threads) if threads > 1 else nullcontext() as pool:
+        threaded = ThreadPoolExecutor(threads) if threads > 1 else nullcontext()
+        # once for all threads: those that extract features would switch it during a step
+        with without_tf32(self._device), threaded as pool:
             prepared = ordered_map(
                 lambda step: self._pairs(sources, step), steps, pool, window=2 * threads
             )

@@ -69,7 +69,7 @@ def test_tf32_is_off_only_during_inference(newer: bool) -> None:
         pytest.skip("this torch has the older settings only")
     code = (
         "import torch\n"
-        "from megloc_kapture.nets.runtime import _without_tf32\n"
+        "from megloc_kapture.nets.runtime import without_tf32\n"
         "products = torch.backends.cuda.matmul\n"
     )
     code += (
@@ -78,7 +78,8 @@ def test_tf32_is_off_only_during_inference(newer: bool) -> None:
         else "products.allow_tf32 = True\nread = lambda: products.allow_tf32\n"
     )
     code += (
-        "with _without_tf32():\n    assert getattr(products, 'fp32_precision', 'ieee') == 'ieee'\n"
+        "with without_tf32(torch.device('cuda')):\n"
+        "    assert getattr(products, 'fp32_precision', 'ieee') == 'ieee'\n"
         "assert read()\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

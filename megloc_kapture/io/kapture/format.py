@@ -44,7 +44,10 @@ class Sensor:
             raise DataError(f"a sensor of type {self.sensor_type!r} has no camera model")
         model = self.params[0] if self.params else ""
         if model == UNKNOWN_CAMERA:
-            raise DataError("camera is not calibrated (UNKNOWN_CAMERA); give it intrinsics first")
+            raise DataError(
+                "camera is not calibrated (UNKNOWN_CAMERA); give it intrinsics, or localize the "
+                "image with `megloc localize --query`, which estimates the focal length"
+            )
         if model not in CAMERA_MODEL_NUM_PARAMS:
             known = ", ".join([*CAMERA_MODEL_NUM_PARAMS, UNKNOWN_CAMERA])
             raise DataError(f"unknown camera model {model!r}; known: {known}")
