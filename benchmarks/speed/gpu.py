@@ -87,7 +87,7 @@ def seconds_each(
     started = time.perf_counter()
     results = [call(item) for item in items]
     if device != "cpu":
-        torch.cuda.synchronize()
+        torch.cuda.synchronize(device)
     return results, (time.perf_counter() - started) / len(items)
 
 
@@ -384,7 +384,7 @@ def main() -> None:
                 )
     if options.device != "cpu":
         glue = Path(__file__).with_name("superpoint_superglue.py")
-        subprocess.run([sys.executable, str(glue), "--device", "cuda"], check=True)
+        subprocess.run([sys.executable, str(glue), "--device", options.device], check=True)
 
 
 if __name__ == "__main__":

@@ -313,7 +313,7 @@ def _plugins(folder: Path, device: Device, *, half: bool) -> tuple[SuperPoint, S
     )
 
 
-def on_gpu(num: int, repeat: int) -> None:
+def on_gpu(gpu: Device, num: int, repeat: int) -> None:
     """Results of the GPU against the processor's, and both machines' speed, through the plugins."""
     noise = (random_image()[0, 0].numpy() * 255).astype(np.uint8)
     image = np.ascontiguousarray(np.repeat(noise[:, :, None], 3, axis=2))
@@ -327,12 +327,12 @@ def on_gpu(num: int, repeat: int) -> None:
         confidence = dict(zip(map(tuple, matches.tolist()), scores.tolist(), strict=True))
         kinds: tuple[tuple[str, Device, bool], ...] = (
             ("processor", "cpu", False),
-            ("GPU", "cuda", False),
-            ("GPU, half precision", "cuda", True),
+            ("GPU", gpu, False),
+            ("GPU, half precision", gpu, True),
         )
         for label, device, half in kinds:
             points, glue = _plugins(Path(folder), device, half=half)
-            many = others if device == "cuda" else others[:1]
+            many = others if device == gpu else others[:1]
             seconds = in_turns(
                 {
                     "image": partial(points.extract, image),
@@ -359,20 +359,20 @@ def on_gpu(num: int, repeat: int) -> None:
         f"{WIDTH}x{HEIGHT}, {num} keypoints; keypoints and matches: Jaccard index to the processor"
     )
     print(table(rows))
-    print(f"peak memory on the GPU {torch.cuda.max_memory_allocated() / 2**20:.0f} MB")
+    print(f"peak memory on the GPU {torch.cuda.max_memory_allocated(gpu) / 2**20:.0f} MB")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
     parser.add_argument("--keypoints", type=int, default=1500)
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
     os.environ["HF_HUB_OFFLINE"] = "1"
     torch.set_num_threads(options.threads)
-    if options.device == "cuda":
-        on_gpu(options.keypoints, options.repeat)
+    if options.device != "cpu":
+        on_gpu(options.device, options.keypoints, options.repeat)
         return
     load = os.getloadavg()[0]
     # first: a new process starts from what this one has

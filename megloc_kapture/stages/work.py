@@ -7,6 +7,7 @@ process only: threads read ahead, one thread computes batches, and the executor 
 from __future__ import annotations
 
 import json
+import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -83,7 +84,9 @@ class Items:
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-_READERS = 4  # threads that read ahead for a GPU
+# threads that read ahead for a GPU, and threads that share a plugin on one
+_READERS = min(os.cpu_count() or 1, 16)
+_THREADS = 4
 
 
 class Track(Protocol):
@@ -202,7 +205,7 @@ class Work:
     def _one_by_one(
         self, function: Callable[[Item], Result], items: Iterable[Item], in_threads: bool
     ) -> Iterator[Result]:
-        with ThreadPoolExecutor(_READERS) if in_threads else nullcontext(self.executor) as executor:
+        with ThreadPoolExecutor(_THREADS) if in_threads else nullcontext(self.executor) as executor:
             yield from ordered_map(function, items, executor)
 
     def _has_gpu(self, plugins: Sequence[object]) -> bool:
