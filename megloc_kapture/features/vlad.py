@@ -5,8 +5,8 @@ equations 1 and 2, as in MegLoc::
 
     V(j, k) = sum_i a_k(x_i) (x_i(j) - c_k(j)),   a_k(x) = exp(-alpha |x - c_k|^2) / sum_k'(...)
 
-Intra-normalisation: Arandjelovic and Zisserman, All about VLAD, CVPR 2013. Power law: Perronnin et
-al., ECCV 2010. Whitening of several vocabularies: Jegou and Chum, ECCV 2012.
+Intra-normalisation: Arandjelovic and Zisserman, All about VLAD, CVPR 2013. Whitening of several
+vocabularies: Jegou and Chum, ECCV 2012.
 """
 
 from __future__ import annotations
@@ -32,6 +32,13 @@ _WHITENING_NUMBERS = 1 << 28
 _COLUMNS = 4096
 # relative variances below this are float32 rounding
 _LEAST = 1e-9
+# exponent of the deviations that whitening divides by, as in AP-GeM: with 1, as in Jegou and Chum,
+# all images of a small map are equally dissimilar
+WHITENING_POWER = 0.5
+# sharpness of soft assignment for unit descriptors; with 10 retrieval is worse
+ALPHA = 30.0
+# descriptors that train a vocabulary, sampled evenly over the images; steps of Lloyd's algorithm
+TRAINING_DESCRIPTORS, LLOYD_STEPS = 200_000, 20
 
 
 class VladOptions(Options):
@@ -45,23 +52,7 @@ class VladOptions(Options):
         description="PCA whitening learnt on the map, to at most this many and fewer than it has "
         "images; none without",
     )
-    whitening_power: float = Field(
-        default=0.5,
-        ge=0,
-        le=1,
-        description="of the deviations that whitening divides by; 1 as in Jegou and Chum, 0.5 as "
-        "in AP-GeM",
-    )
     assignment: Literal["hard", "soft"] = "hard"
-    alpha: float = Field(
-        default=30.0, gt=0, description="sharpness of soft assignment, for unit descriptors"
-    )
-    intra_normalization: bool = Field(default=True, description="unit length per cluster")
-    power: float = Field(default=1.0, gt=0, le=1, description="signed power law, 0.5 is usual")
-    training_descriptors: int = Field(
-        default=200_000, gt=0, description="sampled evenly over the map's images"
-    )
-    iterations: int = Field(default=20, gt=0, description="of Lloyd's algorithm, at most")
     seed: int = Field(default=0, ge=0)
 
 
@@ -145,7 +136,7 @@ def train_vlad(
     ``length`` and ``read`` return an image's number of descriptors and its descriptors (N, D).
     """
     options = options or VladOptions()
-    rows = sample_rows(map(length, images), options.training_descriptors, options.seed)
+    rows = sample_rows(map(length, images), TRAINING_DESCRIPTORS, options.seed)
     sampled = [
         np.asarray(read(image)[chosen], dtype=np.float32)
         for image, chosen in zip(images, rows, strict=True)
@@ -166,7 +157,7 @@ def train_vlad(
     describe = partial(_read_and_aggregate, read, vocabulary, options)
     for row, vector in zip(vectors, each(describe, described), strict=True):
         row[:] = vector
-    whitening = learn_whitening(vectors, options.dimensions, options.whitening_power)
+    whitening = learn_whitening(vectors, options.dimensions, WHITENING_POWER)
     return Vocabulary(vocabulary.centres, whitening)
 
 
@@ -197,7 +188,7 @@ def _cluster(data: Float32, options: VladOptions, number: int) -> Float32:
     rng = np.random.default_rng([options.seed, number])
     centres = _plus_plus(data, options.num_clusters, rng)
     previous = np.full(len(data), -1, dtype=np.int64)
-    for _ in range(options.iterations):
+    for _ in range(LLOYD_STEPS):
         labels = _nearest(data, centres)
         if np.array_equal(labels, previous):
             break
@@ -290,14 +281,9 @@ def _aggregate_one(data: Float32, centres: Float32, options: VladOptions) -> NDA
         residuals = np.zeros(centres.shape)
         for start in range(0, len(data), _CHUNK):
             part = data[start : start + _CHUNK]
-            weights = soft_assignment(part, centres, options.alpha)
+            weights = soft_assignment(part, centres, ALPHA)
             residuals += weights.T @ part - weights.sum(axis=0)[:, None] * centres
-    if options.intra_normalization:
-        residuals = _unit(residuals)
-    vector = residuals.ravel()
-    if options.power != 1.0:
-        vector = np.sign(vector) * np.abs(vector) ** options.power
-    return _unit(vector)
+    return _unit(_unit(residuals).ravel())
 
 
 def soft_assignment(

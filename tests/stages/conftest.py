@@ -44,7 +44,7 @@ from megloc_kapture.stages.work import HERE
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 EXTRACTOR = RootSift(RootSiftOptions(max_keypoints=800))
-VLAD = VladOptions(num_clusters=8, training_descriptors=2000)
+VLAD = VladOptions(num_clusters=8)
 BY_VLAD = Retrieval(("vlad_rootsift",))
 
 MAP_POSES = {

@@ -101,7 +101,7 @@ def test_a_map_with_descriptors_is_taken_as_it_is(world, tmp_path: Path, folder_
 
 
 def test_the_vocabulary_and_its_whitening_are_copied(world: Any, tmp_path: Path) -> None:
-    options = VladOptions(num_clusters=8, training_descriptors=2000, dimensions=3)
+    options = VladOptions(num_clusters=8, dimensions=3)
     extract_vlad(world.mapping(), [world.mapping()], TYPE, tmp_path, options)
     copy_features(world.mapping().with_features([tmp_path]), tmp_path / "map")
     copy = read_vocabulary(tmp_path / "map/reconstruction/global_features/vlad_rootsift")

@@ -116,7 +116,7 @@ def test_vectors_of_different_lengths_are_refused(world: Any, tmp_path: Path) ->
 # ------------------------------------------------------------------------------------ global vlad
 
 
-VLAD = VladOptions(num_clusters=8, training_descriptors=2000)
+VLAD = VladOptions(num_clusters=8)
 
 
 PLACE = Path("global_features", "vlad_rootsift")
