@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import cache, lru_cache
@@ -21,6 +22,7 @@ from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, sha256_of
 from megloc_kapture.values import Device, Options
 
+_log = logging.getLogger(__name__)
 _computing = RLock()
 AnyOptions = TypeVar("AnyOptions", bound=Options)
 Net = TypeVar("Net", bound=nn.Module)
@@ -52,10 +54,22 @@ def inference(device: torch.device, half_precision: bool = False) -> Iterator[No
     """Disable gradients; half precision is float16 on a GPU, bfloat16 on a CPU, and never TF32."""
     half = torch.float16 if device.type == "cuda" else torch.bfloat16
     autocast = torch.autocast(device.type, dtype=half, enabled=half_precision)
+    if half_precision and device.type == "cpu" and not has_bfloat16():
+        _warn_of_slow_half()
     # TF32 is a setting of the process, so only one thread computes at a time
     alone = _computing if device.type == "cuda" else nullcontext()
     with alone, without_tf32(device), torch.inference_mode(), autocast:
         yield
+
+
+def has_bfloat16() -> bool:
+    """Return whether this processor has bfloat16, without which convolutions are very slow."""
+    return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
+
+
+@cache
+def _warn_of_slow_half() -> None:
+    _log.warning("this processor has no bfloat16: half precision is 100 times slower than full")
 
 
 @contextmanager
