@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import tyro
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.io.camera_list import CameraList, read_cameras
 from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
 from megloc_kapture.io.kapture import KaptureFolder
@@ -100,8 +100,7 @@ class Console:
 
 def existing(folders: Sequence[Path]) -> tuple[Path, ...]:
     for folder in folders:
-        if not folder.is_dir():
-            raise DataError("no such folder", path=folder)
+        require(folder.is_dir(), "no such folder", path=folder)
     return tuple(folders)
 
 

@@ -21,7 +21,7 @@ from megloc_kapture.cli.common import (
     existing,
     side_tables_beside,
 )
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.io.output_folders import staged_output
 
 EVALUATION = "evaluation"
@@ -196,8 +196,7 @@ class Check(Common):
         from megloc_kapture.pipeline.submission import check_dataset
 
         check_known(self.dataset)
-        if not self.file.exists():
-            raise DataError("no such file", path=self.file)
+        require(self.file.exists(), "no such file", path=self.file)
         data = self.data or self._workspace(console)
         reference = None if data is None else read_reference(data)
         if reference is not None and data is not None:

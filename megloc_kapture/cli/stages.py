@@ -32,7 +32,7 @@ from megloc_kapture.cli.common import (
     existing,
     side_tables_beside,
 )
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import OptionError, require
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.matching.verification import KnownPoseOptions
 from megloc_kapture.pipeline.plan import run_plan
@@ -219,10 +219,8 @@ def _read_pairs_of(path: Path, first: KaptureFolder, second: KaptureFolder) -> l
     pairs = read_pairs(path)
     known_first, known_second = (set(one.read().image_names()) for one in (first, second))
     for pair in pairs:
-        if pair.query not in known_first:
-            raise DataError(f"no image {pair.query} in {first.root}", path=path)
-        if pair.map not in known_second:
-            raise DataError(f"no image {pair.map} in {second.root}", path=path)
+        require(pair.query in known_first, f"no image {pair.query} in {first.root}", path=path)
+        require(pair.map in known_second, f"no image {pair.map} in {second.root}", path=path)
     return pairs
 
 

@@ -23,7 +23,7 @@ from megloc_kapture.cli.common import (
     camera_of_text,
     refuse_given,
 )
-from megloc_kapture.errors import DataError, OptionError, OutputError
+from megloc_kapture.errors import DataError, OptionError, OutputError, require
 from megloc_kapture.io.images import WRITABLE_SUFFIXES
 from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.pipeline.executors import single_threaded
@@ -202,8 +202,7 @@ class Render(Linked, Working):
             raise OptionError(f"--max-side {self.max_side} is not positive")
         refuse_given("--pose", camera=self.camera, depth=self.depth)
         data = self.kapture_map(many).read()
-        if not data.poses():
-            raise DataError("no image here has a pose", path=many)
+        require(data.poses(), "no image here has a pose", path=many)
         with self.staged(self.output, RENDERED, force=self.force) as (out, work):
             count = render_along(
                 self.field,

@@ -21,7 +21,7 @@ from megloc_kapture.datasets.kapture_folders import (
     warn_of_scaled,
 )
 from megloc_kapture.datasets.reference_map import write_reference_map
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import (
     BINARY_FILES,
     TEXT_FILES,
@@ -212,8 +212,9 @@ class ColmapReconstruction:
         folder = KaptureFolder(output)
         descriptors = folder.descriptors(local_type)
         for image in folder.keypoints(local_type).names:
-            if image not in descriptors:
-                raise DataError(f"image {image!r} has no descriptors", path=source.database)
+            require(
+                image in descriptors, f"image {image!r} has no descriptors", path=source.database
+            )
         return counts
 
     def _write_with_sift(self, output: Path, work: Work) -> dict[str, float]:

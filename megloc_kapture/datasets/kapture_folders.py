@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.dataset_tables import (
     GROUPS_FILE,
     NAMES_FILE,
@@ -49,8 +49,7 @@ def is_kapture(folder: Path) -> bool:
 def check_root(root: Path) -> Path:
     """Check that ``root`` has a mapping/ and a query/ kapture, and return it."""
     root = Path(root)
-    if not root.is_dir():
-        raise DataError("no such folder", path=root)
+    require(root.is_dir(), "no such folder", path=root)
     for part in (MAPPING, QUERY):
         try:  # in Python 3.14 is_file() reports unreadable files as missing
             (root / part / _SENSORS).stat()
@@ -110,8 +109,7 @@ def checked_folders(
     map_data, query_data = with_cameras_of_images(mapping), with_cameras_of_images(query)
     check_images(mapping, map_data)
     _map_poses(mapping)
-    if not query_data.records_camera:
-        raise DataError("there are no query images", path=query.root)
+    require(query_data.records_camera, "there are no query images", path=query.root)
     renamed = map(prefixed(query_prefix), query_data.image_names())
     shared = sorted(set(map_data.image_names()) & set(renamed))
     if shared:
@@ -188,8 +186,7 @@ def _tables_beside(mapping: KaptureFolder) -> Path:
 
 def _map_poses(mapping: KaptureFolder) -> dict[str, RigidTransform]:
     poses = mapping.read().poses()
-    if not poses:
-        raise DataError("no mapping image has a pose", path=mapping.root)
+    require(poses, "no mapping image has a pose", path=mapping.root)
     return poses
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase, FeatureType
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.files import link_records
 from megloc_kapture.io.kapture import (
@@ -52,8 +52,7 @@ class ReferenceModel:
 
 def check_model_files(files: Iterable[Path]) -> None:
     for file in files:
-        if not file.is_file():
-            raise DataError("missing; the reference model is read from it", path=file)
+        require(file.is_file(), "missing; the reference model is read from it", path=file)
 
 
 def write_reference_map(

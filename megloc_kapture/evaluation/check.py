@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.evaluation import pose_files
 from megloc_kapture.evaluation.pose_files import parse_pose, parse_timestamp
 from megloc_kapture.evaluation.protocols import PROTOCOLS, Benchmark, benchmark_of
@@ -173,8 +173,7 @@ def check_submission(
 
 
 def _check_file(path: Path, dataset: str, reference: Reference) -> tuple[int, list[Finding]]:
-    if path.is_dir():
-        raise DataError("a folder; the pose file of this challenge is one file", path=path)
+    require(not path.is_dir(), "a folder; the pose file of this challenge is one file", path=path)
     rows = _read_rows(path, "ltvl")
     world = reference.world
     findings = _check_poses(rows.poses, reference, lambda _, pose: world.pose_in_local(pose))
@@ -228,12 +227,12 @@ class _Rows(NamedTuple):
 
 def _read_rows(path: Path, kind: PoseFileFormat) -> _Rows:
     text = read_text(path)
-    if pose_files.is_colmap_images(text):
-        raise DataError(
-            "this is COLMAP's images.txt, not a pose file; `megloc import colmap` of its folder "
-            "and `megloc submit` make one",
-            path=path,
-        )
+    require(
+        not pose_files.is_colmap_images(text),
+        "this is COLMAP's images.txt, not a pose file; `megloc import colmap` of its folder "
+        "and `megloc submit` make one",
+        path=path,
+    )
     is_mlad = kind == "mlad"
     num_keys, columns = (2, pose_files.MLAD_COLUMNS) if is_mlad else (1, pose_files.COLUMNS)
     lines, poses, findings = dict[str, int](), dict[str, RigidTransform](), list[Finding]()

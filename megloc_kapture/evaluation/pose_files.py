@@ -27,7 +27,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, Field
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.dataset_tables import (
     MAX_QUATERNION_NORM_ERROR,
     PoseFileFormat,
@@ -74,8 +74,7 @@ def names_in_pose_file(images: Iterable[str], names: Names) -> dict[str, str]:
         by_image = {image: name for image, name in names.items() if image in wanted}
     by_name: dict[str, str] = {}
     for image, name in by_image.items():
-        if not is_name(name):
-            raise DataError(f"image {image!r}: a pose file cannot hold the name {name!r}")
+        require(is_name(name), f"image {image!r}: a pose file cannot hold the name {name!r}")
         if name in by_name:
             raise DataError(
                 f"images {by_name[name]!r} and {image!r} would both be called {name!r} in the pose "
@@ -111,10 +110,8 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
     for number, fields in rows:
         name = fields[0]
         try:
-            if len(fields) != 8:
-                raise DataError(f"{len(fields)} columns instead of 8 ({COLUMNS})")
-            if name in poses:
-                raise DataError(f"{name!r} is given twice")
+            require(len(fields) == 8, f"{len(fields)} columns instead of 8 ({COLUMNS})")
+            require(name not in poses, f"{name!r} is given twice")
             values = [parse_number(field) for field in fields[1:]]
             failed = not np.isfinite(values).all() or not any(values[:4])
             poses[name] = None if failed else parse_pose(fields[1:], "ltvl", repr(name))
@@ -210,11 +207,14 @@ def checked_pose(
     whose: str,
 ) -> RigidTransform:
     # larger squares overflow
-    if not all(abs(v) < 1e100 for v in (*quat_wxyz, *translation)):
-        raise DataError(f"{whose}: the pose is not finite")
+    require(
+        all(abs(v) < 1e100 for v in (*quat_wxyz, *translation)), f"{whose}: the pose is not finite"
+    )
     norm = math.sqrt(sum(q * q for q in quat_wxyz))
-    if not abs(norm - 1.0) < MAX_QUATERNION_NORM_ERROR:
-        raise DataError(f"{whose}: quaternion of length {norm:g}, not 1")
+    require(
+        abs(norm - 1.0) < MAX_QUATERNION_NORM_ERROR,
+        f"{whose}: quaternion of length {norm:g}, not 1",
+    )
     if abs(norm - 1.0) > 1e-12:
         w, x, y, z = (q / norm for q in quat_wxyz)
         quat_wxyz = (w, x, y, z)
@@ -248,8 +248,10 @@ class RelativePose:
 def timestamp_of(image: str) -> int:
     """Return the timestamp in an image name of 4Seasons (``.../1600000000000000000.png``)."""
     stem = PurePosixPath(image).stem
-    if not _TIMESTAMP.fullmatch(stem):
-        raise DataError(f"image {image!r} is not named after a timestamp, as MLAD's rows need")
+    require(
+        _TIMESTAMP.fullmatch(stem),
+        f"image {image!r} is not named after a timestamp, as MLAD's rows need",
+    )
     return int(stem)
 
 
@@ -295,8 +297,7 @@ def read_mlad_file(path: Path | str) -> list[RelativePose]:
                 raise DataError(f"{len(fields)} columns instead of {wanted}")
             reference, query = (parse_timestamp(field) for field in fields[:2])
             whose, pose = f"pair {reference} {query}", None
-            if (reference, query) in pairs:
-                raise DataError(f"{whose} is given twice")
+            require((reference, query) not in pairs, f"{whose} is given twice")
             if columns == 9:
                 pose = parse_pose(fields[2:], "mlad", whose)
         except DataError as error:
@@ -307,8 +308,7 @@ def read_mlad_file(path: Path | str) -> list[RelativePose]:
 
 
 def parse_timestamp(text: str) -> int:
-    if not _TIMESTAMP.fullmatch(text):
-        raise DataError(f"{text!r} is not a timestamp (a whole number)")
+    require(_TIMESTAMP.fullmatch(text), f"{text!r} is not a timestamp (a whole number)")
     return int(text)
 
 

@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.evaluation import pose_files
 from megloc_kapture.evaluation.protocols import Benchmark
 from megloc_kapture.io import tables
@@ -206,8 +206,7 @@ def read_result(
 
 def read_poses(source: Path) -> dict[str, RigidTransform]:
     """Read ``cam_from_world`` by name of a kapture folder, a COLMAP model or a pose file."""
-    if not source.exists():
-        raise DataError("no such file or folder", path=source)
+    require(source.exists(), "no such file or folder", path=source)
     if (model := model_of(source)) is not None:
         if (model / "images.txt").is_file():
             return pose_files.read_pose_file(model / "images.txt")

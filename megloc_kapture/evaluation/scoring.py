@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.evaluation.confidence import Confidence, confidence_of
 from megloc_kapture.evaluation.metrics import (
     PoseErrors,
@@ -232,8 +232,7 @@ def evaluate_poses(
             f"{min(both)!r} has a true pose, but is listed as showing nothing of the map"
         )
     counted = tuple(sorted(benchmark.scored(truth)))
-    if not counted:
-        raise DataError("no query with a true pose to count: is this the right ground truth?")
+    require(counted, "no query with a true pose to count: is this the right ground truth?")
     thresholds = tuple(thresholds or benchmark.thresholds())
     conditions = benchmark.conditions({*counted, *nowhere})
     errors = pose_errors(result.poses, truth, counted)
@@ -360,8 +359,7 @@ def evaluate_pairs(
         p.query if times[p.query] == 1 else f"{p.query} from {p.reference}, {p.file}": p
         for p in pairs
     }
-    if len(named) != len(pairs):
-        raise DataError("a pair of reference and query is listed twice in one file")
+    require(len(named) == len(pairs), "a pair of reference and query is listed twice in one file")
     called = _conditions({pair.file for pair in pairs})
     conditions = tuple(filter(None, dict.fromkeys(called[pair.file] for pair in pairs)))
     by_center = evaluate_poses(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import OptionError, require
 from megloc_kapture.evaluation.metrics import (
     PoseErrors,
     RecallAt,
@@ -94,8 +94,7 @@ def evaluate_without_truth(
     if not results or len(set(labels)) != len(labels):
         raise OptionError("results need different labels, and at least one is needed")
     images = sorted({i for r in results for i in r.images} if queries is None else set(queries))
-    if not images:
-        raise DataError("no query: the results name no image")
+    require(images, "no query: the results name no image")
     conditions = benchmark.conditions(images)
     members = row_members([conditions.get(image, "") for image in images], benchmark.protocol)
     thresholds = tuple(thresholds or benchmark.thresholds())

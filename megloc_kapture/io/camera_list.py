@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import check_relative, named, read_text
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera
 
@@ -65,11 +65,9 @@ def read_camera_rows(path: Path) -> dict[str, Camera]:
                     f"{', '.join(CAMERA_MODEL_NUM_PARAMS)}"
                 )
             name = check_relative(row["name"])
-            if name in cameras:
-                raise DataError(f"{name!r} is listed twice")
+            require(name not in cameras, f"{name!r} is listed twice")
             cameras[name] = _camera(row["model"], re.split(r"[\s,]+", row["numbers"]))
-    if not cameras:
-        raise DataError("no camera in this list", path=path)
+    require(cameras, "no camera in this list", path=path)
     return cameras
 
 
@@ -78,6 +76,8 @@ def _camera(model: str, fields: list[str]) -> Camera:
         width, height, *params = map(float, fields)
     except ValueError as error:
         raise DataError(f"width, height and parameters must be numbers, got {fields}") from error
-    if not (width.is_integer() and height.is_integer()):
-        raise DataError(f"image size {width:g}x{height:g} is not in whole pixels")
+    require(
+        width.is_integer() and height.is_integer(),
+        f"image size {width:g}x{height:g} is not in whole pixels",
+    )
     return Camera(model, int(width), int(height), tuple(params))

@@ -26,7 +26,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, FiniteFloat, field_validator
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import require
 from megloc_kapture.io.csv_table import Column, ImageName, Table, flag
 from megloc_kapture.io.files import (
     ModelT,
@@ -152,14 +152,12 @@ class Protocol(Options):
 
 
 def _word(text: str) -> str:
-    if text.split() != [text]:
-        raise DataError(f"a pose file cannot hold the name {text!r}")
+    require(text.split() == [text], f"a pose file cannot hold the name {text!r}")
     return text
 
 
 def _not_empty(text: str) -> str:
-    if not text:
-        raise DataError("permitted is empty")
+    require(text, "permitted is empty")
     return text
 
 

@@ -16,7 +16,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import check_relative
 
 
@@ -46,8 +46,7 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
-        if not self.path.is_file():
-            raise DataError("file is missing", path=path)
+        require(self.path.is_file(), "file is missing", path=path)
         log = self.path.with_name(self.path.name + "-wal")
         if log.is_file() and log.stat().st_size:
             raise DataError(

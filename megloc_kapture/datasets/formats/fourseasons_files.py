@@ -18,7 +18,7 @@ from megloc_kapture.datasets.formats.text_lines import (
     read_rigid_matrix,
     shown,
 )
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import require
 from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -59,8 +59,7 @@ def read_pinhole(path: Path) -> Camera:
     """Read ``undistorted_calib_N.txt``: ``Pinhole fx fy cx cy 0 0 0 0``, the size, twice."""
     form = "'Pinhole fx fy cx cy 0.0 0.0 0.0 0.0', 'width height', 'crop', 'width height'"
     lines = read_lines(path, comments=True)
-    if len(lines) not in (2, 4):
-        raise DataError(f"expected the lines {form}, got {len(lines)}", path=path)
+    require(len(lines) in (2, 4), f"expected the lines {form}, got {len(lines)}", path=path)
     first = lines[0]
     model, *values = first.comma_fields
     params = first.numbers_of(values, "camera parameter")
@@ -125,8 +124,7 @@ def _by_timestamp(path: Path, parse: Callable[[Line], Row]) -> dict[int, Row]:
         if timestamp in rows:
             raise line.error(f"timestamp {timestamp} is given twice")
         rows[timestamp] = parse(line)
-    if not rows:
-        raise DataError("the file has no rows", path=path)
+    require(rows, "the file has no rows", path=path)
     return rows
 
 
@@ -177,8 +175,7 @@ def read_transformations(path: Path) -> Transformations:
             found[name] = line
     transforms = []
     for name in ("transform_S_AS", "transform_w_gpsw", "transform_e_gpsw"):
-        if name not in found:
-            raise DataError(f"there is no {name}", path=path)
+        require(name in found, f"there is no {name}", path=path)
         transforms.append(_transform(found[name], found[name].comma_fields))
     scale = None
     if (row := found.get("GNSS scale")) is not None:
@@ -213,6 +210,5 @@ def read_relocalization(path: Path) -> list[RelocalizationRow]:
         reference, query = (_timestamp(line, field) for field in fields[:2])
         pose = _transform(line, fields[2:]) if len(fields) == 9 else None
         rows.setdefault((reference, query), RelocalizationRow(reference, query, pose))
-    if not rows:
-        raise DataError("no pair in the file", path=path)
+    require(rows, "no pair in the file", path=path)
     return list(rows.values())

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.files import check_relative, named, reading
 from megloc_kapture.io.kapture.sensors import unit_quaternion
@@ -48,8 +48,11 @@ class NvmModel:
 def read_nvm(path: Path, *, with_points: bool = True) -> NvmModel:
     """Read the only model of a file; an extra list of unregistered images is ignored."""
     with reading(path), open(path, encoding="utf-8-sig", errors="surrogateescape") as file:
-        if not file.readline().startswith("NVM_V3"):
-            raise DataError("not an NVM file: the first line must begin with NVM_V3", path=path)
+        require(
+            file.readline().startswith("NVM_V3"),
+            "not an NVM file: the first line must begin with NVM_V3",
+            path=path,
+        )
         rows = (line for line in file if line.strip())
         with named(path):
             names, cameras = _read_cameras(rows, _count(rows, "cameras"))
@@ -94,8 +97,7 @@ def _read_points(rows: Iterator[str], count: int, images: int, with_points: bool
     while count:
         lines = list(islice(rows, min(_ROWS, count)))
         count -= len(lines)
-        if not lines:
-            raise DataError("the file ends before its last point")
+        require(lines, "the file ends before its last point")
         if with_points:
             parts.append(_parse_points(lines, images))
     return SparsePoints.joined(parts)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import named, read_text
 from megloc_kapture.values import RigidTransform
 
@@ -95,8 +95,11 @@ def read_lines(path: Path, *, comments: bool = False) -> list[Line]:
 def read_rigid_matrix(path: Path, *, comments: bool = False) -> RigidTransform:
     """Read a 4x4 matrix of comma- or blank-separated numbers as a transform."""
     lines = read_lines(path, comments=comments)
-    if [len(line.comma_fields) for line in lines] != [4] * 4:
-        raise DataError("expected four lines of four numbers", path=path)
+    require(
+        [len(line.comma_fields) for line in lines] == [4] * 4,
+        "expected four lines of four numbers",
+        path=path,
+    )
     rows = [line.numbers_of(line.comma_fields, "matrix element") for line in lines]
     return lines[-1].rigid_transform(np.array(rows))
 

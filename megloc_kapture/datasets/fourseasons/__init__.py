@@ -18,7 +18,7 @@ from megloc_kapture.datasets.formats.fourseasons_files import (
     timestamp_of_name,
 )
 from megloc_kapture.datasets.official import Count, Missing
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, require
 
 CAMERAS = ("cam0", "cam1")
 CALIBRATION_FOLDERS = ("calibration", "Calibration")
@@ -105,17 +105,12 @@ def find_recordings(root: Path) -> dict[str, Recording]:
         for folder in _folders(root)
         if any((folder / mark).exists() for mark in _MARKS)
     }
-    if not found:
-        raise DataError(
-            f"no recording here, a folder with {_IMAGES}/ or {GNSS_POSES} in it",
-            path=root,
-        )
+    require(found, f"no recording here, a folder with {_IMAGES}/ or {GNSS_POSES} in it", path=root)
     return found
 
 
 def _folders(root: Path) -> list[Path]:
-    if not root.is_dir():
-        raise DataError("no such folder", path=root)
+    require(root.is_dir(), "no such folder", path=root)
     return sorted(path for path in root.iterdir() if path.is_dir())
 
 
@@ -180,12 +175,12 @@ def select(
         targets = [name for name in recordings if name not in sources]
     missing.files += [root / name for name in (*sources, *targets) if name not in recordings]
     sources, targets = ([n for n in names if n in recordings] for names in (sources, targets))
-    if not sources:
-        raise DataError(
-            f"{len(recordings)} recordings, none for the map; needed are one with published poses "
-            "(GNSSPoses.txt or poses.txt) and another for the queries",
-            path=root,
-        )
+    require(
+        sources,
+        f"{len(recordings)} recordings, none for the map; needed are one with published poses "
+        "(GNSSPoses.txt or poses.txt) and another for the queries",
+        path=root,
+    )
     if not targets:
         missing.files.append(root / ANOTHER_RECORDING)
     return Selection(

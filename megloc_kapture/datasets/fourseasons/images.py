@@ -27,7 +27,7 @@ from megloc_kapture.datasets.fourseasons import (
     RelocalizationFile,
 )
 from megloc_kapture.datasets.official import Missing
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.dataset_tables import RelocalizationPair, SimilarityTransform, World
 from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.values import RigidTransform
@@ -215,10 +215,10 @@ def _gnss_poses(recording: Recording, min_fusion_quality: int) -> KeyframePoses:
         x, y, z = (scale * value for value in row.slam_from_cam.translation)
         metric = RigidTransform(row.slam_from_cam.quat_wxyz, (x, y, z))
         poses[timestamp] = scene_from_slam @ metric
-    if not poses:
-        raise DataError(
-            f"none of its {len(dropped)} poses has a fusion quality of {min_fusion_quality} or "
-            "better; lower min_fusion_quality takes them",
-            path=path,
-        )
+    require(
+        poses,
+        f"none of its {len(dropped)} poses has a fusion quality of {min_fusion_quality} or "
+        "better; lower min_fusion_quality takes them",
+        path=path,
+    )
     return KeyframePoses(poses, transformations.e_from_gpsw, dropped)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.datasets.formats.text_lines import Line, read_lines
 from megloc_kapture.datasets.official import Missing
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import named
 from megloc_kapture.values import RigidTransform
 
@@ -97,10 +97,11 @@ def read_transformation(path: Path | str) -> RigidTransform:
     """Read ``floor_from_scan``: the second 4x4 matrix of the file, after refinement."""
     path = Path(path)
     rows = [line for line in read_lines(path) if _has_four_numbers(line)]
-    if len(rows) != 8:
-        raise DataError(
-            f"{len(rows)} rows of four numbers; expected two matrices of four rows each", path=path
-        )
+    require(
+        len(rows) == 8,
+        f"{len(rows)} rows of four numbers; expected two matrices of four rows each",
+        path=path,
+    )
     matrix = np.array([row.numbers_of(row.fields, "matrix element") for row in rows[4:]])
     return rows[7].rigid_transform(matrix)
 
@@ -142,8 +143,7 @@ class Layout:
 
     @classmethod
     def find(cls, root: Path) -> Layout:
-        if not root.is_dir():
-            raise DataError("no such folder", path=root)
+        require(root.is_dir(), "no such folder", path=root)
         for name in _ROOTS:
             cutouts, alignments, query = (
                 _first(root / name, names) for names in (_CUTOUTS, _ALIGNMENTS, _QUERIES)

@@ -15,7 +15,7 @@ import numpy as np
 from megloc_kapture.datasets.formats.nvm import read_nvm
 from megloc_kapture.datasets.formats.text_lines import Line, read_lines, shown
 from megloc_kapture.datasets.official import Missing
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import SparsePoints, colmap_model_files, read_colmap_model
 from megloc_kapture.values import RigidTransform
 
@@ -112,8 +112,7 @@ def read_train_poses(path: Path) -> list[ListedImage]:
 
 def _some_lines(path: Path) -> list[Line]:
     lines = read_lines(path)
-    if not lines:
-        raise DataError("no image in the list", path=path)
+    require(lines, "no image in the list", path=path)
     return lines
 
 

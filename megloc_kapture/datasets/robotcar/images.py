@@ -25,7 +25,7 @@ from megloc_kapture.datasets.robotcar import (
     read_intrinsics,
     read_test_names,
 )
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.geometry.poses import rotation_angles_deg, stack_poses
 from megloc_kapture.io.files import named
 from megloc_kapture.io.images import image_size
@@ -215,12 +215,12 @@ def read_kapture_images(form: KaptureForm, missing: Missing) -> dict[ImageKey, K
                 f"image {image.name!r}; expected condition/camera/time.jpg", path=image.file
             )
         note_time(key, at_time, partial(DataError, path=image.file))
-        if cameras.setdefault(key.camera, image.camera) != image.camera:
-            raise DataError(
-                f"camera {key.camera} is not that of other images; all of RobotCar's images are "
-                "rectified to one for each side",
-                path=image.file,
-            )
+        require(
+            cameras.setdefault(key.camera, image.camera) == image.camera,
+            f"camera {key.camera} is not that of other images; all of RobotCar's images are "
+            "rectified to one for each side",
+            path=image.file,
+        )
         found[key] = image
     return found
 

@@ -19,7 +19,7 @@ from typing import Any, Literal, Self, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from megloc_kapture.errors import DataError, OutputError
+from megloc_kapture.errors import DataError, OutputError, require
 from megloc_kapture.io.files import (
     check_component,
     check_relative,
@@ -68,8 +68,10 @@ class FeatureConfig:
 
     def __post_init__(self) -> None:
         dtype = np.dtype(self.dtype)
-        if dtype.newbyteorder("<") not in DTYPES.values():
-            raise DataError(f"dtype {dtype.name!r} is not one of {', '.join(DTYPES)}")
+        require(
+            dtype.newbyteorder("<") in DTYPES.values(),
+            f"dtype {dtype.name!r} is not one of {', '.join(DTYPES)}",
+        )
         if self.dsize < 1:
             raise DataError(f"dsize {self.dsize} is not positive")
         object.__setattr__(self, "dtype", dtype.newbyteorder("<"))
@@ -115,8 +117,7 @@ def read_config(path: Path, kind: ArrayKind) -> FeatureConfig:
         for fields in rows:
             check_columns(fields, CONFIG_HEADER[kind].count(",") + 1)
             name, dtype, dsize, *rest = fields
-            if dtype not in DTYPES:
-                raise DataError(f"dtype {dtype!r} is not one of {', '.join(DTYPES)}")
+            require(dtype in DTYPES, f"dtype {dtype!r} is not one of {', '.join(DTYPES)}")
             if not re.fullmatch("[0-9]{1,9}", dsize) or int(dsize) == 0:
                 raise DataError(f"dsize {dsize!r} is not a positive integer")
             keypoints_type = check_component(rest[0]) if kind == "descriptors" else None

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import check_relative, has_control_characters, named, read_text
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
@@ -40,11 +40,15 @@ class Sensor:
     params: tuple[str, ...]
 
     def camera(self) -> Camera:
-        if self.sensor_type not in CAMERA_SENSOR_TYPES:
-            raise DataError(f"a sensor of type {self.sensor_type!r} has no camera model")
+        require(
+            self.sensor_type in CAMERA_SENSOR_TYPES,
+            f"a sensor of type {self.sensor_type!r} has no camera model",
+        )
         model = self.params[0] if self.params else ""
-        if model == UNKNOWN_CAMERA:
-            raise DataError("camera is not calibrated (UNKNOWN_CAMERA); give it intrinsics first")
+        require(
+            model != UNKNOWN_CAMERA,
+            "camera is not calibrated (UNKNOWN_CAMERA); give it intrinsics first",
+        )
         if model not in CAMERA_MODEL_NUM_PARAMS:
             known = ", ".join([*CAMERA_MODEL_NUM_PARAMS, UNKNOWN_CAMERA])
             raise DataError(f"unknown camera model {model!r}; known: {known}")
@@ -113,8 +117,10 @@ class KaptureData:
 
     def camera_of(self, image: str) -> Camera:
         sensor_id = self.record_of(image)[1]
-        if sensor_id not in self.sensors:
-            raise DataError(f"image {image!r} was taken by the unknown sensor {sensor_id!r}")
+        require(
+            sensor_id in self.sensors,
+            f"image {image!r} was taken by the unknown sensor {sensor_id!r}",
+        )
         with named(about=f"sensor {sensor_id!r} of image {image!r}"):
             return self.sensors[sensor_id].camera()
 
@@ -149,8 +155,7 @@ class KaptureData:
 
 def _pixels(text: str) -> int:
     value = parse_float(text, "camera parameter")
-    if value != int(value):
-        raise DataError(f"image size {text!r} is not a whole number of pixels")
+    require(value == int(value), f"image size {text!r} is not a whole number of pixels")
     return int(value)
 
 
@@ -187,8 +192,7 @@ def read_rows(path: Path, *, version_required: bool = False) -> Iterator[Iterato
 def check_version(path: Path, first_line: str, *, required: bool) -> None:
     found = _VERSION_PATTERN.search(first_line)
     if found is None:
-        if required:
-            raise DataError(f"the first line must be '{FORMAT_LINE}'", path=path, line=1)
+        require(not required, f"the first line must be '{FORMAT_LINE}'", path=path, line=1)
     elif found[1] not in _READ_VERSIONS:
         message = f"kapture format {found[1]} is not supported; convert it to {FORMAT_VERSION}"
         raise DataError(message, path=path, line=1)

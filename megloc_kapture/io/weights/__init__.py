@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
 
-from megloc_kapture.errors import DataError, OptionError, OutputError, suggestion
+from megloc_kapture.errors import DataError, OptionError, OutputError, require, suggestion
 from megloc_kapture.io.files import (
     atomic_write,
     check_component,
@@ -351,6 +351,5 @@ def _state_dict(found: Any, path: Path) -> dict[str, torch.Tensor]:
         for key, value in items
         if isinstance(value, torch.Tensor)
     }
-    if not tensors:
-        raise DataError("holds no tensors by name", path=path)
+    require(tensors, "holds no tensors by name", path=path)
     return tensors

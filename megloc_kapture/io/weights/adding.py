@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError
+from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError, require
 from megloc_kapture.io.files import atomic_write, output_error, write_bytes
 from megloc_kapture.io.weights import (
     UNVERIFIED,
@@ -60,8 +60,7 @@ def add_weights(
 
     An ``unverified`` file may differ from the published one, and is used where that is missing.
     """
-    if not source.is_file():
-        raise DataError("no such file", path=source)
+    require(source.is_file(), "no such file", path=source)
     found = describe(source.name, source)
     sha256 = sha256_of(found)
     weights, target = _recognised(source, sha256, name)
@@ -99,8 +98,7 @@ def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:
         raise OptionError(f"{output}: the file to write must end in .safetensors")
     if output.exists() and not force:
         raise OutputError(f"{output}: exists; -f replaces it")
-    if not source.is_file():
-        raise DataError("no such file", path=source)
+    require(source.is_file(), "no such file", path=source)
     file = describe(source.name, source)
     # views of shared memory are stored separately
     tensors = {name: tensor.contiguous().clone() for name, tensor in read_weights(file).items()}
