@@ -11,14 +11,8 @@ from typing import TypeVar
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.dataset_tables import (
-    GROUPS_FILE,
-    NAMES_FILE,
     NOWHERE_FILE,
-    PRIORS_FILE,
-    PROTOCOL_FILE,
-    RELOCALIZATION_FILE,
     SIDE_TABLES,
-    WORLD_FILE,
     ImageGroup,
     Protocol,
     SideTables,
@@ -32,6 +26,7 @@ from megloc_kapture.io.files import check_relative, link_images
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
+from megloc_kapture.io.output_folders import files_below
 from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -63,35 +58,12 @@ def check_root(root: Path) -> Path:
 
 
 def input_files(root: Path) -> Iterator[Path]:
-    """Yield every file that an import depends on."""
-    for part in (MAPPING, QUERY, QUERY_GT):
-        folder = KaptureFolder(root / part)
-        if (folder.root / "sensors").is_dir():
-            files = files_of(folder, images=part != QUERY_GT)
-            # queries without image fail later, see stages/localized_folder.py
-            yield from (path for path in files if part != QUERY or path.is_file())
+    """Yield every file that an import of kapture folders depends on."""
+    parts = [root / part / "sensors" for part in (MAPPING, QUERY)]
+    yield from files_below(*parts, root / SIDE_TABLES)
+    yield from sorted((root / QUERY_GT / "sensors").glob("*.txt"))
     if (nowhere := root / QUERY_GT / NOWHERE_FILE).is_file():
         yield nowhere
-    tables = (GROUPS_FILE, PRIORS_FILE, PROTOCOL_FILE, WORLD_FILE, NAMES_FILE, RELOCALIZATION_FILE)
-    for name in tables:
-        if (table := root / SIDE_TABLES / name).is_file():
-            yield table
-
-
-def files_of(folder: KaptureFolder, *, images: bool = True) -> Iterator[Path]:
-    """Yield every file of a kapture folder; ``images`` includes masks and depth."""
-    sensors = folder.root / "sensors"
-    yield from sorted(sensors.glob("*.txt"))
-    if not images:
-        return
-    for name in folder.read().records_depth.values():
-        if folder.depth_path(name).is_file():
-            yield folder.depth_path(name)
-    for image in folder.read().image_names():
-        yield folder.image_path(image)
-        mask = sensors / "masks" / f"{image}.png"
-        if mask.is_file():
-            yield mask
 
 
 def tell_of_truth_without_query(folder: Path, images: Sequence[str]) -> None:
@@ -175,9 +147,7 @@ def import_mapping(mapping: KaptureFolder, output: Path) -> dict[str, float]:
 
 
 def mapping_files(mapping: KaptureFolder) -> Iterator[Path]:
-    yield from files_of(mapping)
-    if (groups := _tables_beside(mapping) / GROUPS_FILE).is_file():
-        yield groups
+    yield from files_below(mapping.root / "sensors", _tables_beside(mapping))
 
 
 def _tables_beside(mapping: KaptureFolder) -> Path:

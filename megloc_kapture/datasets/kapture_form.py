@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from megloc_kapture.datasets.kapture_folders import check_image_size, files_of, is_kapture
+from megloc_kapture.datasets.kapture_folders import check_image_size, is_kapture
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture import KaptureFolder
@@ -51,13 +50,6 @@ class KaptureForm:
             if found[0]:
                 return cls(parent, tuple(one for folders in found for one in folders))
         return None
-
-    def input_files(self) -> Iterator[Path]:
-        for path in self.folders:
-            folder = KaptureFolder(path)
-            yield from files_of(folder, images=False)
-            images = (folder.image_path(name) for name in folder.read().image_names())
-            yield from (image for image in images if image.exists())
 
     def read(self, missing: Missing) -> list[KaptureImage]:
         """Read the existing images by folder and time; check one image size per camera."""

@@ -6,7 +6,7 @@ optional ``reference/`` (the dataset's model); images are linked.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
@@ -164,12 +164,6 @@ def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: boo
         )
     if dataset.write_more is not None:
         dataset.write_more(output)
-
-
-def ground_truth_files(root: Path) -> Iterator[Path]:
-    folder = root / GROUND_TRUTH
-    yield from sorted((folder / QUERY / "sensors").glob("*.txt"))
-    yield from sorted((folder / SIDE_TABLES).glob("*.csv"))
 
 
 def read_ground_truth(

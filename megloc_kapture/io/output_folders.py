@@ -24,6 +24,7 @@ from megloc_kapture.io.files import (
 )
 
 MARKER = ".megloc"
+_ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z")
 
 
 @dataclass(frozen=True)
@@ -164,6 +165,28 @@ def _merge(source: Path, target: Path) -> None:
             if path.is_symlink():
                 path.unlink()
             os.replace(entry, path)
+
+
+def files_below(*folders: Path) -> Iterator[Path]:
+    """Yield the files below folders, without archives, hidden files and outputs of commands.
+
+    Links are followed. A download that is unpacked has the same files before and after its
+    archive is deleted.
+    """
+    for root in folders:
+        for place, names, files in os.walk(root, followlinks=True):
+            here = Path(place)
+            names[:] = [name for name in names if _is_data(here, name)]
+            shown = (here / n for n in files if not (n.startswith(".") or n.endswith(_ARCHIVES)))
+            yield from (path for path in shown if path.is_file())
+
+
+def _is_data(folder: Path, name: str) -> bool:
+    path = folder / name
+    if name.startswith(".") or (path / MARKER).is_file():
+        return False
+    # a link to a folder around it never ends
+    return not (path.is_symlink() and folder.resolve().is_relative_to(path.resolve()))
 
 
 def replace_directory(new: Path, path: Path) -> None:

@@ -28,7 +28,13 @@ from megloc_kapture.io.files import (
     safe_join,
     write_bytes,
 )
-from megloc_kapture.io.output_folders import MARKER, claim_folder, replace_directory, staged_output
+from megloc_kapture.io.output_folders import (
+    MARKER,
+    claim_folder,
+    files_below,
+    replace_directory,
+    staged_output,
+)
 
 
 def test_a_file_is_written_with_its_folders_and_the_umask(tmp_path: Path) -> None:
@@ -427,3 +433,19 @@ def test_an_error_of_the_system_is_told_with_the_folder(tmp_path: Path) -> None:
         with pytest.raises(kind, match=told), staged_output(tmp_path / "out", kind="map") as out:
             write(out)
     assert tree(tmp_path) == {}
+
+
+def test_files_of_a_dataset(tmp_path: Path) -> None:
+    """Links are followed, not around in circles; archives and outputs are no data."""
+    root = tmp_path / "root"
+    for name in ("a.txt", "deep/b.jpg", "images.zip", ".hidden", ".git/x", "runs/1/c.txt"):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+    claim_folder(root / "runs" / "1", kind="workspace", force=True)
+    (root / "deep" / "around").symlink_to(root)
+    (root / "deep" / "dangling").symlink_to(root / "nowhere")
+    (tmp_path / "beside").mkdir()
+    (tmp_path / "beside" / "d.mat").touch()
+    (root / "beside").symlink_to(tmp_path / "beside")
+    found = {str(path.relative_to(root)) for path in files_below(root, tmp_path / "absent")}
+    assert found == {"a.txt", "deep/b.jpg", "beside/d.mat"}

@@ -6,7 +6,7 @@ downloader leaves kapture folders.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,6 @@ from megloc_kapture.datasets.official import (
     DatasetCard,
     Missing,
     OfficialDataset,
-    ground_truth_files,
     last_part,
     read_ground_truth,
 )
@@ -120,10 +119,6 @@ class Layout:
             return colmap_model_files(self.colmap_model, with_points=with_points)
         files = (self.nvm, self.database_intrinsics)
         return tuple(file for file in files if file.is_file())
-
-    def image_files(self) -> Iterator[Path]:
-        for folder in (DATABASE_FOLDER, SEQUENCES_FOLDER, QUERY_FOLDER):
-            yield from sorted(path for path in (self.images / folder).rglob("*") if path.is_file())
 
     def read(self, version: Version, missing: Missing) -> tuple[AachenImages, int]:
         """Read the existing images, and count v1.1's queries omitted from v1.0."""
@@ -290,20 +285,6 @@ class Aachen:
         files = layout.model_files(layout.version(self.options.version), with_points=reference)
         if reference:
             check_model_files(files)
-
-    def input_files(self, root: Path) -> Iterator[Path]:
-        if (form := _kapture_form(root)) is not None:
-            yield from form.input_files()
-        else:
-            layout, reference = Layout(root), self.options.reference_model
-            version = layout.version(self.options.version)
-            yield from layout.model_files(version, with_points=reference)
-            single = [layout.query_list(DAY), layout.query_list(NIGHT)]
-            if reference and version == "1.0":
-                single.append(layout.feature_database)
-            yield from (path for path in single if path.is_file())
-            yield from layout.image_files()
-        yield from ground_truth_files(Path(root))
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
         self.check(root)

@@ -8,8 +8,6 @@ from functools import cached_property
 from pathlib import Path
 
 from megloc_kapture.datasets.formats.fourseasons_files import (
-    CAMERA_FILES,
-    STEREO_FILE,
     RelocalizationRow,
     StereoCalibration,
     parse_relocalization_name,
@@ -51,9 +49,6 @@ class Recording:
         """Return the name of an image below the dataset's root."""
         return f"{self.name}/{_IMAGES}/{camera}/{timestamp}.png"
 
-    def file_of(self, image: str) -> Path:
-        return self.folder / image.removeprefix(f"{self.name}/")
-
     def image_file(self, timestamp: int, camera: str) -> Path:
         return self.folder / _IMAGES / camera / f"{timestamp}.png"
 
@@ -65,10 +60,6 @@ class Recording:
 
     def calibration(self, root: Path) -> StereoCalibration:
         return read_calibration(self.calibration_folder(root))
-
-    def calibration_files(self, root: Path) -> list[Path]:
-        folder = self.calibration_folder(root)
-        return [folder / name for name in (*CAMERA_FILES, STEREO_FILE)]
 
     def calibration_folder(self, root: Path) -> Path:
         for folder in (self.folder, root):

@@ -8,7 +8,6 @@ pose of the scan in its floor.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -175,17 +174,6 @@ class Layout:
     def wrong_scans(self, floor: str) -> frozenset[str]:
         path = _first(self.alignment(floor), _WRONG_SCANS)
         return frozenset() if path is None else read_wrong_scans(path)
-
-    def input_files(self, floors: tuple[str, ...], *, with_points: bool) -> Iterator[Path]:
-        for floor in floors:
-            alignments = self.alignment(floor)
-            yield from sorted(alignments.glob("transformations/*.txt"))
-            yield from (alignments / n for n in _WRONG_SCANS if (alignments / n).is_file())
-            yield from sorted((self.cutouts / floor).glob("[0-9][0-9][0-9]/*.jpg"))
-            if with_points:
-                pattern = f"[0-9][0-9][0-9]/*.jpg{POINTS_SUFFIX}"
-                yield from sorted((self.cutouts / floor).glob(pattern))
-        yield from (self.query / name for name in self.queries())
 
     def _scan(self, floor: str, number: str, missing: Missing) -> Scan:
         folder = self.cutouts / floor / number

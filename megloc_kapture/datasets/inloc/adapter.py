@@ -6,7 +6,7 @@ its scan in the floor; its depth comes from the scanned points.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -31,7 +31,6 @@ from megloc_kapture.datasets.official import (
     DatasetCard,
     Missing,
     OfficialDataset,
-    ground_truth_files,
     last_part,
     read_ground_truth,
 )
@@ -96,11 +95,6 @@ class InLoc:
         layout = Layout.find(root)
         if not any((layout.cutouts / floor).is_dir() for floor in self.floors):
             raise DataError(f"none of {', '.join(self.floors)} is there", path=layout.cutouts)
-
-    def input_files(self, root: Path) -> Iterator[Path]:
-        layout = Layout.find(root)
-        yield from layout.input_files(self.floors, with_points=self.options.depth)
-        yield from ground_truth_files(root)
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
         self.check(root)

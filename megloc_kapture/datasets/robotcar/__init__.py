@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -176,17 +176,10 @@ class Layout:
         folders = self.individual_models().values()
         return [file for folder in folders for file in colmap_model_files(folder)]
 
-    def image_files(self) -> Iterator[Path]:
-        for condition in _sorted_names(self.images):
-            for camera in CAMERAS:
-                folder = self.images / condition / camera
-                for name in _sorted_names(folder):
-                    if name.endswith(_FILE_TYPES):
-                        yield folder / name
-
     def num_reference_images(self) -> int:
-        files = self.image_files()
-        return sum(path.parent.parent.name == REFERENCE_CONDITION for path in files)
+        folders = (self.images / REFERENCE_CONDITION / camera for camera in CAMERAS)
+        names = (name for folder in folders for name in _sorted_names(folder))
+        return sum(name.endswith(_FILE_TYPES) for name in names)
 
 
 def image_finder(layout: Layout, missing: Missing) -> Callable[[ImageKey], str | None]:

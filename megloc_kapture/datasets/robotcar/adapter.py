@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +16,6 @@ from megloc_kapture.datasets.official import (
     DatasetCard,
     Missing,
     OfficialDataset,
-    ground_truth_files,
     read_ground_truth,
 )
 from megloc_kapture.datasets.reference_map import ReferenceModel, check_model_files
@@ -136,23 +135,6 @@ class RobotCar:
             raise self.card.without(root, absent)
         elif self.options.reference_model:
             check_model_files(Layout(root).points_files(self.options.model))
-
-    def input_files(self, root: Path) -> Iterator[Path]:
-        layout = Layout(root)
-        if (form := _kapture_form(root)) is not None:
-            yield from (path for path in [layout.test_list] if path.is_file())
-            yield from form.input_files()
-        else:
-            single = [of(name) for of in (layout.intrinsics, layout.extrinsics) for name in CAMERAS]
-            single += [layout.train_list, layout.test_list, layout.merged_model]
-            if self.options.reference_model:
-                single.append(layout.feature_database)
-            yield from (path for path in single if path.is_file())
-            yield from layout.query_lists().values()
-            for folder in layout.individual_models().values():
-                yield from sorted(path for path in folder.iterdir() if path.is_file())
-            yield from layout.image_files()
-        yield from ground_truth_files(Path(root))
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
         self.check(root)

@@ -19,7 +19,6 @@ from aachen_files import (
     NIGHT_LIST,
     NVM,
     SEQUENCE,
-    UNLISTED,
     picture,
     write_v1_0,
     write_v1_1,
@@ -307,26 +306,6 @@ def test_truth_beside_the_dataset(root: Path, tmp_path: Path) -> None:
     data.records_camera[3, "any"] = DAY[1]
     data.trajectories[3, "any"] = pose
     write_sensors(root / "ground_truth/query", data)
-    assert "ground_truth/query/sensors/sensors.txt" in inputs(root)
     truth = KaptureFolder(written(root, tmp_path / "out") / "query_gt").read()
     assert truth.poses() == {DAY[1]: pose}
     assert truth.image_names() == sorted(DAY + NIGHT)
-
-
-def inputs(root: Path, **options: object) -> set[str]:
-    files = list(Aachen(AachenOptions(**options)).input_files(root))  # type: ignore[arg-type]
-    assert len(files) == len(set(files)) and all(file.is_file() for file in files)
-    return {str(file.relative_to(root)) for file in files}
-
-
-def test_input_files(root11: Path) -> None:
-    (root11 / "aachen.db").write_bytes(b"")
-    names = (*DATABASE, *SEQUENCE, *DAY, *NIGHT, *ADDED, UNLISTED)
-    always = {*(f"images_upright/{name}" for name in names), DAY_LIST, NIGHT_LIST}
-    model = {f"3D-models/aachen_v_1_1/{n}.txt" for n in ("cameras", "images")}
-    points = "3D-models/aachen_v_1_1/points3D.txt"
-    assert inputs(root11) == {*always, *model}
-    assert inputs(root11, reference_model=True) == {*always, *model, points}
-    assert inputs(root11, version="1.0") == {*always, MODEL, LIST}
-    with_features = {*always, MODEL, LIST, "aachen.db"}
-    assert inputs(root11, version="1.0", reference_model=True) == with_features

@@ -130,17 +130,6 @@ def test_an_image_of_another_size_than_its_camera(root: Path) -> None:
         read(root)
 
 
-def test_input_files_are_what_is_read(downloaded: Path) -> None:
-    files = [str(path.relative_to(downloaded)) for path in Aachen().input_files(downloaded)]
-    assert len(set(files)) == len(files)
-    for part in ("mapping", *PARTS):
-        assert f"{part}/sensors/sensors.txt" in files
-        assert f"{part}/sensors/records_camera.txt" in files
-    assert "mapping/sensors/trajectories.txt" in files
-    images = {path.removeprefix("mapping/sensors/records_data/") for path in files}
-    assert set(read(downloaded).mapping.image_names()) <= images
-
-
 def images_of(folder: Path) -> dict[str, tuple[list[float], Any]]:
     """Cameras and poses by image, as kapture reads them; names of sensors are each tool's own."""
     data = kapture_from_dir(str(folder))

@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 from tools.kapture_import_4seasons import import_4seasons_trajectory, load_4seasons_cameras
 
 from megloc_kapture.datasets.fourseasons import Recording
-from megloc_kapture.datasets.fourseasons.adapter import FourSeasons, FourSeasonsOptions
+from megloc_kapture.datasets.fourseasons.adapter import FourSeasons
 from megloc_kapture.datasets.fourseasons.images import LocalFrame, read_keyframe_poses
 from megloc_kapture.datasets.official import Missing, write_official
 from megloc_kapture.errors import DataError, OptionError
@@ -258,22 +258,6 @@ def test_truth_beside_the_dataset(root: Path) -> None:
     np.testing.assert_allclose(found.center(), pose.center(), atol=1e-8)
     assert dataset.groups[image(SNOW, A + 5)].condition == "blizzard"
     assert dataset.groups[image(SNOW, B + 5)].condition == SNOW
-    files = set(FourSeasons().input_files(root))
-    assert root / "ground_truth/query/sensors/trajectories.txt" in files
-
-
-def test_input_files(root: Path) -> None:
-    write_recording(root, RAIN, (A + 9,), rows=None)
-    files = list(FourSeasons(FourSeasonsOptions(queries=(SNOW,))).input_files(root))
-    assert len(files) == len(set(files)) and all(file.is_file() for file in files)
-    shots = (
-        (r, t, c) for r, d in ((DAY, 0), (SNOW, 5)) for t in (A + d, B + d) for c in ("0", "1")
-    )
-    assert {str(file.relative_to(root)) for file in files} == {
-        *(f"calibration/undistorted_calib_{part}.txt" for part in ("0", "1", "stereo")),
-        *(f"{DAY}/{name}.txt" for name in ("GNSSPoses", "Transformations")),
-        *(image(recording, time, f"cam{camera}") for recording, time, camera in shots),
-    }
 
 
 @pytest.fixture

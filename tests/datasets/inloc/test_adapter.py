@@ -288,19 +288,3 @@ def test_what_is_no_inloc_is_refused_quickly(tmp_path: Path, root: Path) -> None
             shutil.rmtree(root / folder)
         with pytest.raises(DataError, match=message):
             InLoc().check(place)
-
-
-def test_input_files_are_all_that_is_read(root: Path) -> None:
-    read_so = {path for path in root.rglob("*") if path.is_file()}
-    read_so -= {root / "query/iphone7" / name for name in ("._IMG_0801.JPG", "readme.txt")}
-    assert set(InLoc().input_files(root)) == read_so and len(read_so) == 2 * 72 + 2 + 3
-    without = {path for path in read_so if path.suffix != ".mat"}
-    assert set(InLoc(InLocOptions(depth=False)).input_files(root)) == without
-    more = [
-        root / "database/alignments/DUC1/know_incorrect.txt",
-        root / "ground_truth/megloc/groups.csv",
-    ]
-    more[1].parent.mkdir(parents=True)
-    for path in more:
-        path.write_text("image, condition, frame, location, scored\n")
-    assert set(InLoc().input_files(root)) == {*read_so, *more}

@@ -98,8 +98,6 @@ def test_it_is_found_by_the_folder_kapture_unpacks_to(
     choice = choose_dataset("robotcar", None)
     choice.check()
     assert choice.root == downloaded
-    files = {path.relative_to(downloaded).parts[0] for path in choice.input_files(downloaded)}
-    assert files == {"01", "02"}
     with pytest.raises(OptionError, match="kapture folders"):
         RobotCar(RobotCarOptions(reference_model=True)).check(downloaded)
 
