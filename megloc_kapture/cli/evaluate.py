@@ -56,6 +56,7 @@ class Evaluate(Common):
 
     def run(self, console: Console) -> None:
         # slow import
+        from megloc_kapture.evaluation.comparison import compare
         from megloc_kapture.evaluation.evaluate import (
             benchmark_beside,
             evaluate_results,
@@ -64,7 +65,6 @@ class Evaluate(Common):
         from megloc_kapture.evaluation.metrics import Threshold
         from megloc_kapture.evaluation.report.reports import report_text, write_report
         from megloc_kapture.evaluation.scoring import Reported
-        from megloc_kapture.evaluation.statistics import compare
 
         self._check()
         benchmark = benchmark_beside(

@@ -24,18 +24,21 @@ from megloc_kapture.io.weights import (
     PublishedFile,
     Weights,
     WeightsFile,
+    add_weights,
+    convert_weights,
     describe,
+    fetch,
     files_of,
     how_to_convert,
     how_to_get,
     lookup,
+    prove,
     read_weights,
     registry,
     sha256_of,
     to_convert,
     weights_folder,
 )
-from megloc_kapture.io.weights.adding import add_weights, convert_weights, fetch, prove
 from megloc_kapture.pipeline.presets import check_weights, options_of_preset
 
 if TYPE_CHECKING:

@@ -14,13 +14,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
 from megloc_kapture.datasets.kapture_folders import (
     cameras_of_images,
     is_kapture,
     warn_of_scaled,
 )
-from megloc_kapture.datasets.reference_map import write_reference_map
+from megloc_kapture.datasets.reference_map import ColmapDatabase, write_reference_map
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import (
     BINARY_FILES,

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.evaluation.comparison import WithoutTruth, evaluate_without_truth
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.pose_files import poses_by_image
 from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of
@@ -27,7 +28,6 @@ from megloc_kapture.evaluation.results import (
     side_tables_near,
 )
 from megloc_kapture.evaluation.scoring import Evaluation, evaluate_pairs, evaluate_poses
-from megloc_kapture.evaluation.without_truth import WithoutTruth, evaluate_without_truth
 from megloc_kapture.geometry.poses import align_poses, stack_poses
 from megloc_kapture.io.dataset_tables import (
     METRES,

@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, require
-from megloc_kapture.evaluation.confidence import Confidence, confidence_of
 from megloc_kapture.evaluation.metrics import (
+    Confidence,
     PoseErrors,
     RecallRow,
     Threshold,
+    confidence_of,
     pose_errors,
     recall_row,
     row_members,
@@ -37,7 +38,7 @@ from megloc_kapture.refinement.acceptance import squared_distance
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from megloc_kapture.evaluation.statistics import Comparison
+    from megloc_kapture.evaluation.comparison import Comparison
 
 _CHI2_95 = 12.592  # quantile of six degrees of freedom
 
@@ -185,7 +186,7 @@ class Evaluation(Reported):
 
     def compare(self, *others: Evaluation) -> Comparison:
         """Test the differences from other results on the same queries."""
-        from megloc_kapture.evaluation.statistics import compare
+        from megloc_kapture.evaluation.comparison import compare
 
         return compare([self, *others])
 

@@ -26,7 +26,6 @@ from megloc_kapture.evaluation.evaluate import (
     evaluate_results,
     results_without_truth,
 )
-from megloc_kapture.evaluation.report.map_view import top_view
 from megloc_kapture.evaluation.report.queries import (
     ShownQuery,
     StoredInliers,
@@ -35,6 +34,7 @@ from megloc_kapture.evaluation.report.queries import (
     query_facts,
     shown_queries,
     spread,
+    top_view,
 )
 from megloc_kapture.evaluation.report.reports import plain, template
 from megloc_kapture.evaluation.results import Poses, ResultContext

@@ -78,7 +78,7 @@ def map_overview(kapture_map: KaptureMap) -> bytes:
     [x, y, ...] and ``cameras`` [x, y, direction x, direction y, ...] are relative to these and
     subsampled if many. ``images`` counts the map's images, ``unit`` is ``m`` or ``units``.
     """
-    from megloc_kapture.evaluation.report.map_view import top_view  # imports matplotlib
+    from megloc_kapture.evaluation.report.queries import top_view
 
     names = kapture_map.images
     quats, translations = stack_poses([kapture_map.poses[name] for name in names])

@@ -10,8 +10,8 @@ import pytest
 from scored import evaluate_poses
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.confidence import calibration_error, reliability, risk_by_score
 from megloc_kapture.evaluation.evaluate import evaluate
+from megloc_kapture.evaluation.metrics import calibration_error, reliability, risk_by_score
 from megloc_kapture.evaluation.pose_files import write_pose_file, write_provenance
 from megloc_kapture.evaluation.report.reports import report_text, write_report
 from megloc_kapture.io.dataset_tables import read_nowhere, write_nowhere

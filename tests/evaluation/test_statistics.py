@@ -13,16 +13,16 @@ from scipy import stats
 from scored import evaluate_poses
 
 from megloc_kapture.errors import OptionError
-from megloc_kapture.evaluation.metrics import Threshold
-from megloc_kapture.evaluation.report.reports import report_text
-from megloc_kapture.evaluation.scoring import Evaluation
-from megloc_kapture.evaluation.statistics import (
+from megloc_kapture.evaluation.comparison import (
     _resampled_medians,
     compare,
     difference_interval,
     holm,
     mcnemar,
 )
+from megloc_kapture.evaluation.metrics import Threshold
+from megloc_kapture.evaluation.report.reports import report_text
+from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.values import RigidTransform
 
 HERE = RigidTransform.identity()

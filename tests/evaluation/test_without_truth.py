@@ -14,16 +14,16 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.evaluation.comparison import (
+    WithoutTruth,
+    evaluate_without_truth,
+    inliers_quartiles,
+)
 from megloc_kapture.evaluation.evaluate import results_without_truth
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of, protocol_of
 from megloc_kapture.evaluation.report.reports import render_report, report_text, write_report
 from megloc_kapture.evaluation.results import Result
-from megloc_kapture.evaluation.without_truth import (
-    WithoutTruth,
-    evaluate_without_truth,
-    inliers_quartiles,
-)
 from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,

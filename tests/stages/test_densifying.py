@@ -19,7 +19,6 @@ from corner import CAMERA, depth_m
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.report.gallery import depth_pictures
 from megloc_kapture.evaluation.report.queries import StoredInliers
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.view import render_view, scene_of
@@ -217,21 +216,6 @@ def test_an_image_without_a_file_has_a_reason(world: Any, tmp_path: Path) -> Non
     assert counts["images_with_depth"] == 4 and counts["points_lifted"] == 0
     assert rows["left/0.png"].reason == "there is no image file"
     assert all("left/0.png" not in row.sources for row in rows.values())
-
-
-# -------------------------------------------------------------------------------- depth in report
-
-
-def test_pictures_show_the_depth_that_is_there(
-    densified: KaptureFolder, world: Any, tmp_path: Path
-) -> None:
-    shown = depth_pictures(densified)
-    assert [own.name for own in shown] == sorted(densified.read().poses())
-    assert all(own.facts.startswith("depth on ") for own in shown)
-    broken = KaptureFolder(shutil.copytree(densified.root, tmp_path / "map", symlinks=True))
-    (broken.root / DEPTH_FILE).write_text("not a table")
-    for folder in (broken, world.map(), None):
-        assert depth_pictures(folder) == []
 
 
 def test_the_view_shows_the_cloud_on_the_walls(

@@ -14,11 +14,12 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
-from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm
-from megloc_kapture.datasets.kapture_form import KaptureForm, KaptureImage
+from megloc_kapture.datasets.nvm import NvmModel, read_nvm
 from megloc_kapture.datasets.official import (
     Count,
     DatasetCard,
+    KaptureForm,
+    KaptureImage,
     Missing,
     OfficialDataset,
     last_part,

@@ -12,9 +12,6 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from megloc_kapture.datasets.formats.fourseasons_files import (
-    StereoCalibration,
-)
 from megloc_kapture.datasets.fourseasons import (
     CAMERAS,
     GNSS_POSES,
@@ -23,6 +20,7 @@ from megloc_kapture.datasets.fourseasons import (
     Recording,
     RelocalizationFile,
     Selection,
+    StereoCalibration,
     select,
 )
 from megloc_kapture.datasets.fourseasons.images import (

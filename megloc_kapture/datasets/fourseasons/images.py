@@ -12,12 +12,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from megloc_kapture.datasets.formats.fourseasons_files import (
-    StereoCalibration,
-    read_gnss_poses,
-    read_poses,
-    read_transformations,
-)
 from megloc_kapture.datasets.fourseasons import (
     CAMERAS,
     GNSS_POSES,
@@ -25,6 +19,10 @@ from megloc_kapture.datasets.fourseasons import (
     TRANSFORMATIONS,
     Recording,
     RelocalizationFile,
+    StereoCalibration,
+    read_gnss_poses,
+    read_poses,
+    read_transformations,
 )
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError, require

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.formats.text_lines import Line, read_lines
 from megloc_kapture.datasets.official import Missing
+from megloc_kapture.datasets.text_lines import Line, read_lines
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import named
 from megloc_kapture.values import RigidTransform

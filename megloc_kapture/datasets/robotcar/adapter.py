@@ -10,10 +10,10 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from megloc_kapture.datasets.kapture_form import KaptureForm
 from megloc_kapture.datasets.official import (
     Count,
     DatasetCard,
+    KaptureForm,
     Missing,
     OfficialDataset,
     read_ground_truth,

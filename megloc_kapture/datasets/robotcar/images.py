@@ -9,9 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from megloc_kapture.datasets.formats.text_lines import read_rigid_matrix
-from megloc_kapture.datasets.kapture_form import KaptureForm, KaptureImage
-from megloc_kapture.datasets.official import Missing, with_poses
+from megloc_kapture.datasets.official import KaptureForm, KaptureImage, Missing, with_poses
 from megloc_kapture.datasets.robotcar import (
     CAMERAS,
     REFERENCE_CONDITION,
@@ -25,6 +23,7 @@ from megloc_kapture.datasets.robotcar import (
     read_intrinsics,
     read_test_names,
 )
+from megloc_kapture.datasets.text_lines import read_rigid_matrix
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.geometry.poses import rotation_angles_deg, stack_poses
 from megloc_kapture.io.files import named

@@ -10,21 +10,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from megloc_kapture.evaluation.confidence import Confidence
-from megloc_kapture.evaluation.metrics import RecallAt, RecallRow, Threshold, pose_errors
-from megloc_kapture.evaluation.scoring import CovarianceCheck, Evaluation
-from megloc_kapture.evaluation.statistics import (
+from megloc_kapture.evaluation.comparison import (
     NUM_RESAMPLES,
     SIGNIFICANCE,
+    AgreementRow,
     Comparison,
     MedianDifference,
     PairedTest,
-)
-from megloc_kapture.evaluation.without_truth import (
-    AgreementRow,
     WithoutTruth,
     inliers_quartiles,
 )
+from megloc_kapture.evaluation.metrics import (
+    Confidence,
+    RecallAt,
+    RecallRow,
+    Threshold,
+    pose_errors,
+)
+from megloc_kapture.evaluation.scoring import CovarianceCheck, Evaluation
 from megloc_kapture.io.tables import ConsistencyRow
 from megloc_kapture.values import MIN_CONFIDENCE
 

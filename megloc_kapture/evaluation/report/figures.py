@@ -18,9 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
-from megloc_kapture.evaluation.confidence import Confidence
-from megloc_kapture.evaluation.report.map_view import top_view
-from megloc_kapture.evaluation.report.queries import ShownQuery, frame_of_query
+from megloc_kapture.evaluation.metrics import Confidence
+from megloc_kapture.evaluation.report.queries import ShownQuery, frame_of_query, top_view
 from megloc_kapture.evaluation.results import Poses
 from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.geometry.poses import camera_centers, stack_poses

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from kapture.converter.colmap.database import COLMAPDatabase
 
-from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
+from megloc_kapture.datasets.reference_map import ColmapDatabase
 from megloc_kapture.errors import DataError
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py

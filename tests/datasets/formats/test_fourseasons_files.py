@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.formats.fourseasons_files import (
+from megloc_kapture.datasets.fourseasons import (
     parse_relocalization_name,
     read_calibration,
     read_gnss_poses,

@@ -13,8 +13,8 @@ from kapture.io.records import TransferAction
 from megloc_twins.model_files import write_nvm
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.formats import nvm as nvm_reader
-from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm
+from megloc_kapture.datasets import nvm as nvm_reader
+from megloc_kapture.datasets.nvm import NvmModel, read_nvm
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.images import write_image

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from scored import evaluate_poses
 
 from megloc_kapture.evaluation.report.figures import views_from_above
-from megloc_kapture.evaluation.report.map_view import top_view
-from megloc_kapture.evaluation.report.queries import shown_queries
+from megloc_kapture.evaluation.report.queries import shown_queries, top_view
 from megloc_kapture.geometry.poses import camera_centers, stack_poses
 from megloc_kapture.values import RigidTransform
 

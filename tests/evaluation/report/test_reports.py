@@ -15,6 +15,7 @@ import pytest
 from scored import evaluate_poses
 
 from megloc_kapture.errors import OutputError
+from megloc_kapture.evaluation.comparison import MedianDifference, compare
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.content import (
     format_degrees,
@@ -28,7 +29,6 @@ from megloc_kapture.evaluation.report.queries import shown_queries, worst_querie
 from megloc_kapture.evaluation.report.reports import render_report, report_text, write_report
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation
-from megloc_kapture.evaluation.statistics import MedianDifference, compare
 from megloc_kapture.io.tables import QueryStatus
 from megloc_kapture.values import RefinementRow, RigidTransform
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.weights.adding import TransferError, fetch
+from megloc_kapture.io.weights import TransferError, fetch
 
 CONTENT = np.random.default_rng(0).bytes(300_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()

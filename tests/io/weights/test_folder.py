@@ -20,7 +20,10 @@ from safetensors.torch import save_file
 from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError
 from megloc_kapture.io import weights as weights_module
 from megloc_kapture.io.weights import (
+    SOURCE_KEY,
     MissingWeightsError,
+    add_weights,
+    convert_weights,
     describe,
     find_weights,
     read_weights,
@@ -29,7 +32,6 @@ from megloc_kapture.io.weights import (
     share_weights,
     weights_folder,
 )
-from megloc_kapture.io.weights.adding import SOURCE_KEY, add_weights, convert_weights
 from megloc_kapture.nets.runtime import load_strictly
 from megloc_kapture.pipeline.executors import open_executor
 
@@ -251,7 +253,7 @@ def test_convert_keeps_everything_and_is_deterministic(published: Path, tmp_path
     source = published / "r2d2" / "r2d2_WAF_N16.pt"
     before = source.read_bytes()
     places = [tmp_path / f"{row}.safetensors" for row in range(2)]
-    code = "import sys; from pathlib import Path; import megloc_kapture.io.weights.adding as c;"
+    code = "import sys; from pathlib import Path; import megloc_kapture.io.weights as c;"
     code += "c.convert_weights(Path(sys.argv[1]), Path(sys.argv[2]))"
     count = convert_weights(source, places[0])
     subprocess.run([sys.executable, "-c", code, source, places[1]], check=True)
