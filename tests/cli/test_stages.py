@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 from collections.abc import Callable
 from contextlib import redirect_stderr
 from dataclasses import dataclass, fields
@@ -174,53 +173,6 @@ def test_several_global_features_are_fused(
         assert score == pytest.approx((found["hard"][pair] + found["soft"][pair]) / 2, abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    "command",
-    ["densify", "refine-map", "refine-poses", "triangulate", "pairs-mapping", "pairs-query"],
-)
-def test_a_scheduler_that_nothing_asks_is_refused(
-    megloc: Any, finished: Path, tmp_path: Path, command: str
-) -> None:
-    out, query = tmp_path / "out", ("--query", finished / "query")
-    given: tuple[Any, ...] = (command, "-i", finished / "map", "-o", out)
-    if command == "refine-poses":
-        given += (*query, "--poses", finished / "localized", "--by", "icp")
-    if command == "pairs-query":
-        given += (*query, "--exhaustive")
-    if command == "pairs-mapping":
-        given += ("--by", "poses")
-    if command == "triangulate":
-        given += ("--features-dir", finished / "matches" / "mapping")
-    megloc(*given, "--scheduler", "tcp://127.0.0.1:1").refused("--scheduler needs --executor dask")
-    assert not out.exists()
-    if command in ("pairs-query", "pairs-mapping"):
-        assert megloc(*given, "--workers", "2").status == 0
-        assert megloc(*given[:-1], given[-1], "-f", "--workers", "0").status == 2
-
-
-def test_output_of_another_kind_is_refused(
-    megloc: Any, made: Made, scene: Path, tmp_path: Path
-) -> None:
-    # features where a map is
-    command = ["extract-local", "-i", scene / "query", "-o", made.map, *OPTIONS, *INLINE]
-    megloc(*command, "-q").refused(f"{made.map}: is not empty and not a features of megloc")
-    # more features beside ours
-    command[4] = shutil.copytree(made.vlad, tmp_path / "vlad")
-    assert megloc(*command, "-q").status == 0
-    assert KaptureFolder(scene / "query", features_dirs=[tmp_path / "vlad"]).types("keypoints")
-
-
-def test_what_cannot_be_extracted_is_refused(megloc: Any, scene: Path, tmp_path: Path) -> None:
-    described = ["extract-global", "-i", scene / "mapping", "-o", tmp_path / "out"]
-    megloc(*described, "--features", "nothing").refused(
-        "unknown global features 'nothing'; known: vlad, apgem, delg"
-    )
-    command = ["extract-local", "-i", scene / "query", "-i", scene / "query"]
-    done = megloc(*command, "-o", tmp_path / "features", "-q")
-    done.refused(r"image 0001\.jpg stands in two kapture folders at once")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_ways_to_pair(megloc: Any, finished: Path, tmp_path: Path) -> None:
     mapping, points, pairs = finished / "mapping", finished / "map", tmp_path / "pairs.txt"
     command = ("pairs-mapping", "-i", mapping, "-o", pairs, "--by")
@@ -297,18 +249,6 @@ def test_what_cannot_be_matched_is_refused(megloc: Any, workspace: Path, tmp_pat
     done = megloc(*command, "--pairs", workspace / "pairs/mapping.txt")
     done.refused(f"{spoilt}: 799 descriptors for 800 keypoints")
     assert not (tmp_path / "new").exists()
-
-
-def test_import_links_images_and_prefixes_queries(megloc: Any, scene: Path, tmp_path: Path) -> None:
-    done = megloc("import", "kapture", scene, "-o", tmp_path / "in", "--query-prefix", "q/")
-    counts = dict(line.rsplit(maxsplit=1) for line in done.out.splitlines())
-    expected = {"map images": "7", "map images with pose": "7", "queries": "4"}
-    assert counts == expected | {"queries with truth": "4"}
-    query = KaptureFolder(tmp_path / "in" / "query")
-    assert query.read().image_names()[0] == "q/0001.jpg"
-    original = scene / "query/sensors/records_data/0001.jpg"
-    assert query.image_path("q/0001.jpg").read_bytes() == original.read_bytes()
-    megloc("import", "venice", scene, "-o", tmp_path / "x").refused("unknown dataset 'venice'")
 
 
 def test_networks_compute_where_the_flags_say(

@@ -63,21 +63,6 @@ def test_a_matcher_and_its_files(megloc: Any, inputs: Path, tmp_path: Path) -> N
     assert again.status == 0 and again.out == done.out
 
 
-def test_what_it_refuses(megloc: Any, inputs: Path, tmp_path: Path) -> None:
-    output = ("-o", tmp_path / "x.safetensors")
-    train = ("train", "descriptor", "-i", inputs / "mine", *output)
-    for words, message in (
-        (("--set", "step=3"), r"unknown option step; did you mean 'steps'"),
-        (("--set", "pairs.labels.positive=3"), r"unknown option pairs\.labels\.positive"),
-        (("--set", "layers=3"), r"option layers: it should be a multiple of 2"),
-        (("--features", "rootsift"), r"superpoint and xfeat can be trained"),
-        (("--features", "superpoint"), r"the weights superpoint_v1 are missing"),
-    ):
-        megloc(*train, *words).refused(message)
-    megloc("train", "matcher", *output).refused("nothing to train on")
-    assert not list(tmp_path.iterdir())
-
-
 QUICK = ("--steps", "6", "--max-side", "40", "--device", "cpu")
 HERE = ("--max-side", "80", "--executor", "inline")
 CAMERA_TEXT = "SIMPLE_PINHOLE,48,36,40,24,18"
@@ -263,21 +248,3 @@ def test_what_is_refused(megloc: Any, mapping: Path, field: Path, tmp_path: Path
     train = ("train-field", "-i", mapping, "-o", tmp_path / "out")
     megloc(*train, "--steps", "0").refused("steps: .*greater than 0")
     assert not out.exists() and not (tmp_path / "out").exists()
-
-
-def test_a_damaged_field_is_named(megloc: Any, mapping: Path, field: Path, tmp_path: Path) -> None:
-    command = (pose_text(mapping), "--camera", CAMERA_TEXT, "-o", tmp_path / "view.png")
-    for name, content, said in (
-        ("field.json", b"{}", r"field\.json: .*kind"),
-        ("field.safetensors", b"nonsense", r"field\.safetensors: "),
-    ):
-        broken = tmp_path / name
-        shutil.copytree(field, broken)
-        (broken / name).write_bytes(content)
-        megloc("render", broken, *command).refused(said)
-    fewer = tmp_path / "fewer"
-    shutil.copytree(field, fewer)
-    manifest = json.loads((field / "field.json").read_text())
-    manifest["images"].pop()
-    (fewer / "field.json").write_text(json.dumps(manifest))
-    megloc("render", fewer, *command).refused("keys of another shape: appearance.weight")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -57,26 +57,6 @@ def test_a_slanted_world_is_seen_along_its_own_vertical(world: Any) -> None:
     np.testing.assert_allclose(
         np.linalg.norm(flat - flat[0], axis=1), np.linalg.norm(ground - ground[0], axis=1)
     )
-
-
-def test_cameras_that_agree_on_no_vertical_are_seen_where_they_spread() -> None:
-    rng = np.random.default_rng(0)
-    quats = Rotation.random(200, rng=rng).as_quat(scalar_first=True)
-    centers = rng.normal(size=(200, 3)) * [30.0, 0.1, 20.0]
-    view = top_view(quats, centers)
-    assert set(view.labels) == {"x", "z"}
-
-
-@pytest.mark.parametrize("slant", [0.0, 0.7])
-@pytest.mark.parametrize("count", [1, 2, 3, 4])
-def test_few_cameras_on_one_vertical_line(
-    upright: Callable[..., RigidTransform], count: int, slant: float
-) -> None:
-    turn = moved(0.0, (float(np.cos(slant)), float(np.sin(slant)), 0.0, 0.0))
-    poses = [upright(np.array([1.0, 2.0, float(i)]), 0.3) @ turn for i in range(count)]
-    view = top_view(*arrays(poses))
-    page = np.stack([view.right, view.up])
-    np.testing.assert_allclose(page @ page.T, np.eye(2), atol=1e-12)
 
 
 def test_frames_are_drawn_apart() -> None:

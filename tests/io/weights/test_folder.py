@@ -11,7 +11,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from hostile import Runs
@@ -32,8 +31,6 @@ from megloc_kapture.io.weights import (
     share_weights,
     weights_folder,
 )
-from megloc_kapture.nets.runtime import load_strictly
-from megloc_kapture.pipeline.executors import open_executor
 
 COUNTS = {
     "aliked-t16": 192_588,
@@ -167,12 +164,6 @@ def test_code_is_not_run(tmp_path: Path) -> None:
     assert not (tmp_path / "made").exists()
 
 
-def test_a_score_of_numpy_beside_the_weights(tmp_path: Path) -> None:
-    for score in (np.float64(0.7), np.float32(0.7)):
-        torch.save({"model_state": {"a": torch.ones(1)}, "best_score": score}, tmp_path / "x.pth")
-        assert read_weights(find_weights(str(tmp_path / "x.pth"))).keys() == {"a"}
-
-
 def test_looking_for_weights_does_not_import_torch() -> None:
     code = (
         "import sys, megloc_kapture.io.weights as w\n"
@@ -285,23 +276,6 @@ def test_convert_views_of_one_memory_and_refuses(tmp_path: Path) -> None:
         with pytest.raises(kind, match=message):
             convert_weights(wrong, target)
     convert_weights(source, place, force=True)
-
-
-def _is_mapped(path: Path) -> bool:
-    """True if a network's parameters are pages of the shared file, which the system keeps once."""
-    net = load_strictly(torch.nn.Linear(64, 1), read_weights(describe("own", path)), "own")
-    at, lines = net.weight.data_ptr(), Path("/proc/self/maps").read_text().splitlines()
-    spans = [line.split()[0].split("-") for line in lines if "/weights-" in line]
-    return any(int(first, 16) <= at < int(end, 16) for first, end in spans)
-
-
-@pytest.mark.skipif(not Path("/proc/self/maps").is_file(), reason="Linux tells it")
-def test_workers_have_one_copy(tmp_path: Path) -> None:
-    torch.save(torch.nn.Linear(64, 1).state_dict(), tmp_path / "own.pth")
-    assert not _is_mapped(tmp_path / "own.pth")
-    with open_executor("processes", 2) as executor:
-        assert executor is not None
-        assert all(executor.map(_is_mapped, [tmp_path / "own.pth"] * 4))
 
 
 def test_what_was_read_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
