@@ -54,6 +54,12 @@ class OptionError(MeglocError):
     """An invalid option or argument; lists the valid values."""
 
 
+def check_option(condition: object, message: str) -> None:
+    """Raise OptionError unless the condition is true; the message is formatted in any case."""
+    if not condition:
+        raise OptionError(message)
+
+
 class OutputError(MeglocError):
     """The output cannot be written: existing files, no space, no permission."""
 

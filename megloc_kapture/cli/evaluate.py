@@ -21,7 +21,7 @@ from megloc_kapture.cli.common import (
     existing,
     side_tables_beside,
 )
-from megloc_kapture.errors import DataError, OptionError, require
+from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.io.output_folders import staged_output
 
 EVALUATION = "evaluation"
@@ -92,14 +92,11 @@ class Evaluate(Common):
         console.result(report_text(found))
 
     def _check(self) -> None:
-        if not self.input:
-            raise OptionError("no result given; use -i")
+        check_option(self.input, "no result given; use -i")
         resolved = [path.resolve() for path in self.input]
         twice = next((p for p in self.input if resolved.count(p.resolve()) > 1), None)
-        if twice is not None:
-            raise OptionError(f"{twice} is given twice")
-        if self.align != "none" and self.gt is None:
-            raise OptionError("--align needs true poses (--gt)")
+        check_option(twice is None, f"{twice} is given twice")
+        check_option(self.align == "none" or self.gt is not None, "--align needs true poses (--gt)")
         existing([path for path in (self.side_tables, self.map) if path is not None])
 
 

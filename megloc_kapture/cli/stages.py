@@ -32,7 +32,7 @@ from megloc_kapture.cli.common import (
     existing,
     side_tables_beside,
 )
-from megloc_kapture.errors import OptionError, require
+from megloc_kapture.errors import OptionError, check_option, require
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.matching.verification import KnownPoseOptions
 from megloc_kapture.pipeline.plan import run_plan
@@ -114,8 +114,7 @@ class ExtractLocal(Linked, StageCommand):
     force: Force = False
 
     def run(self, console: Console) -> None:
-        if not self.input:
-            raise OptionError("no kapture folder given; use -i")
+        check_option(self.input, "no kapture folder given; use -i")
         folders = [self.kapture_map(path) for path in self.input]
         options = self.options(self.named("local_features", self.features))
         extractors = options.make_extractors()
@@ -235,8 +234,9 @@ class OutsideStage(Working):
 
     def run(self, console: Console) -> None:
         stage = load_plugin(STAGES, self.stage, assigned(self.set))
-        if not (self.workspace / "stages").is_dir():
-            raise OptionError(f"{self.workspace} is no workspace of megloc eval")
+        check_option(
+            (self.workspace / "stages").is_dir(), f"{self.workspace} is no workspace of megloc eval"
+        )
         workspace = Workspace(self.workspace)
         with self.working_in(workspace) as work:
             run_plan([stage], workspace, work, say=console.say)

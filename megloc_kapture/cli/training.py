@@ -23,7 +23,7 @@ from megloc_kapture.cli.common import (
     camera_of_text,
     refuse_given,
 )
-from megloc_kapture.errors import DataError, OptionError, OutputError, require
+from megloc_kapture.errors import DataError, OptionError, OutputError, check_option, require
 from megloc_kapture.io.images import WRITABLE_SUFFIXES
 from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.pipeline.executors import single_threaded
@@ -230,8 +230,9 @@ class Render(Linked, Working):
         if self.depth is not None:
             endings.append((self.depth, (".png",)))
         for path, known in endings:
-            if path.suffix.lower() not in known:
-                raise OptionError(f"{path}: the file must end in {' or '.join(known)}")
+            check_option(
+                path.suffix.lower() in known, f"{path}: the file must end in {' or '.join(known)}"
+            )
             if path.exists() and not self.force:
                 raise OutputError(f"{path}: stands there; -f replaces it")
         with single_threaded():

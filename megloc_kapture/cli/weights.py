@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,9 +15,11 @@ from megloc_kapture.errors import (
     MeglocError,
     OptionError,
     OutputError,
+    check_option,
     missing_extra,
 )
 from megloc_kapture.evaluation.pose_files import installed_version
+from megloc_kapture.evaluation.report.content import as_text
 from megloc_kapture.io.weights import (
     MissingWeightsError,
     PublishedFile,
@@ -47,21 +48,14 @@ if TYPE_CHECKING:
 WRONG_FILES = 2
 
 
-class LicenceError(MeglocError):
-    """Weights under a licence that was not agreed to."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class List(Common):
     """List all networks: file, size, licence, whether it is there and its sha256 known."""
 
     def run(self, console: Console) -> None:
-        rows: list[tuple[str, ...]] = [
-            ("name", "what for", "file", "size", "licence", "state", "sha256")
-        ]
-        rows += [_row(weights) for weights in registry().values()]
-        for line in _aligned(rows):
-            console.result(line)
+        import pandas as pd  # slow import
+
+        console.result(as_text(pd.DataFrame([_row(weights) for weights in registry().values()])))
         console.result(f"\nfolder of weights: {weights_folder()}")
         console.result("(!) megloc weights fetch asks for consent: --accept-licence")
         console.result("* not confirmed on the original file:")
@@ -95,7 +89,7 @@ class Fetch(Common):
         for name in names:
             try:
                 wanted.append(_fetchable(lookup(name), self.accept_licence))
-            except (MissingWeightsError, LicenceError) as error:
+            except (MissingWeightsError, OptionError) as error:
                 if self.preset is None:
                     raise
                 refused.append(str(error))
@@ -262,11 +256,11 @@ def _fetchable(weights: Weights, accepted: bool) -> tuple[Weights, PublishedFile
             f"{weights.name} cannot be fetched by a program: download it from {weights.page} and "
             "run: megloc weights add FILE"
         )
-    if not (weights.commercial or accepted):
-        raise LicenceError(
-            f"{weights.name} has a licence to agree to: {weights.licence}: {weights.terms} "
-            f"(whole text at {weights.page}); if you do, add --accept-licence"
-        )
+    check_option(
+        weights.commercial or accepted,
+        f"{weights.name} has a licence to agree to: {weights.licence}: {weights.terms} "
+        f"(whole text at {weights.page}); if you do, add --accept-licence",
+    )
     return weights, file, file.url
 
 
@@ -300,22 +294,18 @@ def _state(weights: Weights) -> str:
     return "to convert" if to_convert(weights) else "missing"
 
 
-def _row(weights: Weights) -> tuple[str, ...]:
+def _row(weights: Weights) -> dict[str, str]:
     there = [describe(weights.name, path).published for path in files_of(weights)]
     file = next((one for one in weights.files if one in there), weights.files[0])
-    size = "?" if file.size is None else f"{file.size / 1e6:.2f} MB"
-    name = f"{weights.name} *" if weights.unverified else weights.name
-    licence = weights.licence if weights.commercial else f"{weights.licence} (!)"
-    known = "known" if file.sha256 else "not known"
-    names = " | ".join(f.name for f in weights.files)
-    return name, weights.purpose, names, size, licence, _state(weights), known
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        yield "  ".join(cells).rstrip()
+    return {
+        "name": f"{weights.name} *" if weights.unverified else weights.name,
+        "what for": weights.purpose,
+        "file": " | ".join(f.name for f in weights.files),
+        "size": "?" if file.size is None else f"{file.size / 1e6:.2f} MB",
+        "licence": weights.licence if weights.commercial else f"{weights.licence} (!)",
+        "state": _state(weights),
+        "sha256": "known" if file.sha256 else "not known",
+    }
 
 
 _PACKAGES = (

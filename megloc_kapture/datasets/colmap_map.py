@@ -78,20 +78,18 @@ def find_colmap(
     also lie next to the model. Arguments ``images`` and ``database`` replace the search.
     """
     models = _models(path)
-    if not models:
-        raise DataError(
-            f"no COLMAP model: neither {BINARY_FILES[1]} nor {TEXT_FILES[1]} is here, in sparse/ "
-            "or in sparse/0",
-            path=path,
-        )
+    require(
+        models,
+        f"no COLMAP model: neither {BINARY_FILES[1]} nor {TEXT_FILES[1]} is here, in sparse/ "
+        "or in sparse/0",
+        path=path,
+    )
     if len(models) > 1:
         choices = ", ".join(str(model.relative_to(path)) for model in models)
         raise DataError(f"there are several models, give one of them: {choices}", path=path)
     model = models[0]
-    if images is not None and not images.is_dir():
-        raise DataError("no such folder of images", path=images)
-    if database is not None and not database.is_file():
-        raise DataError("no such database", path=database)
+    require(images is None or images.is_dir(), "no such folder of images", path=images)
+    require(database is None or database.is_file(), "no such database", path=database)
     around = [Path(os.path.abspath(model))]
     around += around[0].parents[: 2 if around[0].parent.name == SPARSE else 1]
     found_images = (folder / IMAGES for folder in around if (folder / IMAGES).is_dir())
@@ -190,14 +188,14 @@ class ColmapReconstruction:
         if source.database is not None:
             with ColmapDatabase(source.database) as opened:
                 found = opened.feature_type()
-                local_type = None if found is None else found.name
-        if local_type is None and source.images is None:
-            raise DataError(
-                "there are no descriptors to match queries with: `megloc import colmap` takes the "
-                "database that the model was made of (--database), or the images to extract them "
-                "from (--images)",
-                path=source.model,
-            )
+                local_type = None if found is None else found[0]
+        require(
+            local_type is not None or source.images is not None,
+            "there are no descriptors to match queries with: `megloc import colmap` takes the "
+            "database that the model was made of (--database), or the images to extract them "
+            "from (--images)",
+            path=source.model,
+        )
         if not len(self.model.points):
             raise OtherFeaturesError("the model has no points", path=source.model)
         if local_type is None:

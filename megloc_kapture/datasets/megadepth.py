@@ -132,7 +132,8 @@ def _of_table(root: Path, scene: str, table: Path) -> Iterator[_Image]:
         ) from error
     shapes = [(len(images), *shape) for shape in ((), (3, 3), (4, 4))]
     for name, array, shape in zip(_ARRAYS, (images, intrinsics, poses), shapes, strict=True):
-        if array.shape != shape or array.dtype.kind not in ("U" if array is images else "fiu"):
+        kinds = "U" if array is images else "fiu"
+        if array.shape != shape or array.dtype.kind not in kinds:
             raise DataError(f"{name} is {array.dtype} {array.shape}, expected {shape}", path=table)
     for row in np.argsort(images):
         path = safe_join(root, str(images[row]))

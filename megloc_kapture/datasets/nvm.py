@@ -48,11 +48,8 @@ class NvmModel:
 def read_nvm(path: Path, *, with_points: bool = True) -> NvmModel:
     """Read the only model of a file; an extra list of unregistered images is ignored."""
     with reading(path), open(path, encoding="utf-8-sig", errors="surrogateescape") as file:
-        require(
-            file.readline().startswith("NVM_V3"),
-            "not an NVM file: the first line must begin with NVM_V3",
-            path=path,
-        )
+        if not file.readline().startswith("NVM_V3"):
+            raise DataError("not an NVM file: the first line must begin with NVM_V3", path=path)
         rows = (line for line in file if line.strip())
         with named(path):
             names, cameras = _read_cameras(rows, _count(rows, "cameras"))
@@ -66,8 +63,7 @@ def read_nvm(path: Path, *, with_points: bool = True) -> NvmModel:
 
 def _count(rows: Iterator[str], what: str) -> int:
     text = next(rows, "").strip()
-    if not text.isdecimal():
-        raise DataError(f"expected the number of {what}, got {text[:40]!r}")
+    require(text.isdecimal(), f"expected the number of {what}, got {text[:40]!r}")
     return int(text)
 
 
@@ -86,8 +82,9 @@ def _read_cameras(rows: Iterator[str], count: int) -> tuple[tuple[str, ...], NDA
             if len(values) != 9 or not np.isfinite(values).all() or name in cameras:
                 raise DataError("expected 10 finite numbers, and each image once")
         cameras[name] = values
-    if not cameras or len(cameras) < count:
-        raise DataError(f"the file ends after {len(cameras)} of {count} cameras")
+    require(
+        cameras and len(cameras) >= count, f"the file ends after {len(cameras)} of {count} cameras"
+    )
     return tuple(cameras), np.array(list(cameras.values()))
 
 

@@ -19,7 +19,7 @@ from megloc_kapture.datasets.kapture_folders import (
     tell_of_truth_without_query,
 )
 from megloc_kapture.datasets.reference_map import ReferenceModel, write_reference_map
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.io.dataset_tables import (
     SIDE_TABLES,
     ImageGroup,
@@ -136,8 +136,9 @@ def check_official(dataset: OfficialDataset, *, allow_missing: bool = False) -> 
     root = dataset.missing.root if dataset.missing is not None else None
     if not dataset.mapping.records_camera or not dataset.mapping.trajectories:
         raise DataError("no mapping image with a pose is left to import", path=root)
-    if not dataset.query.records_camera and not allow_missing:
-        raise DataError("no query image is left to import", path=root)
+    require(
+        dataset.query.records_camera or allow_missing, "no query image is left to import", path=root
+    )
     shared = set(dataset.mapping.image_names()) & set(dataset.query.image_names())
     if shared:
         raise DataError(f"image {min(shared)!r} is in the map and a query", path=root)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -30,24 +30,16 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 
-
-class FeatureType(NamedTuple):
-    """A feature type: kapture name, and dtype of the descriptors."""
-
-    name: str
-    dtype: str
-
-
 # ids of COLMAP's feature/types.h with the names of our extractors or weights; COLMAP stores all
 # descriptors as bytes, those of networks are float32
 _SIFT, _UNDEFINED = 0, -1
 _TYPES = {
-    _UNDEFINED: FeatureType("colmap-undefined", "u1"),
-    _SIFT: FeatureType("sift", "u1"),
-    1: FeatureType("aliked-n16rot", "<f4"),
-    2: FeatureType("aliked-n32", "<f4"),
-    3: FeatureType("loma-b", "<f4"),
-    4: FeatureType("loma-b128", "<f4"),
+    _UNDEFINED: ("colmap-undefined", "u1"),
+    _SIFT: ("sift", "u1"),
+    1: ("aliked-n16rot", "<f4"),
+    2: ("aliked-n32", "<f4"),
+    3: ("loma-b", "<f4"),
+    4: ("loma-b128", "<f4"),
 }
 _SIFT_SIZE = 128
 
@@ -84,7 +76,7 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
         found = self._array("keypoints", name, "<f4")
         return np.empty((0, 2), np.float32) if found is None else np.ascontiguousarray(found[:, :2])
 
-    def feature_type(self) -> FeatureType | None:
+    def feature_type(self) -> tuple[str, str] | None:
         """Return the type of all features, or None without descriptors."""
         with self._reading():
             if self._has_types():
@@ -93,15 +85,15 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
             else:  # before version 4: SIFT, or imported features
                 rows = self._rows("SELECT DISTINCT cols FROM descriptors WHERE rows > 0")
                 kinds = {_SIFT if size == _SIFT_SIZE else _UNDEFINED for (size,) in rows}
-        found = [_TYPES.get(kind) or FeatureType(f"colmap-{kind}", "u1") for kind in kinds]
+        found = [_TYPES.get(kind) or (f"colmap-{kind}", "u1") for kind in kinds]
         if len(found) > 1:
-            names = ", ".join(sorted(kind.name for kind in found))
+            names = ", ".join(sorted(name for name, _ in found))
             raise self._error(f"has descriptors of several types: {names}")
         return found[0] if found else None
 
-    def descriptors(self, name: str, expected: FeatureType = _TYPES[_SIFT]) -> NDArray[Any] | None:
+    def descriptors(self, name: str, dtype: str = "u1") -> NDArray[Any] | None:
         """Return the descriptors of an image, (N, D) of the type's dtype, or None."""
-        return self._array("descriptors", name, expected.dtype)
+        return self._array("descriptors", name, dtype)
 
     def _array(self, table: str, name: str, dtype: str) -> NDArray[Any] | None:
         if name not in self.images:
@@ -253,9 +245,9 @@ class _DatabaseFeatures(AbstractContextManager["_DatabaseFeatures"]):
         self, database: ColmapDatabase, output: Path, keypoints_type: str, names: Mapping[str, str]
     ) -> None:
         self._database = database
-        self._type = database.feature_type() or FeatureType(keypoints_type, "u1")
-        if self._type.name != keypoints_type:
-            raise self._error(f"has features of type {self._type.name}, not {keypoints_type}")
+        self._type, self._dtype = database.feature_type() or (keypoints_type, "u1")
+        if self._type != keypoints_type:
+            raise self._error(f"has features of type {self._type}, not {keypoints_type}")
         self._output, self._names = output, names
         self._by_stem: dict[str, list[str]] = {}
         for name in database.images:
@@ -287,7 +279,7 @@ class _DatabaseFeatures(AbstractContextManager["_DatabaseFeatures"]):
                 f"is not of this model: feature {features[worst]} of {name_there!r} is at "
                 f"({x:.1f}, {y:.1f}), in the model at ({model_x:.1f}, {model_y:.1f})"
             )
-        descriptors = self._database.descriptors(name_there, self._type)
+        descriptors = self._database.descriptors(name_there, self._dtype)
         if descriptors is not None:
             self._write(name, descriptors, len(keypoints))
         elif len(keypoints) == 0:
@@ -310,7 +302,7 @@ class _DatabaseFeatures(AbstractContextManager["_DatabaseFeatures"]):
         return found[0] if found else None
 
     def _write(self, name: str, descriptors: NDArray[Any], num_keypoints: int) -> None:
-        kind, size = self._type.name, descriptors.shape[1]
+        kind, size = self._type, descriptors.shape[1]
         if self._writer is None:
             config = FeatureConfig(kind.upper(), descriptors.dtype, size, kind, "L2")
             self._writer = FeatureWriter(self._output, "descriptors", kind, config)

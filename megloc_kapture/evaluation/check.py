@@ -127,10 +127,11 @@ def read_reference(folder: Path) -> Reference:
         KaptureFolder(path) if (path / "sensors" / "sensors.txt").is_file() else None
         for path in (folder / "mapping", folder / "query")
     )
-    if mapping is None and query is None and not tables.is_dir():
-        raise DataError(
-            "no imported dataset: it has none of mapping/, query/ and megloc/", path=folder
-        )
+    require(
+        mapping is not None or query is not None or tables.is_dir(),
+        "no imported dataset: it has none of mapping/, query/ and megloc/",
+        path=folder,
+    )
     rules = benchmark_of(tables)
     queries = frozenset() if query is None else frozenset(query.read().image_names())
     names = rules.names or pose_files.names_in_pose_file(

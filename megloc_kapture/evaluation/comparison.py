@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from megloc_kapture.errors import OptionError, require
+from megloc_kapture.errors import OptionError, check_option, require
 from megloc_kapture.evaluation.metrics import (
     LEVEL,
     PoseErrors,
@@ -126,8 +126,7 @@ def compare(evaluations: Sequence[Evaluation]) -> Comparison:
 
 
 def _check_comparable(evaluations: Sequence[Evaluation]) -> None:
-    if len(evaluations) < 2:
-        raise OptionError("at least two results are needed to compare")
+    check_option(len(evaluations) >= 2, "at least two results are needed to compare")
     first = evaluations[0]
     labels = [evaluation.label for evaluation in evaluations]
     if len(set(labels)) != len(labels):
@@ -142,8 +141,7 @@ def _check_comparable(evaluations: Sequence[Evaluation]) -> None:
                 [query.condition for query in other.queries],
             ),
         ):
-            if ours != theirs:
-                raise OptionError(f"{first.label} and {other.label} have different {kind}")
+            check_option(ours == theirs, f"{first.label} and {other.label} have different {kind}")
 
 
 def mcnemar(only_first: int, only_second: int) -> float:

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.evaluation.comparison import WithoutTruth, evaluate_without_truth
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.pose_files import poses_by_image
@@ -132,11 +132,11 @@ def evaluate_results(
     elif relative:
         raise OptionError("--align: the challenge compares relative poses, which need none")
     references = first_map_poses(contexts) if relative else {}
-    if relative and not references:
-        raise DataError(
-            f"the {len(benchmark.pairs)} pairs to relocalize need the poses of their references, "
-            "which are the map's: give it with --map"
-        )
+    require(
+        not relative or references,
+        f"the {len(benchmark.pairs)} pairs to relocalize need the poses of their references, "
+        "which are the map's: give it with --map",
+    )
     read = _read(results, benchmark, contexts, labels, true_poses, references)
     if not isinstance(truth, Mapping) and side_tables_near(truth) is None:
         true_poses = _in_local_frame(true_poses, read, benchmark.world, truth)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from megloc_kapture.errors import OptionError
+from megloc_kapture.errors import OptionError, check_option
 from megloc_kapture.geometry.poses import invert, rotation_angles_deg, stack_poses
 from megloc_kapture.io.dataset_tables import Protocol
 from megloc_kapture.values import Options, RigidTransform
@@ -226,8 +226,9 @@ def row_members(conditions: Sequence[str], protocol: Protocol) -> dict[str, NDAr
     rows += [(pool, members) for pool, members in pooled if members.any()]
     rows.append((ALL, np.ones(len(of_query), bool)))
     for name, number in Counter(name for name, _ in rows).items():
-        if number > 1:
-            raise OptionError(f"two rows of the recall table would be called {name!r}; rename one")
+        check_option(
+            number <= 1, f"two rows of the recall table would be called {name!r}; rename one"
+        )
     return dict(rows)
 
 

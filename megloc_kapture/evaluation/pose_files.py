@@ -211,10 +211,8 @@ def checked_pose(
         all(abs(v) < 1e100 for v in (*quat_wxyz, *translation)), f"{whose}: the pose is not finite"
     )
     norm = math.sqrt(sum(q * q for q in quat_wxyz))
-    require(
-        abs(norm - 1.0) < MAX_QUATERNION_NORM_ERROR,
-        f"{whose}: quaternion of length {norm:g}, not 1",
-    )
+    if not abs(norm - 1.0) < MAX_QUATERNION_NORM_ERROR:
+        raise DataError(f"{whose}: quaternion of length {norm:g}, not 1")
     if abs(norm - 1.0) > 1e-12:
         w, x, y, z = (q / norm for q in quat_wxyz)
         quat_wxyz = (w, x, y, z)
@@ -248,10 +246,8 @@ class RelativePose:
 def timestamp_of(image: str) -> int:
     """Return the timestamp in an image name of 4Seasons (``.../1600000000000000000.png``)."""
     stem = PurePosixPath(image).stem
-    require(
-        _TIMESTAMP.fullmatch(stem),
-        f"image {image!r} is not named after a timestamp, as MLAD's rows need",
-    )
+    if not _TIMESTAMP.fullmatch(stem):
+        raise DataError(f"image {image!r} is not named after a timestamp, as MLAD's rows need")
     return int(stem)
 
 
@@ -372,29 +368,25 @@ def _sha256(path: Path) -> str:
     return hashlib.sha256(read_content(path)).hexdigest()
 
 
-class _Beside(BaseModel):
+class _Provenance(BaseModel):
     files: dict[str, str] = {}
-    confidence: Any = None
-
-
-class _Confidences(BaseModel):
-    confidence: dict[str, Annotated[float, Field(ge=0, le=1)]]
+    confidence: dict[str, Annotated[float, Field(ge=0, le=1)]] = {}
 
 
 def read_confidences(target: Path | str) -> dict[str, float]:
     """Read image -> confidence from the JSON beside a pose file.
 
-    Empty, with a warning, if the JSON has the SHA-256 of another pose file; empty without
-    confidences.
+    Empty, with a warning, if the JSON is none of ours or has the SHA-256 of another pose file.
     """
     target, path = Path(target), provenance_path(target)
+    if not path.is_file():
+        return {}
     try:
-        beside = read_json_model(path, _Beside) if path.is_file() else _Beside()
-    except DataError:
+        provenance = read_json_model(path, _Provenance)
+    except DataError as error:
+        _log.warning("%s; its confidences are left out", error)
         return {}
-    if beside.confidence is None:
-        return {}
-    if beside.files.get(target.name) not in (None, _sha256(target)):
+    if provenance.files.get(target.name, "") not in ("", _sha256(target)):
         _log.warning("%s is of another pose file; its confidences are left out", path)
         return {}
-    return read_json_model(path, _Confidences).confidence
+    return provenance.confidence

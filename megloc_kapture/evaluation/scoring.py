@@ -116,14 +116,6 @@ class Reported:
         return pd.DataFrame(columns).set_index("image")
 
 
-@dataclass(frozen=True, slots=True)
-class CovarianceCheck:
-    """Number of poses with a covariance, and of errors within its 95 % region."""
-
-    num_poses: int
-    num_within: int
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class Evaluation(Reported):
     """One result; without true poses ``truth`` and ``thresholds`` are empty.
@@ -139,6 +131,7 @@ class Evaluation(Reported):
     pairs : name of a query -> its pair, for the MLAD challenges.
     nowhere : queries that show nothing of the map; right without a pose, and in no row.
     by_center : of MLAD's pairs, the evaluation by the distance of camera centres.
+    covariance : ``num_poses`` with a covariance, and ``num_within`` its 95 % region.
     alignment : note on how the poses were, or could be, aligned with the truth.
     """
 
@@ -155,7 +148,7 @@ class Evaluation(Reported):
     truth_known_by: str = ""
     pairs: Mapping[str, RelocalizationPair] = field(default_factory=dict)
     nowhere: tuple[QueryResult, ...] = ()
-    covariance: CovarianceCheck | None = None
+    covariance: Mapping[str, int] | None = None
     by_center: Evaluation | None = None
     context: ResultContext = field(default_factory=ResultContext)
     alignment: str = ""
@@ -267,14 +260,14 @@ def evaluate_poses(
 
 def _check_covariances(
     queries: Sequence[QueryResult], result: Result, truth: Poses
-) -> CovarianceCheck | None:
+) -> dict[str, int] | None:
     covariances = result.covariances
     names = [q.image for q in queries if q.outcome == "localized" and q.image in covariances]
     within = sum(
         squared_distance(truth[name], result.poses[name], covariances[name]) <= _CHI2_95
         for name in names
     )
-    return CovarianceCheck(len(names), within) if names else None
+    return {"num_poses": len(names), "num_within": within} if names else None
 
 
 def recall_rows(

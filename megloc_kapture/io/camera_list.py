@@ -76,8 +76,6 @@ def _camera(model: str, fields: list[str]) -> Camera:
         width, height, *params = map(float, fields)
     except ValueError as error:
         raise DataError(f"width, height and parameters must be numbers, got {fields}") from error
-    require(
-        width.is_integer() and height.is_integer(),
-        f"image size {width:g}x{height:g} is not in whole pixels",
-    )
+    if not width.is_integer() or not height.is_integer():
+        raise DataError(f"image size {width:g}x{height:g} is not in whole pixels")
     return Camera(model, int(width), int(height), tuple(params))

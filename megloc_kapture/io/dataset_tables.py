@@ -21,7 +21,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, FiniteFloat, field_validator
@@ -161,29 +161,6 @@ def _not_empty(text: str) -> str:
     return text
 
 
-class _GroupRow(NamedTuple):
-    image: ImageName
-    condition: str
-    frame: str
-    location: str
-    scored: Annotated[bool, flag("1", "0")]
-
-
-class _PriorRow(NamedTuple):
-    query: ImageName
-    permitted: Annotated[str, Column("a group or an image", _not_empty)]
-
-
-class _NameRow(NamedTuple):
-    image: ImageName
-    name: Annotated[str, Column("one word", _word)]
-
-
-class _UnreadableRow(NamedTuple):
-    image: ImageName
-    reason: str
-
-
 @dataclass(frozen=True, slots=True)
 class RelocalizationPair:
     """One row of an MLAD relocalization file, with kapture's image names."""
@@ -193,10 +170,18 @@ class RelocalizationPair:
     query: ImageName
 
 
-_GROUPS = Table(_GroupRow, keys=[("image",)])
-_PRIORS = Table(_PriorRow, keys=[("query", "permitted")])
-_NAMES = Table(_NameRow, keys=[("image",), ("name",)])
-_UNREADABLE = Table(_UnreadableRow, keys=[("image",)])
+_GROUPS: Table[Any] = Table(
+    {"image": ImageName, "condition": str, "frame": str, "location": str, "scored": flag("1", "0")},
+    keys=[("image",)],
+)
+_PRIORS: Table[Any] = Table(
+    {"query": ImageName, "permitted": Column("a group or an image", _not_empty)},
+    keys=[("query", "permitted")],
+)
+_NAMES: Table[Any] = Table(
+    {"image": ImageName, "name": Column("one word", _word)}, keys=[("image",), ("name",)]
+)
+_UNREADABLE: Table[Any] = Table({"image": ImageName, "reason": str}, keys=[("image",)])
 _RELOCALIZATION = Table(RelocalizationPair)
 
 
@@ -240,13 +225,13 @@ def write_side_tables(folder: Path, tables: SideTables) -> None:
 def read_groups(folder: Path | str) -> dict[str, ImageGroup]:
     names = tuple(ImageGroup.model_fields)
     return {
-        row.image: ImageGroup(**{name: getattr(row, name) for name in names})
-        for row in sorted(_GROUPS.read_if_there(Path(folder) / GROUPS_FILE))
+        image: ImageGroup(**dict(zip(names, values, strict=True)))
+        for image, *values in sorted(_GROUPS.read_if_there(Path(folder) / GROUPS_FILE))
     }
 
 
 def write_groups(folder: Path | str, groups: Mapping[str, ImageGroup]) -> None:
-    rows = [_GroupRow(image, **group.model_dump()) for image, group in sorted(groups.items())]
+    rows = [(image, *group.model_dump().values()) for image, group in sorted(groups.items())]
     _GROUPS.write(Path(folder) / GROUPS_FILE, rows)
 
 
@@ -259,7 +244,7 @@ def read_priors(folder: Path | str) -> dict[str, tuple[str, ...]]:
 
 
 def write_priors(folder: Path | str, priors: Mapping[str, Sequence[str]]) -> None:
-    rows = sorted({_PriorRow(query, group) for query in priors for group in priors[query]})
+    rows = sorted({(query, group) for query in priors for group in priors[query]})
     _PRIORS.write(Path(folder) / PRIORS_FILE, rows)
 
 
@@ -268,7 +253,7 @@ def read_names(folder: Path | str) -> dict[str, str]:
 
 
 def write_names(folder: Path | str, names: Mapping[str, str]) -> None:
-    _NAMES.write(Path(folder) / NAMES_FILE, [_NameRow(*item) for item in names.items()])
+    _NAMES.write(Path(folder) / NAMES_FILE, names.items())
 
 
 def read_unreadable(folder: Path | str, name: str = UNREADABLE_FILE) -> dict[str, str]:
@@ -278,8 +263,7 @@ def read_unreadable(folder: Path | str, name: str = UNREADABLE_FILE) -> dict[str
 def write_unreadable(
     folder: Path | str, reasons: Mapping[str, str], name: str = UNREADABLE_FILE
 ) -> None:
-    rows = [_UnreadableRow(*row) for row in sorted(reasons.items())]
-    _UNREADABLE.write(Path(folder) / name, rows)
+    _UNREADABLE.write(Path(folder) / name, sorted(reasons.items()))
 
 
 def tables_of(root: Path | str) -> Path | None:

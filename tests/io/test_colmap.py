@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,6 +16,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from megloc_kapture.errors import OutputError
 from megloc_kapture.io import colmap as module
 from megloc_kapture.io.colmap import (
     MapImage,
@@ -271,3 +273,20 @@ def test_parts_with_fewer_than_30_common_points_come_apart(
         for name, pose in model.poses.items():
             moved = np.array(pose.translation)
             assert moved == pytest.approx((-0.2 * (FIRST + SECOND).index(name), 0, 0), abs=1e-9)
+
+
+def test_a_disk_without_room_for_the_database_is_said_before_colmap_meets_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, images, _ = scene(CAMERAS["PINHOLE"])
+    asked = []
+
+    def usage(path: str) -> Any:
+        asked.append(Path(path).parent)
+        return shutil.disk_usage(path)._replace(free=1 << 19)
+
+    monkeypatch.setattr("megloc_kapture.io.colmap.disk_usage", usage)
+    with pytest.raises(OutputError, match="0 MB are free, COLMAP's database takes 1 MB"):
+        triangulate(images, {}, scratch=tmp_path / "map")
+    assert asked == [tmp_path / "map"]
+    assert list((tmp_path / "map").iterdir()) == []

@@ -26,7 +26,7 @@ from megloc_kapture.datasets.official import (
     read_ground_truth,
 )
 from megloc_kapture.datasets.reference_map import ReferenceModel, check_model_files
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.camera_list import read_camera_rows
 from megloc_kapture.io.colmap_model import SparsePoints, colmap_model_files, read_colmap_model
@@ -107,12 +107,11 @@ class Layout:
         if wanted == "auto":
             wanted = "1.1" if self.colmap_model.is_dir() else "1.0"
         model = self.nvm if wanted == "1.0" else self.colmap_model
-        if not model.exists():
-            raise DataError(
-                f"the model of Aachen Day-Night v{wanted} is missing: "
-                f"{model.relative_to(self.root)}",
-                path=self.root,
-            )
+        require(
+            model.exists(),
+            f"the model of Aachen Day-Night v{wanted} is missing: {model.relative_to(self.root)}",
+            path=self.root,
+        )
         return wanted
 
     def model_files(self, version: Version, *, with_points: bool) -> tuple[Path, ...]:
@@ -149,11 +148,11 @@ class Layout:
         if missing.require(self.database_intrinsics):
             listed = read_camera_rows(self.database_intrinsics)
         for position, name in enumerate(nvm.names):
-            if listed is not None and name not in listed:
-                raise DataError(
-                    f"no line for {name!r}, an image of {self.nvm.name}",
-                    path=self.database_intrinsics,
-                )
+            require(
+                listed is None or name in listed,
+                f"no line for {name!r}, an image of {self.nvm.name}",
+                path=self.database_intrinsics,
+            )
             if missing.require(self.images / name):
                 camera = self._centred(nvm, position) if listed is None else listed[name]
                 pose = nvm.cam_from_world(position)
@@ -175,12 +174,11 @@ class Layout:
             if not missing.require(path):
                 continue
             for position, (name, camera) in enumerate(read_camera_rows(path).items()):
-                if listed.setdefault(name, path) != path:
-                    raise DataError(
-                        f"image {name!r} is also in {listed[name].name}: a query by day or at "
-                        "night?",
-                        path=path,
-                    )
+                require(
+                    listed.setdefault(name, path) == path,
+                    f"image {name!r} is also in {listed[name].name}: a query by day or at night?",
+                    path=path,
+                )
                 if images.version == "1.0" and name.startswith(ADDITIONAL_NIGHT):
                     left_out += 1
                 elif missing.require(self.images / name):
@@ -212,10 +210,11 @@ def from_kapture(
         for position, image in enumerate(queries):
             images.add_query(image.name, condition, position, image.camera)
     for image in found:
-        if image.is_query and image.name not in images.conditions:
-            raise DataError(
-                f"query {image.name!r} has neither {DAY}/ nor {NIGHT}/ in its name", path=form.root
-            )
+        require(
+            not image.is_query or image.name in images.conditions,
+            f"query {image.name!r} has neither {DAY}/ nor {NIGHT}/ in its name",
+            path=form.root,
+        )
     return images, {image.name: image.file for image in found}
 
 

@@ -71,8 +71,9 @@ def read_pinhole(path: Path) -> Camera:
     for line in lines[1::2]:
         line.expect(line.comma_fields, 2, "width height, in pixels")
         sizes.append([line.count_of(text, "size") for text in line.comma_fields])
-    if sizes[0] != sizes[-1]:
-        raise lines[3].error(f"the image size is {sizes[0]} first, then {sizes[-1]}")
+    lines[-1].require(
+        sizes[0] == sizes[-1], f"the image size is {sizes[0]} first, then {sizes[-1]}"
+    )
     width, height = sizes[0]
     with first.named():
         return Camera("PINHOLE", width, height, tuple(params[:4]))
@@ -123,8 +124,7 @@ def _by_timestamp(path: Path, parse: Callable[[Line], Row]) -> dict[int, Row]:
     rows: dict[int, Row] = {}
     for line in read_lines(path, comments=True):
         timestamp = _timestamp(line, line.comma_fields[0])
-        if timestamp in rows:
-            raise line.error(f"timestamp {timestamp} is given twice")
+        line.require(timestamp not in rows, f"timestamp {timestamp} is given twice")
         rows[timestamp] = parse(line)
     require(rows, "the file has no rows", path=path)
     return rows
@@ -145,8 +145,9 @@ def _transform(line: Line, fields: Sequence[str]) -> RigidTransform:
 
 def _scale(line: Line, text: str) -> float:
     scale = line.number_of(text, "scale")
-    if not 1 / _MAX_SCALE < scale < _MAX_SCALE:
-        raise line.error(f"scale {text} is not a factor between units of length")
+    line.require(
+        1 / _MAX_SCALE < scale < _MAX_SCALE, f"scale {text} is not a factor between units of length"
+    )
     return scale
 
 

@@ -34,7 +34,7 @@ from megloc_kapture.datasets.official import (
     last_part,
     read_ground_truth,
 )
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.dataset_tables import ImageGroup, World
 from megloc_kapture.io.images import image_size, write_depth_map
@@ -108,12 +108,12 @@ class InLoc:
                     left_out.append(scan.location)
                 else:
                     map_.add(scan, missing)
-        if self.options.depth and map_.groups and not (map_.depth_jobs or allow_missing):
-            raise DataError(
-                f"no cutout has its points (.jpg{POINTS_SUFFIX}); the download without "
-                "them is imported with the option depth = false",
-                path=layout.cutouts,
-            )
+        require(
+            not self.options.depth or not map_.groups or map_.depth_jobs or allow_missing,
+            f"no cutout has its points (.jpg{POINTS_SUFFIX}); the download without "
+            "them is imported with the option depth = false",
+            path=layout.cutouts,
+        )
         names = [f"{QUERIES}/{name}" for name in layout.queries()]
         query = _queries(names, layout.query)
         truth, true_groups = read_ground_truth(root, query, World())

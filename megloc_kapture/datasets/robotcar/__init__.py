@@ -102,8 +102,7 @@ def read_train_poses(path: Path) -> list[ListedImage]:
     for line in _some_lines(path):
         line.expect(line.fields, 17, "a name and 16 matrix elements")
         image = _listed(line, line.fields[0]).image
-        if image in listed:
-            raise line.error(f"{line.fields[0]!r} is given twice")
+        line.require(image not in listed, f"{line.fields[0]!r} is given twice")
         values = line.numbers_of(line.fields[1:], "matrix element")
         world_from_cam = line.rigid_transform(np.array(values).reshape(4, 4))
         listed[image] = ListedImage(image, line, world_from_cam.inverse())
@@ -326,8 +325,7 @@ def read_test_names(
     for entry in read_test_list(path):
         known = _scored_query(entry, at_time, allow_missing)
         unlisted += known is None
-        if known in train:
-            raise entry.line.error(f"{entry.line.text!r} is a training image too")
+        entry.line.require(known not in train, f"{entry.line.text!r} is a training image too")
         if known is not None:
             test[known] = entry.line.text
     return test, unlisted
@@ -351,10 +349,10 @@ def _scored_query(
     entry: ListedImage, at_time: Mapping[tuple[str, int], ImageKey], allow_missing: bool
 ) -> ImageKey | None:
     image = entry.image
-    if image.camera != SCORED_CAMERA:
-        raise entry.line.error(
-            f"an image of camera {image.camera!r}, expected {SCORED_CAMERA!r} only"
-        )
+    entry.line.require(
+        image.camera == SCORED_CAMERA,
+        f"an image of camera {image.camera!r}, expected {SCORED_CAMERA!r} only",
+    )
     found = at_time.get((image.camera, image.timestamp))
     if found is not None and image.condition in ("", found.condition):
         return found

@@ -42,7 +42,7 @@ from megloc_kapture.datasets.robotcar.images import (
     reference_of_kapture,
     select,
 )
-from megloc_kapture.errors import OptionError
+from megloc_kapture.errors import check_option
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.dataset_tables import ImageGroup, World
@@ -233,11 +233,11 @@ class RobotCar:
         )
 
     def _check_version(self, version: int) -> None:
-        if version == 1 and (self.options.train_as_map or self.options.queries != "all"):
-            raise OptionError(
-                "train_as_map and queries are about version 2, whose lists are not there or not "
-                "wanted (version=2)"
-            )
+        check_option(
+            version != 1 or (not self.options.train_as_map and self.options.queries == "all"),
+            "train_as_map and queries are about version 2, whose lists are not there or not "
+            "wanted (version=2)",
+        )
 
 
 def _kapture_form(root: Path) -> KaptureForm | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from megloc_kapture.evaluation.metrics import (
     Threshold,
     pose_errors,
 )
-from megloc_kapture.evaluation.scoring import CovarianceCheck, Evaluation
+from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.io.tables import ConsistencyRow
 from megloc_kapture.values import MIN_CONFIDENCE
 
@@ -149,11 +149,9 @@ def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[st
     return sentences
 
 
-def covariance_sentence(check: CovarianceCheck) -> str:
-    return (
-        f"{check.num_within} of {counted(check.num_poses, 'error lies', 'errors lie')} within the "
-        "claimed 95 % region"
-    )
+def covariance_sentence(check: Mapping[str, int]) -> str:
+    errors = counted(check["num_poses"], "error lies", "errors lie")
+    return f"{check['num_within']} of {errors} within the claimed 95 % region"
 
 
 def consistency_sentence(row: ConsistencyRow) -> str:

@@ -68,12 +68,9 @@ class FeatureConfig:
 
     def __post_init__(self) -> None:
         dtype = np.dtype(self.dtype)
-        require(
-            dtype.newbyteorder("<") in DTYPES.values(),
-            f"dtype {dtype.name!r} is not one of {', '.join(DTYPES)}",
-        )
-        if self.dsize < 1:
-            raise DataError(f"dsize {self.dsize} is not positive")
+        if dtype.newbyteorder("<") not in DTYPES.values():
+            raise DataError(f"dtype {dtype.name!r} is not one of {', '.join(DTYPES)}")
+        require(self.dsize >= 1, f"dsize {self.dsize} is not positive")
         object.__setattr__(self, "dtype", dtype.newbyteorder("<"))
         object.__setattr__(self, "dsize", int(self.dsize))
 
@@ -255,12 +252,12 @@ class FeatureReader:
         paths = [folder / f"{kind}.txt" for folder in folders]
         self.config, *others = [read_config(path, kind) for path in paths]
         for path, config in zip(paths[1:], others, strict=True):
-            if (config.dtype, config.dsize) != (self.config.dtype, self.config.dsize):
-                raise DataError(
-                    f"{config.dsize} x {config.dtype.name}, but {paths[0]} "
-                    f"has {self.config.dsize} x {self.config.dtype.name}",
-                    path=path,
-                )
+            require(
+                (config.dtype, config.dsize) == (self.config.dtype, self.config.dsize),
+                f"{config.dsize} x {config.dtype.name}, but {paths[0]} "
+                f"has {self.config.dsize} x {self.config.dtype.name}",
+                path=path,
+            )
         self._names: list[str] | None = None
 
     @property

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import check_no_escape, safe_join
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture.features import (
@@ -192,12 +192,11 @@ class KaptureFolder:
                     f"image {image!r} has descriptors but no keypoints of type {keypoints_type!r}",
                     path=descriptors.where(image),
                 )
-            if descriptors.length(image) != keypoints.length(image):
-                raise DataError(
-                    f"{descriptors.length(image)} descriptors for "
-                    f"{keypoints.length(image)} keypoints",
-                    path=descriptors.where(image),
-                )
+            require(
+                descriptors.length(image) == keypoints.length(image),
+                f"{descriptors.length(image)} descriptors for {keypoints.length(image)} keypoints",
+                path=descriptors.where(image),
+            )
 
     def _check_matches(
         self,
@@ -210,11 +209,11 @@ class KaptureFolder:
             for image, column in zip(pair, indices.T, strict=True):
                 if keypoints is None or image not in keypoints or len(column) == 0:
                     continue
-                if column.max() >= keypoints.length(image):
-                    raise DataError(
-                        f"matches of {pair[0]!r} and {pair[1]!r} (type {matches.type_name!r}) "
-                        f"point past the keypoints of {image!r}"
-                    )
+                require(
+                    column.max() < keypoints.length(image),
+                    f"matches of {pair[0]!r} and {pair[1]!r} (type {matches.type_name!r}) "
+                    f"point past the keypoints of {image!r}",
+                )
 
     def _check_observations(self, observations: Observations, num_points: int, path: Path) -> None:
         limit = np.full(len(observations.image_names), np.iinfo(np.int32).max, dtype=np.int64)
@@ -242,11 +241,11 @@ class KaptureFolder:
             size = read_image_rgb(path).shape[1::-1]
             sensor = data.sensors[data.record_of(image)[1]]
             expected = (int(float(sensor.params[1])), int(float(sensor.params[2])))
-            if size != expected:
-                raise DataError(
-                    f"image is {size[0]}x{size[1]}, its camera {expected[0]}x{expected[1]}",
-                    path=path,
-                )
+            require(
+                size == expected,
+                f"image is {size[0]}x{size[1]}, its camera {expected[0]}x{expected[1]}",
+                path=path,
+            )
 
 
 def _same_content(first: Path, second: Path) -> bool:

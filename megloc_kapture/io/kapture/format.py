@@ -40,24 +40,20 @@ class Sensor:
     params: tuple[str, ...]
 
     def camera(self) -> Camera:
-        require(
-            self.sensor_type in CAMERA_SENSOR_TYPES,
-            f"a sensor of type {self.sensor_type!r} has no camera model",
-        )
+        if self.sensor_type not in CAMERA_SENSOR_TYPES:
+            raise DataError(f"a sensor of type {self.sensor_type!r} has no camera model")
         model = self.params[0] if self.params else ""
-        require(
-            model != UNKNOWN_CAMERA,
-            "camera is not calibrated (UNKNOWN_CAMERA); give it intrinsics first",
-        )
+        if model == UNKNOWN_CAMERA:
+            raise DataError("camera is not calibrated (UNKNOWN_CAMERA); give it intrinsics first")
         if model not in CAMERA_MODEL_NUM_PARAMS:
             known = ", ".join([*CAMERA_MODEL_NUM_PARAMS, UNKNOWN_CAMERA])
             raise DataError(f"unknown camera model {model!r}; known: {known}")
         expected = CAMERA_MODEL_NUM_PARAMS[model] + 2
-        if len(self.params) != expected + 1:
-            raise DataError(
-                f"camera model {model} takes {expected} parameters "
-                f"(width and height included), got {len(self.params) - 1}"
-            )
+        require(
+            len(self.params) == expected + 1,
+            f"camera model {model} takes {expected} parameters "
+            f"(width and height included), got {len(self.params) - 1}",
+        )
         width, height = (_pixels(text) for text in self.params[1:3])
         params = tuple(parse_float(text, "camera parameter") for text in self.params[3:])
         return Camera(model, width, height, params)
@@ -117,10 +113,8 @@ class KaptureData:
 
     def camera_of(self, image: str) -> Camera:
         sensor_id = self.record_of(image)[1]
-        require(
-            sensor_id in self.sensors,
-            f"image {image!r} was taken by the unknown sensor {sensor_id!r}",
-        )
+        if sensor_id not in self.sensors:
+            raise DataError(f"image {image!r} was taken by the unknown sensor {sensor_id!r}")
         with named(about=f"sensor {sensor_id!r} of image {image!r}"):
             return self.sensors[sensor_id].camera()
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from megloc_kapture.errors import DataError, require
+from megloc_kapture.errors import DataError
 from megloc_kapture.io.files import check_relative, output_error, write_bytes
 from megloc_kapture.io.kapture.features import (
     SUFFIX,
@@ -161,9 +161,7 @@ def write_pairs(path: Path | str, pairs: Iterable[ImagePair]) -> None:
     rows = []
     for pair in pairs:
         score = float(pair.score)
-        require(
-            -float("inf") < score < float("inf"),
-            f"score of {pair.query!r}, {pair.map!r} is not finite",
-        )
+        if not (-float("inf") < score < float("inf")):
+            raise DataError(f"score of {pair.query!r}, {pair.map!r} is not finite")
         rows.append([check_relative(pair.query), check_relative(pair.map), repr(score)])
     write_bytes(path, format_table(PAIRS_HEADER, rows))

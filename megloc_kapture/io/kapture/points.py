@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import (
     atomic_write,
     check_component,
@@ -288,11 +288,11 @@ def read_point_covariances(root: Path, num_points: int) -> NDArray[np.float64] |
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as error:  # numpy parses the header as Python literals
         raise DataError(f"no array of numpy: {error}", path=path) from error
-    if array.dtype != np.float64 or array.shape != (num_points, 6):
-        raise DataError(
-            f"{array.dtype} {array.shape}, expected float64 ({num_points}, 6): one row per point",
-            path=path,
-        )
+    require(
+        array.dtype == np.float64 and array.shape == (num_points, 6),
+        f"{array.dtype} {array.shape}, expected float64 ({num_points}, 6): one row per point",
+        path=path,
+    )
     return np.asarray(array)
 
 

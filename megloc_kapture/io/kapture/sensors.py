@@ -181,10 +181,8 @@ def unit_quaternion(
 ) -> tuple[float, float, float, float]:
     """Normalise a quaternion; DataError if its length differs from 1 by 1e-3 or more."""
     norm = math.hypot(*quat_wxyz)
-    require(
-        abs(norm - 1.0) < MAX_QUATERNION_ERROR,
-        f"rotation is not a unit quaternion (length {norm:.6g})",
-    )
+    if not abs(norm - 1.0) < MAX_QUATERNION_ERROR:
+        raise DataError(f"rotation is not a unit quaternion (length {norm:.6g})")
     if abs(norm - 1.0) <= _QUATERNION_ROUNDING:
         return quat_wxyz
     w, x, y, z = quat_wxyz

@@ -22,13 +22,14 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import AfterValidator, Field, StringConstraints
 
 from megloc_kapture.errors import (
     DataError,
     MeglocError,
     OptionError,
     OutputError,
+    check_option,
     require,
     suggestion,
 )
@@ -41,6 +42,7 @@ from megloc_kapture.io.files import (
     user_cache,
     write_bytes,
 )
+from megloc_kapture.values import Options
 
 if TYPE_CHECKING:
     import torch
@@ -59,11 +61,7 @@ _FileName = Annotated[str, AfterValidator(check_relative)]
 # ----------------------------------------------------------------------------------- registry
 
 
-class _Entry(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class PublishedFile(_Entry):
+class PublishedFile(Options):
     """One published file of a network's weights; None where a value is unknown."""
 
     name: _FileName  # in the folder of weights
@@ -78,7 +76,7 @@ class PublishedFile(_Entry):
         return (self.name, *self.also)
 
 
-class Weights(_Entry):
+class Weights(Options):
     """The checkpoint of one network."""
 
     name: Annotated[str, AfterValidator(check_component)]
@@ -369,10 +367,6 @@ SOURCE_KEY = "source_sha256"  # in a converted file's metadata
 _TIMEOUT_S = 60.0
 
 
-class TransferError(MeglocError):
-    """An unreachable server, a refusal, or a broken transfer."""
-
-
 def fetch(url: str, path: Path, *, sha256: str | None = None, progress: Any = None) -> None:
     """Download a file, named once complete and verified; ``progress`` has tqdm's interface."""
     import pooch
@@ -385,9 +379,9 @@ def fetch(url: str, path: Path, *, sha256: str | None = None, progress: Any = No
         path.parent.mkdir(parents=True, exist_ok=True)
         pooch.core.stream_download(url, path, known, downloader)
     except requests.exceptions.HTTPError as error:
-        raise TransferError(f"{url}: the server answers {error}") from error
+        raise MeglocError(f"{url}: the server answers {error}") from error
     except requests.exceptions.RequestException as error:
-        raise TransferError(f"{url}: the transfer broke: {error}") from error
+        raise MeglocError(f"{url}: the transfer broke: {error}") from error
     except ValueError as error:  # pooch: wrong sha256
         raise DataError(f"the download is not the published file: {error}", path=url) from error
     except OSError as error:
@@ -435,8 +429,9 @@ def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:
     """Convert a checkpoint to safetensors with its sha256; return the number of tensors."""
     from safetensors.torch import save
 
-    if output.suffix != ".safetensors":
-        raise OptionError(f"{output}: the file to write must end in .safetensors")
+    check_option(
+        output.suffix == ".safetensors", f"{output}: the file to write must end in .safetensors"
+    )
     if output.exists() and not force:
         raise OutputError(f"{output}: exists; -f replaces it")
     require(source.is_file(), "no such file", path=source)

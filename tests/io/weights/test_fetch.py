@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from megloc_kapture.errors import DataError
-from megloc_kapture.io.weights import TransferError, fetch
+from megloc_kapture.errors import DataError, MeglocError
+from megloc_kapture.io.weights import fetch
 
 CONTENT = np.random.default_rng(0).bytes(300_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
@@ -93,9 +93,9 @@ def test_a_whole_file(server: Server, place: Path) -> None:
     ("change", "kind", "message"),
     [
         ({"content": b"another"}, DataError, "the download is not the published file: .*" + SHA256),
-        ({"break_after": 1000}, TransferError, "the transfer broke"),
-        ({"status": 404}, TransferError, "the server answers 404"),
-        ({"address": "http://127.0.0.1:9"}, TransferError, "the transfer broke"),
+        ({"break_after": 1000}, MeglocError, "the transfer broke"),
+        ({"status": 404}, MeglocError, "the server answers 404"),
+        ({"address": "http://127.0.0.1:9"}, MeglocError, "the transfer broke"),
     ],
     ids=["another file", "broken", "refused", "no server"],
 )

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hostile import Runs
@@ -299,3 +300,9 @@ def test_what_was_read_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         for name, tensor in tensors.items():
             assert torch.equal(found[name], tensor) and found[name].dtype == tensor.dtype
     assert second["a"].is_shared_file  # type: ignore[attr-defined]
+
+
+def test_a_score_of_numpy_beside_the_weights(tmp_path: Path) -> None:
+    for score in (np.float64(0.7), np.float32(0.7)):
+        torch.save({"model_state": {"a": torch.ones(1)}, "best_score": score}, tmp_path / "x.pth")
+        assert read_weights(find_weights(str(tmp_path / "x.pth"))).keys() == {"a"}
