@@ -21,6 +21,7 @@ from megloc_kapture.datasets.text_lines import (
     shown,
 )
 from megloc_kapture.errors import DataError, OptionError, require
+from megloc_kapture.evaluation.pose_files import RelativePose
 from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -187,15 +188,6 @@ def read_transformations(path: Path) -> Transformations:
     return Transformations(s_from_as, w_from_gpsw, e_from_gpsw, scale)
 
 
-@dataclass(frozen=True, slots=True)
-class RelocalizationRow:
-    """A pair of keyframes (ns); ``query_from_reference`` (metres) is None if withheld."""
-
-    reference: int
-    query: int
-    query_from_reference: RigidTransform | None
-
-
 def parse_relocalization_name(name: str) -> tuple[str | None, str] | None:
     """Return source and target recording of a file name; the source may be omitted."""
     for pattern in _RELOCALIZATION_NAMES:
@@ -205,14 +197,14 @@ def parse_relocalization_name(name: str) -> tuple[str | None, str] | None:
     return None
 
 
-def read_relocalization(path: Path) -> list[RelocalizationRow]:
-    rows: dict[tuple[int, int], RelocalizationRow] = {}
+def read_relocalization(path: Path) -> list[RelativePose]:
+    rows: dict[tuple[int, int], RelativePose] = {}
     for line in read_lines(path, comments=True):
         fields = line.comma_fields
         line.expect(fields, (2, 9), "reference query [tx ty tz qx qy qz qw]")
         reference, query = (_timestamp(line, field) for field in fields[:2])
         pose = _transform(line, fields[2:]) if len(fields) == 9 else None
-        rows.setdefault((reference, query), RelocalizationRow(reference, query, pose))
+        rows.setdefault((reference, query), RelativePose(reference, query, pose))
     require(rows, "no pair in the file", path=path)
     return list(rows.values())
 
@@ -281,7 +273,7 @@ class RelocalizationFile:
     target: str
 
     @cached_property
-    def rows(self) -> list[RelocalizationRow]:
+    def rows(self) -> list[RelativePose]:
         return read_relocalization(self.path)
 
     def count(self) -> Count:

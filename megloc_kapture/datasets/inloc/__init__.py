@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.datasets.text_lines import Line, read_lines
@@ -70,19 +71,9 @@ class Cutout:
         The camera looks along the scan's -x axis (z up), rotated by the yaw to the right and by the
         pitch upwards.
         """
-        yaw, pitch = np.radians(-self.yaw_deg), np.radians(-self.pitch_deg)
         pano_from_scan = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
-        about_x = np.array(
-            [
-                [1, 0, 0],
-                [0, np.cos(pitch), -np.sin(pitch)],
-                [0, np.sin(pitch), np.cos(pitch)],
-            ]
-        )
-        about_y = np.array(
-            [[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]]
-        )
-        return RigidTransform.from_matrix(about_x @ about_y @ pano_from_scan, np.zeros(3))
+        turn = Rotation.from_euler("yx", [-self.yaw_deg, -self.pitch_deg], degrees=True)
+        return RigidTransform.from_matrix(turn.as_matrix() @ pano_from_scan, np.zeros(3))
 
 
 def parse_cutout_name(name: str) -> Cutout:

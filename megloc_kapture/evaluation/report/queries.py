@@ -201,23 +201,14 @@ _MIN_AGREEMENT = 0.5
 _AXIS_COSINE = float(np.cos(np.deg2rad(15.0)))
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class TopView:
-    """Orthonormal directions (3,) of the world that are right and up on the page; axis labels."""
-
-    right: NDArray[np.float64]
-    up: NDArray[np.float64]
-    labels: tuple[str, str]
-
-    def project(self, centers: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.stack([centers @ self.right, centers @ self.up], axis=1)
-
-
-def top_view(quats_wxyz: NDArray[np.float64], centers: NDArray[np.float64]) -> TopView:
+def top_view(
+    quats_wxyz: NDArray[np.float64], centers: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], tuple[str, str]]:
     """Look down on cameras ``cam_from_world`` (N, 4) with centres (N, 3), N at least 1.
 
     Vertical is the mean downward direction of the images, or without agreement the direction in
-    which the centres spread least.
+    which the centres spread least. Returns directions (2, 3) of the world that are right and up on
+    the page, orthonormal, and labels of these axes.
     """
     down = rotate(invert_quats(quats_wxyz), np.array([0.0, 1.0, 0.0])).mean(axis=0)
     length = float(np.linalg.norm(down))
@@ -229,13 +220,13 @@ def top_view(quats_wxyz: NDArray[np.float64], centers: NDArray[np.float64]) -> T
         first, second = (nearest + 1) % 3, (nearest + 2) % 3
         if upward[nearest] < 0:  # swapped, so that the page is not mirrored
             first, second = second, first
-        return TopView(np.eye(3)[first], np.eye(3)[second], ("xyz"[first], "xyz"[second]))
+        return np.eye(3)[[first, second]], ("xyz"[first], "xyz"[second])
     right = axes[0] - (axes[0] @ upward) * upward
     if np.linalg.norm(right) < 1e-6:  # the cameras stand on one vertical line
         right = np.eye(3)[int(np.argmin(np.abs(upward)))]
         right = right - (right @ upward) * upward
     right = _signed(right / np.linalg.norm(right))
-    return TopView(right, np.cross(upward, right), ("along the map", "across the map"))
+    return np.stack([right, np.cross(upward, right)]), ("along the map", "across the map")
 
 
 def _signed(direction: NDArray[np.float64]) -> NDArray[np.float64]:
