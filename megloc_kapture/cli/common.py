@@ -39,8 +39,7 @@ Input = Annotated[Path, tyro.conf.arg(aliases=["-i"])]
 Inputs = Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["-i"]), tyro.conf.UseAppendAction]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 Force = Annotated[
-    bool,
-    tyro.conf.arg(aliases=["-f"], help="Write into a folder that has other things in it."),
+    bool, tyro.conf.arg(aliases=["-f"], help="Write into a folder that has other things in it.")
 ]
 Overwrite = Annotated[bool, tyro.conf.arg(aliases=["-f"])]
 Folders = Annotated[tuple[Path, ...], tyro.conf.UseAppendAction]
@@ -105,12 +104,6 @@ def assigned_pairs(flag: str, texts: Sequence[str], takes: str) -> Iterator[tupl
         name, _, value = text.rpartition("=")
         check_option(name and value, f"{flag} takes {takes}, got {text!r}")
         yield name, value
-
-
-def refuse_given(of: str, **flags: object) -> None:
-    """Raise OptionError if a flag of another mode is given."""
-    for name, value in flags.items():
-        check_option(value is None, f"--{name.replace('_', '-')} changes nothing: it is of {of}")
 
 
 def opened_map(path: Path, console: Console, *, force: bool = False) -> Path:

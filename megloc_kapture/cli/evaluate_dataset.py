@@ -16,12 +16,7 @@ from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.tables import STATUS_FILE, read_status
 from megloc_kapture.localization.focal_length import misfits_text
 from megloc_kapture.pipeline.datasets import BenchmarkFile, DatasetChoice
-from megloc_kapture.pipeline.evaluation_plan import (
-    explain,
-    explained,
-    plan_evaluation,
-    recall_rows,
-)
+from megloc_kapture.pipeline.evaluation_plan import explain, explained, plan_evaluation, recall_rows
 from megloc_kapture.pipeline.plan import all_kept, run_plan
 from megloc_kapture.pipeline.presets import assigned
 from megloc_kapture.pipeline.run import choose_run

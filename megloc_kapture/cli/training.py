@@ -21,7 +21,6 @@ from megloc_kapture.cli.common import (
     Texts,
     Working,
     camera_of_text,
-    refuse_given,
 )
 from megloc_kapture.errors import DataError, OptionError, OutputError, check_option, require
 from megloc_kapture.io.images import WRITABLE_SUFFIXES
@@ -146,7 +145,7 @@ class TrainField(Linked, Common):
             )
 
         mapping, state = self.kapture_map(self.input), self.output / STATE_FILE
-        claim = claim_folder(self.output, kind=FIELD, force=self.force)
+        undo_claim = claim_folder(self.output, kind=FIELD, force=self.force)
         try:
             if self.force:
                 remove(state)
@@ -154,7 +153,7 @@ class TrainField(Linked, Common):
                 psnr_db = train_field_of_map(mapping, self.output, options, progress=progress)
         except BaseException:
             if not state.exists():
-                claim.undo()
+                undo_claim()
             raise
         mean = f"{sum(psnr_db.values()) / len(psnr_db):.1f} dB" if psnr_db else "none held out"
         console.result(f"{self.output}: PSNR of {len(psnr_db)} held-out images: {mean}")
@@ -193,14 +192,11 @@ class Render(Linked, Working):
             raise OptionError("say what to render: --pose and --camera, --along or --between")
         many = self.along or self.between
         if many is None:
-            others = {"workers": self.workers, "scheduler": self.scheduler}
-            refuse_given("--along and --between", max_side=self.max_side, **others)
             self._render_one()
             console.result(f"rendered: {self.output}")
             return
         if self.max_side is not None and self.max_side < 1:
             raise OptionError(f"--max-side {self.max_side} is not positive")
-        refuse_given("--pose", camera=self.camera, depth=self.depth)
         data = self.kapture_map(many).read()
         require(data.poses(), "no image here has a pose", path=many)
         with self.staged(self.output, RENDERED, force=self.force) as (out, work):

@@ -33,7 +33,6 @@ from megloc_kapture.io.weights import (
     how_to_convert,
     how_to_get,
     lookup,
-    prove,
     read_weights,
     registry,
     sha256_of,
@@ -274,7 +273,7 @@ def _wrong(console: Console, weights: Weights) -> int:
     for path in paths:
         file = describe(weights.name, path)
         try:
-            prove(file, file.published, weights)
+            read_weights(file)
             console.result(f"{weights.name}: {path} ({_trust(file)})")
         except MeglocError as error:
             wrong += 1

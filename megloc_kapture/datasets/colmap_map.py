@@ -14,11 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.datasets.kapture_folders import (
-    cameras_of_images,
-    is_kapture,
-    warn_of_scaled,
-)
+from megloc_kapture.datasets.kapture_folders import cameras_of_images, is_kapture, warn_of_scaled
 from megloc_kapture.datasets.reference_map import ColmapDatabase, write_reference_map
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import (
@@ -201,10 +197,7 @@ class ColmapReconstruction:
         if local_type is None:
             return self._write_with_sift(output, work)
         counts = self._write_reference(
-            output,
-            keypoints_type=local_type,
-            database=source.database,
-            database_names=self.renamed,
+            output, keypoints_type=local_type, database=source.database, database_names=self.renamed
         )
         folder = KaptureFolder(output)
         descriptors = folder.descriptors(local_type)

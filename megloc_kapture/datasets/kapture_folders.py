@@ -11,7 +11,6 @@ from typing import TypeVar
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.dataset_tables import (
-    NOWHERE_FILE,
     SIDE_TABLES,
     ImageGroup,
     Protocol,
@@ -46,24 +45,19 @@ def check_root(root: Path) -> Path:
     root = Path(root)
     require(root.is_dir(), "no such folder", path=root)
     for part in (MAPPING, QUERY):
-        try:  # in Python 3.14 is_file() reports unreadable files as missing
-            (root / part / _SENSORS).stat()
-        except (FileNotFoundError, NotADirectoryError) as error:
-            raise DataError(
-                f"{part}/{_SENSORS} is missing; a dataset of kapture folders has "
-                "mapping/ and query/, and query_gt/ where the true poses are known",
-                path=root,
-            ) from error
+        require(
+            is_kapture(root / part),
+            f"{part}/{_SENSORS} is missing; a dataset of kapture folders has mapping/ and query/, "
+            "and query_gt/ where the true poses are known",
+            path=root,
+        )
     return root
 
 
 def input_files(root: Path) -> Iterator[Path]:
     """Yield every file that an import of kapture folders depends on."""
     parts = [root / part / "sensors" for part in (MAPPING, QUERY)]
-    yield from files_below(*parts, root / SIDE_TABLES)
-    yield from sorted((root / QUERY_GT / "sensors").glob("*.txt"))
-    if (nowhere := root / QUERY_GT / NOWHERE_FILE).is_file():
-        yield nowhere
+    yield from files_below(*parts, root / QUERY_GT, root / SIDE_TABLES)
 
 
 def tell_of_truth_without_query(folder: Path, images: Sequence[str]) -> None:

@@ -24,12 +24,7 @@ from megloc_kapture.evaluation.metrics import (
 )
 from megloc_kapture.evaluation.protocols import Benchmark
 from megloc_kapture.evaluation.results import Result
-from megloc_kapture.evaluation.scoring import (
-    Evaluation,
-    Reported,
-    query_result,
-    recall_rows,
-)
+from megloc_kapture.evaluation.scoring import Evaluation, Reported, query_result, recall_rows
 
 SIGNIFICANCE = 0.05
 NUM_RESAMPLES, _CHUNK = 2000, 250
@@ -170,15 +165,9 @@ def _resampled_medians(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
     The same N draws the same positions, so results on the same queries stay paired.
     """
-    rng = np.random.default_rng(0)
-    medians = list[NDArray[np.float64]]()
-    for _ in range(NUM_RESAMPLES // _CHUNK):
-        drawn = values[rng.integers(len(values), size=(_CHUNK, len(values)))]
-        # twice as fast as np.median
-        middle = (len(values) - 1) // 2, len(values) // 2
-        drawn.partition(middle, axis=1)
-        medians.append(0.5 * (drawn[:, middle[0]] + drawn[:, middle[1]]))
-    return np.concatenate(medians)
+    rng, size = np.random.default_rng(0), (_CHUNK, len(values))
+    chunks = (values[rng.integers(len(values), size=size)] for _ in range(NUM_RESAMPLES // _CHUNK))
+    return np.concatenate([np.median(drawn, axis=1) for drawn in chunks])
 
 
 def difference_interval(

@@ -94,10 +94,7 @@ def evaluate(
 
 
 def benchmark_beside(
-    beside: Sequence[object],
-    *,
-    side_tables: Path | str | None = None,
-    dataset: str | None = None,
+    beside: Sequence[object], *, side_tables: Path | str | None = None, dataset: str | None = None
 ) -> Benchmark:
     """Return the benchmark of side tables, by default of the first workspace of the paths."""
     for path in beside:

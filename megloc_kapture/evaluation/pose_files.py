@@ -145,9 +145,7 @@ def _colmap_rows(text: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def poses_by_image(
-    poses: Poses,
-    images: Iterable[str],
-    names: Mapping[str, str] | None = None,
+    poses: Poses, images: Iterable[str], names: Mapping[str, str] | None = None
 ) -> dict[str, RigidTransform]:
     """Rename the poses of a pose file to the images of a kapture folder.
 

@@ -64,10 +64,7 @@ def quiet_stderr() -> Iterator[None]:
 
 def new_colmap_camera(camera: Camera) -> Any:
     return load_pycolmap().Camera(
-        model=camera.model,
-        width=camera.width,
-        height=camera.height,
-        params=list(camera.params),
+        model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
     )
 
 

@@ -166,10 +166,7 @@ def _check_complete(path: Path) -> None:
     head, length_type, item = _RECORDS[path.name]
     length_size = struct.calcsize(length_type)
     try:
-        with (
-            open(path, "rb") as file,
-            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
-        ):
+        with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             (count,), at = struct.unpack_from("<Q", data), 8
             for _ in range(count):
                 at += head

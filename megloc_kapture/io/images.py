@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap import focal_from_exif
-from megloc_kapture.io.files import read_content, write_bytes
+from megloc_kapture.io.files import read_content, reading, write_bytes
 from megloc_kapture.values import Camera
 
 if TYPE_CHECKING:
@@ -185,15 +185,8 @@ def _encoded(path: Path, image: NDArray[np.uint8], jpeg_quality: int) -> bytes:
 
 def check_image_file(path: Path) -> None:
     """Raise DataError unless the path is a file; its content is not checked."""
-    try:
-        if path.is_file():
-            return
-        present = path.exists()
-    except OSError as error:
-        raise DataError(f"cannot read: {error.strerror}", path=path) from error
-    # reading a pipe or a device might never end
-    problem = "not an image but a folder, pipe or device" if present else "no such image"
-    raise DataError(problem, path=path)
+    with reading(path):
+        require(path.is_file(), "no such image", path=path)
 
 
 def _check_complete(path: Path | str | None, content: bytes) -> None:
@@ -288,9 +281,9 @@ def is_image(path: Path) -> bool:
     """Return whether a file is an image of a supported format, by its content."""
     from PIL import Image
 
+    if not path.is_file():
+        return False
     try:
-        if not path.is_file():  # reading a pipe might never end
-            return False
         with _quiet(), Image.open(path) as image:
             return image.format in _FORMATS
     except Exception:

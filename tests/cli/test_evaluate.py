@@ -110,21 +110,6 @@ def test_two_results_are_compared(megloc: Any, runs: Path) -> None:
     assert "a/localized and poses.txt find the same 38 queries" in " ".join(done.out.split())
 
 
-def test_a_datasets_protocol_by_name(megloc: Any, runs: Path) -> None:
-    truth = write_kapture(runs / "lone/gt", IMAGES, poses_off(0.0))
-    result = write_kapture(runs / "lone_result", IMAGES, poses_off(0.3))
-    plain = megloc("evaluate", "-i", result, "--gt", truth)
-    assert "0.05 m, 5 deg" in plain.out and "night" not in plain.out
-    named = megloc("evaluate", "-i", result, "--gt", truth, "--dataset", "aachen")
-    assert "recall (%) at 0.25 m, 2 deg / 0.5 m, 5 deg / 5 m, 10 deg" in named.out
-    # its conditions are folders of the images
-    assert [line.split()[0] for line in named.out.splitlines()[6:8]] == ["day", "night"]
-    inloc = megloc("evaluate", "-i", result, "--gt", truth, "--dataset", "inloc")
-    assert "0.0 / 100.0 / 100.0" in inloc.out
-    own = megloc("evaluate", "-i", result, "--gt", truth, "--thresholds", "0.4,1", "0.3")
-    assert "recall (%) at 0.4 m, 1 deg / 0.3 m\n" in own.out
-
-
 def test_without_truth(megloc: Any, runs: Path) -> None:
     out = runs / "out"
     done = megloc(*results(runs, "a", "b"), "-o", out)

@@ -140,39 +140,6 @@ def test_reranking_keeps_the_best_matched_and_their_matches(
     megloc(*command, *both).refused(r"reranked\.txt exists; -f")
 
 
-def test_several_global_features_are_fused(
-    megloc: Any, made: Made, scene: Path, tmp_path: Path
-) -> None:
-    soft = tmp_path / "soft"
-    features = ["--features-dir", made.features]
-    done = megloc(
-        *("extract-global", "-i", scene / "mapping", "--query", scene / "query", "-o", soft),
-        *(*features, *INLINE, "--set", "global_features.options.assignment=soft", "-q"),
-    )
-    assert (done.status, done.err) == (0, "")
-    # the same vectors under a second name
-    second = soft / "global_features" / "second"
-    (soft / "global_features" / "vlad_rootsift").rename(second)
-    folders = ["--features-dir", made.vlad, "--features-dir", soft]
-    command = ["pairs-query", "-i", scene / "mapping", "--query", scene / "query"]
-    megloc(*command, "-o", tmp_path / "none.txt", *folders).refused(
-        "several types of global_features, name one: second, vlad_rootsift"
-    )
-    found = {}
-    for name, arguments in {
-        "hard": ["--features", "vlad_rootsift"],
-        "both": ["--features", "vlad_rootsift", "second", "--fusion", "mean"],
-        "soft": ["--features", "second"],
-    }.items():
-        out = tmp_path / f"{name}.txt"
-        done = megloc(*command, "-o", out, *folders, *arguments, "-q")
-        assert (done.status, done.err) == (0, "")
-        found[name] = {(pair.query, pair.map): pair.score for pair in read_pairs(out)}
-    assert found["hard"] != found["soft"]
-    for pair, score in found["both"].items():
-        assert score == pytest.approx((found["hard"][pair] + found["soft"][pair]) / 2, abs=1e-6)
-
-
 def test_ways_to_pair(megloc: Any, finished: Path, tmp_path: Path) -> None:
     mapping, points, pairs = finished / "mapping", finished / "map", tmp_path / "pairs.txt"
     command = ("pairs-mapping", "-i", mapping, "-o", pairs, "--by")
@@ -207,33 +174,6 @@ def test_ways_to_pair(megloc: Any, finished: Path, tmp_path: Path) -> None:
     query = ["pairs-query", "-i", mapping, "--query", finished / "query", "--exhaustive", "-q"]
     assert megloc(*query, "-o", tmp_path / "query.txt").status == 0
     assert len(read_pairs(tmp_path / "query.txt")) == 28
-
-
-def test_a_map_of_two_types_of_features(megloc: Any, scene: Path, tmp_path: Path) -> None:
-    features, mapping, pairs = tmp_path / "features", scene / "mapping", tmp_path / "pairs.txt"
-    place = ("-i", mapping, "--features-dir", features)
-    few = ("--set", "local_features.rootsift.options.max_keypoints=500")
-    few += ("--set", "local_features.sift.options.first_octave=0")
-    both = ("--features", "rootsift", "sift")
-    match = ["match", *place, "--pairs", pairs, "-o", features, *INLINE, "--features"]
-    commands = [
-        ["extract-local", "-i", mapping, "-o", features, *both, *few, *INLINE],
-        ["pairs-mapping", "-i", mapping, "-o", pairs, "--by", "sequence"],
-        *([*match, name] for name in ("rootsift", "sift")),
-    ]
-    for command in commands:
-        done = megloc(*command, "-q")
-        assert done.status == 0, done
-    megloc("triangulate", *place, "-o", tmp_path / "map").refused("several types of matches")
-    done = megloc("triangulate", *place, "-o", tmp_path / "map", *both)
-    lines = [line.split() for line in done.err.splitlines()][-3:]
-    assert [line[0] for line in lines[:2]] == ["rootsift:", "sift:"]
-    folder = KaptureFolder(tmp_path / "map")
-    folder.validate()
-    found = folder.observations()
-    assert [int(line[3]) for line in lines[:2]] == [len(found["rootsift"]), len(found["sift"])]
-    assert min(len(seen) for seen in found.values()) > 100
-    assert int(lines[2][0]) == len(folder.points3d())
 
 
 def test_what_cannot_be_matched_is_refused(megloc: Any, workspace: Path, tmp_path: Path) -> None:

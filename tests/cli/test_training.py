@@ -161,22 +161,6 @@ def test_views_along_a_result(megloc: Any, mapping: Path, field: Path, tmp_path:
     megloc("render", field, "--along", one, "-o", tmp_path / "x").refused("rendered into one file")
 
 
-@pytest.mark.slow
-def test_processes_render_the_same_views(
-    megloc: Any, mapping: Path, field: Path, tmp_path: Path
-) -> None:
-    command = ("render", field, "--along", mapping, "--max-side", "32")
-    for workers in ("1", "2"):
-        assert megloc(*command, "-o", tmp_path / workers, "--workers", workers).status == 0
-    one, two = (
-        {path.relative_to(root): path.read_bytes() for path in root.rglob("*.*") if path.is_file()}
-        for root in (tmp_path / "1", tmp_path / "2")
-    )
-    assert one == two and len(one) >= 2 * len(KaptureFolder(mapping).read().poses())
-    elsewhere = ("--scheduler", "tcp://127.0.0.1:1")
-    megloc(*command, "-o", tmp_path / "x", *elsewhere).refused("needs --executor dask")
-
-
 def test_views_that_no_camera_took_join_the_map(
     megloc: Any, mapping: Path, field: Path, tmp_path: Path
 ) -> None:
@@ -232,10 +216,7 @@ def test_what_is_refused(megloc: Any, mapping: Path, field: Path, tmp_path: Path
         ((), "say what to render: --pose and --camera, --along or --between"),
         (("--between", mapping, "--along", mapping), "say what to render"),
         ((pose,), "--pose needs the --camera"),
-        ((pose, *camera, "--max-side", "9"), "--max-side changes nothing"),
-        ((pose, *camera, "--workers", "2"), "--workers changes nothing"),
         ((pose, *camera, "--appearance", "me.jpg"), "not trained on an image 'me.jpg'"),
-        (("--along", mapping, *camera), "--camera changes"),
         (("--between", out / "none"), "none"),
         *(
             ((f"--pose={wrong}", *camera), "qw,qx,qy,qz,tx")

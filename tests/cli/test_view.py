@@ -68,18 +68,6 @@ def test_inliers_lie_where_the_query_sees_their_points(finished: Path) -> None:
         assert np.linalg.norm(seen - pixels, axis=1).max() <= 12.0
 
 
-def test_it_is_opened_in_the_browser(
-    megloc: Any, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    opened: list[str] = []
-    monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url) or len(opened) == 1)
-    out = tmp_path / "a view.html"
-    command = ("view", finished / "map", "-o", out, "--open")
-    assert "no browser" not in megloc(*command).err
-    assert "no browser could be started; open the file in one" in megloc(*command).err
-    assert opened == [out.as_uri()] * 2
-
-
 def test_from_python(finished: Path, tmp_path: Path, data_of: Any) -> None:
     opened = megloc_package.open_map(finished / "map", features_dirs=[finished])
     opened.view(tmp_path / "map.html")

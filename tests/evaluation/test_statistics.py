@@ -105,16 +105,6 @@ def test_medians_with_missing_poses() -> None:
     assert low == -np.inf and high <= 0.0
 
 
-def test_median_of_resamples_is_numpys() -> None:
-    for size in (30, 31):
-        values = np.random.default_rng(2).exponential(size=size)
-        drawn = np.random.default_rng(0).integers(size, size=(2000, size))
-        expected = np.median(values[drawn], axis=1)
-        np.testing.assert_allclose(
-            _resampled_medians(values), expected, rtol=(1 - size % 2) * 1e-15
-        )
-
-
 @pytest.mark.parametrize(
     ("others", "words"),
     [

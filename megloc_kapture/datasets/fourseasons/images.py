@@ -173,8 +173,7 @@ class LocalFrame:
         official_from_local = scene @ RigidTransform((1.0, 0.0, 0.0, 0.0), self.origin)
         return World(
             official_from_local=SimilarityTransform(
-                quat_wxyz=official_from_local.quat_wxyz,
-                translation=official_from_local.translation,
+                quat_wxyz=official_from_local.quat_wxyz, translation=official_from_local.translation
             )
         )
 
@@ -207,8 +206,7 @@ def _gnss_poses(recording: Recording, min_fusion_quality: int) -> KeyframePoses:
         scale = transformations.gnss_scale if row.scale is None else row.scale
         if scale is None:
             raise DataError(
-                "the pose has no scale, and Transformations.txt has none either",
-                path=path,
+                "the pose has no scale, and Transformations.txt has none either", path=path
             )
         x, y, z = (scale * value for value in row.slam_from_cam.translation)
         metric = RigidTransform(row.slam_from_cam.quat_wxyz, (x, y, z))

@@ -327,9 +327,7 @@ def read_test_names(
 
 
 def note_time(
-    image: ImageKey,
-    at_time: dict[tuple[str, int], ImageKey],
-    error: Callable[[str], DataError],
+    image: ImageKey, at_time: dict[tuple[str, int], ImageKey], error: Callable[[str], DataError]
 ) -> None:
     """Register camera and time of an image; raise ``error`` if another image has both."""
     if image.camera not in CAMERAS:

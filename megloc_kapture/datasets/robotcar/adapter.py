@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from megloc_kapture.datasets.official import (
     Count,
@@ -91,12 +91,6 @@ class RobotCarOptions(Options):
         "the benchmark permits to know; false: with all",
     )
 
-    @model_validator(mode="after")
-    def _usable(self) -> RobotCarOptions:
-        if self.train_as_map and self.queries == "train":
-            raise ValueError("train_as_map leaves nothing for queries=train")
-        return self
-
 
 class RobotCar:
     """Adapter of RobotCar Seasons: all locations form one map in one metric frame.
@@ -111,12 +105,7 @@ class RobotCar:
         published_at="https://data.ciirc.cvut.cz/public/projects/2020VisualLocalization/"
         "RobotCar-Seasons/",
         size="tens of GB, much of it a feature database that only the reference model needs",
-        folders=(
-            "RobotCar-Seasons",
-            "RobotCar_Seasons",
-            "robotcar_seasons",
-            "RobotCar_Seasons-v2",
-        ),
+        folders=("RobotCar-Seasons", "RobotCar_Seasons", "robotcar_seasons", "RobotCar_Seasons-v2"),
         layout="images/<condition>/{left,rear,right}/*.jpg (archives extracted in place), "
         "intrinsics/, extrinsics/, 3D-models/all-merged/all.nvm, "
         "3D-models/individual/{queries_per_location,colmap_reconstructions}/ and, for version 2, "
@@ -234,9 +223,9 @@ class RobotCar:
 
     def _check_version(self, version: int) -> None:
         check_option(
-            version != 1 or (not self.options.train_as_map and self.options.queries == "all"),
-            "train_as_map and queries are about version 2, whose lists are not there or not "
-            "wanted (version=2)",
+            version == 2 or not (self.options.train_as_map or self.options.queries != "all"),
+            "train_as_map and queries are about version 2, whose lists are not there or not wanted "
+            "(version=2)",
         )
 
 

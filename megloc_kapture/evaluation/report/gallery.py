@@ -13,11 +13,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.report.content import counted
-from megloc_kapture.evaluation.report.queries import (
-    ShownQuery,
-    query_facts,
-    spread,
-)
+from megloc_kapture.evaluation.report.queries import ShownQuery, query_facts, spread
 from megloc_kapture.evaluation.results import Poses, ResultContext
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px
 from megloc_kapture.io.images import read_image_rgb

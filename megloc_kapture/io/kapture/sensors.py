@@ -13,7 +13,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from megloc_kapture.errors import DataError, require
-from megloc_kapture.io.files import check_no_escape, check_relative, named, remove, write_bytes
+from megloc_kapture.io.files import check_no_escape, check_relative, remove, write_bytes
 from megloc_kapture.io.kapture.format import (
     CAMERA_SENSOR_TYPES,
     UNKNOWN_CAMERA,
@@ -210,17 +210,15 @@ def write_sensors(root: Path, data: KaptureData) -> None:
 
 
 def _sensor_rows(data: KaptureData) -> list[list[str]]:
-    rows = []
-    for sensor_id, sensor in sorted(data.sensors.items()):
-        with named(about=f"sensor {sensor_id!r}"):
-            check_sensor(sensor)
-        rows.append([sensor_id, sensor.name, sensor.sensor_type, *sensor.params])
-    return rows
+    return [
+        [sensor_id, sensor.name, sensor.sensor_type, *sensor.params]
+        for sensor_id, sensor in sorted(data.sensors.items())
+    ]
 
 
 def _rig_rows(data: KaptureData) -> list[list[str]]:
     return [
-        [rig_id, sensor_id, *_pose_fields(pose, f"rig {rig_id!r}")]
+        [rig_id, sensor_id, *_pose_fields(pose)]
         for rig_id, members in sorted(data.rigs.items())
         for sensor_id, pose in sorted(members.items())
     ]
@@ -228,7 +226,7 @@ def _rig_rows(data: KaptureData) -> list[list[str]]:
 
 def _trajectory_rows(data: KaptureData) -> list[list[str]]:
     return [
-        [str(int(time)), device, *_pose_fields(pose, f"trajectory of {device!r} at {time}")]
+        [str(int(time)), device, *_pose_fields(pose)]
         for (time, device), pose in sorted(data.trajectories.items())
     ]
 
@@ -240,9 +238,6 @@ def _record_rows(records: dict[tuple[int, str], str]) -> list[list[str]]:
     ]
 
 
-def _pose_fields(pose: RigidTransform, where: str) -> list[str]:
-    values = [float(v) for v in (*pose.quat_wxyz, *pose.translation)]
-    require(all(map(math.isfinite, values)), f"{where}: the pose is not finite")
-    with named(about=where):
-        quat = unit_quaternion((values[0], values[1], values[2], values[3]))
-    return [repr(v) for v in (*quat, *values[4:])]
+def _pose_fields(pose: RigidTransform) -> list[str]:
+    w, x, y, z = map(float, pose.quat_wxyz)
+    return [repr(float(v)) for v in (*unit_quaternion((w, x, y, z)), *pose.translation)]

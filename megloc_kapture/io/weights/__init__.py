@@ -300,7 +300,7 @@ def share_weights(folder: Path | None) -> None:
 
 
 def _read(file: WeightsFile) -> dict[str, torch.Tensor]:
-    check_sha256(file)
+    check_sha256(file, file.published)
     if file.path.suffix == ".safetensors":
         from safetensors.torch import load_file
 
@@ -313,13 +313,13 @@ def _read(file: WeightsFile) -> dict[str, torch.Tensor]:
     return _state_dict(_load_torch(file.path), file.path)
 
 
-def check_sha256(file: WeightsFile) -> None:
-    """Raise DataError if the sha256 differs from the registry's."""
-    known = file.published and file.published.sha256
-    if known and known != sha256_of(file):
+def check_sha256(file: WeightsFile, published: PublishedFile | None) -> None:
+    """Raise DataError if the sha256 differs from the published one, where it is known."""
+    if published and published.sha256 and sha256_of(file) != published.sha256:
         raise DataError(
-            f"is not the published file of {file.name}: sha256 {sha256_of(file)} instead of "
-            f"{known}; fetch or add it again, or give your own file by its path",
+            f"is not the published {published.name} of {file.name}: sha256 {sha256_of(file)} "
+            f"instead of {published.sha256}; fetch or add it again, or give your own file by its "
+            "path",
             path=file.path,
         )
 
@@ -403,7 +403,8 @@ def add_weights(
     if expected is not None and expected.convert:
         command = how_to_convert(weights, source)
         raise DataError(f"is not read as it is; convert it once: {command}", path=source)
-    prove(found, None if unverified else expected, weights)
+    check_sha256(found, None if unverified else expected)
+    read_weights(found)
     path = weights_folder() / (f"{UNVERIFIED}/{target}" if unverified else target)
     if path.exists() and not force:
         if sha256_of(describe(weights.name, path)) == sha256:
@@ -412,17 +413,6 @@ def add_weights(
     with open(source, "rb") as content, atomic_write(path) as copy:
         shutil.copyfileobj(content, copy)
     return describe(weights.name, path)
-
-
-def prove(file: WeightsFile, published: PublishedFile | None, weights: Weights) -> None:
-    """Raise DataError unless a file loads and has the published sha256, where known."""
-    if published and published.sha256 and sha256_of(file) != published.sha256:
-        raise DataError(
-            f"is not the published {published.name} of {weights.name}: "
-            f"sha256 {sha256_of(file)} instead of {published.sha256}",
-            path=file.path,
-        )
-    read_weights(file)
 
 
 def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:

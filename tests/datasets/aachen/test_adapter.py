@@ -152,31 +152,6 @@ def test_folders_that_are_met_with_other_names(root11: Path, folder: str, images
     assert dataset.missing is not None and dataset.missing.files == []
 
 
-def test_summary_and_remarks(root11: Path) -> None:
-    old, new = read(root11, version="1.0"), read(root11)
-    assert [(count.what, count.found, count.published) for count in old.summary] == [
-        ("database images", 3, 4328),
-        ("day queries", 3, 824),
-        ("night queries", 1, 98),
-    ]
-    both = [(count.what, count.found, count.published) for count in new.summary]
-    assert both == [
-        ("database images", 3, 4328),
-        ("sequence images", 2, 2369),
-        ("map images", 5, 6697),
-        ("cameras of map and night queries", 5, 5234),
-        ("day queries", 3, 824),
-        ("night queries", 2, 191),
-    ]
-    chosen = read(root11, version="1.1")
-    assert [(count.what, count.found, count.published) for count in chosen.summary] == both
-    left_out = [any("left out" in remark for remark in one.remarks) for one in (old, new)]
-    assert left_out == [True, False]
-    # a query keeps its record whichever version is read
-    for dataset in (old, new):
-        assert dataset.query.record_of(NIGHT[0]) == (200_001, "night_00001")
-
-
 def test_missing_files_are_refused_or_passed_over(root11: Path, tmp_path: Path) -> None:
     gone = {DATABASE[0], SEQUENCE[1], DAY[1], ADDED[0]}
     for name in gone:

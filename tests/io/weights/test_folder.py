@@ -153,7 +153,8 @@ def test_a_file_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 def test_another_file_under_a_published_name_is_refused(folder: Path) -> None:
     path = write(folder / "superpoint_v1.pth")
     file, known = find_weights("superpoint_v1"), registry()["superpoint_v1"].files[0].sha256
-    told = f"{path}: is not the published file of superpoint_v1: sha256 {sha256_of(file)} instead"
+    told = f"{path}: is not the published superpoint_v1.pth of superpoint_v1: sha256 "
+    told += f"{sha256_of(file)} instead"
     with pytest.raises(DataError, match=re.escape(f"{told} of {known}; ")):
         read_weights(file)
 
@@ -226,7 +227,7 @@ def test_add_refuses_what_is_broken_and_on_request_takes_another_file(
     assert read_weights(found).keys() == read_weights(describe("own", own)).keys()
     # the published one comes first, and is checked
     shutil.copyfile(own, folder / "superpoint_v1.pth")
-    with pytest.raises(DataError, match="is not the published file"):
+    with pytest.raises(DataError, match="is not the published superpoint_v1.pth"):
         read_weights(find_weights("superpoint_v1"))
 
 
