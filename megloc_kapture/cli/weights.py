@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -40,9 +40,6 @@ from megloc_kapture.io.weights import (
     weights_folder,
 )
 from megloc_kapture.pipeline.presets import check_weights, options_of_preset
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
 
 WRONG_FILES = 2
 
@@ -108,9 +105,7 @@ class Fetch(Common):
 
         console.say(f"{weights.name}: {url}")
         console.say(f"  licence: {weights.licence}: {weights.terms}")
-        with _progress(console) as progress:
-            bar = _Bar(progress, f"  {file.name}")
-            fetch(url, place, sha256=file.sha256, progress=bar)
+        fetch(url, place, sha256=file.sha256, track=console.track)
         state = "sha256 right"
         if file.sha256 is None:
             found = describe(weights.name, place)
@@ -210,37 +205,6 @@ def _missing(preset: str) -> tuple[str, ...]:
     except MissingWeightsError as error:
         return error.names
     return ()
-
-
-def _progress(console: Console) -> Progress:
-    from rich.console import Console as RichConsole
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
-
-    columns = TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn()
-    hidden = console.quiet or not console.terminal
-    return Progress(*columns, console=RichConsole(stderr=True), transient=True, disable=hidden)
-
-
-class _Bar:
-    """A bar of rich with the part of tqdm's interface that pooch uses."""
-
-    def __init__(self, progress: Progress, label: str) -> None:
-        self._progress, self._task = progress, progress.add_task(label, total=None)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name == "total":
-            self._progress.update(self._task, total=value)
-        else:
-            super().__setattr__(name, value)
-
-    def update(self, size: int) -> None:
-        self._progress.advance(self._task, size)
-
-    def reset(self) -> None:
-        self._progress.reset(self._task)
-
-    def close(self) -> None:
-        self._progress.stop_task(self._task)
 
 
 def _say_to_convert(console: Console, weights: Weights, file: PublishedFile, place: Path) -> None:

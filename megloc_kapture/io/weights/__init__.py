@@ -14,7 +14,7 @@ import hashlib
 import os
 import shutil
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -364,20 +364,34 @@ def _state_dict(found: Any, path: Path) -> dict[str, torch.Tensor]:
 
 
 SOURCE_KEY = "source_sha256"  # in a converted file's metadata
-_TIMEOUT_S = 60.0
+_TIMEOUT_S, _CHUNK = 60.0, 1_000_000
 
 
-def fetch(url: str, path: Path, *, sha256: str | None = None, progress: Any = None) -> None:
-    """Download a file, named once complete and verified; ``progress`` has tqdm's interface."""
+Track = Callable[[Iterable[bytes], int, str], Iterable[bytes]]
+
+
+def fetch(url: str, path: Path, *, sha256: str | None = None, track: Track | None = None) -> None:
+    """Download a file, named once complete and verified; ``track`` shows chunks of 1 MB."""
     import pooch
     import requests
 
+    def download(url: str, output: str, _: object) -> None:
+        with (
+            requests.get(url, stream=True, timeout=_TIMEOUT_S) as answer,
+            open(output, "wb") as file,
+        ):
+            answer.raise_for_status()
+            chunks: Iterable[bytes] = answer.iter_content(_CHUNK)
+            if track is not None:
+                size = int(answer.headers.get("content-length", 0))
+                chunks = track(chunks, -(-size // _CHUNK), path.name)
+            file.writelines(chunks)
+
     known = None if sha256 is None else f"sha256:{sha256}"
-    downloader = pooch.HTTPDownloader(progressbar=progress or False, timeout=_TIMEOUT_S)
     pooch.get_logger().setLevel("WARNING")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        pooch.core.stream_download(url, path, known, downloader)
+        pooch.core.stream_download(url, path, known, download)
     except requests.exceptions.HTTPError as error:
         raise MeglocError(f"{url}: the server answers {error}") from error
     except requests.exceptions.RequestException as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -69,23 +69,15 @@ def place(tmp_path: Path) -> Path:
     return tmp_path / "weights" / "net.pth"
 
 
-class Bar:
-    total, seen = 0, 0
-
-    def update(self, size: int) -> None:
-        self.seen += size
-
-    def reset(self) -> None:
-        self.seen = 0
-
-    def close(self) -> None:
-        pass
-
-
 def test_a_whole_file(server: Server, place: Path) -> None:
-    bar = Bar()
-    fetch(server.url, place, sha256=SHA256, progress=bar)
-    assert place.read_bytes() == CONTENT and bar.total == bar.seen == len(CONTENT)
+    seen = []
+
+    def track(chunks: Iterable[bytes], total: int, label: str) -> Iterable[bytes]:
+        seen.append((total, label))
+        return chunks
+
+    fetch(server.url, place, sha256=SHA256, track=track)
+    assert place.read_bytes() == CONTENT and seen == [(1, "net.pth")]
     assert [path.name for path in place.parent.iterdir()] == ["net.pth"]
 
 
