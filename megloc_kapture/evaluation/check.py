@@ -6,7 +6,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,14 +175,14 @@ def check_submission(
 
 def _check_file(path: Path, dataset: str, reference: Reference) -> tuple[int, list[Finding]]:
     require(not path.is_dir(), "a folder; the pose file of this challenge is one file", path=path)
-    rows = _read_rows(path, "ltvl")
+    lines, poses, of_rows = _read_rows(path, "ltvl")
     world = reference.world
-    findings = _check_poses(rows.poses, reference, lambda _, pose: world.pose_in_local(pose))
+    findings = _check_poses(poses, reference, lambda _, pose: world.pose_in_local(pose))
     if reference.expected:
-        findings += _check_names(rows.lines, reference, dataset)
+        findings += _check_names(lines, reference, dataset)
     else:
-        findings += [*_check_shape(rows.lines, dataset), _not_checked("names", reference)]
-    return len(rows.poses), [replace(f, file=path.name) for f in [*findings, *rows.findings]]
+        findings += [*_check_shape(lines, dataset), _not_checked("names", reference)]
+    return len(poses), [replace(f, file=path.name) for f in [*findings, *of_rows]]
 
 
 def _check_mlad(path: Path, reference: Reference) -> tuple[int, list[Finding]]:
@@ -190,7 +190,7 @@ def _check_mlad(path: Path, reference: Reference) -> tuple[int, list[Finding]]:
     for pair in reference.pairs:
         stamps = f"{PurePosixPath(pair.reference).stem} {PurePosixPath(pair.query).stem}"
         wanted[pair.file][stamps] = pair.reference
-    findings, poses = list[Finding](), 0
+    findings, num_poses = list[Finding](), 0
     if path.is_dir():
         files = {str(p.relative_to(path)): p for p in sorted(path.rglob("*.txt"))}
         if absent := [name for name in wanted if name not in files]:
@@ -201,32 +201,23 @@ def _check_mlad(path: Path, reference: Reference) -> tuple[int, list[Finding]]:
         fitting = [name for name in wanted if PurePosixPath(name).name == path.name]
         files = {fitting[0] if fitting else path.name: path}
     for name, file in files.items():
-        rows = _read_rows(file, "mlad")
-        poses += len(rows.poses)
-        of_file = list(rows.findings)
+        lines, poses, of_file = _read_rows(file, "mlad")
+        num_poses += len(poses)
         if wanted and name not in wanted:
             message = f"must be named like its relocalization file: {_some(wanted)}"
             of_file.append(Finding("error", "file-name", message))
         elif wanted:
-            of_file += _check_pairs(rows, wanted[name], reference)
+            of_file += _check_pairs(lines, poses, wanted[name], reference)
         findings += [replace(finding, file=name) for finding in of_file]
     if not wanted:
         findings.append(_not_checked("pairs", reference))
-    return poses, findings
+    return num_poses, findings
 
 
-class _Rows(NamedTuple):
-    """Rows by name, or by two timestamps with a blank between them.
-
-    ``lines`` has the line number of every row, ``poses`` those with a valid pose.
-    """
-
-    lines: dict[str, int]
-    poses: dict[str, RigidTransform]
-    findings: list[Finding]
-
-
-def _read_rows(path: Path, kind: PoseFileFormat) -> _Rows:
+def _read_rows(
+    path: Path, kind: PoseFileFormat
+) -> tuple[dict[str, int], dict[str, RigidTransform], list[Finding]]:
+    """Return line numbers and valid poses by name, or by two timestamps, and wrong rows."""
     text = read_text(path)
     require(
         not pose_files.is_colmap_images(text),
@@ -271,7 +262,7 @@ def _read_rows(path: Path, kind: PoseFileFormat) -> _Rows:
             problem("pose", f"{error.message}; the columns are {columns}")
     if not lines:
         findings.append(Finding("error", "empty", "there is no pose in the file"))
-    return _Rows(lines, poses, findings)
+    return lines, poses, findings
 
 
 def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -> list[Finding]:
@@ -337,28 +328,31 @@ def _check_shape(names: Iterable[str], dataset: str) -> list[Finding]:
     return findings
 
 
-def _check_pairs(rows: _Rows, wanted: Mapping[str, str], reference: Reference) -> list[Finding]:
-    unknown = [key for key in rows.lines if key not in wanted]
+def _check_pairs(
+    lines: Mapping[str, int],
+    read: Mapping[str, RigidTransform],
+    wanted: Mapping[str, str],
+    reference: Reference,
+) -> list[Finding]:
+    unknown = [key for key in lines if key not in wanted]
     swapped = [key for key in unknown if " ".join(reversed(key.split(" "))) in wanted]
-    if 2 * len(swapped) > len(rows.lines):
+    if 2 * len(swapped) > len(lines):
         what = "with the two timestamps swapped: the reference comes first, then the query"
         return [_about("error", "swapped", swapped, "row", what)]
     findings = [
-        Finding("error", "unknown", f"pair {key} is not asked for", line=rows.lines[key])
+        Finding("error", "unknown", f"pair {key} is not asked for", line=lines[key])
         for key in unknown
     ]
-    if missing := [key for key in wanted if key not in rows.lines]:
+    if missing := [key for key in wanted if key not in lines]:
         what = f"of {len(wanted)} without a row, and every one needs one"
         findings.append(_about("error", "missing", missing, "pair", what))
     # the identity fills in for a missing pose, and fits no convention
     identity = RigidTransform.identity()
-    if dummies := [key for key, pose in rows.poses.items() if pose == identity]:
+    if dummies := [key for key, pose in read.items() if pose == identity]:
         findings.append(_about("note", "dummies", dummies, "row", "with the identity, a dummy"))
     map_poses, scale = reference.map_poses, reference.world.official_from_local.scale
     poses = {
-        key: pose
-        for key, pose in rows.poses.items()
-        if pose != identity and wanted.get(key) in map_poses
+        key: pose for key, pose in read.items() if pose != identity and wanted.get(key) in map_poses
     }
     if scale == 1.0:  # poses are not compared with a map in other units
         in_local = lambda key, pose: pose @ map_poses[wanted[key]]  # noqa: E731

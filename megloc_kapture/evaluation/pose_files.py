@@ -34,6 +34,7 @@ from megloc_kapture.io.dataset_tables import (
     PoseFileNames,
 )
 from megloc_kapture.io.files import (
+    named,
     read_content,
     read_json_model,
     read_text,
@@ -109,14 +110,12 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
     poses: dict[str, RigidTransform | None] = {}
     for number, fields in rows:
         name = fields[0]
-        try:
+        with named(path, number):
             require(len(fields) == 8, f"{len(fields)} columns instead of 8 ({COLUMNS})")
             require(name not in poses, f"{name!r} is given twice")
             values = [parse_number(field) for field in fields[1:]]
             failed = not np.isfinite(values).all() or not any(values[:4])
             poses[name] = None if failed else parse_pose(fields[1:], "ltvl", repr(name))
-        except DataError as error:
-            raise DataError(error.message, path=path, line=number) from error
     if failures := [name for name, pose in poses.items() if pose is None]:
         message = "%s: rows of nan or zeros are queries without a pose: %d, the first is %s"
         _log.warning(message, path, len(failures), failures[0])
@@ -285,7 +284,7 @@ def read_mlad_file(path: Path | str) -> list[RelativePose]:
         if not fields:
             continue
         columns = columns or (2 if len(fields) == 2 else 9)
-        try:
+        with named(path, number):
             if len(fields) != columns:
                 wanted = f"9 ({MLAD_COLUMNS})" if columns == 9 else "2, as in the rows before"
                 raise DataError(f"{len(fields)} columns instead of {wanted}")
@@ -294,8 +293,6 @@ def read_mlad_file(path: Path | str) -> list[RelativePose]:
             require((reference, query) not in pairs, f"{whose} is given twice")
             if columns == 9:
                 pose = parse_pose(fields[2:], "mlad", whose)
-        except DataError as error:
-            raise DataError(error.message, path=path, line=number) from error
         pairs.add((reference, query))
         rows.append(RelativePose(reference, query, pose))
     return rows

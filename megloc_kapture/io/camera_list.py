@@ -10,7 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
 from megloc_kapture.errors import DataError, require
-from megloc_kapture.io.files import check_relative, named, read_text
+from megloc_kapture.io.files import check_relative
+from megloc_kapture.io.text_lines import read_lines
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera
 
 _ROW = re.compile(
@@ -54,11 +55,9 @@ def read_cameras(path: Path) -> Camera | CameraList:
 def read_camera_rows(path: Path) -> dict[str, Camera]:
     """Read the cameras of a list by image name, in file order."""
     cameras: dict[str, Camera] = {}
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        with named(path, number):
-            row = _ROW.fullmatch(line.strip())
+    for line in read_lines(path, comments=True):
+        with line.named():
+            row = _ROW.fullmatch(line.text)
             if row is None:
                 raise DataError(
                     "expected a row NAME MODEL WIDTH HEIGHT PARAMS..., MODEL one of "

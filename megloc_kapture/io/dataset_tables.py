@@ -31,12 +31,11 @@ from megloc_kapture.io.csv_table import Column, ImageName, Table, flag
 from megloc_kapture.io.files import (
     ModelT,
     check_relative,
-    named,
     read_json_model,
-    read_text,
     write_bytes,
     write_json_model,
 )
+from megloc_kapture.io.text_lines import read_lines
 from megloc_kapture.values import Options, RigidTransform
 
 SIDE_TABLES = "megloc"
@@ -322,11 +321,9 @@ def read_nowhere(truth: Path | str) -> tuple[str, ...]:
     if not path.is_file():
         return ()
     names: set[str] = set()
-    for line, text in enumerate(read_text(path).splitlines(), start=1):
-        name = text.strip()
-        if name and not name.startswith("#"):
-            with named(path, line):
-                names.add(check_relative(name))
+    for line in read_lines(path, comments=True):
+        with line.named():
+            names.add(check_relative(line.text))
     return tuple(sorted(names))
 
 

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import TypeVar
 
 from megloc_kapture.datasets.official import Count, Missing
-from megloc_kapture.datasets.text_lines import Line, read_lines, read_rigid_matrix, shown
 from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.evaluation.pose_files import RelativePose
 from megloc_kapture.io.kapture.sensors import unit_quaternion
+from megloc_kapture.io.text_lines import Line, read_lines, read_rigid_matrix, shown
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA_FILES = ("undistorted_calib_0.txt", "undistorted_calib_1.txt")

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.official import Missing
-from megloc_kapture.datasets.text_lines import Line, read_lines
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import named
+from megloc_kapture.io.text_lines import Line, read_lines
 from megloc_kapture.values import RigidTransform
 
 FLOORS = ("DUC1", "DUC2")

@@ -14,9 +14,9 @@ import numpy as np
 
 from megloc_kapture.datasets.nvm import read_nvm
 from megloc_kapture.datasets.official import Missing
-from megloc_kapture.datasets.text_lines import Line, read_lines, shown
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import SparsePoints, colmap_model_files, read_colmap_model
+from megloc_kapture.io.text_lines import Line, read_lines, shown
 from megloc_kapture.values import RigidTransform
 
 CAMERAS = ("left", "rear", "right")

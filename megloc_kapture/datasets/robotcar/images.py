@@ -23,12 +23,12 @@ from megloc_kapture.datasets.robotcar import (
     read_intrinsics,
     read_test_names,
 )
-from megloc_kapture.datasets.text_lines import read_rigid_matrix
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.geometry.poses import rotation_angles_deg, stack_poses
 from megloc_kapture.io.files import named
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureData, Sensor
+from megloc_kapture.io.text_lines import read_rigid_matrix
 from megloc_kapture.values import Camera, RigidTransform
 
 RIG_ID = "car"

@@ -22,6 +22,7 @@ from megloc_kapture.io.files import (
     atomic_write,
     check_component,
     check_relative,
+    named,
     reading,
     write_bytes,
 )
@@ -216,13 +217,12 @@ def _integers(texts: Sequence[str]) -> NDArray[np.int64]:
 
 def _raise_for_line(path: Path, lines: Sequence[str], first: int) -> None:
     for number, line in enumerate(lines, first):
-        try:
-            _parse([line], _numbers(), _numbers())
-        except (ValueError, OverflowError) as error:
-            message = f"expected {OBSERVATIONS_HEADER.removeprefix('# ')}, ids from 0 on"
-            raise DataError(message, path=path, line=number) from error
-        except DataError as error:
-            raise DataError(error.message, path=path, line=number) from error
+        with named(path, number):
+            try:
+                _parse([line], _numbers(), _numbers())
+            except (ValueError, OverflowError) as error:
+                message = f"expected {OBSERVATIONS_HEADER.removeprefix('# ')}, ids from 0 on"
+                raise DataError(message) from error
 
 
 def write_observations(root: Path, observations: Mapping[str, Observations]) -> None:

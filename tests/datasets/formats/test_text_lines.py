@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from megloc_kapture.datasets.text_lines import read_lines, read_rigid_matrix
+from megloc_kapture.io.text_lines import read_lines, read_rigid_matrix
 
 
 @pytest.fixture
