@@ -18,7 +18,7 @@ from megloc_kapture.errors import (
     check_option,
     missing_extra,
 )
-from megloc_kapture.evaluation.pose_files import installed_version
+from megloc_kapture.evaluation.pose_files import PACKAGES, installed_version
 from megloc_kapture.evaluation.report.content import as_text
 from megloc_kapture.io.weights import (
     MissingWeightsError,
@@ -271,26 +271,13 @@ def _row(weights: Weights) -> dict[str, str]:
     }
 
 
-_PACKAGES = (
-    "megloc-kapture",
-    "kapture",
-    "numpy",
-    "scipy",
-    "opencv-python-headless",
-    "pycolmap",
-    "poselib",
-    "torch",
-    "numba",
-)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Doctor(Common):
     """Check the environment: versions, known-bad combinations, GPU, weights."""
 
     def run(self, console: Console) -> None:
         """Print the environment and exit with 2 if something is wrong."""
-        for package in _PACKAGES:
+        for package in (*PACKAGES, "kapture", "numba"):
             console.result(f"{package:24s}{installed_version(package) or 'not installed'}")
         console.result(f"{'GPU':24s}{gpu()}")
         console.result(f"{'weights':24s}{summary()}")

@@ -16,6 +16,7 @@ from megloc_kapture.errors import DataError, require
 from megloc_kapture.evaluation import pose_files
 from megloc_kapture.evaluation.pose_files import parse_pose, parse_timestamp
 from megloc_kapture.evaluation.protocols import PROTOCOLS, Benchmark, benchmark_of
+from megloc_kapture.evaluation.report.content import counted
 from megloc_kapture.geometry.conventions import CONVENTIONS, better_conventions
 from megloc_kapture.geometry.poses import camera_centers, rotation_matrices, stack_poses
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, PoseFileFormat, Protocol
@@ -96,9 +97,9 @@ class CheckReport:
         of_severity = Counter(finding.severity for finding in self.findings)
         outcome = "no problem found"
         if of_severity["error"]:
-            outcome = f"{_plural(of_severity['error'], 'problem')} found"
+            outcome = f"{counted(of_severity['error'], 'problem')} found"
         if of_severity["warning"]:
-            outcome += f", {_plural(of_severity['warning'], 'warning')}"
+            outcome += f", {counted(of_severity['warning'], 'warning')}"
         of = "" if self.expected is None else f" of {self.expected} queries"
         return [*shown, f"{self.poses} poses{of}: {outcome}"]
 
@@ -244,7 +245,7 @@ def _read_rows(
             problem("comment", "a comment; the format has none, and no header")
             continue
         if len(fields) != num_keys + 7:
-            message = f"{_plural(len(fields), 'column')} instead of {num_keys + 7} ({columns})"
+            message = f"{counted(len(fields), 'column')} instead of {num_keys + 7} ({columns})"
             problem("columns", message + "; separated by blanks, not commas" * ("," in line))
             if len(fields) < num_keys or "," in fields[0]:
                 continue
@@ -294,7 +295,7 @@ def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -
     if wrong:
         first = next(iter(wrong))
         message = (
-            f"{_plural(len(wrong), 'name')} other than in the challenge's list: {first} should be "
+            f"{counted(len(wrong), 'name')} other than in the challenge's list: {first} should be "
             f"{wrong[first]}"
         )
         only_endings = all(n.rpartition(".")[0] == r.rpartition(".")[0] for n, r in wrong.items())
@@ -367,7 +368,7 @@ def _check_poses(
 ) -> list[Finding]:
     map_poses, unit = list(reference.map_poses.values()), reference.world.unit
     if min(len(map_poses), len(poses)) < _MIN_POSES:
-        message = f"{_plural(len(poses), 'pose')} and {_plural(len(map_poses), 'map camera')}: too "
+        message = f"{counted(len(poses), 'pose')} and {counted(len(map_poses), 'map camera')}: too "
         return [Finding("note", "too-few", f"{message}few to compare")] if map_poses else []
     extent = float(np.ptp(_centers(map_poses), axis=0).max()) or 1.0
     # a wrong direction counts as much as a camera at the other end of the map
@@ -403,7 +404,7 @@ def _check_poses(
             f"convention explains it; is it another frame, or another scale? {shown}"
         )
         return [Finding("error", "far", message, names=far_names)]
-    message = f"{_plural(len(far), 'pose')} far from every map camera: {shown}"
+    message = f"{counted(len(far), 'pose')} far from every map camera: {shown}"
     return [Finding("warning", "far", message, names=far_names)]
 
 
@@ -437,11 +438,6 @@ def _not_checked(things: str, reference: Reference) -> Finding:
     return Finding("note", "not-checked", f"the {things} are not checked: {why}")
 
 
-def _plural(count: int, noun: str) -> str:
-    plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
-    return f"{count} {noun if count == 1 else plural}"
-
-
 def _some(names: Iterable[str]) -> str:
     listed = list(names)
     text = ", ".join(listed[:_NAMES_SHOWN])
@@ -449,5 +445,5 @@ def _some(names: Iterable[str]) -> str:
 
 
 def _about(severity: Severity, kind: str, names: Sequence[str], noun: str, what: str) -> Finding:
-    message = f"{_plural(len(names), noun)} {what}: {_some(names)}"
+    message = f"{counted(len(names), noun)} {what}: {_some(names)}"
     return Finding(severity, kind, message, names=tuple(names))

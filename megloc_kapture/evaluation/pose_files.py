@@ -304,7 +304,7 @@ def parse_timestamp(text: str) -> int:
 
 
 # what can change a pose or a figure of the report
-_PACKAGES = (
+PACKAGES = (
     "megloc-kapture",
     "numpy",
     "scipy",
@@ -325,7 +325,7 @@ def installed_version(package: str) -> str | None:
 
 
 def package_versions() -> dict[str, str]:
-    versions = {package: installed_version(package) for package in _PACKAGES}
+    versions = {package: installed_version(package) for package in PACKAGES}
     return {package: version for package, version in versions.items() if version is not None}
 
 
