@@ -31,13 +31,13 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 import megloc_kapture as megloc
-from megloc_kapture.evaluation.confidence import (
+from megloc_kapture.evaluation.metrics import (
     calibration_error,
+    confidence_interval,
     least_area,
     reliability,
     risk_by_score,
 )
-from megloc_kapture.evaluation.metrics import confidence_interval
 from megloc_kapture.geometry.cameras import principal_point_px, shift_principal_point
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder

@@ -42,8 +42,22 @@ def _rebuild_data_error(
     return kind(message, path=path, line=line)
 
 
+def require(
+    condition: object, message: str, *, path: Path | str | None = None, line: int | None = None
+) -> None:
+    """Raise DataError unless the condition is true; the message is formatted in any case."""
+    if not condition:
+        raise DataError(message, path=path, line=line)
+
+
 class OptionError(MeglocError):
     """An invalid option or argument; lists the valid values."""
+
+
+def check_option(condition: object, message: str) -> None:
+    """Raise OptionError unless the condition is true; the message is formatted in any case."""
+    if not condition:
+        raise OptionError(message)
 
 
 class OutputError(MeglocError):

@@ -8,7 +8,7 @@ part of a stage's fingerprint and manifest.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -357,10 +357,6 @@ class DatasetAdapter(Protocol):
 
     def check(self, root: Path) -> None:
         """Check quickly whether ``root`` can be this dataset; DataError if not."""
-        ...
-
-    def input_files(self, root: Path) -> Iterator[Path]:
-        """Yield every file that an import of ``root`` may depend on, including images; cheap."""
         ...
 
     def read(self, root: Path, *, allow_missing: bool = False) -> Any:

@@ -23,12 +23,12 @@ import numpy as np
 from timing import Timed, table
 
 from megloc_kapture.evaluation.check import check_submission, read_reference
+from megloc_kapture.evaluation.comparison import compare
 from megloc_kapture.evaluation.evaluate import evaluate_results
 from megloc_kapture.evaluation.pose_files import write_pose_file
 from megloc_kapture.evaluation.protocols import benchmark_of, protocol_of
 from megloc_kapture.evaluation.report.reports import report_text, write_report
 from megloc_kapture.evaluation.results import context_of
-from megloc_kapture.evaluation.statistics import compare
 from megloc_kapture.geometry.poses import unstack_poses
 from megloc_kapture.io.dataset_tables import ImageGroup, write_groups, write_names, write_protocol
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from datetime import timedelta
 from itertools import starmap
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import tyro
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.io.camera_list import CameraList, read_cameras
 from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
 from megloc_kapture.io.kapture import KaptureFolder
@@ -39,8 +39,7 @@ Input = Annotated[Path, tyro.conf.arg(aliases=["-i"])]
 Inputs = Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["-i"]), tyro.conf.UseAppendAction]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 Force = Annotated[
-    bool,
-    tyro.conf.arg(aliases=["-f"], help="Write into a folder that has other things in it."),
+    bool, tyro.conf.arg(aliases=["-f"], help="Write into a folder that has other things in it.")
 ]
 Overwrite = Annotated[bool, tyro.conf.arg(aliases=["-f"])]
 Folders = Annotated[tuple[Path, ...], tyro.conf.UseAppendAction]
@@ -76,14 +75,9 @@ class Console:
             yield from items
         elif self.terminal:
             from rich.console import Console as RichConsole
-            from rich.progress import Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+            from rich.progress import MofNCompleteColumn, Progress
 
-            class Rate(TaskProgressColumn):
-                def render(self, task: Any) -> Any:
-                    return self.render_speed(task.finished_speed or task.speed)
-
-            bar, of = Progress.get_default_columns()[1], TextColumn("{task.completed}/{task.total}")
-            columns = (TextColumn("{task.description}"), bar, of, Rate(), TimeRemainingColumn())
+            columns = (*Progress.get_default_columns(), MofNCompleteColumn())
             with Progress(*columns, console=RichConsole(stderr=True), transient=True) as progress:
                 yield from progress.track(items, total=total, description=f"  {label}")
         else:
@@ -100,8 +94,7 @@ class Console:
 
 def existing(folders: Sequence[Path]) -> tuple[Path, ...]:
     for folder in folders:
-        if not folder.is_dir():
-            raise DataError("no such folder", path=folder)
+        require(folder.is_dir(), "no such folder", path=folder)
     return tuple(folders)
 
 
@@ -109,16 +102,8 @@ def assigned_pairs(flag: str, texts: Sequence[str], takes: str) -> Iterator[tupl
     """Yield both sides of each ``A=B``, split at the last sign."""
     for text in texts:
         name, _, value = text.rpartition("=")
-        if not (name and value):
-            raise OptionError(f"{flag} takes {takes}, got {text!r}")
+        check_option(name and value, f"{flag} takes {takes}, got {text!r}")
         yield name, value
-
-
-def refuse_given(of: str, **flags: object) -> None:
-    """Raise OptionError if a flag of another mode is given."""
-    for name, value in flags.items():
-        if value is not None:
-            raise OptionError(f"--{name.replace('_', '-')} changes nothing: it is of {of}")
 
 
 def opened_map(path: Path, console: Console, *, force: bool = False) -> Path:

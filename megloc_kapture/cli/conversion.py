@@ -22,7 +22,6 @@ from megloc_kapture.cli.common import (
 from megloc_kapture.datasets.colmap_map import find_colmap
 from megloc_kapture.datasets.kapture_folders import QUERY
 from megloc_kapture.datasets.megadepth import MegaDepthOptions, import_megadepth
-from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.dataset_tables import NO_METRES, SIDE_TABLES
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.datasets import (
@@ -206,11 +205,6 @@ class View(Linked, Common):
         # slow import
         from megloc_kapture.evaluation.view import write_view
 
-        for path in (self.result, self.gt):
-            if path is not None and not path.exists():
-                raise DataError("no such file or folder", path=path)
-        if self.gt is not None and self.result is None:
-            raise OptionError("--gt needs a result to compare with it: megloc view MAP RESULT")
         folder = self.kapture(opened_map(self.map, console))
         left_out = write_view(self.output, folder, self.result, self.gt, force=self.force)
         if left_out:

@@ -21,7 +21,7 @@ from megloc_kapture.cli.common import (
     existing,
     side_tables_beside,
 )
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.io.output_folders import staged_output
 
 EVALUATION = "evaluation"
@@ -56,6 +56,7 @@ class Evaluate(Common):
 
     def run(self, console: Console) -> None:
         # slow import
+        from megloc_kapture.evaluation.comparison import compare
         from megloc_kapture.evaluation.evaluate import (
             benchmark_beside,
             evaluate_results,
@@ -64,7 +65,6 @@ class Evaluate(Common):
         from megloc_kapture.evaluation.metrics import Threshold
         from megloc_kapture.evaluation.report.reports import report_text, write_report
         from megloc_kapture.evaluation.scoring import Reported
-        from megloc_kapture.evaluation.statistics import compare
 
         self._check()
         benchmark = benchmark_beside(
@@ -92,14 +92,11 @@ class Evaluate(Common):
         console.result(report_text(found))
 
     def _check(self) -> None:
-        if not self.input:
-            raise OptionError("no result given; use -i")
+        check_option(self.input, "no result given; use -i")
         resolved = [path.resolve() for path in self.input]
         twice = next((p for p in self.input if resolved.count(p.resolve()) > 1), None)
-        if twice is not None:
-            raise OptionError(f"{twice} is given twice")
-        if self.align != "none" and self.gt is None:
-            raise OptionError("--align needs true poses (--gt)")
+        check_option(twice is None, f"{twice} is given twice")
+        check_option(self.align == "none" or self.gt is not None, "--align needs true poses (--gt)")
         existing([path for path in (self.side_tables, self.map) if path is not None])
 
 
@@ -196,8 +193,7 @@ class Check(Common):
         from megloc_kapture.pipeline.submission import check_dataset
 
         check_known(self.dataset)
-        if not self.file.exists():
-            raise DataError("no such file", path=self.file)
+        require(self.file.exists(), "no such file", path=self.file)
         data = self.data or self._workspace(console)
         reference = None if data is None else read_reference(data)
         if reference is not None and data is not None:

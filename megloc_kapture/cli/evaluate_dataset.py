@@ -9,19 +9,14 @@ from typing import Annotated
 import tyro
 
 from megloc_kapture.cli.common import Console, Deciding, Overwrite, Texts, Working
-from megloc_kapture.errors import OptionError
+from megloc_kapture.errors import OptionError, check_option
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.reports import AGREEMENT_TEXT, RECALL_TEXT, REPORT_HTML
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.tables import STATUS_FILE, read_status
 from megloc_kapture.localization.focal_length import misfits_text
 from megloc_kapture.pipeline.datasets import BenchmarkFile, DatasetChoice
-from megloc_kapture.pipeline.evaluation_plan import (
-    explain,
-    explained,
-    plan_evaluation,
-    recall_rows,
-)
+from megloc_kapture.pipeline.evaluation_plan import explain, explained, plan_evaluation, recall_rows
 from megloc_kapture.pipeline.plan import all_kept, run_plan
 from megloc_kapture.pipeline.presets import assigned
 from megloc_kapture.pipeline.run import choose_run
@@ -136,8 +131,9 @@ class Eval(Deciding, Working):
             return
         if self.until not in (None, "evaluation"):
             raise OptionError(f"--fail-below needs stage evaluation; --until {self.until} skips it")
-        if not choice.has_truth():
-            raise OptionError(f"--fail-below needs true poses: {choice.root}/query_gt is missing")
+        check_option(
+            choice.has_truth(), f"--fail-below needs true poses: {choice.root}/query_gt is missing"
+        )
 
     def _hand_in(self, console: Console, pose_file: Path, submissions: Path | None) -> None:
         if submissions is not None:

@@ -28,7 +28,7 @@ from megloc_kapture.cli.common import (
     opened_map,
 )
 from megloc_kapture.datasets.kapture_folders import is_kapture
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.io.dataset_tables import METRES
 from megloc_kapture.io.files import read_text
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
@@ -133,14 +133,15 @@ class Localize(Reading, Deciding, Common):
     def _check_queries(self) -> None:
         if (self.query is None) == (not self.images):
             raise OptionError("give the queries: either --query, a kapture folder, or --images")
-        if self.query is not None and self.query.is_file():
-            raise OptionError(
-                f"--query {self.query}: takes a kapture folder; a list of cameras goes to "
-                "--camera, the images to --images"
-            )
+        check_option(
+            self.query is None or not self.query.is_file(),
+            f"--query {self.query}: takes a kapture folder; a list of cameras goes to "
+            "--camera, the images to --images",
+        )
         for path in self.images:
-            if is_kapture(path):
-                raise OptionError(f"--images {path}: a kapture folder; give it by --query")
+            check_option(
+                not is_kapture(path), f"--images {path}: a kapture folder; give it by --query"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,10 +205,11 @@ class Serve(Reading, Deciding, Common):
 def _read_token(path: Path) -> str:
     """Read a token of one line of printable ASCII."""
     token = read_text(path).strip()
-    if len(token) < _MIN_TOKEN_LENGTH or not token.isascii() or not token.isprintable():
-        raise DataError(
-            f"a token is one line of {_MIN_TOKEN_LENGTH} or more printable characters", path=path
-        )
+    require(
+        len(token) >= _MIN_TOKEN_LENGTH and token.isascii() and token.isprintable(),
+        f"a token is one line of {_MIN_TOKEN_LENGTH} or more printable characters",
+        path=path,
+    )
     return token
 
 

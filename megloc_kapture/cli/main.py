@@ -13,30 +13,15 @@ import sys
 import traceback
 from collections.abc import Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Protocol
+from typing import Annotated, Any, NoReturn
 
 from megloc_kapture.errors import MeglocError, OptionError, missing_extra, suggestion
-
-if TYPE_CHECKING:
-    from megloc_kapture.cli.common import Console
 
 DONE, DEFECT, USER_ERROR, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
 
 class Terminated(BaseException):
     """SIGTERM asks the process to end."""
-
-
-class Command(Protocol):
-    """A command: its flags are its fields."""
-
-    debug: bool
-
-    def console(self) -> Console: ...
-
-    def run(self, console: Console) -> int | None:
-        """Run the command; return the exit status, or None for success."""
-        ...
 
 
 # name, module:class and first help line, so that only the requested command is imported
@@ -152,7 +137,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sys.exit(DONE)
         import tyro
 
-        command: Command = tyro.cli(
+        command = tyro.cli(
             _parser(given), args=given, prog="megloc", config=(tyro.conf.OmitArgPrefixes,)
         )
         debug = command.debug

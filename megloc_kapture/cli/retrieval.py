@@ -9,7 +9,7 @@ from typing import Literal
 
 from megloc_kapture.cli.common import Console, Folders, Force, Input, Output, Overwrite, Reading
 from megloc_kapture.cli.stages import FEATURES, StageCommand, only_type, restrictions_beside
-from megloc_kapture.errors import OptionError
+from megloc_kapture.errors import OptionError, check_option
 from megloc_kapture.io.kapture import KaptureFolder, write_pairs
 from megloc_kapture.retrieval.fusion import FusionMethod
 from megloc_kapture.stages.candidates import Retrieval
@@ -178,11 +178,11 @@ class PairsQuery(Reading, StageCommand):
     def _types_of_both(self, mapping: KaptureFolder, query: KaptureFolder) -> list[str]:
         both = set(mapping.types("descriptors")) & set(query.types("descriptors"))
         asked = self.local_features or sorted(both)
-        if not asked:
-            raise OptionError(
-                f"{query.root}: no local features that the map has as well; give their folder "
-                "with --features-dir"
-            )
+        check_option(
+            asked,
+            f"{query.root}: no local features that the map has as well; give their folder "
+            "with --features-dir",
+        )
         return [only_type(mapping, "descriptors", one) for one in asked]
 
 
@@ -205,5 +205,4 @@ def _retrieval(
 
 
 def _refuse_existing(path: Path, *, force: bool) -> None:
-    if path.exists() and not force:
-        raise OptionError(f"{path} exists; -f overwrites it")
+    check_option(not path.exists() or force, f"{path} exists; -f overwrites it")

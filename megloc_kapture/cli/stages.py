@@ -32,7 +32,7 @@ from megloc_kapture.cli.common import (
     existing,
     side_tables_beside,
 )
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import OptionError, check_option, require
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.matching.verification import KnownPoseOptions
 from megloc_kapture.pipeline.plan import run_plan
@@ -114,8 +114,7 @@ class ExtractLocal(Linked, StageCommand):
     force: Force = False
 
     def run(self, console: Console) -> None:
-        if not self.input:
-            raise OptionError("no kapture folder given; use -i")
+        check_option(self.input, "no kapture folder given; use -i")
         folders = [self.kapture_map(path) for path in self.input]
         options = self.options(self.named("local_features", self.features))
         extractors = options.make_extractors()
@@ -219,10 +218,8 @@ def _read_pairs_of(path: Path, first: KaptureFolder, second: KaptureFolder) -> l
     pairs = read_pairs(path)
     known_first, known_second = (set(one.read().image_names()) for one in (first, second))
     for pair in pairs:
-        if pair.query not in known_first:
-            raise DataError(f"no image {pair.query} in {first.root}", path=path)
-        if pair.map not in known_second:
-            raise DataError(f"no image {pair.map} in {second.root}", path=path)
+        require(pair.query in known_first, f"no image {pair.query} in {first.root}", path=path)
+        require(pair.map in known_second, f"no image {pair.map} in {second.root}", path=path)
     return pairs
 
 
@@ -237,8 +234,9 @@ class OutsideStage(Working):
 
     def run(self, console: Console) -> None:
         stage = load_plugin(STAGES, self.stage, assigned(self.set))
-        if not (self.workspace / "stages").is_dir():
-            raise OptionError(f"{self.workspace} is no workspace of megloc eval")
+        check_option(
+            (self.workspace / "stages").is_dir(), f"{self.workspace} is no workspace of megloc eval"
+        )
         workspace = Workspace(self.workspace)
         with self.working_in(workspace) as work:
             run_plan([stage], workspace, work, say=console.say)

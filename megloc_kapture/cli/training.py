@@ -21,9 +21,8 @@ from megloc_kapture.cli.common import (
     Texts,
     Working,
     camera_of_text,
-    refuse_given,
 )
-from megloc_kapture.errors import DataError, OptionError, OutputError
+from megloc_kapture.errors import DataError, OptionError, OutputError, check_option, require
 from megloc_kapture.io.images import WRITABLE_SUFFIXES
 from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.pipeline.executors import single_threaded
@@ -146,7 +145,7 @@ class TrainField(Linked, Common):
             )
 
         mapping, state = self.kapture_map(self.input), self.output / STATE_FILE
-        claim = claim_folder(self.output, kind=FIELD, force=self.force)
+        undo_claim = claim_folder(self.output, kind=FIELD, force=self.force)
         try:
             if self.force:
                 remove(state)
@@ -154,7 +153,7 @@ class TrainField(Linked, Common):
                 psnr_db = train_field_of_map(mapping, self.output, options, progress=progress)
         except BaseException:
             if not state.exists():
-                claim.undo()
+                undo_claim()
             raise
         mean = f"{sum(psnr_db.values()) / len(psnr_db):.1f} dB" if psnr_db else "none held out"
         console.result(f"{self.output}: PSNR of {len(psnr_db)} held-out images: {mean}")
@@ -193,17 +192,13 @@ class Render(Linked, Working):
             raise OptionError("say what to render: --pose and --camera, --along or --between")
         many = self.along or self.between
         if many is None:
-            others = {"workers": self.workers, "scheduler": self.scheduler}
-            refuse_given("--along and --between", max_side=self.max_side, **others)
             self._render_one()
             console.result(f"rendered: {self.output}")
             return
         if self.max_side is not None and self.max_side < 1:
             raise OptionError(f"--max-side {self.max_side} is not positive")
-        refuse_given("--pose", camera=self.camera, depth=self.depth)
         data = self.kapture_map(many).read()
-        if not data.poses():
-            raise DataError("no image here has a pose", path=many)
+        require(data.poses(), "no image here has a pose", path=many)
         with self.staged(self.output, RENDERED, force=self.force) as (out, work):
             count = render_along(
                 self.field,
@@ -231,8 +226,9 @@ class Render(Linked, Working):
         if self.depth is not None:
             endings.append((self.depth, (".png",)))
         for path, known in endings:
-            if path.suffix.lower() not in known:
-                raise OptionError(f"{path}: the file must end in {' or '.join(known)}")
+            check_option(
+                path.suffix.lower() in known, f"{path}: the file must end in {' or '.join(known)}"
+            )
             if path.exists() and not self.force:
                 raise OutputError(f"{path}: stands there; -f replaces it")
         with single_threaded():

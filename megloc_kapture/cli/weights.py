@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -16,15 +15,20 @@ from megloc_kapture.errors import (
     MeglocError,
     OptionError,
     OutputError,
+    check_option,
     missing_extra,
 )
-from megloc_kapture.evaluation.pose_files import installed_version
+from megloc_kapture.evaluation.pose_files import PACKAGES, installed_version
+from megloc_kapture.evaluation.report.content import as_text
 from megloc_kapture.io.weights import (
     MissingWeightsError,
     PublishedFile,
     Weights,
     WeightsFile,
+    add_weights,
+    convert_weights,
     describe,
+    fetch,
     files_of,
     how_to_convert,
     how_to_get,
@@ -35,17 +39,9 @@ from megloc_kapture.io.weights import (
     to_convert,
     weights_folder,
 )
-from megloc_kapture.io.weights.adding import add_weights, convert_weights, fetch, prove
 from megloc_kapture.pipeline.presets import check_weights, options_of_preset
 
-if TYPE_CHECKING:
-    from rich.progress import Progress
-
 WRONG_FILES = 2
-
-
-class LicenceError(MeglocError):
-    """Weights under a licence that was not agreed to."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,12 +49,9 @@ class List(Common):
     """List all networks: file, size, licence, whether it is there and its sha256 known."""
 
     def run(self, console: Console) -> None:
-        rows: list[tuple[str, ...]] = [
-            ("name", "what for", "file", "size", "licence", "state", "sha256")
-        ]
-        rows += [_row(weights) for weights in registry().values()]
-        for line in _aligned(rows):
-            console.result(line)
+        import pandas as pd  # slow import
+
+        console.result(as_text(pd.DataFrame([_row(weights) for weights in registry().values()])))
         console.result(f"\nfolder of weights: {weights_folder()}")
         console.result("(!) megloc weights fetch asks for consent: --accept-licence")
         console.result("* not confirmed on the original file:")
@@ -92,7 +85,7 @@ class Fetch(Common):
         for name in names:
             try:
                 wanted.append(_fetchable(lookup(name), self.accept_licence))
-            except (MissingWeightsError, LicenceError) as error:
+            except (MissingWeightsError, OptionError) as error:
                 if self.preset is None:
                     raise
                 refused.append(str(error))
@@ -112,9 +105,7 @@ class Fetch(Common):
 
         console.say(f"{weights.name}: {url}")
         console.say(f"  licence: {weights.licence}: {weights.terms}")
-        with _progress(console) as progress:
-            bar = _Bar(progress, f"  {file.name}")
-            fetch(url, place, sha256=file.sha256, progress=bar)
+        fetch(url, place, sha256=file.sha256, track=console.track)
         state = "sha256 right"
         if file.sha256 is None:
             found = describe(weights.name, place)
@@ -216,37 +207,6 @@ def _missing(preset: str) -> tuple[str, ...]:
     return ()
 
 
-def _progress(console: Console) -> Progress:
-    from rich.console import Console as RichConsole
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
-
-    columns = TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn()
-    hidden = console.quiet or not console.terminal
-    return Progress(*columns, console=RichConsole(stderr=True), transient=True, disable=hidden)
-
-
-class _Bar:
-    """A bar of rich with the part of tqdm's interface that pooch uses."""
-
-    def __init__(self, progress: Progress, label: str) -> None:
-        self._progress, self._task = progress, progress.add_task(label, total=None)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name == "total":
-            self._progress.update(self._task, total=value)
-        else:
-            super().__setattr__(name, value)
-
-    def update(self, size: int) -> None:
-        self._progress.advance(self._task, size)
-
-    def reset(self) -> None:
-        self._progress.reset(self._task)
-
-    def close(self) -> None:
-        self._progress.stop_task(self._task)
-
-
 def _say_to_convert(console: Console, weights: Weights, file: PublishedFile, place: Path) -> None:
     if file.convert and next(files_of(weights), None) is None:
         console.result(f"{weights.name}: convert it once: {how_to_convert(weights, place)}")
@@ -259,11 +219,11 @@ def _fetchable(weights: Weights, accepted: bool) -> tuple[Weights, PublishedFile
             f"{weights.name} cannot be fetched by a program: download it from {weights.page} and "
             "run: megloc weights add FILE"
         )
-    if not (weights.commercial or accepted):
-        raise LicenceError(
-            f"{weights.name} has a licence to agree to: {weights.licence}: {weights.terms} "
-            f"(whole text at {weights.page}); if you do, add --accept-licence"
-        )
+    check_option(
+        weights.commercial or accepted,
+        f"{weights.name} has a licence to agree to: {weights.licence}: {weights.terms} "
+        f"(whole text at {weights.page}); if you do, add --accept-licence",
+    )
     return weights, file, file.url
 
 
@@ -277,7 +237,7 @@ def _wrong(console: Console, weights: Weights) -> int:
     for path in paths:
         file = describe(weights.name, path)
         try:
-            prove(file, file.published, weights)
+            read_weights(file)
             console.result(f"{weights.name}: {path} ({_trust(file)})")
         except MeglocError as error:
             wrong += 1
@@ -297,35 +257,18 @@ def _state(weights: Weights) -> str:
     return "to convert" if to_convert(weights) else "missing"
 
 
-def _row(weights: Weights) -> tuple[str, ...]:
+def _row(weights: Weights) -> dict[str, str]:
     there = [describe(weights.name, path).published for path in files_of(weights)]
     file = next((one for one in weights.files if one in there), weights.files[0])
-    size = "?" if file.size is None else f"{file.size / 1e6:.2f} MB"
-    name = f"{weights.name} *" if weights.unverified else weights.name
-    licence = weights.licence if weights.commercial else f"{weights.licence} (!)"
-    known = "known" if file.sha256 else "not known"
-    names = " | ".join(f.name for f in weights.files)
-    return name, weights.purpose, names, size, licence, _state(weights), known
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        yield "  ".join(cells).rstrip()
-
-
-_PACKAGES = (
-    "megloc-kapture",
-    "kapture",
-    "numpy",
-    "scipy",
-    "opencv-python-headless",
-    "pycolmap",
-    "poselib",
-    "torch",
-    "numba",
-)
+    return {
+        "name": f"{weights.name} *" if weights.unverified else weights.name,
+        "what for": weights.purpose,
+        "file": " | ".join(f.name for f in weights.files),
+        "size": "?" if file.size is None else f"{file.size / 1e6:.2f} MB",
+        "licence": weights.licence if weights.commercial else f"{weights.licence} (!)",
+        "state": _state(weights),
+        "sha256": "known" if file.sha256 else "not known",
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -334,7 +277,7 @@ class Doctor(Common):
 
     def run(self, console: Console) -> None:
         """Print the environment and exit with 2 if something is wrong."""
-        for package in _PACKAGES:
+        for package in (*PACKAGES, "kapture", "numba"):
             console.result(f"{package:24s}{installed_version(package) or 'not installed'}")
         console.result(f"{'GPU':24s}{gpu()}")
         console.result(f"{'weights':24s}{summary()}")

@@ -14,14 +14,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
-from megloc_kapture.datasets.kapture_folders import (
-    cameras_of_images,
-    is_kapture,
-    warn_of_scaled,
-)
-from megloc_kapture.datasets.reference_map import write_reference_map
-from megloc_kapture.errors import DataError
+from megloc_kapture.datasets.kapture_folders import cameras_of_images, is_kapture, warn_of_scaled
+from megloc_kapture.datasets.reference_map import ColmapDatabase, write_reference_map
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import (
     BINARY_FILES,
     TEXT_FILES,
@@ -79,20 +74,18 @@ def find_colmap(
     also lie next to the model. Arguments ``images`` and ``database`` replace the search.
     """
     models = _models(path)
-    if not models:
-        raise DataError(
-            f"no COLMAP model: neither {BINARY_FILES[1]} nor {TEXT_FILES[1]} is here, in sparse/ "
-            "or in sparse/0",
-            path=path,
-        )
+    require(
+        models,
+        f"no COLMAP model: neither {BINARY_FILES[1]} nor {TEXT_FILES[1]} is here, in sparse/ "
+        "or in sparse/0",
+        path=path,
+    )
     if len(models) > 1:
         choices = ", ".join(str(model.relative_to(path)) for model in models)
         raise DataError(f"there are several models, give one of them: {choices}", path=path)
     model = models[0]
-    if images is not None and not images.is_dir():
-        raise DataError("no such folder of images", path=images)
-    if database is not None and not database.is_file():
-        raise DataError("no such database", path=database)
+    require(images is None or images.is_dir(), "no such folder of images", path=images)
+    require(database is None or database.is_file(), "no such database", path=database)
     around = [Path(os.path.abspath(model))]
     around += around[0].parents[: 2 if around[0].parent.name == SPARSE else 1]
     found_images = (folder / IMAGES for folder in around if (folder / IMAGES).is_dir())
@@ -191,29 +184,27 @@ class ColmapReconstruction:
         if source.database is not None:
             with ColmapDatabase(source.database) as opened:
                 found = opened.feature_type()
-                local_type = None if found is None else found.name
-        if local_type is None and source.images is None:
-            raise DataError(
-                "there are no descriptors to match queries with: `megloc import colmap` takes the "
-                "database that the model was made of (--database), or the images to extract them "
-                "from (--images)",
-                path=source.model,
-            )
+                local_type = None if found is None else found[0]
+        require(
+            local_type is not None or source.images is not None,
+            "there are no descriptors to match queries with: `megloc import colmap` takes the "
+            "database that the model was made of (--database), or the images to extract them "
+            "from (--images)",
+            path=source.model,
+        )
         if not len(self.model.points):
             raise OtherFeaturesError("the model has no points", path=source.model)
         if local_type is None:
             return self._write_with_sift(output, work)
         counts = self._write_reference(
-            output,
-            keypoints_type=local_type,
-            database=source.database,
-            database_names=self.renamed,
+            output, keypoints_type=local_type, database=source.database, database_names=self.renamed
         )
         folder = KaptureFolder(output)
         descriptors = folder.descriptors(local_type)
         for image in folder.keypoints(local_type).names:
-            if image not in descriptors:
-                raise DataError(f"image {image!r} has no descriptors", path=source.database)
+            require(
+                image in descriptors, f"image {image!r} has no descriptors", path=source.database
+            )
         return counts
 
     def _write_with_sift(self, output: Path, work: Work) -> dict[str, float]:

@@ -9,16 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.dataset_tables import (
-    GROUPS_FILE,
-    NAMES_FILE,
-    NOWHERE_FILE,
-    PRIORS_FILE,
-    PROTOCOL_FILE,
-    RELOCALIZATION_FILE,
     SIDE_TABLES,
-    WORLD_FILE,
     ImageGroup,
     Protocol,
     SideTables,
@@ -32,6 +25,7 @@ from megloc_kapture.io.files import check_relative, link_images
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
+from megloc_kapture.io.output_folders import files_below
 from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -49,50 +43,21 @@ def is_kapture(folder: Path) -> bool:
 def check_root(root: Path) -> Path:
     """Check that ``root`` has a mapping/ and a query/ kapture, and return it."""
     root = Path(root)
-    if not root.is_dir():
-        raise DataError("no such folder", path=root)
+    require(root.is_dir(), "no such folder", path=root)
     for part in (MAPPING, QUERY):
-        try:  # in Python 3.14 is_file() reports unreadable files as missing
-            (root / part / _SENSORS).stat()
-        except (FileNotFoundError, NotADirectoryError) as error:
-            raise DataError(
-                f"{part}/{_SENSORS} is missing; a dataset of kapture folders has "
-                "mapping/ and query/, and query_gt/ where the true poses are known",
-                path=root,
-            ) from error
+        require(
+            is_kapture(root / part),
+            f"{part}/{_SENSORS} is missing; a dataset of kapture folders has mapping/ and query/, "
+            "and query_gt/ where the true poses are known",
+            path=root,
+        )
     return root
 
 
 def input_files(root: Path) -> Iterator[Path]:
-    """Yield every file that an import depends on."""
-    for part in (MAPPING, QUERY, QUERY_GT):
-        folder = KaptureFolder(root / part)
-        if (folder.root / "sensors").is_dir():
-            files = files_of(folder, images=part != QUERY_GT)
-            # queries without image fail later, see stages/localized_folder.py
-            yield from (path for path in files if part != QUERY or path.is_file())
-    if (nowhere := root / QUERY_GT / NOWHERE_FILE).is_file():
-        yield nowhere
-    tables = (GROUPS_FILE, PRIORS_FILE, PROTOCOL_FILE, WORLD_FILE, NAMES_FILE, RELOCALIZATION_FILE)
-    for name in tables:
-        if (table := root / SIDE_TABLES / name).is_file():
-            yield table
-
-
-def files_of(folder: KaptureFolder, *, images: bool = True) -> Iterator[Path]:
-    """Yield every file of a kapture folder; ``images`` includes masks and depth."""
-    sensors = folder.root / "sensors"
-    yield from sorted(sensors.glob("*.txt"))
-    if not images:
-        return
-    for name in folder.read().records_depth.values():
-        if folder.depth_path(name).is_file():
-            yield folder.depth_path(name)
-    for image in folder.read().image_names():
-        yield folder.image_path(image)
-        mask = sensors / "masks" / f"{image}.png"
-        if mask.is_file():
-            yield mask
+    """Yield every file that an import of kapture folders depends on."""
+    parts = [root / part / "sensors" for part in (MAPPING, QUERY)]
+    yield from files_below(*parts, root / QUERY_GT, root / SIDE_TABLES)
 
 
 def tell_of_truth_without_query(folder: Path, images: Sequence[str]) -> None:
@@ -110,8 +75,7 @@ def checked_folders(
     map_data, query_data = with_cameras_of_images(mapping), with_cameras_of_images(query)
     check_images(mapping, map_data)
     _map_poses(mapping)
-    if not query_data.records_camera:
-        raise DataError("there are no query images", path=query.root)
+    require(query_data.records_camera, "there are no query images", path=query.root)
     renamed = map(prefixed(query_prefix), query_data.image_names())
     shared = sorted(set(map_data.image_names()) & set(renamed))
     if shared:
@@ -177,9 +141,7 @@ def import_mapping(mapping: KaptureFolder, output: Path) -> dict[str, float]:
 
 
 def mapping_files(mapping: KaptureFolder) -> Iterator[Path]:
-    yield from files_of(mapping)
-    if (groups := _tables_beside(mapping) / GROUPS_FILE).is_file():
-        yield groups
+    yield from files_below(mapping.root / "sensors", _tables_beside(mapping))
 
 
 def _tables_beside(mapping: KaptureFolder) -> Path:
@@ -188,8 +150,7 @@ def _tables_beside(mapping: KaptureFolder) -> Path:
 
 def _map_poses(mapping: KaptureFolder) -> dict[str, RigidTransform]:
     poses = mapping.read().poses()
-    if not poses:
-        raise DataError("no mapping image has a pose", path=mapping.root)
+    require(poses, "no mapping image has a pose", path=mapping.root)
     return poses
 
 

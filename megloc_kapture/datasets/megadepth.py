@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import read_colmap_model
 from megloc_kapture.io.files import check_component, link_records, safe_join
 from megloc_kapture.io.images import image_size, write_depth_map
@@ -58,14 +58,12 @@ def import_megadepth(
     """Write ``output/SCENE`` of each scene; images without metric depth are omitted."""
     options = options or MegaDepthOptions()
     scenes = [check_component(name) for name in options.scenes] or _scenes(root)
-    if not scenes:
-        raise DataError(f"neither {_UNDISTORTED}/SCENE nor {_SCENE_INFO}/SCENE.npz", path=root)
+    require(scenes, f"neither {_UNDISTORTED}/SCENE nor {_SCENE_INFO}/SCENE.npz", path=root)
     counts = {"scenes": 0, "images": 0, "without_depth": 0}
     for scene in scenes:
         images = list(_images(root, scene))
         written = _write_scene(output / scene, work.track(images, len(images), scene))
-        if not written:
-            raise DataError(f"scene {scene} has no image that is there with its depth", path=root)
+        require(written, f"scene {scene} has no image that is there with its depth", path=root)
         counts["scenes"] += 1
         counts["images"] += written
         counts["without_depth"] += len(images) - written
@@ -134,7 +132,8 @@ def _of_table(root: Path, scene: str, table: Path) -> Iterator[_Image]:
         ) from error
     shapes = [(len(images), *shape) for shape in ((), (3, 3), (4, 4))]
     for name, array, shape in zip(_ARRAYS, (images, intrinsics, poses), shapes, strict=True):
-        if array.shape != shape or array.dtype.kind not in ("U" if array is images else "fiu"):
+        kinds = "U" if array is images else "fiu"
+        if array.shape != shape or array.dtype.kind not in kinds:
             raise DataError(f"{name} is {array.dtype} {array.shape}, expected {shape}", path=table)
     for row in np.argsort(images):
         path = safe_join(root, str(images[row]))
@@ -154,8 +153,7 @@ def _write_scene(output: Path, images: Sequence[_Image] | Iterator[_Image]) -> i
         if depth_m is None:
             continue
         name = f"images/{image.path.name}"
-        if name in links:
-            raise DataError("the scene has two images of this name", path=image.path)
+        require(name not in links, "the scene has two images of this name", path=image.path)
         links[name] = image.path
         sensor, depth_sensor, rig = f"{number}", f"{number}_depth", f"{number}_rig"
         depth_camera = scaled_camera(image.camera, depth_m.shape[1], depth_m.shape[0])

@@ -6,7 +6,7 @@ optional ``reference/`` (the dataset's model); images are linked.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
@@ -14,10 +14,12 @@ from megloc_kapture.datasets.kapture_folders import (
     MAPPING,
     QUERY,
     QUERY_GT,
+    check_image_size,
+    is_kapture,
     tell_of_truth_without_query,
 )
 from megloc_kapture.datasets.reference_map import ReferenceModel, write_reference_map
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.io.dataset_tables import (
     SIDE_TABLES,
     ImageGroup,
@@ -28,7 +30,7 @@ from megloc_kapture.io.dataset_tables import (
 )
 from megloc_kapture.io.files import link_records
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
-from megloc_kapture.values import Options, RigidTransform
+from megloc_kapture.values import Camera, Options, RigidTransform
 
 GROUND_TRUTH = "ground_truth"
 REFERENCE = "reference"
@@ -134,8 +136,9 @@ def check_official(dataset: OfficialDataset, *, allow_missing: bool = False) -> 
     root = dataset.missing.root if dataset.missing is not None else None
     if not dataset.mapping.records_camera or not dataset.mapping.trajectories:
         raise DataError("no mapping image with a pose is left to import", path=root)
-    if not dataset.query.records_camera and not allow_missing:
-        raise DataError("no query image is left to import", path=root)
+    require(
+        dataset.query.records_camera or allow_missing, "no query image is left to import", path=root
+    )
     shared = set(dataset.mapping.image_names()) & set(dataset.query.image_names())
     if shared:
         raise DataError(f"image {min(shared)!r} is in the map and a query", path=root)
@@ -164,12 +167,6 @@ def write_official(dataset: OfficialDataset, output: Path, *, allow_missing: boo
         )
     if dataset.write_more is not None:
         dataset.write_more(output)
-
-
-def ground_truth_files(root: Path) -> Iterator[Path]:
-    folder = root / GROUND_TRUTH
-    yield from sorted((folder / QUERY / "sensors").glob("*.txt"))
-    yield from sorted((folder / SIDE_TABLES).glob("*.csv"))
 
 
 def read_ground_truth(
@@ -202,3 +199,91 @@ def with_poses(data: KaptureData, poses: Mapping[tuple[int, str], RigidTransform
 
 def last_part(image: str) -> str:
     return PurePosixPath(image).name
+
+
+# kapture's guide to converting Aachen puts the folders next to the official files
+_PARENTS = (".", "kapture")
+_FOLDERS = ("mapping", "query_day", "query_night", "query")
+_FOLDERS_OF_LOCATIONS = ("[0-9][0-9]/mapping", "[0-9][0-9]/query")
+
+
+@dataclass(frozen=True, slots=True)
+class KaptureImage:
+    """An image with its kapture data; ``locations`` are ``001`` and so on."""
+
+    name: str
+    file: Path
+    timestamp: int
+    sensor_id: str
+    camera: Camera
+    cam_from_world: RigidTransform | None
+    is_query: bool
+    locations: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class KaptureForm:
+    """The kapture folders of a dataset, the map's first."""
+
+    root: Path
+    folders: tuple[Path, ...]
+
+    @classmethod
+    def find(cls, root: Path, *, with_locations: bool = False) -> KaptureForm | None:
+        """Find the folders below a root; return None without a map."""
+        patterns = _FOLDERS_OF_LOCATIONS if with_locations else _FOLDERS
+        for parent in (Path(root) / name for name in _PARENTS):
+            found = [
+                [one for one in sorted(parent.glob(pattern)) if is_kapture(one)]
+                for pattern in patterns
+            ]
+            if found[0]:
+                return cls(parent, tuple(one for folders in found for one in folders))
+        return None
+
+    def read(self, missing: Missing) -> list[KaptureImage]:
+        """Read the existing images by folder and time; check one image size per camera."""
+        images: dict[str, KaptureImage] = {}
+        for path in self.folders:
+            folder = KaptureFolder(path)
+            data = folder.read()
+            number = path.parent.name
+            locations = (f"{int(number):03d}",) if number.isdecimal() else ()
+            checked: set[str] = set()
+            for (timestamp, sensor_id), name in sorted(data.records_camera.items()):
+                if (known := images.get(name)) is not None:
+                    both = tuple(dict.fromkeys((*known.locations, *locations)))
+                    images[name] = replace(known, locations=both)
+                    continue
+                file, camera = folder.image_path(name), data.camera_of(name)
+                if not missing.require(file):
+                    continue
+                if sensor_id not in checked:
+                    check_image_size(file, camera)
+                    checked.add(sensor_id)
+                pose = data.device_from_world(timestamp, sensor_id)
+                images[name] = KaptureImage(
+                    name,
+                    file,
+                    timestamp,
+                    sensor_id,
+                    camera,
+                    pose,
+                    path.name != "mapping",
+                    locations,
+                )
+        return list(images.values())
+
+    def rig(self) -> dict[str, RigidTransform]:
+        """Return ``sensor_from_rig`` by sensor id; the first folder wins."""
+        found: dict[str, RigidTransform] = {}
+        for path in self.folders:
+            for members in KaptureFolder(path).read().rigs.values():
+                found = {**members, **found}
+        return found
+
+    def without_model(self) -> OptionError:
+        return OptionError(
+            f"the reference model is read from the official layout, and {self.root} has kapture "
+            "folders; megloc localize localizes in a kapture map"
+        )

@@ -6,16 +6,17 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.evaluation import pose_files
 from megloc_kapture.evaluation.pose_files import parse_pose, parse_timestamp
 from megloc_kapture.evaluation.protocols import PROTOCOLS, Benchmark, benchmark_of
+from megloc_kapture.evaluation.report.content import counted
 from megloc_kapture.geometry.conventions import CONVENTIONS, better_conventions
 from megloc_kapture.geometry.poses import camera_centers, rotation_matrices, stack_poses
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, PoseFileFormat, Protocol
@@ -96,9 +97,9 @@ class CheckReport:
         of_severity = Counter(finding.severity for finding in self.findings)
         outcome = "no problem found"
         if of_severity["error"]:
-            outcome = f"{_plural(of_severity['error'], 'problem')} found"
+            outcome = f"{counted(of_severity['error'], 'problem')} found"
         if of_severity["warning"]:
-            outcome += f", {_plural(of_severity['warning'], 'warning')}"
+            outcome += f", {counted(of_severity['warning'], 'warning')}"
         of = "" if self.expected is None else f" of {self.expected} queries"
         return [*shown, f"{self.poses} poses{of}: {outcome}"]
 
@@ -127,10 +128,11 @@ def read_reference(folder: Path) -> Reference:
         KaptureFolder(path) if (path / "sensors" / "sensors.txt").is_file() else None
         for path in (folder / "mapping", folder / "query")
     )
-    if mapping is None and query is None and not tables.is_dir():
-        raise DataError(
-            "no imported dataset: it has none of mapping/, query/ and megloc/", path=folder
-        )
+    require(
+        mapping is not None or query is not None or tables.is_dir(),
+        "no imported dataset: it has none of mapping/, query/ and megloc/",
+        path=folder,
+    )
     rules = benchmark_of(tables)
     queries = frozenset() if query is None else frozenset(query.read().image_names())
     names = rules.names or pose_files.names_in_pose_file(
@@ -173,16 +175,15 @@ def check_submission(
 
 
 def _check_file(path: Path, dataset: str, reference: Reference) -> tuple[int, list[Finding]]:
-    if path.is_dir():
-        raise DataError("a folder; the pose file of this challenge is one file", path=path)
-    rows = _read_rows(path, "ltvl")
+    require(not path.is_dir(), "a folder; the pose file of this challenge is one file", path=path)
+    lines, poses, of_rows = _read_rows(path, "ltvl")
     world = reference.world
-    findings = _check_poses(rows.poses, reference, lambda _, pose: world.pose_in_local(pose))
+    findings = _check_poses(poses, reference, lambda _, pose: world.pose_in_local(pose))
     if reference.expected:
-        findings += _check_names(rows.lines, reference, dataset)
+        findings += _check_names(lines, reference, dataset)
     else:
-        findings += [*_check_shape(rows.lines, dataset), _not_checked("names", reference)]
-    return len(rows.poses), [replace(f, file=path.name) for f in [*findings, *rows.findings]]
+        findings += [*_check_shape(lines, dataset), _not_checked("names", reference)]
+    return len(poses), [replace(f, file=path.name) for f in [*findings, *of_rows]]
 
 
 def _check_mlad(path: Path, reference: Reference) -> tuple[int, list[Finding]]:
@@ -190,7 +191,7 @@ def _check_mlad(path: Path, reference: Reference) -> tuple[int, list[Finding]]:
     for pair in reference.pairs:
         stamps = f"{PurePosixPath(pair.reference).stem} {PurePosixPath(pair.query).stem}"
         wanted[pair.file][stamps] = pair.reference
-    findings, poses = list[Finding](), 0
+    findings, num_poses = list[Finding](), 0
     if path.is_dir():
         files = {str(p.relative_to(path)): p for p in sorted(path.rglob("*.txt"))}
         if absent := [name for name in wanted if name not in files]:
@@ -201,39 +202,30 @@ def _check_mlad(path: Path, reference: Reference) -> tuple[int, list[Finding]]:
         fitting = [name for name in wanted if PurePosixPath(name).name == path.name]
         files = {fitting[0] if fitting else path.name: path}
     for name, file in files.items():
-        rows = _read_rows(file, "mlad")
-        poses += len(rows.poses)
-        of_file = list(rows.findings)
+        lines, poses, of_file = _read_rows(file, "mlad")
+        num_poses += len(poses)
         if wanted and name not in wanted:
             message = f"must be named like its relocalization file: {_some(wanted)}"
             of_file.append(Finding("error", "file-name", message))
         elif wanted:
-            of_file += _check_pairs(rows, wanted[name], reference)
+            of_file += _check_pairs(lines, poses, wanted[name], reference)
         findings += [replace(finding, file=name) for finding in of_file]
     if not wanted:
         findings.append(_not_checked("pairs", reference))
-    return poses, findings
+    return num_poses, findings
 
 
-class _Rows(NamedTuple):
-    """Rows by name, or by two timestamps with a blank between them.
-
-    ``lines`` has the line number of every row, ``poses`` those with a valid pose.
-    """
-
-    lines: dict[str, int]
-    poses: dict[str, RigidTransform]
-    findings: list[Finding]
-
-
-def _read_rows(path: Path, kind: PoseFileFormat) -> _Rows:
+def _read_rows(
+    path: Path, kind: PoseFileFormat
+) -> tuple[dict[str, int], dict[str, RigidTransform], list[Finding]]:
+    """Return line numbers and valid poses by name, or by two timestamps, and wrong rows."""
     text = read_text(path)
-    if pose_files.is_colmap_images(text):
-        raise DataError(
-            "this is COLMAP's images.txt, not a pose file; `megloc import colmap` of its folder "
-            "and `megloc submit` make one",
-            path=path,
-        )
+    require(
+        not pose_files.is_colmap_images(text),
+        "this is COLMAP's images.txt, not a pose file; `megloc import colmap` of its folder "
+        "and `megloc submit` make one",
+        path=path,
+    )
     is_mlad = kind == "mlad"
     num_keys, columns = (2, pose_files.MLAD_COLUMNS) if is_mlad else (1, pose_files.COLUMNS)
     lines, poses, findings = dict[str, int](), dict[str, RigidTransform](), list[Finding]()
@@ -253,7 +245,7 @@ def _read_rows(path: Path, kind: PoseFileFormat) -> _Rows:
             problem("comment", "a comment; the format has none, and no header")
             continue
         if len(fields) != num_keys + 7:
-            message = f"{_plural(len(fields), 'column')} instead of {num_keys + 7} ({columns})"
+            message = f"{counted(len(fields), 'column')} instead of {num_keys + 7} ({columns})"
             problem("columns", message + "; separated by blanks, not commas" * ("," in line))
             if len(fields) < num_keys or "," in fields[0]:
                 continue
@@ -271,7 +263,7 @@ def _read_rows(path: Path, kind: PoseFileFormat) -> _Rows:
             problem("pose", f"{error.message}; the columns are {columns}")
     if not lines:
         findings.append(Finding("error", "empty", "there is no pose in the file"))
-    return _Rows(lines, poses, findings)
+    return lines, poses, findings
 
 
 def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -> list[Finding]:
@@ -303,7 +295,7 @@ def _check_names(lines: Mapping[str, int], reference: Reference, dataset: str) -
     if wrong:
         first = next(iter(wrong))
         message = (
-            f"{_plural(len(wrong), 'name')} other than in the challenge's list: {first} should be "
+            f"{counted(len(wrong), 'name')} other than in the challenge's list: {first} should be "
             f"{wrong[first]}"
         )
         only_endings = all(n.rpartition(".")[0] == r.rpartition(".")[0] for n, r in wrong.items())
@@ -337,28 +329,31 @@ def _check_shape(names: Iterable[str], dataset: str) -> list[Finding]:
     return findings
 
 
-def _check_pairs(rows: _Rows, wanted: Mapping[str, str], reference: Reference) -> list[Finding]:
-    unknown = [key for key in rows.lines if key not in wanted]
+def _check_pairs(
+    lines: Mapping[str, int],
+    read: Mapping[str, RigidTransform],
+    wanted: Mapping[str, str],
+    reference: Reference,
+) -> list[Finding]:
+    unknown = [key for key in lines if key not in wanted]
     swapped = [key for key in unknown if " ".join(reversed(key.split(" "))) in wanted]
-    if 2 * len(swapped) > len(rows.lines):
+    if 2 * len(swapped) > len(lines):
         what = "with the two timestamps swapped: the reference comes first, then the query"
         return [_about("error", "swapped", swapped, "row", what)]
     findings = [
-        Finding("error", "unknown", f"pair {key} is not asked for", line=rows.lines[key])
+        Finding("error", "unknown", f"pair {key} is not asked for", line=lines[key])
         for key in unknown
     ]
-    if missing := [key for key in wanted if key not in rows.lines]:
+    if missing := [key for key in wanted if key not in lines]:
         what = f"of {len(wanted)} without a row, and every one needs one"
         findings.append(_about("error", "missing", missing, "pair", what))
     # the identity fills in for a missing pose, and fits no convention
     identity = RigidTransform.identity()
-    if dummies := [key for key, pose in rows.poses.items() if pose == identity]:
+    if dummies := [key for key, pose in read.items() if pose == identity]:
         findings.append(_about("note", "dummies", dummies, "row", "with the identity, a dummy"))
     map_poses, scale = reference.map_poses, reference.world.official_from_local.scale
     poses = {
-        key: pose
-        for key, pose in rows.poses.items()
-        if pose != identity and wanted.get(key) in map_poses
+        key: pose for key, pose in read.items() if pose != identity and wanted.get(key) in map_poses
     }
     if scale == 1.0:  # poses are not compared with a map in other units
         in_local = lambda key, pose: pose @ map_poses[wanted[key]]  # noqa: E731
@@ -373,7 +368,7 @@ def _check_poses(
 ) -> list[Finding]:
     map_poses, unit = list(reference.map_poses.values()), reference.world.unit
     if min(len(map_poses), len(poses)) < _MIN_POSES:
-        message = f"{_plural(len(poses), 'pose')} and {_plural(len(map_poses), 'map camera')}: too "
+        message = f"{counted(len(poses), 'pose')} and {counted(len(map_poses), 'map camera')}: too "
         return [Finding("note", "too-few", f"{message}few to compare")] if map_poses else []
     extent = float(np.ptp(_centers(map_poses), axis=0).max()) or 1.0
     # a wrong direction counts as much as a camera at the other end of the map
@@ -409,7 +404,7 @@ def _check_poses(
             f"convention explains it; is it another frame, or another scale? {shown}"
         )
         return [Finding("error", "far", message, names=far_names)]
-    message = f"{_plural(len(far), 'pose')} far from every map camera: {shown}"
+    message = f"{counted(len(far), 'pose')} far from every map camera: {shown}"
     return [Finding("warning", "far", message, names=far_names)]
 
 
@@ -443,11 +438,6 @@ def _not_checked(things: str, reference: Reference) -> Finding:
     return Finding("note", "not-checked", f"the {things} are not checked: {why}")
 
 
-def _plural(count: int, noun: str) -> str:
-    plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
-    return f"{count} {noun if count == 1 else plural}"
-
-
 def _some(names: Iterable[str]) -> str:
     listed = list(names)
     text = ", ".join(listed[:_NAMES_SHOWN])
@@ -455,5 +445,5 @@ def _some(names: Iterable[str]) -> str:
 
 
 def _about(severity: Severity, kind: str, names: Sequence[str], noun: str, what: str) -> Finding:
-    message = f"{_plural(len(names), noun)} {what}: {_some(names)}"
+    message = f"{counted(len(names), noun)} {what}: {_some(names)}"
     return Finding(severity, kind, message, names=tuple(names))

@@ -10,7 +10,8 @@ from typing import Literal
 
 import numpy as np
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, require
+from megloc_kapture.evaluation.comparison import WithoutTruth, evaluate_without_truth
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.pose_files import poses_by_image
 from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of
@@ -27,7 +28,6 @@ from megloc_kapture.evaluation.results import (
     side_tables_near,
 )
 from megloc_kapture.evaluation.scoring import Evaluation, evaluate_pairs, evaluate_poses
-from megloc_kapture.evaluation.without_truth import WithoutTruth, evaluate_without_truth
 from megloc_kapture.geometry.poses import align_poses, stack_poses
 from megloc_kapture.io.dataset_tables import (
     METRES,
@@ -94,10 +94,7 @@ def evaluate(
 
 
 def benchmark_beside(
-    beside: Sequence[object],
-    *,
-    side_tables: Path | str | None = None,
-    dataset: str | None = None,
+    beside: Sequence[object], *, side_tables: Path | str | None = None, dataset: str | None = None
 ) -> Benchmark:
     """Return the benchmark of side tables, by default of the first workspace of the paths."""
     for path in beside:
@@ -132,11 +129,11 @@ def evaluate_results(
     elif relative:
         raise OptionError("--align: the challenge compares relative poses, which need none")
     references = first_map_poses(contexts) if relative else {}
-    if relative and not references:
-        raise DataError(
-            f"the {len(benchmark.pairs)} pairs to relocalize need the poses of their references, "
-            "which are the map's: give it with --map"
-        )
+    require(
+        not relative or references,
+        f"the {len(benchmark.pairs)} pairs to relocalize need the poses of their references, "
+        "which are the map's: give it with --map",
+    )
     read = _read(results, benchmark, contexts, labels, true_poses, references)
     if not isinstance(truth, Mapping) and side_tables_near(truth) is None:
         true_poses = _in_local_frame(true_poses, read, benchmark.world, truth)

@@ -27,13 +27,14 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, Field
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.dataset_tables import (
     MAX_QUATERNION_NORM_ERROR,
     PoseFileFormat,
     PoseFileNames,
 )
 from megloc_kapture.io.files import (
+    named,
     read_content,
     read_json_model,
     read_text,
@@ -74,8 +75,7 @@ def names_in_pose_file(images: Iterable[str], names: Names) -> dict[str, str]:
         by_image = {image: name for image, name in names.items() if image in wanted}
     by_name: dict[str, str] = {}
     for image, name in by_image.items():
-        if not is_name(name):
-            raise DataError(f"image {image!r}: a pose file cannot hold the name {name!r}")
+        require(is_name(name), f"image {image!r}: a pose file cannot hold the name {name!r}")
         if name in by_name:
             raise DataError(
                 f"images {by_name[name]!r} and {image!r} would both be called {name!r} in the pose "
@@ -110,16 +110,12 @@ def read_pose_file(path: Path | str) -> dict[str, RigidTransform]:
     poses: dict[str, RigidTransform | None] = {}
     for number, fields in rows:
         name = fields[0]
-        try:
-            if len(fields) != 8:
-                raise DataError(f"{len(fields)} columns instead of 8 ({COLUMNS})")
-            if name in poses:
-                raise DataError(f"{name!r} is given twice")
+        with named(path, number):
+            require(len(fields) == 8, f"{len(fields)} columns instead of 8 ({COLUMNS})")
+            require(name not in poses, f"{name!r} is given twice")
             values = [parse_number(field) for field in fields[1:]]
             failed = not np.isfinite(values).all() or not any(values[:4])
             poses[name] = None if failed else parse_pose(fields[1:], "ltvl", repr(name))
-        except DataError as error:
-            raise DataError(error.message, path=path, line=number) from error
     if failures := [name for name, pose in poses.items() if pose is None]:
         message = "%s: rows of nan or zeros are queries without a pose: %d, the first is %s"
         _log.warning(message, path, len(failures), failures[0])
@@ -148,9 +144,7 @@ def _colmap_rows(text: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def poses_by_image(
-    poses: Poses,
-    images: Iterable[str],
-    names: Mapping[str, str] | None = None,
+    poses: Poses, images: Iterable[str], names: Mapping[str, str] | None = None
 ) -> dict[str, RigidTransform]:
     """Rename the poses of a pose file to the images of a kapture folder.
 
@@ -210,8 +204,9 @@ def checked_pose(
     whose: str,
 ) -> RigidTransform:
     # larger squares overflow
-    if not all(abs(v) < 1e100 for v in (*quat_wxyz, *translation)):
-        raise DataError(f"{whose}: the pose is not finite")
+    require(
+        all(abs(v) < 1e100 for v in (*quat_wxyz, *translation)), f"{whose}: the pose is not finite"
+    )
     norm = math.sqrt(sum(q * q for q in quat_wxyz))
     if not abs(norm - 1.0) < MAX_QUATERNION_NORM_ERROR:
         raise DataError(f"{whose}: quaternion of length {norm:g}, not 1")
@@ -289,31 +284,27 @@ def read_mlad_file(path: Path | str) -> list[RelativePose]:
         if not fields:
             continue
         columns = columns or (2 if len(fields) == 2 else 9)
-        try:
+        with named(path, number):
             if len(fields) != columns:
                 wanted = f"9 ({MLAD_COLUMNS})" if columns == 9 else "2, as in the rows before"
                 raise DataError(f"{len(fields)} columns instead of {wanted}")
             reference, query = (parse_timestamp(field) for field in fields[:2])
             whose, pose = f"pair {reference} {query}", None
-            if (reference, query) in pairs:
-                raise DataError(f"{whose} is given twice")
+            require((reference, query) not in pairs, f"{whose} is given twice")
             if columns == 9:
                 pose = parse_pose(fields[2:], "mlad", whose)
-        except DataError as error:
-            raise DataError(error.message, path=path, line=number) from error
         pairs.add((reference, query))
         rows.append(RelativePose(reference, query, pose))
     return rows
 
 
 def parse_timestamp(text: str) -> int:
-    if not _TIMESTAMP.fullmatch(text):
-        raise DataError(f"{text!r} is not a timestamp (a whole number)")
+    require(_TIMESTAMP.fullmatch(text), f"{text!r} is not a timestamp (a whole number)")
     return int(text)
 
 
 # what can change a pose or a figure of the report
-_PACKAGES = (
+PACKAGES = (
     "megloc-kapture",
     "numpy",
     "scipy",
@@ -334,7 +325,7 @@ def installed_version(package: str) -> str | None:
 
 
 def package_versions() -> dict[str, str]:
-    versions = {package: installed_version(package) for package in _PACKAGES}
+    versions = {package: installed_version(package) for package in PACKAGES}
     return {package: version for package, version in versions.items() if version is not None}
 
 
@@ -372,29 +363,25 @@ def _sha256(path: Path) -> str:
     return hashlib.sha256(read_content(path)).hexdigest()
 
 
-class _Beside(BaseModel):
+class _Provenance(BaseModel):
     files: dict[str, str] = {}
-    confidence: Any = None
-
-
-class _Confidences(BaseModel):
-    confidence: dict[str, Annotated[float, Field(ge=0, le=1)]]
+    confidence: dict[str, Annotated[float, Field(ge=0, le=1)]] = {}
 
 
 def read_confidences(target: Path | str) -> dict[str, float]:
     """Read image -> confidence from the JSON beside a pose file.
 
-    Empty, with a warning, if the JSON has the SHA-256 of another pose file; empty without
-    confidences.
+    Empty, with a warning, if the JSON is none of ours or has the SHA-256 of another pose file.
     """
     target, path = Path(target), provenance_path(target)
+    if not path.is_file():
+        return {}
     try:
-        beside = read_json_model(path, _Beside) if path.is_file() else _Beside()
-    except DataError:
+        provenance = read_json_model(path, _Provenance)
+    except DataError as error:
+        _log.warning("%s; its confidences are left out", error)
         return {}
-    if beside.confidence is None:
-        return {}
-    if beside.files.get(target.name) not in (None, _sha256(target)):
+    if provenance.files.get(target.name, "") not in ("", _sha256(target)):
         _log.warning("%s is of another pose file; its confidences are left out", path)
         return {}
-    return read_json_model(path, _Confidences).confidence
+    return provenance.confidence

@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.evaluation import pose_files
 from megloc_kapture.evaluation.protocols import Benchmark
 from megloc_kapture.io import tables
@@ -41,8 +41,8 @@ _QUERY, _QUERY_MATCHES = "query", "matches/query"
 _QUERY_PYRAMID, _MAPPING_PYRAMID = "pyramid/query", "pyramid/mapping"
 _SENSORS = "sensors/sensors.txt"
 _MODELS = ("images.bin", "images.txt")
-# images prepared for features, with masks; keypoints are in their pixels
-_PREPARED, _ROLES, _MASKS = "preprocessed", ("mapping", "query"), "sensors/masks"
+# images prepared for features; keypoints are in their pixels
+_PREPARED = "preprocessed"
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,6 @@ class ResultContext:
     queries, mapping : images and cameras, with keypoints and matches; the map has poses.
     refinements : query -> steps of refining its pose.
     consistency : checks of refiners on the map's own images.
-    masked : folders whose images have masks.
     localized : image -> pose, of results in memory; ``cameras`` of queries that are in no folder.
     """
 
@@ -63,7 +62,6 @@ class ResultContext:
     side_tables: Path | None = None
     refinements: Mapping[str, Sequence[RefinementRow]] = field(default_factory=dict)
     consistency: Sequence[ConsistencyRow] = ()
-    masked: Sequence[KaptureFolder] = ()
     localized: Mapping[str, Pose] = field(default_factory=dict)
     cameras: Mapping[str, Camera] = field(default_factory=dict)
     unit: str = METRES
@@ -123,22 +121,11 @@ def context_of(result: Path | str, *, mapping: Path | str | None = None) -> Resu
         refinements=refinements,
         consistency=_if_there(tables.read_consistency, folder / tables.CONSISTENCY_FILE) or (),
         unit=unit_of(result),
-        masked=[] if workspace is None else _masked(workspace),
     )
 
 
 def _if_there(read: Callable[[Path], Read], path: Path) -> Read | None:
     return read(path) if path.is_file() else None
-
-
-def _masked(workspace: Path) -> list[KaptureFolder]:
-    folders = []
-    for role in _ROLES:
-        prepared = workspace / _PREPARED / role
-        folder = prepared if (prepared / _SENSORS).is_file() else workspace / role
-        if (folder / _MASKS).is_dir() and (folder / _SENSORS).is_file():
-            folders.append(KaptureFolder(folder, features_dirs=[workspace]))
-    return folders
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,8 +193,7 @@ def read_result(
 
 def read_poses(source: Path) -> dict[str, RigidTransform]:
     """Read ``cam_from_world`` by name of a kapture folder, a COLMAP model or a pose file."""
-    if not source.exists():
-        raise DataError("no such file or folder", path=source)
+    require(source.exists(), "no such file or folder", path=source)
     if (model := model_of(source)) is not None:
         if (model / "images.txt").is_file():
             return pose_files.read_pose_file(model / "images.txt")

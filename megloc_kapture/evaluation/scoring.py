@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.confidence import Confidence, confidence_of
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.evaluation.metrics import (
+    Confidence,
     PoseErrors,
     RecallRow,
     Threshold,
+    confidence_of,
     pose_errors,
     recall_row,
     row_members,
@@ -37,7 +38,7 @@ from megloc_kapture.refinement.acceptance import squared_distance
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from megloc_kapture.evaluation.statistics import Comparison
+    from megloc_kapture.evaluation.comparison import Comparison
 
 _CHI2_95 = 12.592  # quantile of six degrees of freedom
 
@@ -115,14 +116,6 @@ class Reported:
         return pd.DataFrame(columns).set_index("image")
 
 
-@dataclass(frozen=True, slots=True)
-class CovarianceCheck:
-    """Number of poses with a covariance, and of errors within its 95 % region."""
-
-    num_poses: int
-    num_within: int
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class Evaluation(Reported):
     """One result; without true poses ``truth`` and ``thresholds`` are empty.
@@ -138,6 +131,7 @@ class Evaluation(Reported):
     pairs : name of a query -> its pair, for the MLAD challenges.
     nowhere : queries that show nothing of the map; right without a pose, and in no row.
     by_center : of MLAD's pairs, the evaluation by the distance of camera centres.
+    covariance : ``num_poses`` with a covariance, and ``num_within`` its 95 % region.
     alignment : note on how the poses were, or could be, aligned with the truth.
     """
 
@@ -154,7 +148,7 @@ class Evaluation(Reported):
     truth_known_by: str = ""
     pairs: Mapping[str, RelocalizationPair] = field(default_factory=dict)
     nowhere: tuple[QueryResult, ...] = ()
-    covariance: CovarianceCheck | None = None
+    covariance: Mapping[str, int] | None = None
     by_center: Evaluation | None = None
     context: ResultContext = field(default_factory=ResultContext)
     alignment: str = ""
@@ -185,7 +179,7 @@ class Evaluation(Reported):
 
     def compare(self, *others: Evaluation) -> Comparison:
         """Test the differences from other results on the same queries."""
-        from megloc_kapture.evaluation.statistics import compare
+        from megloc_kapture.evaluation.comparison import compare
 
         return compare([self, *others])
 
@@ -232,8 +226,7 @@ def evaluate_poses(
             f"{min(both)!r} has a true pose, but is listed as showing nothing of the map"
         )
     counted = tuple(sorted(benchmark.scored(truth)))
-    if not counted:
-        raise DataError("no query with a true pose to count: is this the right ground truth?")
+    require(counted, "no query with a true pose to count: is this the right ground truth?")
     thresholds = tuple(thresholds or benchmark.thresholds())
     conditions = benchmark.conditions({*counted, *nowhere})
     errors = pose_errors(result.poses, truth, counted)
@@ -267,14 +260,14 @@ def evaluate_poses(
 
 def _check_covariances(
     queries: Sequence[QueryResult], result: Result, truth: Poses
-) -> CovarianceCheck | None:
+) -> dict[str, int] | None:
     covariances = result.covariances
     names = [q.image for q in queries if q.outcome == "localized" and q.image in covariances]
     within = sum(
         squared_distance(truth[name], result.poses[name], covariances[name]) <= _CHI2_95
         for name in names
     )
-    return CovarianceCheck(len(names), within) if names else None
+    return {"num_poses": len(names), "num_within": within} if names else None
 
 
 def recall_rows(
@@ -360,8 +353,7 @@ def evaluate_pairs(
         p.query if times[p.query] == 1 else f"{p.query} from {p.reference}, {p.file}": p
         for p in pairs
     }
-    if len(named) != len(pairs):
-        raise DataError("a pair of reference and query is listed twice in one file")
+    require(len(named) == len(pairs), "a pair of reference and query is listed twice in one file")
     called = _conditions({pair.file for pair in pairs})
     conditions = tuple(filter(None, dict.fromkeys(called[pair.file] for pair in pairs)))
     by_center = evaluate_poses(

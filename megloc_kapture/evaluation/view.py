@@ -26,7 +26,6 @@ from megloc_kapture.evaluation.evaluate import (
     evaluate_results,
     results_without_truth,
 )
-from megloc_kapture.evaluation.report.map_view import top_view
 from megloc_kapture.evaluation.report.queries import (
     ShownQuery,
     StoredInliers,
@@ -35,6 +34,7 @@ from megloc_kapture.evaluation.report.queries import (
     query_facts,
     shown_queries,
     spread,
+    top_view,
 )
 from megloc_kapture.evaluation.report.reports import plain, template
 from megloc_kapture.evaluation.results import Poses, ResultContext
@@ -47,8 +47,6 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import Camera, RigidTransform
 
 MAX_POINTS, MAX_CAMERAS, MAX_QUERIES = 60_000, 4_000, 2_000
-# points of depth by stereo, and map images that they come from, 0.2 s each
-MAX_DENSE, _MAX_DENSE_IMAGES = 40_000, 40
 # inliers of all queries, and of one
 _MAX_INLIERS, _MAX_INLIERS_OF_ONE = 40_000, 300
 # reading the inliers of a query takes 20 ms or more
@@ -72,7 +70,7 @@ class Scene:
     Attributes
     ----------
     origin : float64 (3,), subtracted from all coordinates.
-    points, colors : (P, 3); the last ``num_dense`` are depth by stereo, the others the map's.
+    points, colors : (P, 3) of the map.
     camera_frusta, frusta, true_frusta : float32 (N, 5, 3) of map cameras, estimates and truths: the
         centre, then rays at depth 1 through the upper left, upper right, lower right and lower left
         corner of the image; NaN without a pose.
@@ -89,7 +87,6 @@ class Scene:
     up: NDArray[np.float64]
     points: NDArray[np.float32]
     colors: NDArray[np.uint8]
-    num_dense: int
     cameras: tuple[str, ...]
     camera_frusta: NDArray[np.float32]
     queries: tuple[ShownQuery, ...]
@@ -193,7 +190,7 @@ def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = 
         return None
     quats, translations = stack_poses(spanning)
     centers = camera_centers(quats, translations)
-    view = top_view(quats, centers)
+    page, _ = top_view(quats, centers)
     # separately, so that ten cameras count beside a thousand points
     ends = [np.quantile(a, _SEEN_AT_FIRST, axis=0) for a in (centers, points[:, :3]) if len(a)]
     low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
@@ -212,17 +209,13 @@ def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = 
     if any(len(xyz) > most for xyz in inliers):
         notes.append(f"Of a query's inliers at most {most} are drawn.")
     inliers = [xyz[spread(len(xyz), most)] for xyz in inliers]
-    up = np.cross(view.right, view.up)
-    colors = _colors(points, up, mapping, kept)
-    dense, dense_colors, dense_images = _dense_points(mapping, notes)
-    dense_frames = _positions([frame_of.get(image, "") for image in dense_images], frames)
+    up = np.cross(*page)
     return Scene(
         title=title,
         origin=origin,
         up=up,
-        points=(np.concatenate([points[:, :3], dense]) - origin).astype(np.float32),
-        colors=np.concatenate([colors, dense_colors]),
-        num_dense=len(dense),
+        points=(points[:, :3] - origin).astype(np.float32),
+        colors=_colors(points, up, mapping, kept),
         cameras=tuple(names),
         camera_frusta=_frusta(poses, _rays(mapping, names, {}), origin),
         queries=tuple(queries),
@@ -232,7 +225,7 @@ def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = 
         num_inliers=tuple(map(len, inliers)),
         radius=max(float(np.linalg.norm(high - low)) / 2, 1e-3),
         frames=tuple(frames),
-        point_frames=np.concatenate([point_frames, dense_frames]),
+        point_frames=point_frames,
         camera_frames=_positions([frame_of[name] for name in names], frames),
         query_frames=_positions([frame_of_query(q, context.frames) for q in queries], frames),
         notes=tuple(notes),
@@ -252,7 +245,6 @@ def render_view(scene: Scene) -> str:
         "origin": scene.origin.tolist(),
         "up": np.round(scene.up, 9).tolist(),
         "radius": scene.radius,
-        "numDense": scene.num_dense,
         "cameras": scene.cameras,
         "queries": [
             {
@@ -275,8 +267,7 @@ def render_view(scene: Scene) -> str:
         data=_script_data(data),
         legend=legend(scene.queries),
         counts={
-            "points": len(scene.points) - scene.num_dense,
-            "dense": scene.num_dense,
+            "points": len(scene.points),
             "cameras": len(scene.cameras),
             "queries": len(scene.queries),
             "failed": len(failed),
@@ -342,30 +333,6 @@ def _point_frames(
             of_image = _positions([frame_of.get(name, "") for name in seen.image_names], frames)
             of_point[seen.point_ids] = of_image[seen.image_ids]
     return of_point
-
-
-def _dense_points(
-    mapping: KaptureFolder | None, notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.uint8], list[str]]:
-    from megloc_kapture.mvs.views import Agreement  # slow imports
-    from megloc_kapture.stages.stereo_depth import fused_cloud, stereo_images
-
-    nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), list[str]()
-    if mapping is None:
-        return nothing
-    images = stereo_images(mapping)
-    names = list(images)
-    if len(names) > _MAX_DENSE_IMAGES:
-        notes.append(f"Depth is shown of {_MAX_DENSE_IMAGES} of {len(names)} images.")
-        names = [names[at] for at in spread(len(names), _MAX_DENSE_IMAGES)]
-    # a view without depth is better than none
-    with contextlib.suppress(DataError):
-        chosen = {name: images[name] for name in names}
-        cloud = fused_cloud(mapping, chosen, Agreement(), max_points=8 * MAX_DENSE)
-        kept = spread(len(cloud.xyz), MAX_DENSE) if len(cloud.xyz) else np.zeros(0, np.int64)
-        colors = np.asarray(np.round(cloud.colours[kept]), np.uint8)
-        return cloud.xyz[kept], colors, [names[int(row)] for row in cloud.image_ids[kept]]
-    return nothing
 
 
 def _colors(

@@ -9,8 +9,9 @@ import re
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
-from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import check_relative, named, read_text
+from megloc_kapture.errors import DataError, require
+from megloc_kapture.io.files import check_relative
+from megloc_kapture.io.text_lines import read_lines
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera
 
 _ROW = re.compile(
@@ -54,22 +55,18 @@ def read_cameras(path: Path) -> Camera | CameraList:
 def read_camera_rows(path: Path) -> dict[str, Camera]:
     """Read the cameras of a list by image name, in file order."""
     cameras: dict[str, Camera] = {}
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        with named(path, number):
-            row = _ROW.fullmatch(line.strip())
+    for line in read_lines(path, comments=True):
+        with line.named():
+            row = _ROW.fullmatch(line.text)
             if row is None:
                 raise DataError(
                     "expected a row NAME MODEL WIDTH HEIGHT PARAMS..., MODEL one of "
                     f"{', '.join(CAMERA_MODEL_NUM_PARAMS)}"
                 )
             name = check_relative(row["name"])
-            if name in cameras:
-                raise DataError(f"{name!r} is listed twice")
+            require(name not in cameras, f"{name!r} is listed twice")
             cameras[name] = _camera(row["model"], re.split(r"[\s,]+", row["numbers"]))
-    if not cameras:
-        raise DataError("no camera in this list", path=path)
+    require(cameras, "no camera in this list", path=path)
     return cameras
 
 
@@ -78,6 +75,6 @@ def _camera(model: str, fields: list[str]) -> Camera:
         width, height, *params = map(float, fields)
     except ValueError as error:
         raise DataError(f"width, height and parameters must be numbers, got {fields}") from error
-    if not (width.is_integer() and height.is_integer()):
+    if not width.is_integer() or not height.is_integer():
         raise DataError(f"image size {width:g}x{height:g} is not in whole pixels")
     return Camera(model, int(width), int(height), tuple(params))

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.errors import DataError, OutputError
+from megloc_kapture.errors import DataError, OutputError, require
 from megloc_kapture.io.files import output_error, owned_name
 from megloc_kapture.values import Camera, Options, RigidTransform
 
@@ -64,10 +64,7 @@ def quiet_stderr() -> Iterator[None]:
 
 def new_colmap_camera(camera: Camera) -> Any:
     return load_pycolmap().Camera(
-        model=camera.model,
-        width=camera.width,
-        height=camera.height,
-        params=list(camera.params),
+        model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
     )
 
 
@@ -197,11 +194,11 @@ def triangulate(
         return TriangulatedPoints(np.zeros((0, 3)), np.zeros(0), empty, empty, empty)
     for (i, j), pairs in matches.items():
         both = np.array([len(images[i].keypoints_px), len(images[j].keypoints_px)])
-        if (np.asarray(pairs).reshape(-1, 2) >= both).any():
-            raise DataError(
-                f"matches between {images[i].name} and {images[j].name} refer to keypoints "
-                f"that the images do not have ({both[0]} and {both[1]})"
-            )
+        require(
+            not (np.asarray(pairs).reshape(-1, 2) >= both).any(),
+            f"matches between {images[i].name} and {images[j].name} refer to keypoints "
+            f"that the images do not have ({both[0]} and {both[1]})",
+        )
     pycolmap = load_pycolmap()
     sizes = [len(image.keypoints_px) for image in images]
     offset = np.mean([image.cam_from_world.center() for image in images], axis=0)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap import load_pycolmap, quiet_stderr
 from megloc_kapture.io.files import check_relative, named, owned_name
 from megloc_kapture.io.kapture.sensors import unit_quaternion
@@ -121,8 +121,7 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
     """Read the model of a folder; without points, their file need not exist."""
     paths = colmap_model_files(folder, with_points=with_points)
     for path in paths:
-        if not path.is_file():
-            raise DataError("file is missing", path=path)
+        require(path.is_file(), "file is missing", path=path)
         if path.name in _RECORDS:
             _check_complete(path)
     with tempfile.TemporaryDirectory(prefix=f".{owned_name()}") as links:
@@ -167,10 +166,7 @@ def _check_complete(path: Path) -> None:
     head, length_type, item = _RECORDS[path.name]
     length_size = struct.calcsize(length_type)
     try:
-        with (
-            open(path, "rb") as file,
-            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
-        ):
+        with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             (count,), at = struct.unpack_from("<Q", data), 8
             for _ in range(count):
                 at += head
@@ -193,12 +189,12 @@ def _camera(camera: Any, path: Path) -> Camera:
     if model in _SAME_AS:
         model, zeros = _SAME_AS[model]
         params += (0.0,) * zeros
-    if model not in CAMERA_MODEL_NUM_PARAMS:
-        raise DataError(
-            f"kapture has no camera model {model}; `colmap image_undistorter` makes a model and "
-            "images with PINHOLE cameras (of panoramas COLMAP's panorama_sfm.py does)",
-            path=path,
-        )
+    require(
+        model in CAMERA_MODEL_NUM_PARAMS,
+        f"kapture has no camera model {model}; `colmap image_undistorter` makes a model and "
+        "images with PINHOLE cameras (of panoramas COLMAP's panorama_sfm.py does)",
+        path=path,
+    )
     with named(path, about=f"camera {camera.camera_id}"):
         return Camera(model, camera.width, camera.height, params)
 
@@ -210,8 +206,7 @@ def _images(model: Any, path: Path) -> tuple[ColmapImage, ...]:
             continue
         with named(path, about=f"image {image.name!r}"):
             name = check_relative(image.name.removeprefix("./"))
-            if name in images:
-                raise DataError("is listed twice")
+            require(name not in images, "is listed twice")
             pose = _transform(image.cam_from_world())
         images[name] = ColmapImage(image_id, name, image.camera_id, pose)
     return tuple(images.values())
@@ -220,8 +215,7 @@ def _images(model: Any, path: Path) -> tuple[ColmapImage, ...]:
 def _transform(transform: Any) -> RigidTransform:
     x, y, z, w = transform.rotation.quat.tolist()
     tx, ty, tz = transform.translation.tolist()
-    if not np.isfinite([tx, ty, tz]).all():
-        raise DataError("the pose is not finite")
+    require(np.isfinite([tx, ty, tz]).all(), "the pose is not finite")
     return RigidTransform(unit_quaternion((w, x, y, z)), (tx, ty, tz))
 
 

@@ -1,7 +1,7 @@
 """CSV tables with a header row, mapped to records.
 
 The header names the columns, in any order, so that a table edited in a spreadsheet still reads. A
-:class:`Table` takes its columns from the annotations of a record type.
+:class:`Table` takes its columns from the annotations of a record type, or from a dictionary.
 """
 
 from __future__ import annotations
@@ -142,6 +142,8 @@ _BY_TYPE: dict[Any, Column] = {
 
 
 def _column(hint: Any) -> Column:
+    if isinstance(hint, Column):
+        return hint
     arguments = get_args(hint)
     if get_origin(hint) is Annotated:
         columns = [part for part in arguments if isinstance(part, Column)]
@@ -154,7 +156,7 @@ def _column(hint: Any) -> Column:
 
 
 class Table(Generic[RowT]):
-    """A CSV table whose rows are records of one type, with annotated fields.
+    """A CSV table whose rows are records of one type, or tuples if columns are given by name.
 
     ``keys`` are groups of columns that must be unique; ``later`` columns, which older files lack,
     get the record's defaults.
@@ -162,21 +164,25 @@ class Table(Generic[RowT]):
 
     def __init__(
         self,
-        row: Callable[..., RowT],
+        row: Callable[..., RowT] | Mapping[str, Any],
         *,
         keys: Sequence[tuple[str, ...]] = (),
         later: Sequence[str] = (),
     ) -> None:
-        self._row, self._keys, self._later = row, keys, later
-        hints = get_type_hints(row, include_extras=True)
-        self._columns = {name: _column(hints[name]) for name in inspect.signature(row).parameters}
+        self._keys, self._later = keys, later
+        if isinstance(row, Mapping):
+            self._row, hints = _as_tuple, row
+        else:
+            known = get_type_hints(row, include_extras=True)
+            self._row, hints = row, {n: known[n] for n in inspect.signature(row).parameters}
+        self._columns = {name: _column(hint) for name, hint in hints.items()}
 
     def read(self, path: Path | str) -> list[RowT]:
         known: set[tuple[tuple[str, ...], ...]] = set()
         rows = []
         for line, cells in read_csv_table(path, tuple(self._columns), optional=self._later):
             with named(path, line):
-                values = {name: self._value(name, text) for name, text in cells.items()}
+                values = {n: self._value(n, cells[n]) for n in self._columns if n in cells}
                 try:
                     rows.append(self._row(**values))
                 except ValidationError as error:
@@ -189,12 +195,15 @@ class Table(Generic[RowT]):
         return self.read(path) if path.exists() else []
 
     def write(self, path: Path | str, rows: Iterable[Any]) -> None:
-        """Write records, or objects with their attributes, in the given order."""
+        """Write records, objects with their attributes, or plain tuples, in the given order."""
         known: set[tuple[tuple[str, ...], ...]] = set()
         lines = []
         for row in rows:
+            plain = type(row) is tuple
+            values = row if plain else [getattr(row, name) for name in self._columns]
             cells = {
-                name: column.write(getattr(row, name)) for name, column in self._columns.items()
+                name: column.write(value)
+                for (name, column), value in zip(self._columns.items(), values, strict=True)
             }
             self._check_keys(cells, known)
             lines.append(tuple(cells.values()))
@@ -214,3 +223,7 @@ class Table(Generic[RowT]):
             return self._columns[name].read(text)
         except ValueError as error:
             raise DataError(f"{name} {text!r} is not {self._columns[name].expected}") from error
+
+
+def _as_tuple(**values: Any) -> Any:
+    return tuple(values.values())

@@ -21,22 +21,21 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, FiniteFloat, field_validator
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import require
 from megloc_kapture.io.csv_table import Column, ImageName, Table, flag
 from megloc_kapture.io.files import (
     ModelT,
     check_relative,
-    named,
     read_json_model,
-    read_text,
     write_bytes,
     write_json_model,
 )
+from megloc_kapture.io.text_lines import read_lines
 from megloc_kapture.values import Options, RigidTransform
 
 SIDE_TABLES = "megloc"
@@ -152,38 +151,13 @@ class Protocol(Options):
 
 
 def _word(text: str) -> str:
-    if text.split() != [text]:
-        raise DataError(f"a pose file cannot hold the name {text!r}")
+    require(text.split() == [text], f"a pose file cannot hold the name {text!r}")
     return text
 
 
 def _not_empty(text: str) -> str:
-    if not text:
-        raise DataError("permitted is empty")
+    require(text, "permitted is empty")
     return text
-
-
-class _GroupRow(NamedTuple):
-    image: ImageName
-    condition: str
-    frame: str
-    location: str
-    scored: Annotated[bool, flag("1", "0")]
-
-
-class _PriorRow(NamedTuple):
-    query: ImageName
-    permitted: Annotated[str, Column("a group or an image", _not_empty)]
-
-
-class _NameRow(NamedTuple):
-    image: ImageName
-    name: Annotated[str, Column("one word", _word)]
-
-
-class _UnreadableRow(NamedTuple):
-    image: ImageName
-    reason: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,10 +169,18 @@ class RelocalizationPair:
     query: ImageName
 
 
-_GROUPS = Table(_GroupRow, keys=[("image",)])
-_PRIORS = Table(_PriorRow, keys=[("query", "permitted")])
-_NAMES = Table(_NameRow, keys=[("image",), ("name",)])
-_UNREADABLE = Table(_UnreadableRow, keys=[("image",)])
+_GROUPS: Table[Any] = Table(
+    {"image": ImageName, "condition": str, "frame": str, "location": str, "scored": flag("1", "0")},
+    keys=[("image",)],
+)
+_PRIORS: Table[Any] = Table(
+    {"query": ImageName, "permitted": Column("a group or an image", _not_empty)},
+    keys=[("query", "permitted")],
+)
+_NAMES: Table[Any] = Table(
+    {"image": ImageName, "name": Column("one word", _word)}, keys=[("image",), ("name",)]
+)
+_UNREADABLE: Table[Any] = Table({"image": ImageName, "reason": str}, keys=[("image",)])
 _RELOCALIZATION = Table(RelocalizationPair)
 
 
@@ -242,13 +224,13 @@ def write_side_tables(folder: Path, tables: SideTables) -> None:
 def read_groups(folder: Path | str) -> dict[str, ImageGroup]:
     names = tuple(ImageGroup.model_fields)
     return {
-        row.image: ImageGroup(**{name: getattr(row, name) for name in names})
-        for row in sorted(_GROUPS.read_if_there(Path(folder) / GROUPS_FILE))
+        image: ImageGroup(**dict(zip(names, values, strict=True)))
+        for image, *values in sorted(_GROUPS.read_if_there(Path(folder) / GROUPS_FILE))
     }
 
 
 def write_groups(folder: Path | str, groups: Mapping[str, ImageGroup]) -> None:
-    rows = [_GroupRow(image, **group.model_dump()) for image, group in sorted(groups.items())]
+    rows = [(image, *group.model_dump().values()) for image, group in sorted(groups.items())]
     _GROUPS.write(Path(folder) / GROUPS_FILE, rows)
 
 
@@ -261,7 +243,7 @@ def read_priors(folder: Path | str) -> dict[str, tuple[str, ...]]:
 
 
 def write_priors(folder: Path | str, priors: Mapping[str, Sequence[str]]) -> None:
-    rows = sorted({_PriorRow(query, group) for query in priors for group in priors[query]})
+    rows = sorted({(query, group) for query in priors for group in priors[query]})
     _PRIORS.write(Path(folder) / PRIORS_FILE, rows)
 
 
@@ -270,7 +252,7 @@ def read_names(folder: Path | str) -> dict[str, str]:
 
 
 def write_names(folder: Path | str, names: Mapping[str, str]) -> None:
-    _NAMES.write(Path(folder) / NAMES_FILE, [_NameRow(*item) for item in names.items()])
+    _NAMES.write(Path(folder) / NAMES_FILE, names.items())
 
 
 def read_unreadable(folder: Path | str, name: str = UNREADABLE_FILE) -> dict[str, str]:
@@ -280,8 +262,7 @@ def read_unreadable(folder: Path | str, name: str = UNREADABLE_FILE) -> dict[str
 def write_unreadable(
     folder: Path | str, reasons: Mapping[str, str], name: str = UNREADABLE_FILE
 ) -> None:
-    rows = [_UnreadableRow(*row) for row in sorted(reasons.items())]
-    _UNREADABLE.write(Path(folder) / name, rows)
+    _UNREADABLE.write(Path(folder) / name, sorted(reasons.items()))
 
 
 def tables_of(root: Path | str) -> Path | None:
@@ -340,11 +321,9 @@ def read_nowhere(truth: Path | str) -> tuple[str, ...]:
     if not path.is_file():
         return ()
     names: set[str] = set()
-    for line, text in enumerate(read_text(path).splitlines(), start=1):
-        name = text.strip()
-        if name and not name.startswith("#"):
-            with named(path, line):
-                names.add(check_relative(name))
+    for line in read_lines(path, comments=True):
+        with line.named():
+            names.add(check_relative(line.text))
     return tuple(sorted(names))
 
 

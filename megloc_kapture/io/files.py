@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from megloc_kapture.errors import DataError, OutputError
+from megloc_kapture.errors import DataError, OutputError, require
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -86,8 +86,7 @@ def has_control_characters(text: str) -> bool:
 @lru_cache(maxsize=1 << 12)
 def check_relative(text: str) -> str:
     """Return ``text`` if it is a plain relative path (``a/b.jpg``), else raise DataError."""
-    if not text:
-        raise DataError("empty path")
+    require(text, "empty path")
     if "\\" in text or has_control_characters(text):
         raise DataError(f"backslash or control character in path {text!r}")
     components = text.split("/")

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap import focal_from_exif
-from megloc_kapture.io.files import read_content, write_bytes
+from megloc_kapture.io.files import read_content, reading, write_bytes
 from megloc_kapture.values import Camera
 
 if TYPE_CHECKING:
@@ -55,8 +55,7 @@ def read_image_rgb(path: Path | str) -> NDArray[np.uint8]:
     """Read an image as uint8 (H, W, 3), RGB, without transparency; see :func:`with_8_bits`."""
     check_image_file(Path(path))
     content = read_content(path)
-    if not content:
-        raise DataError("empty file, not an image", path=path)
+    require(content, "empty file, not an image", path=path)
     return decode_image_rgb(content, path)
 
 
@@ -186,15 +185,8 @@ def _encoded(path: Path, image: NDArray[np.uint8], jpeg_quality: int) -> bytes:
 
 def check_image_file(path: Path) -> None:
     """Raise DataError unless the path is a file; its content is not checked."""
-    try:
-        if path.is_file():
-            return
-        present = path.exists()
-    except OSError as error:
-        raise DataError(f"cannot read: {error.strerror}", path=path) from error
-    # reading a pipe or a device might never end
-    problem = "not an image but a folder, pipe or device" if present else "no such image"
-    raise DataError(problem, path=path)
+    with reading(path):
+        require(path.is_file(), "no such image", path=path)
 
 
 def _check_complete(path: Path | str | None, content: bytes) -> None:
@@ -220,10 +212,11 @@ def read_depth_map(path: Path | str, *, width: int, height: int) -> NDArray[np.f
     path = Path(path)
     content = read_content(path)
     expected = 4 * width * height
-    if len(content) != expected:
-        raise DataError(
-            f"{len(content)} bytes, but {width}x{height} float32 take {expected}", path=path
-        )
+    require(
+        len(content) == expected,
+        f"{len(content)} bytes, but {width}x{height} float32 take {expected}",
+        path=path,
+    )
     return np.frombuffer(content, dtype="<f4").astype(np.float32).reshape(height, width)
 
 
@@ -250,8 +243,7 @@ def extract_frames(video: Path, folder: Path, every: int) -> Iterator[str]:
             number += 1
     finally:
         capture.release()
-    if number == 0:
-        raise DataError("no video, or without a frame that OpenCV can read", path=video)
+    require(number != 0, "no video, or without a frame that OpenCV can read", path=video)
 
 
 # ------------------------------------------------------------------------------ photographs
@@ -289,9 +281,9 @@ def is_image(path: Path) -> bool:
     """Return whether a file is an image of a supported format, by its content."""
     from PIL import Image
 
+    if not path.is_file():
+        return False
     try:
-        if not path.is_file():  # reading a pipe might never end
-            return False
         with _quiet(), Image.open(path) as image:
             return image.format in _FORMATS
     except Exception:
@@ -302,8 +294,7 @@ def read_photo(path: Path | str) -> Photo:
     path = Path(path)
     check_image_file(path)
     known = f"cannot be read; {', '.join(WRITABLE_SUFFIXES)} can"
-    if path.suffix.lower() in UNREAD_SUFFIXES:
-        raise DataError(f"{path.suffix} {known}", path=path)
+    require(path.suffix.lower() not in UNREAD_SUFFIXES, f"{path.suffix} {known}", path=path)
     with _opened(path) as image:
         photo = photo_of(image) if image.format in _FORMATS else None
     if photo is None:

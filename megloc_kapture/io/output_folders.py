@@ -9,8 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from megloc_kapture.errors import DataError, OutputError
@@ -24,33 +23,14 @@ from megloc_kapture.io.files import (
 )
 
 MARKER = ".megloc"
+_ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z")
 
 
-@dataclass(frozen=True)
-class Claim:
-    """A claimed folder, the folders created for it, innermost first, and its former mark."""
-
-    folder: Path
-    made: tuple[Path, ...]
-    old_mark: bytes | None
-
-    def undo(self) -> None:
-        """Restore the mark and remove the created folders; written files stay."""
-        mark = self.folder / MARKER
-        with contextlib.suppress(OSError, OutputError):
-            if self.old_mark is None:
-                mark.unlink(missing_ok=True)
-            elif mark.read_bytes() != self.old_mark:
-                write_bytes(mark, self.old_mark)
-        for folder in self.made:
-            with contextlib.suppress(OSError):
-                folder.rmdir()
-
-
-def claim_folder(folder: Path, *, kind: str, force: bool = False) -> Claim:
+def claim_folder(folder: Path, *, kind: str, force: bool = False) -> Callable[[], None]:
     """Claim a folder that is new, empty or of the same ``kind`` (one word), or any by ``force``.
 
-    Others raise OutputError.
+    Others raise OutputError. Returns a function that undoes the claim: it restores the former mark
+    and removes the folders that the claim created; written files stay.
     """
     folder = Path(folder)
     mark = folder / MARKER
@@ -67,18 +47,25 @@ def claim_folder(folder: Path, *, kind: str, force: bool = False) -> Claim:
             )
     except OSError as error:
         raise output_error(folder, error) from error
-    claim = Claim(folder, made, old_mark)
+
+    def undo() -> None:
+        with contextlib.suppress(OSError, OutputError):
+            if old_mark is None:
+                mark.unlink(missing_ok=True)
+            elif mark.read_bytes() != old_mark:
+                write_bytes(mark, old_mark)
+        for created in made:
+            with contextlib.suppress(OSError):
+                created.rmdir()
+
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not ours:
             write_bytes(mark, _mark_of(kind))
-    except OSError as error:
-        claim.undo()
-        raise output_error(folder, error) from error
-    except OutputError:
-        claim.undo()
-        raise
-    return claim
+    except (OSError, OutputError) as error:
+        undo()
+        raise error if isinstance(error, OutputError) else output_error(folder, error) from error
+    return undo
 
 
 def _kind(mark: bytes) -> str:
@@ -98,7 +85,8 @@ def staged_output(
     Files of the last command of the same kind are removed, unless ``adds`` is set; others stay.
     """
     folder = Path(folder)
-    claim = claim_folder(folder, kind=kind, force=force)
+    old_names = _listed(folder / MARKER, kind)
+    undo_claim = claim_folder(folder, kind=kind, force=force)
     clear_leftovers(folder)
     staging = folder / temporary_name()
     try:
@@ -108,19 +96,19 @@ def staged_output(
             clear_temporary(staging)
             if not adds:
                 new = _files_below(staging)
-                _remove_old_files(folder, _listed(claim.old_mark, kind) - new)
+                _remove_old_files(folder, old_names - new)
                 write_bytes(folder / MARKER, _mark_of(kind, new))
             _merge(staging, folder)
         finally:
             shutil.rmtree(staging, ignore_errors=True)
     except OSError as error:
-        claim.undo()
+        undo_claim()
         # an error without a file name comes from writing: full disk or exceeded quota
         if error.filename is not None and not _lies_in(error.filename, folder):
             raise
         raise output_error(folder, error) from error
     except BaseException:
-        claim.undo()
+        undo_claim()
         raise
 
 
@@ -132,8 +120,9 @@ def _files_below(folder: Path) -> set[str]:
     return found
 
 
-def _listed(mark: bytes | None, kind: str) -> set[str]:
-    if mark is None or _kind(mark) != kind:
+def _listed(path: Path, kind: str) -> set[str]:
+    mark = path.read_bytes() if path.is_file() else b""
+    if _kind(mark) != kind:
         return set()
     return {os.fsdecode(line) for line in mark.split(b"\n")[1:] if line}
 
@@ -164,6 +153,28 @@ def _merge(source: Path, target: Path) -> None:
             if path.is_symlink():
                 path.unlink()
             os.replace(entry, path)
+
+
+def files_below(*folders: Path) -> Iterator[Path]:
+    """Yield the files below folders, without archives, hidden files and outputs of commands.
+
+    Links are followed. A download that is unpacked has the same files before and after its
+    archive is deleted.
+    """
+    for root in folders:
+        for place, names, files in os.walk(root, followlinks=True):
+            here = Path(place)
+            names[:] = [name for name in names if _is_data(here, name)]
+            shown = (here / n for n in files if not (n.startswith(".") or n.endswith(_ARCHIVES)))
+            yield from (path for path in shown if path.is_file())
+
+
+def _is_data(folder: Path, name: str) -> bool:
+    path = folder / name
+    if name.startswith(".") or (path / MARKER).is_file():
+        return False
+    # a link to a folder around it never ends
+    return not (path.is_symlink() and folder.resolve().is_relative_to(path.resolve()))
 
 
 def replace_directory(new: Path, path: Path) -> None:

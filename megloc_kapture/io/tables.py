@@ -20,7 +20,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,19 +162,13 @@ def write_clusters(
     _CLUSTERS.write(path, records)
 
 
-@dataclass(frozen=True)
-class _RefinementRecord:
-    image: str
-    method: str
-    accepted: Annotated[bool, flag("yes", "no")]
-    reason: str
-    moved_m: Annotated[float, number(".6f")]
-    turned_deg: Annotated[float, number(".6f")]
-    measures: Annotated[tuple[str, ...], list_of(";")]
-    before: RigidTransform
-
-
-_REFINEMENT = Table(_RefinementRecord)
+_REFINEMENT: Table[Any] = Table(
+    {
+        **{"image": str, "method": str, "accepted": flag("yes", "no"), "reason": str},
+        **{"moved_m": number(".6f"), "turned_deg": number(".6f")},
+        **{"measures": list_of(";"), "before": RigidTransform},
+    }
+)
 
 
 def refinement_text(rows: Sequence[RefinementRow]) -> str:
@@ -183,10 +177,7 @@ def refinement_text(rows: Sequence[RefinementRow]) -> str:
 
 def read_refinement(path: Path | str) -> list[RefinementRow]:
     """Read ``refinement.csv``; a row without a reason is accepted."""
-    return [
-        RefinementRow(r.image, r.method, r.reason, r.moved_m, r.turned_deg, r.measures, r.before)
-        for r in _REFINEMENT.read(path)
-    ]
+    return [RefinementRow(*row[:2], *row[3:]) for row in _REFINEMENT.read(path)]
 
 
 def write_refinement(path: Path, rows: Iterable[RefinementRow]) -> None:

@@ -33,6 +33,7 @@ from megloc_kapture.evaluation.protocols import TWIN_PREFIX as TWIN_PREFIX
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol
 from megloc_kapture.io.files import write_bytes
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.output_folders import files_below
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, PRESETS
 from megloc_kapture.plugin_loading import load_plugin, plugin_names
 from megloc_kapture.plugins import DATASETS, RENDERED_DATASETS, DatasetAdapter, RenderedDataset
@@ -98,7 +99,8 @@ class DatasetChoice:
         return settings
 
     def input_files(self, root: Path) -> Iterator[Path]:
-        return input_files(root) if self.adapter is None else self.adapter.input_files(root)
+        """Yield the files that an import depends on; of a download, all below its root."""
+        return input_files(root) if self.adapter is None else files_below(root)
 
     def rehearse(self) -> None:
         """Raise the errors of an import without writing anything."""

@@ -43,7 +43,7 @@ class Workspace:
 
     def __init__(self, root: Path, *, force: bool = False) -> None:
         self.root, self.force = Path(root).absolute(), force
-        self._claim = claim_folder(self.root, kind="workspace", force=force)
+        self._undo_claim = claim_folder(self.root, kind="workspace", force=force)
         self._published = False
 
     def path(self, relative: str) -> Path:
@@ -110,7 +110,7 @@ class Workspace:
         with contextlib.suppress(OSError):
             (self.root / LOCK).unlink(missing_ok=True)
             (self.root / PARTIAL).rmdir()
-        self._claim.undo()
+        self._undo_claim()
 
     @contextmanager
     def staging(self, stage: str, mark: str) -> Iterator[Path]:

@@ -22,7 +22,7 @@ from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.io.images import decode_image_rgb, photo_of, turned_upright
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.localizer import Localizer
@@ -170,11 +170,11 @@ def read_query(content: bytes, camera: str | None, *, max_megapixels: float) -> 
         photo = photo_of(image)
         return ImageQuery(photo.upright_camera, turned_upright(pixels, photo.orientation), name)
     known = read_camera(camera)
-    if (known.width, known.height) != (width, height):
-        raise DataError(
-            f"the image is {width}x{height} as it is stored, its camera says "
-            f"{known.width}x{known.height}"
-        )
+    require(
+        (known.width, known.height) == (width, height),
+        f"the image is {width}x{height} as it is stored, its camera says "
+        f"{known.width}x{known.height}",
+    )
     return ImageQuery(known, pixels, name)
 
 

@@ -78,26 +78,26 @@ def map_overview(kapture_map: KaptureMap) -> bytes:
     [x, y, ...] and ``cameras`` [x, y, direction x, direction y, ...] are relative to these and
     subsampled if many. ``images`` counts the map's images, ``unit`` is ``m`` or ``units``.
     """
-    from megloc_kapture.evaluation.report.map_view import top_view  # imports matplotlib
+    from megloc_kapture.evaluation.report.queries import top_view
 
     names = kapture_map.images
     quats, translations = stack_poses([kapture_map.poses[name] for name in names])
     centers = camera_centers(quats, translations)
     origin = centers.mean(axis=0)
-    view = top_view(quats, centers)
+    page, _ = top_view(quats, centers)
     forward = rotate(invert_quats(quats), np.array([0.0, 0.0, 1.0]))
-    cameras = np.hstack([view.project(centers - origin), view.project(forward)])
+    cameras = np.hstack([(centers - origin) @ page.T, forward @ page.T])
     points = _without_outliers(
         np.concatenate([k.index.xyz for k in kapture_map.keypoints.values()])
     )
     content = {
         "images": len(names),
         "unit": kapture_map.unit,
-        "right": _rounded(view.right, 9),
-        "up": _rounded(view.up, 9),
+        "right": _rounded(page[0], 9),
+        "up": _rounded(page[1], 9),
         "origin": origin.tolist(),
         "cameras": _rounded(_sample(cameras, _MAX_CAMERAS)),
-        "points": _rounded(view.project(_sample(points, _MAX_POINTS) - origin)),
+        "points": _rounded((_sample(points, _MAX_POINTS) - origin) @ page.T),
     }
     return json.dumps(content, separators=(",", ":")).encode()
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import re
 import shutil
 from collections.abc import Callable
@@ -139,30 +137,6 @@ def test_localize_refuses_a_bad_map_and_info_finds_the_same_fault(
     assert contents(foreign) == before
 
 
-QUERIES: dict[str, tuple[Spoil, str]] = {
-    "no records": (remove(RECORDS), r"query: there are no query images"),
-    "no features of one": (
-        remove(f"{KEYPOINTS}/{QUERY}.kpt"),
-        r"the weights r2d2_WASF_N16 are missing.*megloc weights fetch r2d2_WASF_N16",
-    ),
-    "other descriptors": (
-        line(f"{DESCRIPTORS}/descriptors.txt", 3, lambda text: text.replace("128", "64")),
-        r"00\d+\.jpg\.desc: .*descriptors for|64 values, the map's 128",
-    ),
-    "path upwards": (line(RECORDS, 3, UPWARDS), r"records_camera\.txt:3: .*'\.\.'"),
-    "camera": (line("sensors/sensors.txt", 3, NO_COLUMN), r"sensors\.txt:3: "),
-}
-
-
-@pytest.mark.parametrize(("spoil", "message"), QUERIES.values(), ids=QUERIES)
-def test_localize_refuses_bad_queries(
-    megloc: Any, foreign: Path, spoil: Spoil, message: str
-) -> None:
-    spoil(foreign / "query")
-    megloc(*localize(foreign)).refused(message)
-    assert not (foreign.parent / "new").exists()
-
-
 def test_features_that_nobody_can_extract(megloc: Any, foreign: Path) -> None:
     rename_type(foreign)
     told = megloc("info", foreign / "map").out
@@ -177,54 +151,6 @@ def test_features_that_nobody_can_extract(megloc: Any, foreign: Path) -> None:
     assert not (foreign.parent / "new").exists()
     told = megloc("info", foreign / "map").out
     assert re.search("map descriptors .*no extractor .*not possible", told)
-
-
-def test_quaternions_almost_of_unit_length_are_normalised(
-    megloc: Any, foreign: Path, contents: Contents
-) -> None:
-    megloc(*localize(foreign))
-    place = foreign.parent / "new" / "localized"
-    expected = contents(place / "sensors")["trajectories.txt"]
-    line(TIMES, 3, quaternion_times(1.0009))(foreign / "map")
-    assert megloc(*localize(foreign)).status == 0
-    assert contents(place / "sensors")["trajectories.txt"] == expected
-
-
-SPECIAL: dict[str, tuple[list[str], str]] = {
-    "no map": (["-i", "{}/nowhere"], r"/nowhere: no such kapture folder"),
-    "no queries": (["--query", "{}/nowhere"], r"/nowhere: no such kapture folder"),
-    "no features folder": (["--features-dir", "{}/nowhere"], r"/nowhere: no such folder"),
-    "no pairs": (["--pairs", "{}/nowhere"], r"/nowhere: "),
-    "strange pairs": (["--pairs", "{}/pairs.txt"], r"nowhere\.jpg, which is no image of the map"),
-    "not a map": (["-i", "{}/query"], r"/query: no map to localize in"),
-    "no such type": (["--keypoints-type", "sift"], r"'sift'; there are: r2d2_800"),
-    "bad value": (["--set", "localization.fallback=guess"], r"option localization\.fallback"),
-    "no workers": (["--workers", "0"], r"0 workers"),
-}
-
-
-@pytest.mark.parametrize(("change", "message"), SPECIAL.values(), ids=SPECIAL)
-def test_arguments_that_cannot_be(
-    megloc: Any, foreign: Path, change: list[str], message: str
-) -> None:
-    header = "# query_image, map_image, score\n"
-    (foreign / "pairs.txt").write_text(f"{header}{QUERY}, nowhere.jpg, 1.0\n")
-    megloc(*localize(foreign), *(text.format(foreign) for text in change)).refused(message)
-    assert not (foreign.parent / "new").exists()
-
-
-@pytest.mark.parametrize("kind", ["file", "folder"])
-def test_localize_leaves_what_others_wrote(megloc: Any, foreign: Path, kind: str) -> None:
-    place = foreign.parent / "new" / "localized"
-    place.parent.mkdir()
-    if kind == "file":
-        place.write_text("mine")
-    else:
-        place.mkdir()
-        (place / "thesis.txt").write_text("mine")
-    megloc(*localize(foreign)).refused(str(place))
-    left = [str(p.relative_to(place.parent)) for p in place.parent.rglob("*")]
-    assert left == (["localized"] if kind == "file" else ["localized", "localized/thesis.txt"])
 
 
 # ------------------------------------------------------------------ megloc eval kapture
@@ -287,64 +213,10 @@ def test_a_bad_dataset_is_refused(
     assert contents(dataset) == before
 
 
-def test_a_truncated_image_of_the_map_stops_the_run_where_it_is_read(
-    megloc: Any, dataset: Path
-) -> None:
-    cut(IMAGE, 20_000)(dataset)
-    run = dataset.parent / "run"
-    megloc(*eval_of(dataset, run)).refused(r"records_data/0005\.jpg: .*(broken|truncated)")
-    assert not (run / "local_features").exists()
-    assert [path.name for path in (run / "stages").glob("[a-z]*.json")] == ["import.json"]
-
-
 def test_where_no_image_of_a_query_can_be_used_the_run_stops(megloc: Any, dataset: Path) -> None:
     for image in (dataset / "query/sensors/records_data").iterdir():
         image.write_bytes(b"")
     megloc(*eval_of(dataset, dataset.parent / "run")).refused(r"records_data/0001\.jpg: empty file")
-
-
-EVALUATION: dict[str, tuple[list[str], str]] = {
-    "no root": (["kapture"], r"dataset kapture needs --root"),
-    "no such root": (["kapture", "--root", "{}/nowhere"], r"/nowhere: no such folder"),
-    "no such dataset": (["venice"], r"unknown dataset 'venice'; known: kapture"),
-    "no such stage": (["--from", "lunch"], r"no stage 'lunch'"),
-    "not done": (["--from", "localization"], r"needs stage import, which has not run"),
-    "no such plugin": (
-        ["--set", "local_features.name=orb"],
-        r"no plugin 'orb' .*registered: .*rootsift",
-    ),
-    "plugin's option": (
-        ["--set", "local_features.options.max_keypoints=many"],
-        r"'rootsift' refuses its options: .*max_keypoints",
-    ),
-    "no config": (["--config", "{}/x"], r"/x: "),
-    "threshold": (["--thresholds", "near"], r"'near'"),
-    "share": (["--fail-below", "60"], r"between 0 and 1"),
-    "never judged": (
-        ["--fail-below", "0.5", "--until", "import"],
-        r"--fail-below needs stage evaluation",
-    ),
-    "prefix": (["--query-prefix", "../up"], r"'\.\.'"),
-    "workers": (["--workers", "-1"], r"-1 workers"),
-}
-
-
-@pytest.mark.parametrize(("arguments", "message"), EVALUATION.values(), ids=EVALUATION)
-def test_eval_that_cannot_be(
-    megloc: Any, scene: Path, tmp_path: Path, arguments: list[str], message: str
-) -> None:
-    of_scene = ["kapture", "--root", "{}"] if arguments[0].startswith("--") else []
-    given = [argument.format(scene) for argument in (*of_scene, *arguments)]
-    megloc("eval", *given, "--workspace", tmp_path / "a" / "b", "--quiet").refused(message)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_fail_below_without_truth_is_refused_before_the_work(megloc: Any, dataset: Path) -> None:
-    shutil.rmtree(dataset / "query_gt")
-    run = dataset.parent / "run"
-    arguments = ["--root", dataset, "--workspace", run, "--fail-below", "0.5"]
-    megloc("eval", "kapture", *arguments).refused(r"dataset/query_gt is missing")
-    assert not run.exists()
 
 
 @pytest.mark.parametrize(
@@ -366,17 +238,3 @@ def test_every_command_names_what_is_missing(megloc: Any, dataset: Path, command
     words = [word.replace("{}", str(dataset)) for word in command.split()]
     megloc(*words).refused("/nowhere|/mapping")
     assert not (dataset / "new").exists()
-
-
-def test_a_folder_that_is_closed_to_us_is_told_in_one_line(
-    megloc: Any, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def closed(path: Any, **how: Any) -> Any:
-        if not isinstance(path, int) and Path(path).is_relative_to(dataset / "query"):
-            raise PermissionError(errno.EACCES, "Permission denied", str(path))
-        return real(path, **how)
-
-    real = os.stat  # whoever runs the tests may be allowed everything
-    monkeypatch.setattr(os, "stat", closed)
-    arguments = ["--root", dataset, "--workspace", tmp_path / "run"]
-    megloc("eval", "kapture", *arguments).refused(f"{dataset}/query.*: Permission denied")

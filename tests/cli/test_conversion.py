@@ -8,13 +8,9 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-import pytest
 from kapture import flatten
 from kapture.io.csv import kapture_from_dir
 from scipy.spatial.transform import Rotation
-
-from megloc_kapture import DataError, OptionError
-from megloc_kapture.pipeline.export import export
 
 
 def poses(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -109,21 +105,3 @@ def test_ply_has_points_and_frusta(megloc: Any, finished: Path, tmp_path: Path) 
     np.testing.assert_allclose(
         sorted(map(tuple, centres)), sorted(tuple(c) for _, c in truth.values()), atol=1e-9
     )
-
-
-def test_what_cannot_be_is_refused(megloc: Any, finished: Path, tmp_path: Path) -> None:
-    out, query = tmp_path / "out", ("--query", finished / "localized")
-    for name, arguments, words in (
-        ("tum", (), "give a map, or localized queries"),
-        ("tum", (*query, "--sensor", "back"), "of camera 'back'"),
-        ("colmap", (*query, "-i", finished / "localized"), "both have"),
-    ):
-        megloc("export", name, *arguments, "-o", out).refused(words)
-    assert not out.exists()
-    out.write_text("mine")
-    megloc("export", "tum", *query, "-o", out).refused("is there already; --force")
-    assert out.read_text() == "mine"
-    with pytest.raises(OptionError, match="did you mean 'nerfstudio'"):
-        export("nerfstudo", out, query=finished / "localized")  # type: ignore[arg-type]
-    with pytest.raises(DataError, match="no such"):
-        export("tum", tmp_path / "a", query=tmp_path / "nothing")

@@ -17,7 +17,6 @@ from aachen_files import write_v1_0
 from megloc_kapture.io.images import write_depth_map, write_image
 from megloc_kapture.io.kapture import KaptureFolder, Sensor, read_pairs, write_sensors
 from megloc_kapture.io.tables import read_status
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.values import RigidTransform
 
 Contents = Callable[[Path], dict[str, bytes]]
@@ -228,18 +227,6 @@ def test_a_changed_image_reruns_everything_and_a_moved_dataset_the_import(
 # ------------------------------------------------------------------ parts of a run
 
 
-def test_a_dry_run_refuses_what_the_import_would(
-    evaluate: Any, dataset: Path, tmp_path: Path
-) -> None:
-    image = dataset / "mapping/sensors/records_data/0005.jpg"
-    write_image(image, np.zeros((4, 4, 3), np.uint8))
-    dry, real = (
-        evaluate(dataset, tmp_path / "run", flag, *until, status=2).err.splitlines()[-1]
-        for flag, *until in (("--dry-run",), ("--until", "import"))
-    )
-    assert dry == real and "0005.jpg: the image is 4x4" in dry
-
-
 def test_import_options_are_those_of_the_dataset(megloc: Any, tmp_path: Path) -> None:
     version = ("--root", write_v1_0(tmp_path / "root"), "--import-option", "version=1.1")
     done = megloc("eval", "aachen", *version, "-w", tmp_path / "run", "--dry-run")
@@ -288,39 +275,6 @@ def test_from_takes_what_another_tool_put_there(
     }
 
 
-# ------------------------------------------------------------------ whose workspace it is
-
-
-def test_a_folder_of_somebody_else_is_refused_and_untouched(
-    megloc: Any, evaluate: Any, scene: Path, tmp_path: Path
-) -> None:
-    place = tmp_path / "home"
-    place.mkdir()
-    (place / "thesis.txt").write_text("mine")
-    megloc("eval", "kapture", "--root", scene, "--workspace", place).refused(f"{place}: .*-f")
-    assert [path.name for path in tmp_path.rglob("*")] == ["home", "thesis.txt"]
-    evaluate(scene, place, "--until", "import", "--force")
-    assert (place / "thesis.txt").read_text() == "mine"
-    assert (place / "mapping").is_dir()
-    evaluate(scene, place, "--until", "import")
-
-
-def test_a_refused_run_changes_nothing(
-    megloc: Any, dataset: Path, workspace: Path, contents: Contents, tmp_path: Path
-) -> None:
-    place, before = tmp_path / "home", contents(workspace)
-    place.mkdir()
-    (place / "thesis.txt").write_text("mine")
-    with Workspace(workspace).lock():
-        megloc("eval", "kapture", "--root", dataset, "--workspace", workspace).refused(
-            f"{workspace}: another run is using this workspace"
-        )
-    assert contents(workspace) == before
-    (dataset / "mapping/sensors/records_data/0005.jpg").unlink()
-    megloc("eval", "kapture", "--root", dataset, "--workspace", place, "-f").refused("0005")
-    assert [path.name for path in place.iterdir()] == ["thesis.txt"]
-
-
 # ------------------------------------------------------------------ the same bytes
 
 
@@ -357,65 +311,6 @@ def test_queries_that_fail_are_misses_and_low_recall_fails_when_asked_for(
     # they are not in the pose file, and the other one does not mind
     expected = (finished / POSES).read_text().splitlines(keepends=True)
     assert (run / POSES).read_text() == "".join(r for r in expected if "0001" in r)
-
-
-def test_no_query_localized_is_no_error(evaluate: Any, dataset: Path) -> None:
-    for image in (dataset / "query/sensors/records_data").iterdir():
-        write_image(image, np.zeros((300, 400, 3), np.uint8))
-    run = dataset.parent / "run"
-    done = evaluate(dataset, run)
-    assert "warning: no query was localized; reasons are in localized/status.csv" in done.err
-    assert (run / POSES).read_text() == ""
-    assert recall(run) == [0.0] * 4
-    # no fallback unless it is asked for, and then it is marked
-    fallback = ("--set", "localization.fallback=retrieval", "--until", "submission")
-    assert ran(evaluate(dataset, run, *fallback).err) == ["localization", "submission"]
-    statuses = read_status(run / "localized" / "status.csv")
-    assert {s.reason for s in statuses.values()} == {"no map image matches"}
-    assert {s.status for s in statuses.values()} == {"failed"}
-    assert {s.fallback for s in statuses.values()} == {"retrieval"}
-    poses = KaptureFolder(run / "localized").read().poses()
-    map_poses = list(KaptureFolder(run / "map").read().poses().values())
-    assert len(poses) == 4 and all(pose in map_poses for pose in poses.values())
-    assert json.loads((run / f"{POSES}.json").read_text())["counts"]["fallbacks"] == 4
-
-
-def rename_queries(dataset: Path) -> dict[str, str]:
-    """Give the queries names that map images have: new name to old."""
-    old_names = KaptureFolder(dataset / "query").read().image_names()
-    names = dict(zip(("0000.jpg", "0002.jpg", "0003.jpg", "0005.jpg"), old_names, strict=True))
-    for part in ("query", "query_gt"):
-        records = dataset / part / "sensors" / "records_camera.txt"
-        text = records.read_text()
-        for new, old in names.items():
-            text = text.replace(f" {old}", f" <{new}")
-        records.write_text(text.replace("<", ""))
-    images = dataset / "query" / "sensors" / "records_data"
-    for old in names.values():
-        (images / old).rename(images / f"x{old}")
-    for new, old in names.items():
-        (images / f"x{old}").rename(images / new)
-    return names
-
-
-def test_equal_names_in_map_and_query(
-    megloc: Any, evaluate: Any, dataset: Path, finished: Path
-) -> None:
-    names = rename_queries(dataset)
-    run = dataset.parent / "run"
-    megloc("eval", "kapture", "--root", dataset, "--workspace", run, "--quiet").refused(
-        r"4 images have the same name in map and query, .*0000\.jpg.*--query-prefix"
-    )
-    assert not run.exists()
-    evaluate(dataset, run, "--query-prefix", "queries", "--until", "submission")
-    found = dict(row.split(" ", 1) for row in (run / POSES).read_text().splitlines())
-    expected = dict(row.split(" ", 1) for row in (finished / POSES).read_text().splitlines())
-    # the pairs are another order of the same, and so the draws of the solver
-    assert set(found) == {f"queries/{new}" for new in names}
-    for new, old in names.items():
-        pose = np.array(found[f"queries/{new}"].split(), float)
-        np.testing.assert_allclose(pose, np.array(expected[old].split(), float), atol=2e-2)
-    assert set(KaptureFolder(run / "query_gt").read().poses()) == set(found)
 
 
 def test_inverted_poses_are_refused_unless_forced(

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from megloc_kapture.evaluation.pose_files import read_pose_file, write_pose_file
+from megloc_kapture.evaluation.pose_files import write_pose_file
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.dataset_tables import (
     ImageGroup,
@@ -111,21 +110,6 @@ def test_two_results_are_compared(megloc: Any, runs: Path) -> None:
     assert "a/localized and poses.txt find the same 38 queries" in " ".join(done.out.split())
 
 
-def test_a_datasets_protocol_by_name(megloc: Any, runs: Path) -> None:
-    truth = write_kapture(runs / "lone/gt", IMAGES, poses_off(0.0))
-    result = write_kapture(runs / "lone_result", IMAGES, poses_off(0.3))
-    plain = megloc("evaluate", "-i", result, "--gt", truth)
-    assert "0.05 m, 5 deg" in plain.out and "night" not in plain.out
-    named = megloc("evaluate", "-i", result, "--gt", truth, "--dataset", "aachen")
-    assert "recall (%) at 0.25 m, 2 deg / 0.5 m, 5 deg / 5 m, 10 deg" in named.out
-    # its conditions are folders of the images
-    assert [line.split()[0] for line in named.out.splitlines()[6:8]] == ["day", "night"]
-    inloc = megloc("evaluate", "-i", result, "--gt", truth, "--dataset", "inloc")
-    assert "0.0 / 100.0 / 100.0" in inloc.out
-    own = megloc("evaluate", "-i", result, "--gt", truth, "--thresholds", "0.4,1", "0.3")
-    assert "recall (%) at 0.4 m, 1 deg / 0.3 m\n" in own.out
-
-
 def test_without_truth(megloc: Any, runs: Path) -> None:
     out = runs / "out"
     done = megloc(*results(runs, "a", "b"), "-o", out)
@@ -181,46 +165,6 @@ def imported(scene: Path, tmp_path: Path) -> Path:
     write_status(root / "localized" / "status.csv", rows)
     write_protocol(root / "megloc", Protocol(dataset="aachen", pose_file_names="basename"))
     return root
-
-
-def test_what_is_told(megloc: Any, imported: Path, tmp_path: Path) -> None:
-    place = tmp_path / "poses.txt"
-    done = megloc("submit", "aachen", "-i", imported / "localized", "-o", place)
-    assert (done.status, done.err) == (0, "")
-    assert done.out == f"3 poses of 4 queries, 1 missing, 1 of the poses guessed: {place}\n"
-    assert len(read_pose_file(place)) == 3
-    beside = json.loads(place.with_name("poses.txt.json").read_text())
-    assert beside["dataset"] == "aachen" and beside["counts"]["missing"] == 1
-    megloc("submit", "aachen", "-i", imported / "localized", "-o", place).refused("exists; -f")
-    again = megloc("submit", "synthetic-aachen", "-i", imported / "localized", "-o", place, "-f")
-    assert again.status == 0
-
-
-def test_side_tables_of_elsewhere(megloc: Any, imported: Path, tmp_path: Path) -> None:
-    result = tmp_path / "elsewhere" / "result"
-    shutil.copytree(imported / "localized", result, symlinks=True)
-    command = ["submit", "aachen", "-i", result, "-o", tmp_path / "poses.txt"]
-    megloc(*command).refused("rules of aachen stand in the megloc/ folder", "--side-tables")
-    done = megloc(*command, "--side-tables", imported / "megloc")
-    assert done.out.startswith("3 poses of 4 queries")
-    megloc(*command, "--side-tables", tmp_path / "nowhere").refused("nowhere: no such folder")
-    assert megloc("submit", "kapture", *command[2:], "-f").out.startswith("3 poses of 4 queries")
-
-
-def test_what_submit_refuses(megloc: Any, imported: Path, tmp_path: Path) -> None:
-    result, place = imported / "localized", tmp_path / "poses.txt"
-    megloc("submit", "robotcar", "-i", result, "-o", place).refused(
-        "dataset robotcar is asked for", "protocol.json is of dataset aachen"
-    )
-    megloc("submit", "cambridge", "-i", result, "-o", place).refused(
-        "unknown dataset 'cambridge'; known: kapture"
-    )
-    megloc("submit", "aachen", "-i", result, "-o", place, "--from-rig").refused("rigs.txt")
-    megloc("submit", "aachen", "-i", result, "-o", tmp_path).refused("is not what is to be written")
-    assert not place.exists()
-    (tmp_path / "poses.txt.json").write_text("mine")
-    megloc("submit", "aachen", "-i", result, "-o", place).refused("poses.txt.json exists; -f")
-    assert (tmp_path / "poses.txt.json").read_text() == "mine" and not place.exists()
 
 
 def test_mlad_goes_to_a_folder(megloc: Any, imported: Path, tmp_path: Path) -> None:
@@ -302,32 +246,3 @@ def test_a_wrong_file(megloc: Any, aachen: Path, poses: Poses, place: Path) -> N
     content = json.loads(done.out)
     assert done.status == 2 and content["ok"] is False
     assert content["findings"][0]["kind"] == "convention"
-
-
-def test_without_data_the_file_alone_is_checked(megloc: Any, aachen: Path, place: Path) -> None:
-    done = megloc("check", "inloc", place)
-    assert done.status == 2 and "not ending in .JPG" in done.out
-    assert "the poses are not checked" in done.out
-    done = megloc("check", "kapture", place)
-    assert done.status == 0 and done.out.endswith("4 poses: no problem found\n")
-    # a twin's run is none of the rendered world
-    mapping = KaptureFolder(aachen / "mapping").read()
-    write_sensors(aachen.parent / "synthetic-aachen-classic" / "mapping", mapping)
-    assert "compared" not in megloc("check", "synthetic", place).err
-    (aachen.parent / "aachen-megloc").mkdir()
-    (aachen / "mapping").rename(aachen.parent / "aachen-megloc" / "mapping")
-    write_sensors(aachen / "mapping", KaptureFolder(aachen / "query").read())
-    done = megloc("check", "aachen", place)
-    assert done.err.startswith("compared with none of runs/aachen-classic, runs/aachen-megloc")
-
-
-def test_what_check_refuses(megloc: Any, aachen: Path, place: Path, tmp_path: Path) -> None:
-    megloc("check", "aachen", tmp_path / "x.txt").refused(r"x\.txt: no such file")
-    megloc("check", "aahcen", place).refused("unknown dataset 'aahcen'")
-    megloc("check", "robotcar", place, "--data", aachen).refused("is of dataset aachen")
-    megloc("check", "aachen", place, "--data", tmp_path).refused("no imported dataset")
-    (aachen / "megloc" / "protocol.json").unlink()
-    megloc("check", "aachen", place, "-q").refused("rules of aachen", "--data")
-    megloc("check", "aachen", tmp_path, "--data", aachen, "-q").refused("rules of aachen")
-    place.write_bytes(b"\xff\xfe")
-    megloc("check", "kapture", place, "-q").refused(r"poses\.txt:1: not a text file in UTF-8")

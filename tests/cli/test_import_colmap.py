@@ -47,19 +47,6 @@ def test_a_model_is_taken_for_a_map(
     assert "7 (7 PINHOLE), 7 with a pose" in told and "extracted by plugin sift" in told
 
 
-def test_images_and_database_can_be_given(megloc: Any, colmap_room: Path, tmp_path: Path) -> None:
-    model = tmp_path / "model"
-    model.symlink_to(colmap_room / "sparse" / "0")
-    given = ("--images", colmap_room / "images", "--database", colmap_room / "database.db")
-    done = megloc("import", "colmap", model, *given, "-o", tmp_path / "map")
-    assert done.status == 0
-    folder = KaptureFolder(tmp_path / "map")
-    assert all(folder.image_path(name).is_file() for name in folder.read().image_names())
-    # without both there is nothing to match queries with
-    refused = megloc("import", "colmap", model, "-o", tmp_path / "none").refused("--database")
-    assert "--images" in refused and not (tmp_path / "none").exists()
-
-
 def test_poses_alone_become_a_kapture(
     megloc: Any, colmap_room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -73,21 +60,6 @@ def test_poses_alone_become_a_kapture(
     for image in model.images.values():
         expected = image.cam_from_world().matrix()
         np.testing.assert_allclose(poses[image.name].matrix()[:3], expected, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        ("colmap {room}/images", "images: no COLMAP model: neither images.bin nor"),
-        ("colmap {room} --images none", "none: no such folder of images"),
-    ],
-)
-def test_what_is_no_colmap_model_is_refused(
-    megloc: Any, colmap_room: Path, scene: Path, tmp_path: Path, words: str, told: str
-) -> None:
-    arguments = (word.format(room=colmap_room, scene=scene) for word in words.split())
-    megloc("import", *arguments, "-o", tmp_path / "map").refused(told)
-    assert not (tmp_path / "map").exists()
 
 
 def write_poses(folder: Path, colmap_room: Path, matrices: dict[str, np.ndarray]) -> None:

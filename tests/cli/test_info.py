@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -67,41 +66,3 @@ def test_cameras_that_are_not_calibrated(megloc: Any, scene: Path, tmp_path: Pat
         data.sensors[name] = replace(sensor, params=("UNKNOWN_CAMERA", *sensor.params[1:3]))
     write_sensors(tmp_path, data)
     assert re.search(r"images +4 \(4 UNKNOWN_CAMERA\)", megloc("info", tmp_path).out)
-
-
-def test_info_says_what_ranks_many_images(megloc: Any, finished: Path, tmp_path: Path) -> None:
-    root = Path(shutil.copytree(finished / "map", tmp_path / "map", symlinks=True))
-    of_vlad = root / "reconstruction" / "global_features"
-    assert described(megloc("info", root).out)["retrieval"] == (
-        "all 7 map images, ranked by VLAD over the map's descriptors"
-    )
-    shutil.rmtree(of_vlad)
-    assert described(megloc("info", root).out)["retrieval"] == "all 7 map images, not ranked"
-    # sixty images more, of one camera and place
-    folder = KaptureFolder(root)
-    data, (local_type,) = folder.read(), folder.types("keypoints")
-    name = data.image_names()[0]
-    timestamp, sensor = data.record_of(name)
-    places = [folder.keypoints(local_type), folder.descriptors(local_type)]
-    for number in range(60):
-        data.records_camera[10_000 + number, sensor] = f"more/{number}.png"
-        data.trajectories[10_000 + number, sensor] = data.trajectories[timestamp, sensor]
-        for reader in places:
-            stored = Path(reader.where(name))
-            copy = stored.parents[len(Path(name).parts) - 1] / f"more/{number}.png{stored.suffix}"
-            copy.parent.mkdir(exist_ok=True)
-            shutil.copyfile(stored, copy)
-    write_sensors(root, data)
-    assert described(megloc("info", root).out)["retrieval"] == (
-        "the 50 of 67 map images that are most similar by VLAD over the map's descriptors"
-    )
-
-
-def test_info_of_a_map_whose_descriptors_are_missing(megloc: Any, foreign: Path) -> None:
-    shutil.rmtree(foreign / "map" / "reconstruction" / "descriptors")
-    told = described(megloc("info", foreign / "map").out)
-    assert told["map descriptors"] == "missing; will be extracted again by plugin r2d2"
-    assert told["retrieval"] == "all 7 map images, not ranked"
-    (foreign / "map" / "sensors" / "records_data").rename(foreign / "away")
-    told = described(megloc("info", foreign / "map").out)
-    assert told["retrieval"] == "not possible without the map's descriptors"

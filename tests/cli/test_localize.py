@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -188,19 +187,6 @@ def test_proxy_folders_of_kapture_localization(
     )
 
 
-def test_our_own_output_is_written_anew(
-    megloc: Any, foreign: Path, contents: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(foreign)
-    done = megloc("localize", "-i", "map", "--query", "query")
-    assert done.status == 0 and "in localized" in done.out
-    expected = contents(foreign / "localized")
-    assert len(KaptureFolder(foreign / "localized").read().poses()) == 4
-    again = queries_of(foreign, foreign / "localized")
-    assert megloc(*again, "--workers", "1").status == 0
-    assert contents(foreign / "localized") == expected
-
-
 def test_given_pairs_take_the_place_of_retrieval(megloc: Any, foreign: Path) -> None:
     names = KaptureFolder(foreign / "query").read().image_names()
     chosen = ["0006.jpg", "0005.jpg", "0003.jpg"]
@@ -237,65 +223,6 @@ def test_retrieval_by_what_both_bring_else_by_our_own(megloc: Any, foreign: Path
     assert re.search(rf"^candidates: (global features )?{by}$", done.err, re.MULTILINE)
     statuses = read_status(foreign / "localized" / "status.csv")
     assert {len(s.candidates) for s in statuses.values()} == {5}
-
-
-def not_finite(content: bytes) -> bytes:
-    values = np.frombuffer(content, "<f4").copy()
-    values[7] = np.nan
-    return values.tobytes()
-
-
-STORED = "local_features/rootsift/keypoints/{}.kpt"
-DESCRIBED = "local_features/rootsift/descriptors/{}.desc"
-VECTORS = "global_features/vlad_rootsift/global_features/{}.gfeat"
-
-
-@pytest.mark.parametrize(
-    ("path", "change", "reason"),
-    [
-        (STORED, not_finite, "not all values are finite"),
-        (DESCRIBED, not_finite, "not all values are finite"),
-        (VECTORS, not_finite, "not all values are finite"),
-        (
-            STORED,
-            lambda content: content[:-3],
-            "are not whole rows of 2 x float32; truncated?",
-        ),
-        (DESCRIBED, lambda content: content[:-512], "799 descriptors for 800 keypoints"),
-        (VECTORS, lambda content: content[:-4], "are not exactly one row of"),
-    ],
-)
-def test_broken_features_of_a_query_fail_it_and_those_of_the_map_end_the_run(
-    megloc: Any,
-    finished: Path,
-    scene: Path,
-    tmp_path: Path,
-    path: str,
-    change: Callable[[bytes], bytes],
-    reason: str,
-) -> None:
-    features, output = tmp_path / "features", tmp_path / "localized"
-    for part in ("local_features", "global_features"):
-        shutil.copytree(finished / part, features / part)
-    spoilt = features / path.format("0001.jpg")
-    spoilt.write_bytes(change(spoilt.read_bytes()))
-    queries = ["--query", scene / "query", "--features-dir", features]
-    top = ["--set", "query_pairs.top_k=3"]  # or nothing would be ranked
-    done = megloc("localize", "-i", finished / "map", *queries, *top, "-o", output)
-    assert done.out.startswith("3 of 4"), done
-    assert "Warning" not in done.err
-    status = read_status(output / "status.csv")["0001.jpg"]
-    assert status.status == "failed"
-    assert status.reason.startswith(f"{spoilt}: ") and reason in status.reason
-    # the map's own, given beside it
-    spoilt = features / path.format("0000.jpg")
-    spoilt.write_bytes(change(spoilt.read_bytes()))
-    bare = tmp_path / "map"
-    shutil.copytree(finished / "map", bare, symlinks=True)
-    for kind in ("keypoints", "descriptors", "global_features"):
-        shutil.rmtree(bare / "reconstruction" / kind)
-    done = megloc("localize", "-i", bare, *queries, *top, "-o", tmp_path / "none")
-    done.refused(f"{spoilt}: .*{reason}")
 
 
 def test_images_that_cannot_be_used_fail_their_query_alone(

@@ -6,20 +6,17 @@ import re
 import shlex
 import subprocess
 import sys
-from importlib.metadata import EntryPoints, version
-from pathlib import Path
+from importlib.metadata import version
 from typing import Any
 
 import pytest
 
 import megloc_kapture
-from megloc_kapture.cli.common import Console
 from megloc_kapture.cli.info import shown
-from megloc_kapture.cli.main import COMMANDS, command_class, main
+from megloc_kapture.cli.main import COMMANDS, main
 from megloc_kapture.pipeline.presets import BASIC_OPTIONS, PRESETS, options_of, options_of_preset
 from megloc_kapture.stages.options import PipelineOptions
 
-PROGRAM = str(Path(sys.executable).with_name("megloc"))
 BAD_ARGUMENTS = {
     "no command": ([], "Missing subcommand"),
     "unknown command": (["localise"], "unknown command 'localise'; did you mean 'localize'"),
@@ -52,20 +49,6 @@ def test_help(megloc: Any, command: str | None, flag: str) -> None:
         assert done.out.startswith(f"usage: megloc {command} ")
 
 
-def test_a_rendered_dataset_is_refused_in_one_line(
-    megloc: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "out"
-    megloc("synth", "venice", "-o", out).refused(
-        "nothing renders 'venice'; known: 4seasons, aachen"
-    )
-    megloc("synth", "aachen", "-o", out, "--set", "width=3").refused("'aachen' .* width: .* 64")
-    monkeypatch.setattr("megloc_kapture.plugin_names.entry_points", lambda group: EntryPoints())
-    megloc("synth", "aachen", "-o", out).refused("pip install megloc-twins")
-    monkeypatch.undo()
-    assert not out.exists()
-
-
 def test_the_list_of_commands_costs_no_solver() -> None:
     code = (
         "import sys\nfrom megloc_kapture.cli.main import main\n"
@@ -74,43 +57,6 @@ def test_the_list_of_commands_costs_no_solver() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.endswith("\n[]\n")
-
-
-def test_the_traceback_is_shown_with_debug_only(megloc: Any, tmp_path: Path) -> None:
-    place = tmp_path / "nowhere"
-    told = f"megloc: {place}: no such kapture folder\n"
-    assert megloc("info", place).err == told
-    done = megloc("info", place, "--debug")
-    assert done.status == 2
-    assert done.err.startswith("Traceback (most recent call last):\n")
-    assert "\nmegloc_kapture.errors.DataError: " in done.err
-    assert done.err.endswith(told)
-
-
-def test_who_stops_reading_gets_no_complaint() -> None:
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "bufsize": 0}
-    for arguments in (["weights", "list"], ["eval", "--help"]):
-        command: Any = subprocess.Popen([PROGRAM, *arguments], **pipes)  # type: ignore[call-overload]
-        command.stdout.close()
-        assert command.stderr.read() == b""
-        assert command.wait() == 0
-
-
-def test_progress_says_how_many_how_fast_and_how_long(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("megloc_kapture.cli.common._LINE_EVERY_S", 0.0)
-    assert list(Console().track("abc", 3, "features, 4 of 7 kept")) == ["a", "b", "c"]
-    lines = capsys.readouterr().err.splitlines()
-    for number, line in enumerate(lines, start=1):
-        start = f"  features, 4 of 7 kept: {number} of 3, "
-        assert re.fullmatch(re.escape(start) + r"[0-9.e+]+/s, 0:00:00 left", line)
-    assert len(lines) == 2
-
-
-def test_every_command_has_its_own_first_line() -> None:
-    for name, (_, text) in COMMANDS.items():
-        assert " ".join((command_class(name).__doc__ or "").split()).startswith(text)
 
 
 def completed(script: str, *words: str) -> list[str]:
@@ -171,19 +117,6 @@ def test_a_step_one_option_and_a_plugin(megloc: Any) -> None:
     assert megloc("options", "query_pairs.top_k").out.count("\n") == 2
     assert "aliked: options.threshold = 0.2\n" in megloc("options", "aliked").out
     assert "vlad: options." in megloc("options", "vlad").out
-
-
-def test_names_that_are_nearly_right(megloc: Any) -> None:
-    megloc("options", "localisation").refused("did you mean localization")
-    megloc("options", "--preset", "moden").refused("did you mean 'modern'\\? known: classic")
-    megloc("eval", "aachn").refused("did you mean 'aachen'\\? known: ")
-    for text, meant in (
-        ("query_pairs.topk=3", "'top_k'"),
-        ("radius=3", "localization.clusters.radius"),
-        ("local_features=aliqued", "'aliked'"),
-    ):
-        megloc("eval", "synthetic-aachen", "--set", text).refused(f"did you mean {meant}")
-    megloc("weights", "fetch", "alikd-n16").refused("did you mean 'aliked-n16'")
 
 
 def test_the_version(megloc: Any) -> None:

@@ -83,22 +83,6 @@ def test_a_model_of_unknown_scale(megloc: Any, colmap_room: Path, tmp_path: Path
         assert f"unit              {told}" in megloc("info", folder).out
 
 
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (("--scale", "0000.jpg", "0002.jpg"), "takes gps, or two photographs and the metres"),
-        (("--scale", "0000.jpg", "0002.jpg", "far"), "'far' is no distance in metres"),
-        (("--camera", "PINHOLE,1"), "not such a list"),
-        (("--preset", "modrn"), "unknown preset"),
-    ],
-)
-def test_what_cannot_be_is_refused(
-    megloc: Any, unposed: Path, tmp_path: Path, arguments: tuple[str, ...], told: str
-) -> None:
-    megloc("map", unposed / "photos", "-o", tmp_path / "map", *arguments).refused(told)
-    assert not (tmp_path / "map").exists()
-
-
 def test_a_known_camera_stays(megloc: Any, unposed: Path, tmp_path: Path) -> None:
     camera = "PINHOLE,400,300,300,302,200,150"
     done = megloc("map", unposed / "photos", "-o", tmp_path / "map", "--camera", camera, *FEW)
@@ -150,24 +134,6 @@ def test_a_foreign_map_is_refined_and_localized_in(
     assert len(theirs.points3d) == len(new.points3d())
     localized = megloc("localize", "-i", out, "--query", place / "query", "-o", tmp_path / "poses")
     assert localized.out.startswith("4 of 4 queries localized in ")
-
-
-def test_what_cannot_be_refined_is_refused(megloc: Any, foreign: Path, tmp_path: Path) -> None:
-    out = tmp_path / "refined"
-    query = megloc("refine-map", "-i", foreign / "query", "-o", out)
-    query.refused("no map to refine", "points3d.txt")
-    unknown = ("--set", "refinement.uncertainty.max_sigma=1")
-    megloc("refine-map", "-i", foreign / "map", "-o", out, *unknown).refused(
-        "unknown option refinement.uncertainty.max_sigma; did you mean 'max_robust_sigmas'"
-    )
-    assert not out.exists()
-    (foreign / "full").mkdir()
-    (foreign / "full" / "file").touch()
-    megloc("refine-map", "-i", foreign / "map", "-o", foreign / "full").refused("is not empty")
-    report = foreign / "map" / "reconstruction" / "refinement.json"
-    report.write_text('{"points_before": "many"}')
-    done = megloc("info", foreign / "map")
-    assert done.status == 2 and "refinement.json" in done.err
 
 
 def refine_poses(finished: Path, poses: Path, output: Path) -> list[Any]:

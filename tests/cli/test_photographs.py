@@ -119,23 +119,6 @@ def test_a_given_camera(megloc: Any, finished: Path, scene: Path, tmp_path: Path
     assert KaptureFolder(out).read().poses() == KaptureFolder(known).read().poses()
 
 
-def test_refused(megloc: Any, finished: Path, scene: Path, tmp_path: Path) -> None:
-    command = ("localize", "-i", finished / "map", "-o", tmp_path / "out")
-    images = ("--images", KaptureFolder(scene / "query").image_path("0004.jpg"))
-    query = ("--query", scene / "query")
-    for arguments, words in (
-        ((), "either --query, .*, or --images"),
-        ((*query, *images), "either --query"),
-        (("--images", tmp_path / "nowhere"), "nowhere: no such file or folder"),
-        *(
-            ((*images, "--camera", text), "give MODEL,WIDTH,HEIGHT")
-            for text in ("PINHOLE,400,300", "PINHOLE", "X,1,2,3", "PINHOLE,4,3,a,b,c,d")
-        ),
-    ):
-        megloc(*command, *arguments).refused(words)
-    assert not (tmp_path / "out").exists()
-
-
 # ------------------------------------------------------------------ real photographs
 
 

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.cli.stages import Preprocess
-from megloc_kapture.errors import OptionError
-from megloc_kapture.io.images import image_size, read_image_rgb, write_image
+from megloc_kapture.io.images import image_size, read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.preprocessing.masks import FixedMask
 
@@ -56,22 +55,6 @@ def test_flags_make_the_options() -> None:
     assert masks.dynamic == ("car", "bus") and masks.user_masks == Path("m") and masks.unchanging
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--bottom-share", "0.2"), "--bottom-share takes CAMERA=VALUE, got '0.2'"),
-        (("--bottom-share", "c=2"), r"bottom_share: .*less than 1"),
-        (("--polygon", "c=0,0 1,1"), "at least 3"),
-        (("--polygon", "c=0,0 1,1 1"), r"polygon\.2"),
-        (("--resize", "0"), "max_size_px: .*greater than 0"),
-        (("--set", "resize=1600"), "unknown option 'resize'; known: .*max_size_px"),
-    ],
-)
-def test_values_that_cannot_be_used(arguments: tuple[str, ...], message: str) -> None:
-    with pytest.raises(OptionError, match=message):
-        flags(*arguments).options()
-
-
 def test_images_are_resized_and_masked(
     megloc: Any, scene: Path, camera: str, tmp_path: Path, contents: Callable[[Path], Any]
 ) -> None:
@@ -95,47 +78,3 @@ def test_images_are_resized_and_masked(
     assert megloc(*small).status == 0
     assert not (out / "sensors" / "masks").exists()
     assert [p.name for p in sorted(out.iterdir())] == [".megloc", "sensors"]
-
-
-def test_nothing_to_do_links_and_an_unknown_camera_is_remarked(
-    megloc: Any, scene: Path, tmp_path: Path
-) -> None:
-    place = ("-i", scene / "query", "-o", tmp_path / "new")
-    done = megloc("preprocess", *place, "--bottom-share", "rear=0.1", *INLINE)
-    assert done.status == 0
-    assert "4 images, 0 of them changed" in done.err
-    assert "remark: a fixed mask fits no image: rear" in done.err
-    assert (tmp_path / "new" / "sensors" / "records_data").is_symlink()
-
-
-def test_a_mask_brought_along(megloc: Any, scene: Path, tmp_path: Path) -> None:
-    name = f"masks/{images_of(scene)[0]}.png"
-    mask = np.full((300, 400), 255, np.uint8)
-    mask[:, :384] = 0
-    write_image(tmp_path / name, mask)
-    places = ("-i", scene / "query", "-o", tmp_path / "new", "--user-masks", tmp_path / "masks")
-    done = megloc("preprocess", *places, "--quiet")
-    assert (done.status, done.err) == (0, "")
-    written = read_image_rgb(tmp_path / "new" / "sensors" / name)[..., 0]
-    np.testing.assert_array_equal(written, mask)
-
-
-def test_what_cannot_be_done_is_said_in_a_line(
-    megloc: Any, scene: Path, tmp_path: Path, camera: str
-) -> None:
-    out = tmp_path / "new"
-    command = ("preprocess", "-i", scene / "query", "-o", out, *INLINE)
-    none = tmp_path / "none"
-    for flag, value, words in (
-        ("--segmenter", "nobody", "no plugin 'nobody' .*segmenters"),
-        ("--mask-file", f"{camera}={tmp_path}/x.png", r"x\.png: no such mask"),
-        ("--user-masks", none, "none: no such folder of masks"),
-        ("--sequence", none, "none: no such folder"),
-        ("--dynamic", "car", "no segmenter"),
-    ):
-        megloc(*command, flag, value).refused(words)
-    megloc(*command, "--unchanging").refused("it has 4 images, and at least 10")
-    assert not out.exists()
-    inside = scene / "query" / "new"
-    megloc(*command[:4], inside).refused("lies in the kapture that is read")
-    assert not inside.exists()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 from collections.abc import Callable
 from contextlib import redirect_stderr
 from dataclasses import dataclass, fields
@@ -141,86 +140,6 @@ def test_reranking_keeps_the_best_matched_and_their_matches(
     megloc(*command, *both).refused(r"reranked\.txt exists; -f")
 
 
-def test_several_global_features_are_fused(
-    megloc: Any, made: Made, scene: Path, tmp_path: Path
-) -> None:
-    soft = tmp_path / "soft"
-    features = ["--features-dir", made.features]
-    done = megloc(
-        *("extract-global", "-i", scene / "mapping", "--query", scene / "query", "-o", soft),
-        *(*features, *INLINE, "--set", "global_features.options.assignment=soft", "-q"),
-    )
-    assert (done.status, done.err) == (0, "")
-    # the same vectors under a second name
-    second = soft / "global_features" / "second"
-    (soft / "global_features" / "vlad_rootsift").rename(second)
-    folders = ["--features-dir", made.vlad, "--features-dir", soft]
-    command = ["pairs-query", "-i", scene / "mapping", "--query", scene / "query"]
-    megloc(*command, "-o", tmp_path / "none.txt", *folders).refused(
-        "several types of global_features, name one: second, vlad_rootsift"
-    )
-    found = {}
-    for name, arguments in {
-        "hard": ["--features", "vlad_rootsift"],
-        "both": ["--features", "vlad_rootsift", "second", "--fusion", "mean"],
-        "soft": ["--features", "second"],
-    }.items():
-        out = tmp_path / f"{name}.txt"
-        done = megloc(*command, "-o", out, *folders, *arguments, "-q")
-        assert (done.status, done.err) == (0, "")
-        found[name] = {(pair.query, pair.map): pair.score for pair in read_pairs(out)}
-    assert found["hard"] != found["soft"]
-    for pair, score in found["both"].items():
-        assert score == pytest.approx((found["hard"][pair] + found["soft"][pair]) / 2, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    "command",
-    ["densify", "refine-map", "refine-poses", "triangulate", "pairs-mapping", "pairs-query"],
-)
-def test_a_scheduler_that_nothing_asks_is_refused(
-    megloc: Any, finished: Path, tmp_path: Path, command: str
-) -> None:
-    out, query = tmp_path / "out", ("--query", finished / "query")
-    given: tuple[Any, ...] = (command, "-i", finished / "map", "-o", out)
-    if command == "refine-poses":
-        given += (*query, "--poses", finished / "localized", "--by", "icp")
-    if command == "pairs-query":
-        given += (*query, "--exhaustive")
-    if command == "pairs-mapping":
-        given += ("--by", "poses")
-    if command == "triangulate":
-        given += ("--features-dir", finished / "matches" / "mapping")
-    megloc(*given, "--scheduler", "tcp://127.0.0.1:1").refused("--scheduler needs --executor dask")
-    assert not out.exists()
-    if command in ("pairs-query", "pairs-mapping"):
-        assert megloc(*given, "--workers", "2").status == 0
-        assert megloc(*given[:-1], given[-1], "-f", "--workers", "0").status == 2
-
-
-def test_output_of_another_kind_is_refused(
-    megloc: Any, made: Made, scene: Path, tmp_path: Path
-) -> None:
-    # features where a map is
-    command = ["extract-local", "-i", scene / "query", "-o", made.map, *OPTIONS, *INLINE]
-    megloc(*command, "-q").refused(f"{made.map}: is not empty and not a features of megloc")
-    # more features beside ours
-    command[4] = shutil.copytree(made.vlad, tmp_path / "vlad")
-    assert megloc(*command, "-q").status == 0
-    assert KaptureFolder(scene / "query", features_dirs=[tmp_path / "vlad"]).types("keypoints")
-
-
-def test_what_cannot_be_extracted_is_refused(megloc: Any, scene: Path, tmp_path: Path) -> None:
-    described = ["extract-global", "-i", scene / "mapping", "-o", tmp_path / "out"]
-    megloc(*described, "--features", "nothing").refused(
-        "unknown global features 'nothing'; known: vlad, apgem, delg"
-    )
-    command = ["extract-local", "-i", scene / "query", "-i", scene / "query"]
-    done = megloc(*command, "-o", tmp_path / "features", "-q")
-    done.refused(r"image 0001\.jpg stands in two kapture folders at once")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_ways_to_pair(megloc: Any, finished: Path, tmp_path: Path) -> None:
     mapping, points, pairs = finished / "mapping", finished / "map", tmp_path / "pairs.txt"
     command = ("pairs-mapping", "-i", mapping, "-o", pairs, "--by")
@@ -257,33 +176,6 @@ def test_ways_to_pair(megloc: Any, finished: Path, tmp_path: Path) -> None:
     assert len(read_pairs(tmp_path / "query.txt")) == 28
 
 
-def test_a_map_of_two_types_of_features(megloc: Any, scene: Path, tmp_path: Path) -> None:
-    features, mapping, pairs = tmp_path / "features", scene / "mapping", tmp_path / "pairs.txt"
-    place = ("-i", mapping, "--features-dir", features)
-    few = ("--set", "local_features.rootsift.options.max_keypoints=500")
-    few += ("--set", "local_features.sift.options.first_octave=0")
-    both = ("--features", "rootsift", "sift")
-    match = ["match", *place, "--pairs", pairs, "-o", features, *INLINE, "--features"]
-    commands = [
-        ["extract-local", "-i", mapping, "-o", features, *both, *few, *INLINE],
-        ["pairs-mapping", "-i", mapping, "-o", pairs, "--by", "sequence"],
-        *([*match, name] for name in ("rootsift", "sift")),
-    ]
-    for command in commands:
-        done = megloc(*command, "-q")
-        assert done.status == 0, done
-    megloc("triangulate", *place, "-o", tmp_path / "map").refused("several types of matches")
-    done = megloc("triangulate", *place, "-o", tmp_path / "map", *both)
-    lines = [line.split() for line in done.err.splitlines()][-3:]
-    assert [line[0] for line in lines[:2]] == ["rootsift:", "sift:"]
-    folder = KaptureFolder(tmp_path / "map")
-    folder.validate()
-    found = folder.observations()
-    assert [int(line[3]) for line in lines[:2]] == [len(found["rootsift"]), len(found["sift"])]
-    assert min(len(seen) for seen in found.values()) > 100
-    assert int(lines[2][0]) == len(folder.points3d())
-
-
 def test_what_cannot_be_matched_is_refused(megloc: Any, workspace: Path, tmp_path: Path) -> None:
     pairs, output = tmp_path / "pairs.txt", ("-o", tmp_path / "new", *INLINE)
     pairs.write_text("0000.jpg, 0002.jpg, 1.0\n0000.jpg, 0001.jpg, 1.0\n")
@@ -297,18 +189,6 @@ def test_what_cannot_be_matched_is_refused(megloc: Any, workspace: Path, tmp_pat
     done = megloc(*command, "--pairs", workspace / "pairs/mapping.txt")
     done.refused(f"{spoilt}: 799 descriptors for 800 keypoints")
     assert not (tmp_path / "new").exists()
-
-
-def test_import_links_images_and_prefixes_queries(megloc: Any, scene: Path, tmp_path: Path) -> None:
-    done = megloc("import", "kapture", scene, "-o", tmp_path / "in", "--query-prefix", "q/")
-    counts = dict(line.rsplit(maxsplit=1) for line in done.out.splitlines())
-    expected = {"map images": "7", "map images with pose": "7", "queries": "4"}
-    assert counts == expected | {"queries with truth": "4"}
-    query = KaptureFolder(tmp_path / "in" / "query")
-    assert query.read().image_names()[0] == "q/0001.jpg"
-    original = scene / "query/sensors/records_data/0001.jpg"
-    assert query.image_path("q/0001.jpg").read_bytes() == original.read_bytes()
-    megloc("import", "venice", scene, "-o", tmp_path / "x").refused("unknown dataset 'venice'")
 
 
 def test_networks_compute_where_the_flags_say(

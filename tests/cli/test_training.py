@@ -63,21 +63,6 @@ def test_a_matcher_and_its_files(megloc: Any, inputs: Path, tmp_path: Path) -> N
     assert again.status == 0 and again.out == done.out
 
 
-def test_what_it_refuses(megloc: Any, inputs: Path, tmp_path: Path) -> None:
-    output = ("-o", tmp_path / "x.safetensors")
-    train = ("train", "descriptor", "-i", inputs / "mine", *output)
-    for words, message in (
-        (("--set", "step=3"), r"unknown option step; did you mean 'steps'"),
-        (("--set", "pairs.labels.positive=3"), r"unknown option pairs\.labels\.positive"),
-        (("--set", "layers=3"), r"option layers: it should be a multiple of 2"),
-        (("--features", "rootsift"), r"superpoint and xfeat can be trained"),
-        (("--features", "superpoint"), r"the weights superpoint_v1 are missing"),
-    ):
-        megloc(*train, *words).refused(message)
-    megloc("train", "matcher", *output).refused("nothing to train on")
-    assert not list(tmp_path.iterdir())
-
-
 QUICK = ("--steps", "6", "--max-side", "40", "--device", "cpu")
 HERE = ("--max-side", "80", "--executor", "inline")
 CAMERA_TEXT = "SIMPLE_PINHOLE,48,36,40,24,18"
@@ -176,22 +161,6 @@ def test_views_along_a_result(megloc: Any, mapping: Path, field: Path, tmp_path:
     megloc("render", field, "--along", one, "-o", tmp_path / "x").refused("rendered into one file")
 
 
-@pytest.mark.slow
-def test_processes_render_the_same_views(
-    megloc: Any, mapping: Path, field: Path, tmp_path: Path
-) -> None:
-    command = ("render", field, "--along", mapping, "--max-side", "32")
-    for workers in ("1", "2"):
-        assert megloc(*command, "-o", tmp_path / workers, "--workers", workers).status == 0
-    one, two = (
-        {path.relative_to(root): path.read_bytes() for path in root.rglob("*.*") if path.is_file()}
-        for root in (tmp_path / "1", tmp_path / "2")
-    )
-    assert one == two and len(one) >= 2 * len(KaptureFolder(mapping).read().poses())
-    elsewhere = ("--scheduler", "tcp://127.0.0.1:1")
-    megloc(*command, "-o", tmp_path / "x", *elsewhere).refused("needs --executor dask")
-
-
 def test_views_that_no_camera_took_join_the_map(
     megloc: Any, mapping: Path, field: Path, tmp_path: Path
 ) -> None:
@@ -247,10 +216,7 @@ def test_what_is_refused(megloc: Any, mapping: Path, field: Path, tmp_path: Path
         ((), "say what to render: --pose and --camera, --along or --between"),
         (("--between", mapping, "--along", mapping), "say what to render"),
         ((pose,), "--pose needs the --camera"),
-        ((pose, *camera, "--max-side", "9"), "--max-side changes nothing"),
-        ((pose, *camera, "--workers", "2"), "--workers changes nothing"),
         ((pose, *camera, "--appearance", "me.jpg"), "not trained on an image 'me.jpg'"),
-        (("--along", mapping, *camera), "--camera changes"),
         (("--between", out / "none"), "none"),
         *(
             ((f"--pose={wrong}", *camera), "qw,qx,qy,qz,tx")
@@ -263,21 +229,3 @@ def test_what_is_refused(megloc: Any, mapping: Path, field: Path, tmp_path: Path
     train = ("train-field", "-i", mapping, "-o", tmp_path / "out")
     megloc(*train, "--steps", "0").refused("steps: .*greater than 0")
     assert not out.exists() and not (tmp_path / "out").exists()
-
-
-def test_a_damaged_field_is_named(megloc: Any, mapping: Path, field: Path, tmp_path: Path) -> None:
-    command = (pose_text(mapping), "--camera", CAMERA_TEXT, "-o", tmp_path / "view.png")
-    for name, content, said in (
-        ("field.json", b"{}", r"field\.json: .*kind"),
-        ("field.safetensors", b"nonsense", r"field\.safetensors: "),
-    ):
-        broken = tmp_path / name
-        shutil.copytree(field, broken)
-        (broken / name).write_bytes(content)
-        megloc("render", broken, *command).refused(said)
-    fewer = tmp_path / "fewer"
-    shutil.copytree(field, fewer)
-    manifest = json.loads((field / "field.json").read_text())
-    manifest["images"].pop()
-    (fewer / "field.json").write_text(json.dumps(manifest))
-    megloc("render", fewer, *command).refused("keys of another shape: appearance.weight")

@@ -68,51 +68,6 @@ def test_inliers_lie_where_the_query_sees_their_points(finished: Path) -> None:
         assert np.linalg.norm(seen - pixels, axis=1).max() <= 12.0
 
 
-def test_a_report_has_the_view_beside_it(
-    megloc: Any, finished: Path, tmp_path: Path, data_of: Any
-) -> None:
-    assert 'href="view.html"' in (finished / "evaluation/report.html").read_text()
-    view = data_of(finished / "evaluation/view.html")
-    assert sum(query["drawn"] for query in view["queries"]) > 20
-    result = ("-i", finished / "localized")
-    for name, truth in (("known", ("--gt", finished / "query_gt")), ("unknown", ())):
-        out = tmp_path / name
-        assert megloc("evaluate", *result, *truth, "-o", out).status == 0
-        assert "The worst queries" in (out / "report.html").read_text()
-        assert (out / "view.html").is_file()
-
-
-def test_refused(megloc: Any, finished: Path, tmp_path: Path, data_of: Any) -> None:
-    other, page = tmp_path / "notes.html", tmp_path / "v.html"
-    other.write_text("mine")
-    a_map, gt = finished / "map", finished / "query_gt"
-    megloc("view", a_map, "-o", other).refused("notes.html", "is no view; -f overwrites")
-    assert other.read_text() == "mine"
-    megloc("view", a_map, "-o", tmp_path).refused("is a folder")
-    for arguments, words in (
-        ((a_map, "--gt", gt), "--gt needs a result"),
-        ((a_map, tmp_path / "no"), "no such file"),
-        ((tmp_path / "no",), "no"),
-        ((finished / "query",), "no image has a pose"),  # images without poses
-    ):
-        megloc("view", *arguments, "-o", page).refused(words)
-    assert not page.exists()
-    assert megloc("view", a_map, "-o", other, "-f").status == 0
-    assert data_of(other)["cameras"]
-
-
-def test_it_is_opened_in_the_browser(
-    megloc: Any, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    opened: list[str] = []
-    monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url) or len(opened) == 1)
-    out = tmp_path / "a view.html"
-    command = ("view", finished / "map", "-o", out, "--open")
-    assert "no browser" not in megloc(*command).err
-    assert "no browser could be started; open the file in one" in megloc(*command).err
-    assert opened == [out.as_uri()] * 2
-
-
 def test_from_python(finished: Path, tmp_path: Path, data_of: Any) -> None:
     opened = megloc_package.open_map(finished / "map", features_dirs=[finished])
     opened.view(tmp_path / "map.html")

@@ -171,26 +171,3 @@ def test_add_check_list(megloc: Any, folder: Path, tmp_path: Path) -> None:
     assert re.search(r"wrong: .*free\.pth: is not the published free\.pth of free", done.out)
     done = megloc("weights", "check", "bound")
     assert done.status == 2 and "run: megloc weights fetch bound --accept-licence" in done.out
-
-
-def test_convert(megloc: Any, tmp_path: Path) -> None:
-    source, place = tmp_path / "free.pth", tmp_path / "free.safetensors"
-    source.write_bytes(FREE)
-    done = megloc("weights", "convert", source, "-o", place)
-    assert (done.status, done.out) == (0, f"{place}: 1 tensors\n")
-    megloc("weights", "convert", source, "-o", place).refused("-f replaces it")
-    source.write_bytes(b"\0\1")
-    megloc("weights", "convert", source, "-o", place, "-f").refused("no file of weights")
-
-
-def test_the_shipped_registry(megloc: Any) -> None:
-    done = megloc("weights", "list")
-    assert done.status == 0 and done.err == ""
-    header, *rows = done.out.splitlines()
-    assert header.split() == ["name", "what", "for", "file", "size", "licence", "state", "sha256"]
-    names = [row.split()[0] for row in rows[: len(weights.registry())]]
-    assert names == list(weights.registry())
-    done = megloc("doctor")
-    assert (done.status, done.err) == (0, "")
-    assert "pycolmap" in done.out and "weights" in done.out
-    assert done.out.endswith("no problem found\n")

@@ -195,21 +195,6 @@ def test_types_of_features(
         assert plugin.options == {"weights": local_type}
 
 
-@pytest.mark.parametrize(
-    ("statement", "match"),
-    [
-        ("UPDATE descriptors SET type = 1", "database.db: .*several types: aliked-n16rot, sift"),
-        ("DELETE FROM descriptors", r"database.db: image '0\d*.jpg' has no descriptors"),
-    ],
-)
-def test_descriptors_of_several_types_or_not_of_all_images_are_refused(
-    own: Path, tmp_path: Path, statement: str, match: str
-) -> None:
-    execute(own, f"{statement} WHERE image_id = 1")
-    with pytest.raises(DataError, match=match):
-        import_colmap(find_colmap(own), tmp_path / "map")
-
-
 def test_the_database_of_an_older_version(colmap_room: Path, own: Path, tmp_path: Path) -> None:
     """Its schema has no types; a model before version 4 has no rigs."""
     for name in ("rigs.bin", "frames.bin"):

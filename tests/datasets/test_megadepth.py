@@ -16,7 +16,6 @@ from megloc_kapture.cli.main import main
 from megloc_kapture.datasets.megadepth import (
     MegaDepthOptions,
     import_megadepth,
-    read_megadepth_depth,
 )
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.images import read_depth_map, write_image
@@ -133,21 +132,6 @@ def test_a_scene_by_its_table(tmp_path: Path) -> None:
         np.savez(table, **{**found, **changes})
         with pytest.raises(DataError, match=message):
             import_megadepth(root, tmp_path / "broken")
-
-
-def test_depth_that_is_none_of_its_own(tmp_path: Path) -> None:
-    path = tmp_path / "a.h5"
-    write_depth(path, np.arange(3, dtype=np.float32))
-    with pytest.raises(DataError, match=r"a\.h5: depth is of shape \(3,\), not an image"):
-        read_megadepth_depth(path)
-    path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(DataError, match=r"a\.h5: .*HDF5"):
-        read_megadepth_depth(path)
-    write_depth(path, np.array([[1.5, np.nan], [0.0, 2.0]], np.float32))
-    found = read_megadepth_depth(path)
-    assert found is not None and found.tolist() == [[1.5, 0.0], [0.0, 2.0]]
-    write_depth(path, np.zeros((2, 2), np.float32))
-    assert read_megadepth_depth(path) is None
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ import pytest
 from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.datasets.official import (
-    Count,
     Missing,
     OfficialDataset,
     read_ground_truth,
@@ -111,20 +110,6 @@ def test_nothing_useful_is_refused(
 ) -> None:
     with pytest.raises(DataError, match=message):
         write_official(replace(dataset, **part), tmp_path / "out")  # type: ignore[arg-type]
-
-
-def test_of_a_partial_download_the_map_alone_will_do(
-    dataset: OfficialDataset, tmp_path: Path
-) -> None:
-    write_official(replace(dataset, query=KaptureData()), tmp_path / "out", allow_missing=True)
-    assert kapture_from_dir(str(tmp_path / "out" / "query")).records_camera is None
-    assert len(KaptureFolder(tmp_path / "out" / "mapping").read().poses()) == 2
-
-
-def test_counts_say_how_they_differ_from_what_is_published() -> None:
-    assert str(Count("night queries", 191, 191)).endswith("  191  as published")
-    assert str(Count("night queries", 98, 191)).endswith("98  published: 191, -93")
-    assert str(Count("cameras", 7)).endswith("  7")
 
 
 def test_ground_truth_beside_a_dataset_comes_in_the_local_frame(

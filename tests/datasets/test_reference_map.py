@@ -85,17 +85,6 @@ def test_kapture_reads_the_map(tmp_path: Path) -> None:
     }
 
 
-def test_another_type_and_a_model_without_points(tmp_path: Path) -> None:
-    write_reference_map(tmp_path / "a", data(), {}, NAMES, points(), keypoints_type="colmap")
-    folder = KaptureFolder(tmp_path / "a")
-    folder.validate()
-    assert folder.types("keypoints") == ["colmap"]
-    assert folder.observations()["colmap"].image_names == ("db/a.jpg", "db/b.jpg")
-    counts = write_reference_map(tmp_path / "b", data(), {}, NAMES, SparsePoints.none())
-    assert counts == {"images": 3, "keypoints": 0, "points": 0, "observations": 0}
-    KaptureFolder(tmp_path / "b").validate()
-
-
 def write_database(
     path: Path, names: dict[str, int], *, shift: float = 0.0, descriptors: int | None = None
 ) -> dict[str, tuple[Any, Any]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -20,14 +19,10 @@ from megloc_kapture.evaluation.check import (
     read_reference,
 )
 from megloc_kapture.io.dataset_tables import (
-    ImageGroup,
     Protocol,
     RelocalizationPair,
     SimilarityTransform,
     World,
-    write_groups,
-    write_names,
-    write_protocol,
 )
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
@@ -169,12 +164,6 @@ def test_single_poses_that_are_far(check: Check) -> None:
     assert (warning.severity, warning.kind, warning.names) == ("warning", "far", ("q/005.jpg",))
 
 
-def test_too_few_poses(check: Check) -> None:
-    reference, poses = made(table)
-    lines = lines_of(poses, "inverted")[:2]
-    assert ("note", "too-few") in kinds(check(lines, reference))
-
-
 GOOD = "a.jpg 0.6 0.8 0 0 1.5 -0.2 3\n"
 
 
@@ -197,28 +186,6 @@ def test_wrong_rows(check: Check, line: str, kind: str, words: str) -> None:
     found = report.findings[0]
     assert (found.severity, found.kind, found.line) == ("error", kind, 3)
     assert words in found.message and report.poses == 1
-
-
-def test_files_that_are_empty_cut_or_something_else(check: Check, tmp_path: Path) -> None:
-    assert ("error", "empty") in kinds(check(["\n"]))
-    assert kinds(check(["b.jpg 1 0 0 0 1.5 -0.2 3.1"]))[0] == ("warning", "cut")
-    with pytest.raises(DataError, match="COLMAP's images.txt"):
-        check(["1 1 0 0 0 0 0 0 1 a.jpg\n", "0 0 -1\n"])
-    with pytest.raises(DataError, match="one file"):
-        check_submission(tmp_path, dataset="kapture")
-    with pytest.raises(DataError, match="no imported dataset"):
-        read_reference(tmp_path)
-
-
-def test_text_and_json(check: Check) -> None:
-    report = check([GOOD, *(f"{n}.jpg 1\n" for n in range(30))])
-    lines = report.lines()
-    assert lines[0].startswith("error: poses.txt:2: 2 columns")
-    assert "error: 20 more of kind 'columns'; --json lists all" in lines
-    assert lines[-1] == "1 poses: 30 problems found"
-    content = json.loads(json.dumps(report.to_json()))
-    assert content["ok"] is False and len(content["findings"]) == 32
-    assert "give one with --data" in content["findings"][-1]["message"]
 
 
 ROBOTCAR = {f"rear/{i}.jpg": f"dawn/rear/{i}.jpg" for i in range(100, 106)}
@@ -272,16 +239,6 @@ def test_unknown_missing_and_double_names(check: Check) -> None:
     missing = found["missing"]
     assert missing.severity == "warning" and missing.message.startswith("3 queries of 5 without")
     assert missing.names == ("IMG_2.jpg", "IMG_3.jpg", "IMG_4.jpg")
-
-
-def test_names_without_a_list(check: Check) -> None:
-    for dataset, line, words in (
-        ("aachen", "q/a.jpg", "with a folder"),
-        ("inloc", "a.jpg", "not ending in .JPG"),
-        ("robotcar", "1.jpg", "without the camera's folder"),
-    ):
-        report = check([f"{line} 1 0 0 0 0 0 0\n"], None, dataset)
-        assert words in report.findings[0].message and report.has_problems
 
 
 def drive() -> tuple[Reference, dict[str, RigidTransform]]:
@@ -352,17 +309,3 @@ def test_a_folder_of_mlad_files(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no pose file"):
         (tmp_path / "empty").mkdir()
         check_submission(tmp_path / "empty", dataset="4seasons")
-
-
-def test_what_is_read_of_an_import(scene: Path, tmp_path: Path) -> None:
-    for part in ("mapping", "query"):
-        (tmp_path / part).symlink_to(scene / part)
-    found = read_reference(tmp_path)
-    queries = KaptureFolder(scene / "query").read().image_names()
-    assert list(found.expected) == queries and found.queries == set(queries)
-    assert found.map_poses == KaptureFolder(scene / "mapping").read().poses()
-    write_protocol(tmp_path / "megloc", Protocol(dataset="aachen"))
-    write_groups(tmp_path / "megloc", {queries[0]: ImageGroup(scored=False)})
-    assert set(read_reference(tmp_path).expected) == set(queries[1:])
-    write_names(tmp_path / "megloc", {queries[1]: "b.png", queries[0]: "a.png"})
-    assert read_reference(tmp_path).expected == {"b.png": queries[1], "a.png": queries[0]}

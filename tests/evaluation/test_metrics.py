@@ -42,12 +42,6 @@ def test_parse_and_print(
     assert str(threshold) == printed
 
 
-@pytest.mark.parametrize("text", ["", "x", "0.25,x", "1,2,3", "-1,2", "1,-2", "nan,2", "inf,2"])
-def test_refused(text: str) -> None:
-    with pytest.raises(OptionError, match="METRES,DEGREES"):
-        Threshold.parse(text)
-
-
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.floats(0, 100), st.floats(0, 179.9), st.integers(0, 2**32 - 1))
 def test_known_displacement(

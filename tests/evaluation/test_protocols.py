@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from megloc_kapture.errors import OptionError
-from megloc_kapture.evaluation.protocols import PROTOCOLS, protocol_of
-from megloc_kapture.io.dataset_tables import Protocol, read_protocol, write_protocol
+from megloc_kapture.evaluation.protocols import protocol_of
+from megloc_kapture.io.dataset_tables import Protocol
 
 
 def test_thresholds_of_the_challenges() -> None:
@@ -23,20 +23,6 @@ def test_thresholds_of_the_challenges() -> None:
     assert sorted(pooled) == sorted(robotcar.conditions)
     assert robotcar.pools["night-all"] == ("night", "night-rain")
     assert len(robotcar.pools["day-all"]) == 7
-
-
-@pytest.mark.parametrize("name", PROTOCOLS)
-def test_every_protocol_survives_its_file(name: str, tmp_path: object) -> None:
-    write_protocol(str(tmp_path), protocol_of(name))
-    assert read_protocol(str(tmp_path)) == protocol_of(name)
-
-
-def test_hidden_truth_is_said_and_a_twins_is_not_hidden() -> None:
-    assert "visuallocalization.net" in protocol_of("aachen").truth
-    twin = protocol_of("synthetic-aachen")
-    assert (twin.dataset, twin.truth) == ("synthetic-aachen", "")
-    assert twin.thresholds == protocol_of("aachen").thresholds
-    assert protocol_of("synthetic").truth == ""
 
 
 @pytest.mark.parametrize("name", ["", "Aachen", "synthetic-kapture", "synthetic-cmu", "cmu"])

@@ -13,13 +13,11 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
-import megloc_kapture as megloc
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.evaluate import evaluate, evaluate_results
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.pose_files import write_pose_file
 from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of, protocol_of
-from megloc_kapture.evaluation.report.reports import report_text, write_report
 from megloc_kapture.evaluation.results import (
     context_of,
     distinct_labels,
@@ -86,15 +84,6 @@ def test_conditions_from_folders_where_no_table_has_them() -> None:
     }
 
 
-def test_a_named_dataset_overrules_the_protocol_and_keeps_the_groups(tmp_path: Path) -> None:
-    write_protocol(tmp_path, Protocol(dataset="mine", thresholds=((1.0, None),)))
-    write_groups(tmp_path, {"a.jpg": ImageGroup(condition="day")})
-    assert benchmark_of(tmp_path).thresholds() == (Threshold(position_m=1.0),)
-    rules = benchmark_of(tmp_path, "inloc")
-    assert rules.protocol.dataset == "inloc" and "a.jpg" in rules.groups
-    assert benchmark_of().protocol == Protocol()
-
-
 def test_workspaces_that_were_recentred_in_other_ways_are_brought_together(
     world: Any, tmp_path: Path, kaptures: Callable[..., Path]
 ) -> None:
@@ -155,15 +144,6 @@ def test_truth_in_the_official_frame_is_brought_to_the_maps(
     errors = evaluate(found, kaptures(tmp_path / "owner", names, official)).errors.position_m
     np.testing.assert_allclose(errors, expected, rtol=0, atol=1e-6)
     assert "owner is in the dataset's official frame" in caplog.text
-
-
-@pytest.mark.parametrize("pose", [(float("nan"), 0.0, 0.0), (1e300, 0.0, 0.0)])
-def test_poses_in_memory_are_finite(world: Any, pose: tuple[float, float, float]) -> None:
-    (name, *_) = world.truth
-    broken = {**world.truth, name: RigidTransform((1.0, 0.0, 0.0, 0.0), pose)}
-    for given in ((broken, world.truth), (world.truth, broken)):
-        with pytest.raises(DataError, match=f"{name}': the pose is not finite"):
-            evaluate(*given)
 
 
 def test_the_challenges_names_are_read_back(
@@ -232,22 +212,6 @@ def test_statuses_and_side_tables_are_used(
     assert other.thresholds == (Threshold(position_m=1.0),)
 
 
-def test_absent_results_are_named(truth: Path, tmp_path: Path) -> None:
-    for paths in ((tmp_path / "nowhere", truth), (truth, tmp_path / "nowhere")):
-        with pytest.raises(DataError, match="nowhere"):
-            evaluate(*paths)
-
-
-def test_it_prints_as_the_recall_table(world: Any, result: Path, tmp_path: Path) -> None:
-    found = megloc.evaluate(result, truth=world.truth)
-    in_memory = evaluate(world.estimated, world.truth)
-    np.testing.assert_array_equal(in_memory.errors.position_m, found.errors.position_m)
-    assert str(found) + "\n" == report_text(found)
-    assert "95 % confidence intervals" in str(found) and str(result) in str(found)
-    found.html(tmp_path / "report.html")
-    assert "How large the errors are" in (tmp_path / "report.html").read_text()
-
-
 def test_what_localizing_gives_brings_reasons_and_inliers(world: Any) -> None:
     first, second, third, *_ = sorted(world.estimated)
     truth = {name: world.truth[name] for name in (first, second, third)}
@@ -258,41 +222,6 @@ def test_what_localizing_gives_brings_reasons_and_inliers(world: Any) -> None:
     assert table.loc[second, "reason"] == "no matches" and table.loc[second, "num_matches"] == 7
     assert table.loc[third, "outcome"] == "missing" and table.loc[third, "num_inliers"] is pd.NA
     assert found.label == "mine"
-
-
-def test_two_results_are_compared(world: Any, tmp_path: Path) -> None:
-    lost = sorted(world.estimated)[:12]
-    fewer = {name: pose for name, pose in world.estimated.items() if name not in lost}
-    all_of_them = evaluate(world.estimated, world.truth, label="all of them")
-    comparison = all_of_them.compare(evaluate(fewer, world.truth, label="fewer"))
-    assert "all of them finds" in " ".join(str(comparison).split())
-    table = comparison.to_pandas()
-    assert (table.loc[lost, "fewer: outcome"] == "missing").all()
-    comparison.html(tmp_path / "comparison.html")
-    assert "The median position error is" in (tmp_path / "comparison.html").read_text()
-    with pytest.raises(OptionError, match="two results are called 'all of them'"):
-        all_of_them.compare(all_of_them)
-    # those without a label are told apart
-    first, second = evaluate_results([world.estimated, {}], world.truth, Benchmark())
-    assert (first.label, second.label) == ("result 1", "result 2")
-
-
-def test_tables_in_python_are_those_of_the_files(world: Any, result: Path, tmp_path: Path) -> None:
-    found = evaluate(result, world.truth)
-    table, at = found.to_pandas(), found.row().recall[1]
-    within = (table["position_error_m"] <= at.threshold.position_m) & (
-        table["angle_error_deg"] <= at.threshold.angle_deg
-    )
-    assert list(table.index) == sorted(world.truth) and within.mean() == at.recall
-    assert table["position_error_m"].median() == found.row().median_position_m
-    assert set(table["outcome"]) == {"localized", "fallback", "missing"}
-    comparison = found.compare(evaluate({}, world.truth, label="nothing"))
-    for number, reported in enumerate((found, comparison)):
-        paths = write_report(tmp_path / str(number), reported)
-        # a missing pose is infinitely far in Python, and empty in the file
-        written = pd.read_csv(paths["per_query.csv"], keep_default_na=False, na_values=[""])
-        here = reported.to_pandas().reset_index().replace({np.inf: np.nan, "": np.nan})
-        pd.testing.assert_frame_equal(written, here, check_dtype=False)
 
 
 def test_nothing_heavy_is_loaded_before_it_is_needed() -> None:

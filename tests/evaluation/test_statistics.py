@@ -13,16 +13,15 @@ from scipy import stats
 from scored import evaluate_poses
 
 from megloc_kapture.errors import OptionError
-from megloc_kapture.evaluation.metrics import Threshold
-from megloc_kapture.evaluation.report.reports import report_text
-from megloc_kapture.evaluation.scoring import Evaluation
-from megloc_kapture.evaluation.statistics import (
+from megloc_kapture.evaluation.comparison import (
     _resampled_medians,
     compare,
     difference_interval,
     holm,
     mcnemar,
 )
+from megloc_kapture.evaluation.metrics import Threshold
+from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.values import RigidTransform
 
 HERE = RigidTransform.identity()
@@ -41,16 +40,6 @@ def result(label: str, errors_m: Sequence[float], **options: Any) -> Evaluation:
     return evaluate_poses(estimated, dict.fromkeys(names, HERE), label=label, **options)
 
 
-def test_the_tables_of_the_sign_test() -> None:
-    # two-sided probabilities as printed in statistical tables
-    number, fewer = [5, 6, 8, 8, 10, 15, 20, 25, 25], [0, 0, 0, 1, 1, 3, 5, 7, 8]
-    printed = [0.0625, 0.0312, 0.0078, 0.0703, 0.0215, 0.0352, 0.0414, 0.0433, 0.1078]
-    more = np.subtract(number, fewer)
-    for first, second in ((fewer, more), (more, fewer)):
-        found = [mcnemar(int(a), int(b)) for a, b in zip(first, second, strict=True)]
-        np.testing.assert_allclose(found, printed, rtol=0, atol=5.1e-5)
-
-
 @given(st.integers(0, 400), st.integers(0, 400))
 def test_equal_to_scipys_binomial_test(only_first: int, only_second: int) -> None:
     ours = mcnemar(only_first, only_second)
@@ -67,17 +56,6 @@ def test_holm_by_hand() -> None:
     assert holm([0.6, 0.9]).tolist() == [1.0, 1.0]
     assert holm([0.02]).tolist() == [0.02]
     assert holm([]).tolist() == []
-
-
-def test_who_finds_what() -> None:
-    first = result("A", [0.1, 0.1, 0.1, 5.0, np.inf, 0.1])
-    second = result("B", [0.1, 5.0, np.inf, 0.1, np.inf, 0.2])
-    (test,) = compare([first, second]).tests
-    assert test.only_first == ("0001.jpg", "0002.jpg")
-    assert test.only_second == ("0003.jpg",)
-    assert (test.both, test.neither) == (2, 1)
-    assert test.p_value == test.p_adjusted == 1.0
-    assert not test.is_real
 
 
 def test_a_large_paired_difference_is_real_although_intervals_overlap() -> None:
@@ -127,16 +105,6 @@ def test_medians_with_missing_poses() -> None:
     assert low == -np.inf and high <= 0.0
 
 
-def test_median_of_resamples_is_numpys() -> None:
-    for size in (30, 31):
-        values = np.random.default_rng(2).exponential(size=size)
-        drawn = np.random.default_rng(0).integers(size, size=(2000, size))
-        expected = np.median(values[drawn], axis=1)
-        np.testing.assert_allclose(
-            _resampled_medians(values), expected, rtol=(1 - size % 2) * 1e-15
-        )
-
-
 @pytest.mark.parametrize(
     ("others", "words"),
     [
@@ -159,17 +127,3 @@ def test_what_does_not_belong_together_is_refused(
     results = [result(label, errors, **options) for label, errors, options in others]
     with pytest.raises(OptionError, match=words):
         compare([result("A", [0.1, 0.2]), *results])
-
-
-@pytest.mark.parametrize("number", [5, 6])
-def test_too_few_queries_say_nothing_of_a_median(number: int) -> None:
-    both = (
-        result(name, [m + 0.001 * k for k in range(number)]) for name, m in (("a", 0.1), ("b", 0.5))
-    )
-    comparison = compare(list(both))
-    median = comparison.medians[0]
-    text = " ".join(report_text(comparison).split())
-    assert np.isnan(median.low_m) == (number == 5) and median.is_real == (number == 6)
-    verdict = ("-0.4000 m; too few queries to tell it from chance.", "the difference is real")
-    assert verdict[number - 5] in text
-    assert f"too few queries ({number}) to compare recall by" in text

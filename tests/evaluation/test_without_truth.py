@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,16 +12,16 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.evaluation.evaluate import results_without_truth
-from megloc_kapture.evaluation.metrics import Threshold
-from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of, protocol_of
-from megloc_kapture.evaluation.report.reports import render_report, report_text, write_report
-from megloc_kapture.evaluation.results import Result
-from megloc_kapture.evaluation.without_truth import (
+from megloc_kapture.evaluation.comparison import (
     WithoutTruth,
     evaluate_without_truth,
     inliers_quartiles,
 )
+from megloc_kapture.evaluation.evaluate import results_without_truth
+from megloc_kapture.evaluation.metrics import Threshold
+from megloc_kapture.evaluation.protocols import Benchmark, benchmark_of, protocol_of
+from megloc_kapture.evaluation.report.reports import render_report, report_text
+from megloc_kapture.evaluation.results import Result
 from megloc_kapture.io.dataset_tables import (
     ImageGroup,
     Protocol,
@@ -109,33 +107,6 @@ def test_agreement_of_two_results(found: WithoutTruth, first: Result) -> None:
     twin = Result("twin", first.poses, first.images, first.statuses)
     (row,) = evaluate_without_truth([first, twin], thresholds=THRESHOLDS).agreement
     assert [at.num_within for at in row.within] == [3, 3] and row.median_m == 0.0
-
-
-def test_said_in_every_file(
-    found: WithoutTruth, tmp_path: Path, page_of: Callable[[str], Any]
-) -> None:
-    paths = write_report(tmp_path, found, map_poses=MAP, provenance={"preset": "classic"})
-    text = paths["agreement.txt"].read_text()
-    assert text == report_text(found)
-    assert "No recall: Nobody tells." in text and "accuracy" in text
-    assert "25.0 / 50.0" in text
-    assert "Only A has a pose for 1 query, only B for 1." in text
-    assert text.isascii() and max(map(len, text.splitlines())) <= 100
-    summary = json.loads(paths["agreement.json"].read_text())
-    assert summary["statement"] == "Nobody tells."
-    row = summary["results"][0]["rows"][-1]
-    assert (row["num_localized"], row["num_fallback"]) == (2, 1)
-    assert summary["agreement"][1]["median_m"] is None
-    with paths["per_query.csv"].open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["A: outcome"] for row in rows] == ["localized", "localized", "fallback", "missing"]
-    assert float(rows[0]["A to B: position_m"]) == pytest.approx(0.1)
-    assert rows[3]["A to B: position_m"] == ""
-    html = paths["report.html"].read_text()
-    page = page_of(html)
-    assert "No recall: Nobody tells." in page.text and "only B for 1." in page.text
-    again = render_report(found, map_poses=MAP, provenance={"preset": "classic"})
-    assert again == html
 
 
 def test_one_pose_file_alone_and_no_pose_at_all(

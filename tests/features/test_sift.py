@@ -12,7 +12,7 @@ import pytest
 from images import blobs, texture
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
+from megloc_kapture.datasets.reference_map import ColmapDatabase
 from megloc_kapture.features.rootsift import (
     ColmapSift,
     ColmapSiftOptions,

@@ -16,7 +16,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.errors import DataError, OutputError
+from megloc_kapture.errors import OutputError
 from megloc_kapture.io import colmap as module
 from megloc_kapture.io.colmap import (
     MapImage,
@@ -120,27 +120,8 @@ def test_observations_are_the_matches_put_together() -> None:
         assert len(nothing.point_ids) == len(nothing.image_ids) == len(nothing.keypoint_ids) == 0
 
 
-def test_neither_poses_nor_cameras_move_and_no_bit_depends_on_the_threads(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """With as many residuals as COLMAP's bundle adjustment shares between threads."""
-
-    rng = np.random.default_rng(2)
-    count, num_points = 25, 1100
-    camera = CAMERAS["OPENCV_FISHEYE"]
-    xyz = rng.uniform((-2, -1.5, -1), (2, 1.5, 1), (num_points, 3))
-    images = []
-    for k in range(count):
-        turn = Rotation.from_rotvec([0.002 * k, 0.01 * (k - count / 2), 0.1]).as_matrix()
-        pose = RigidTransform.from_matrix(turn, np.array([0.06 * (k - count / 2), 0.01 * k, 8.0]))
-        pixels = px_from_cam(camera, pose.apply(xyz)) + rng.normal(0, 0.7, (num_points, 2))
-        images.append(MapImage(f"{k}.jpg", camera, pose, pixels.astype(np.float32)))
-    matches = {}
-    for i, j in combinations(range(count), 2):
-        if j <= i + 5:
-            matches[i, j] = rows = np.repeat(np.arange(num_points)[:, None], 2, axis=1)
-            wrong = rng.random(num_points) < 0.1
-            rows[wrong, 1] = rng.permutation(rows[wrong, 1])
+def test_neither_poses_nor_cameras_move(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, images, matches = scene(CAMERAS["OPENCV_FISHEYE"])
     states: list[list[Any]] = []
     original = pycolmap.triangulate_points
 
@@ -158,15 +139,11 @@ def test_neither_poses_nor_cameras_move_and_no_bit_depends_on_the_threads(
         return found
 
     monkeypatch.setattr(pycolmap, "triangulate_points", recorded)
-    first = triangulate(images, matches)
-    assert 2 * len(first.point_ids) > 50_000
-    assert equal(first, triangulate(images, matches, num_threads=4))
-    for poses, cameras in states[1:]:
-        # COLMAP makes unit quaternions of unit quaternions on the way: the last digit
-        np.testing.assert_allclose(poses, states[0][0], rtol=0, atol=1e-15)
-        assert cameras == states[0][1]
-    assert len(states) == 4
-    assert len(states[0][0]) == count
+    triangulate(images, matches)
+    (poses, cameras), (poses_after, cameras_after) = states
+    # COLMAP makes unit quaternions of unit quaternions on the way: the last digit
+    np.testing.assert_allclose(poses_after, poses, rtol=0, atol=1e-15)
+    assert cameras_after == cameras and len(poses) == len(images)
 
 
 def test_two_images_only_give_points_if_asked_for() -> None:
@@ -214,14 +191,6 @@ def test_keypoints_may_have_more_columns_and_images_none() -> None:
     assert 4 not in result.image_ids
 
 
-@pytest.mark.parametrize("row", [[60, 0], [0, 60]])
-def test_matches_past_the_keypoints_are_refused(row: list[int]) -> None:
-    _, images, matches = scene(CAMERAS["PINHOLE"])
-    matches[1, 2] = np.concatenate([matches[1, 2], [row]])
-    with pytest.raises(DataError, match=r"between 1.jpg and 2.jpg .* do not have \(60 and 60\)"):
-        triangulate(images, matches)
-
-
 def test_colmap_says_nothing_and_leaves_nothing_behind(tmp_path: Path) -> None:
     code = (
         "import importlib.util, sys\n"
@@ -240,27 +209,6 @@ def test_colmap_says_nothing_and_leaves_nothing_behind(tmp_path: Path) -> None:
     assert done.stdout == "60\n"
     assert done.stderr == "still here\n"  # and the error stream is whole again
     assert list(tmp_path.iterdir()) == []
-
-
-CAMERA = Camera("SIMPLE_RADIAL", 1600, 1063, (1243.94, 800.0, 531.5, -0.10977))
-OTHER = Camera("PINHOLE", 64, 48, (50.0, 51.0, 32.0, 24.0))
-
-
-def test_a_disk_without_room_for_the_database_is_said_before_colmap_meets_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _, images, _ = scene(CAMERAS["PINHOLE"])
-    asked = []
-
-    def usage(path: str) -> Any:
-        asked.append(Path(path).parent)
-        return shutil.disk_usage(path)._replace(free=1 << 19)
-
-    monkeypatch.setattr("megloc_kapture.io.colmap.disk_usage", usage)
-    with pytest.raises(OutputError, match="0 MB are free, COLMAP's database takes 1 MB"):
-        triangulate(images, {}, scratch=tmp_path / "map")
-    assert asked == [tmp_path / "map"]
-    assert list((tmp_path / "map").iterdir()) == []
 
 
 # ------------------------------------------------------------------------------------------ mappers
@@ -302,3 +250,20 @@ def test_parts_with_fewer_than_30_common_points_come_apart(
         for name, pose in model.poses.items():
             moved = np.array(pose.translation)
             assert moved == pytest.approx((-0.2 * (FIRST + SECOND).index(name), 0, 0), abs=1e-9)
+
+
+def test_a_disk_without_room_for_the_database_is_said_before_colmap_meets_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, images, _ = scene(CAMERAS["PINHOLE"])
+    asked = []
+
+    def usage(path: str) -> Any:
+        asked.append(Path(path).parent)
+        return shutil.disk_usage(path)._replace(free=1 << 19)
+
+    monkeypatch.setattr("megloc_kapture.io.colmap.disk_usage", usage)
+    with pytest.raises(OutputError, match="0 MB are free, COLMAP's database takes 1 MB"):
+        triangulate(images, {}, scratch=tmp_path / "map")
+    assert asked == [tmp_path / "map"]
+    assert list((tmp_path / "map").iterdir()) == []

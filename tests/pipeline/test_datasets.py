@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
@@ -42,9 +42,6 @@ class Toy:
     def check(self, root: Path) -> None:
         if not (root / "1.jpg").is_file():
             raise DataError("1.jpg is missing", path=root)
-
-    def input_files(self, root: Path) -> Iterator[Path]:
-        yield root / "1.jpg"
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
         sensor = Sensor.from_camera(Camera("SIMPLE_PINHOLE", 10, 8, (9.0, 5.0, 4.0)))

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import json
-import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -19,10 +16,6 @@ from corner import CAMERA, depth_m
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.evaluation.report.gallery import depth_pictures
-from megloc_kapture.evaluation.report.queries import StoredInliers
-from megloc_kapture.evaluation.results import ResultContext
-from megloc_kapture.evaluation.view import render_view, scene_of
 from megloc_kapture.geometry.cameras import project, scaled_camera
 from megloc_kapture.io.kapture import KaptureFolder, read_point_covariances, write_sensors
 from megloc_kapture.io.tables import read_depth_rows
@@ -217,41 +210,6 @@ def test_an_image_without_a_file_has_a_reason(world: Any, tmp_path: Path) -> Non
     assert counts["images_with_depth"] == 4 and counts["points_lifted"] == 0
     assert rows["left/0.png"].reason == "there is no image file"
     assert all("left/0.png" not in row.sources for row in rows.values())
-
-
-# -------------------------------------------------------------------------------- depth in report
-
-
-def test_pictures_show_the_depth_that_is_there(
-    densified: KaptureFolder, world: Any, tmp_path: Path
-) -> None:
-    shown = depth_pictures(densified)
-    assert [own.name for own in shown] == sorted(densified.read().poses())
-    assert all(own.facts.startswith("depth on ") for own in shown)
-    broken = KaptureFolder(shutil.copytree(densified.root, tmp_path / "map", symlinks=True))
-    (broken.root / DEPTH_FILE).write_text("not a table")
-    for folder in (broken, world.map(), None):
-        assert depth_pictures(folder) == []
-
-
-def test_the_view_shows_the_cloud_on_the_walls(
-    world: Any, densified: KaptureFolder, distance_to_walls: Any
-) -> None:
-    scene = scene_of("corner", StoredInliers(ResultContext(mapping=densified)))
-    assert scene is not None and scene.num_dense > 3000
-    dense = scene.points[-scene.num_dense :] + scene.origin
-    assert np.mean(distance_to_walls(dense) < 0.1) > 0.95
-    own = densified.points3d()[:, :3]
-    np.testing.assert_allclose(scene.points[: len(own)] + scene.origin, own, atol=1e-5)
-    page = render_view(scene)
-    again = scene_of("corner", StoredInliers(ResultContext(mapping=KaptureFolder(densified.root))))
-    assert again is not None and render_view(again) == page
-    assert 'id="show-dense"' in page and f"{scene.num_dense:,} of depth by stereo" in page
-    data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])
-    assert data["numDense"] == scene.num_dense
-    assert len(base64.b64decode(data["points"])) == 12 * len(scene.points)
-    bare = scene_of("corner", StoredInliers(ResultContext(mapping=world.map())))
-    assert bare is not None and bare.num_dense == 0 and 'id="show-dense"' not in render_view(bare)
 
 
 def test_fused_points_are_fewer_than_pixels_with_depth(

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.formats.nvm import NvmModel
+from megloc_kapture.datasets.nvm import NvmModel
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.colmap_model import (
     BINARY_FILES,

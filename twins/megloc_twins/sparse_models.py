@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.datasets.formats.nvm import NvmModel
+from megloc_kapture.datasets.nvm import NvmModel
 from megloc_kapture.features.rootsift import ColmapSift
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.colmap import (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from megloc_twins.fourseasons import DUSK, REFERENCE, WINTER, FourSeasonsTwinOptions
 
-from megloc_kapture.datasets.formats.fourseasons_files import (
+from megloc_kapture.datasets.fourseasons import (
     read_gnss_poses,
     read_transformations,
 )

@@ -23,8 +23,8 @@ from megloc_twins.synthetic_kapture import SyntheticWorld
 from numpy.typing import NDArray
 
 from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
-from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
 from megloc_kapture.datasets.official import write_official
+from megloc_kapture.datasets.reference_map import ColmapDatabase
 from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
 from megloc_kapture.io.colmap import px_from_cam
 from megloc_kapture.io.colmap_model import SparsePoints

@@ -6,7 +6,7 @@ downloader leaves kapture folders.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -14,19 +14,19 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
-from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm
-from megloc_kapture.datasets.kapture_form import KaptureForm, KaptureImage
+from megloc_kapture.datasets.nvm import NvmModel, read_nvm
 from megloc_kapture.datasets.official import (
     Count,
     DatasetCard,
+    KaptureForm,
+    KaptureImage,
     Missing,
     OfficialDataset,
-    ground_truth_files,
     last_part,
     read_ground_truth,
 )
 from megloc_kapture.datasets.reference_map import ReferenceModel, check_model_files
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.camera_list import read_camera_rows
 from megloc_kapture.io.colmap_model import SparsePoints, colmap_model_files, read_colmap_model
@@ -107,12 +107,11 @@ class Layout:
         if wanted == "auto":
             wanted = "1.1" if self.colmap_model.is_dir() else "1.0"
         model = self.nvm if wanted == "1.0" else self.colmap_model
-        if not model.exists():
-            raise DataError(
-                f"the model of Aachen Day-Night v{wanted} is missing: "
-                f"{model.relative_to(self.root)}",
-                path=self.root,
-            )
+        require(
+            model.exists(),
+            f"the model of Aachen Day-Night v{wanted} is missing: {model.relative_to(self.root)}",
+            path=self.root,
+        )
         return wanted
 
     def model_files(self, version: Version, *, with_points: bool) -> tuple[Path, ...]:
@@ -120,10 +119,6 @@ class Layout:
             return colmap_model_files(self.colmap_model, with_points=with_points)
         files = (self.nvm, self.database_intrinsics)
         return tuple(file for file in files if file.is_file())
-
-    def image_files(self) -> Iterator[Path]:
-        for folder in (DATABASE_FOLDER, SEQUENCES_FOLDER, QUERY_FOLDER):
-            yield from sorted(path for path in (self.images / folder).rglob("*") if path.is_file())
 
     def read(self, version: Version, missing: Missing) -> tuple[AachenImages, int]:
         """Read the existing images, and count v1.1's queries omitted from v1.0."""
@@ -153,11 +148,11 @@ class Layout:
         if missing.require(self.database_intrinsics):
             listed = read_camera_rows(self.database_intrinsics)
         for position, name in enumerate(nvm.names):
-            if listed is not None and name not in listed:
-                raise DataError(
-                    f"no line for {name!r}, an image of {self.nvm.name}",
-                    path=self.database_intrinsics,
-                )
+            require(
+                listed is None or name in listed,
+                f"no line for {name!r}, an image of {self.nvm.name}",
+                path=self.database_intrinsics,
+            )
             if missing.require(self.images / name):
                 camera = self._centred(nvm, position) if listed is None else listed[name]
                 pose = nvm.cam_from_world(position)
@@ -179,12 +174,11 @@ class Layout:
             if not missing.require(path):
                 continue
             for position, (name, camera) in enumerate(read_camera_rows(path).items()):
-                if listed.setdefault(name, path) != path:
-                    raise DataError(
-                        f"image {name!r} is also in {listed[name].name}: a query by day or at "
-                        "night?",
-                        path=path,
-                    )
+                require(
+                    listed.setdefault(name, path) == path,
+                    f"image {name!r} is also in {listed[name].name}: a query by day or at night?",
+                    path=path,
+                )
                 if images.version == "1.0" and name.startswith(ADDITIONAL_NIGHT):
                     left_out += 1
                 elif missing.require(self.images / name):
@@ -216,10 +210,11 @@ def from_kapture(
         for position, image in enumerate(queries):
             images.add_query(image.name, condition, position, image.camera)
     for image in found:
-        if image.is_query and image.name not in images.conditions:
-            raise DataError(
-                f"query {image.name!r} has neither {DAY}/ nor {NIGHT}/ in its name", path=form.root
-            )
+        require(
+            not image.is_query or image.name in images.conditions,
+            f"query {image.name!r} has neither {DAY}/ nor {NIGHT}/ in its name",
+            path=form.root,
+        )
     return images, {image.name: image.file for image in found}
 
 
@@ -290,20 +285,6 @@ class Aachen:
         files = layout.model_files(layout.version(self.options.version), with_points=reference)
         if reference:
             check_model_files(files)
-
-    def input_files(self, root: Path) -> Iterator[Path]:
-        if (form := _kapture_form(root)) is not None:
-            yield from form.input_files()
-        else:
-            layout, reference = Layout(root), self.options.reference_model
-            version = layout.version(self.options.version)
-            yield from layout.model_files(version, with_points=reference)
-            single = [layout.query_list(DAY), layout.query_list(NIGHT)]
-            if reference and version == "1.0":
-                single.append(layout.feature_database)
-            yield from (path for path in single if path.is_file())
-            yield from layout.image_files()
-        yield from ground_truth_files(Path(root))
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
         self.check(root)

@@ -1,24 +1,208 @@
-"""4Seasons' recordings on disk, relocalization files, and the selection of both."""
+"""4Seasons' recordings on disk, their text files, and those of the MLAD challenges.
+
+Commas or blanks separate fields, ``#`` begins a comment line. Timestamps are integer nanoseconds
+and are never converted to float, which would lose digits. Quaternions are x y z w.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
-from megloc_kapture.datasets.formats.fourseasons_files import (
-    CAMERA_FILES,
-    STEREO_FILE,
-    RelocalizationRow,
-    StereoCalibration,
-    parse_relocalization_name,
-    read_calibration,
-    read_relocalization,
-    timestamp_of_name,
-)
 from megloc_kapture.datasets.official import Count, Missing
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, require
+from megloc_kapture.evaluation.pose_files import RelativePose
+from megloc_kapture.io.kapture.sensors import unit_quaternion
+from megloc_kapture.io.text_lines import Line, read_lines, read_rigid_matrix, shown
+from megloc_kapture.values import Camera, RigidTransform
+
+CAMERA_FILES = ("undistorted_calib_0.txt", "undistorted_calib_1.txt")
+STEREO_FILE = "undistorted_calib_stereo.txt"
+
+_TIMESTAMP = re.compile(r"[1-9][0-9]{0,18}")
+_MAX_SCALE = 1e6
+# relocalization files of 2021, 2020 (in the source's folder) and 2022
+_RELOCALIZATION_NAMES = (
+    re.compile(r"relocalizationFile_(?P<source>.+)_to_(?P<target>.+)\.txt"),
+    re.compile(r"relocalizationFile_(?P<target>.+?)(?:_(?:easy|moderate|hard))?\.txt"),
+    re.compile(r"reloc_(?P<source>.+)_to_(?P<target>.+)\.txt"),
+)
+
+Row = TypeVar("Row")
+
+
+@dataclass(frozen=True, slots=True)
+class StereoCalibration:
+    """The PINHOLE cameras of the undistorted images, cam0 left and cam1 right.
+
+    ``cam1_from_cam0`` is in metres. The dataset's page says "from the right to the left camera",
+    but camchain.yaml, the sign and all users of the data agree on cam1 from cam0.
+    """
+
+    cam0: Camera
+    cam1: Camera
+    cam1_from_cam0: RigidTransform
+
+
+def read_calibration(folder: Path) -> StereoCalibration:
+    cam0, cam1 = (read_pinhole(folder / name) for name in CAMERA_FILES)
+    return StereoCalibration(cam0, cam1, read_rigid_matrix(folder / STEREO_FILE, comments=True))
+
+
+def read_pinhole(path: Path) -> Camera:
+    """Read ``undistorted_calib_N.txt``: ``Pinhole fx fy cx cy 0 0 0 0``, the size, twice."""
+    form = "'Pinhole fx fy cx cy 0.0 0.0 0.0 0.0', 'width height', 'crop', 'width height'"
+    lines = read_lines(path, comments=True)
+    require(len(lines) in (2, 4), f"expected the lines {form}, got {len(lines)}", path=path)
+    first = lines[0]
+    model, *values = first.comma_fields
+    params = first.numbers_of(values, "camera parameter")
+    if model != "Pinhole" or len(values) not in (4, 8) or any(params[4:]):
+        raise first.error(f"expected {form}, without distortion, as images are undistorted")
+    sizes = []
+    for line in lines[1::2]:
+        line.expect(line.comma_fields, 2, "width height, in pixels")
+        sizes.append([line.count_of(text, "size") for text in line.comma_fields])
+    lines[-1].require(
+        sizes[0] == sizes[-1], f"the image size is {sizes[0]} first, then {sizes[-1]}"
+    )
+    width, height = sizes[0]
+    with first.named():
+        return Camera("PINHOLE", width, height, tuple(params[:4]))
+
+
+@dataclass(frozen=True, slots=True)
+class GnssPose:
+    """A row of ``GNSSPoses.txt``; None if a field is missing.
+
+    ``slam_from_cam`` is the undistorted left camera's pose in SLAM units, ``scale`` metres per
+    unit, ``fusion_quality`` 2 for fused with GNSS, 1 for interpolated, 0 for none.
+    """
+
+    slam_from_cam: RigidTransform
+    scale: float | None
+    fusion_quality: float | None
+
+
+def read_gnss_poses(path: Path) -> dict[int, GnssPose]:
+    """Read ``GNSSPoses.txt`` by timestamp (ns).
+
+    A row is ``timestamp tx ty tz qx qy qz qw [scale [fusion_quality [v3]]]``; published rows have
+    10 fields, their header announces 11.
+    """
+
+    def parse(line: Line) -> GnssPose:
+        fields = line.comma_fields
+        form = "timestamp tx ty tz qx qy qz qw scale fusion_quality v3"
+        line.expect(fields, range(8, 12), form)
+        scale = _scale(line, fields[8]) if len(fields) > 8 else None
+        quality = line.number_of(fields[9], "fusion_quality") if fields[9:] else None
+        return GnssPose(_transform(line, fields[1:8]), scale, quality)
+
+    return _by_timestamp(path, parse)
+
+
+def read_poses(path: Path) -> dict[int, RigidTransform]:
+    """Read ``poses.txt`` (ECCV 2020 challenge): ``world_from_cam`` by timestamp (ns), metres."""
+    return _by_timestamp(path, lambda line: _transform(line, line.comma_fields[1:]))
+
+
+def timestamp_of_name(stem: str) -> int | None:
+    """Return the time (ns) encoded in a file name; None for other names."""
+    return int(stem) if _TIMESTAMP.fullmatch(stem) else None
+
+
+def _by_timestamp(path: Path, parse: Callable[[Line], Row]) -> dict[int, Row]:
+    rows: dict[int, Row] = {}
+    for line in read_lines(path, comments=True):
+        timestamp = _timestamp(line, line.comma_fields[0])
+        line.require(timestamp not in rows, f"timestamp {timestamp} is given twice")
+        rows[timestamp] = parse(line)
+    require(rows, "the file has no rows", path=path)
+    return rows
+
+
+def _timestamp(line: Line, text: str) -> int:
+    if not _TIMESTAMP.fullmatch(text):
+        raise line.error(f"{shown(text)} is not a timestamp, a whole number of nanoseconds")
+    return int(text)
+
+
+def _transform(line: Line, fields: Sequence[str]) -> RigidTransform:
+    line.expect(fields, 7, "tx ty tz qx qy qz qw")
+    tx, ty, tz, qx, qy, qz, qw = line.numbers_of(fields, "pose")
+    with line.named():
+        return RigidTransform(unit_quaternion((qw, qx, qy, qz)), (tx, ty, tz))
+
+
+def _scale(line: Line, text: str) -> float:
+    scale = line.number_of(text, "scale")
+    line.require(
+        1 / _MAX_SCALE < scale < _MAX_SCALE, f"scale {text} is not a factor between units of length"
+    )
+    return scale
+
+
+@dataclass(frozen=True, slots=True)
+class Transformations:
+    """The transforms from a recording's SLAM world to the earth (ECEF), e.
+
+    The level visual world is w, the scene's east-north-up frame is gpsw. ``gnss_scale`` is metres
+    per SLAM unit, or None.
+    """
+
+    s_from_as: RigidTransform
+    w_from_gpsw: RigidTransform
+    e_from_gpsw: RigidTransform
+    gnss_scale: float | None
+
+
+def read_transformations(path: Path) -> Transformations:
+    """Read ``Transformations.txt``: pairs of a line ``# name: ...`` and a line of numbers."""
+    found: dict[str, Line] = {}
+    name = ""
+    for line in read_lines(path):
+        if line.text.startswith("#"):
+            name = line.text[1:].partition(":")[0].strip()
+        elif name in found:
+            raise line.error(f"{name!r} is given twice")
+        else:
+            found[name] = line
+    transforms = []
+    for name in ("transform_S_AS", "transform_w_gpsw", "transform_e_gpsw"):
+        require(name in found, f"there is no {name}", path=path)
+        transforms.append(_transform(found[name], found[name].comma_fields))
+    scale = None
+    if (row := found.get("GNSS scale")) is not None:
+        scale = _scale(row, row.text)
+    s_from_as, w_from_gpsw, e_from_gpsw = transforms
+    return Transformations(s_from_as, w_from_gpsw, e_from_gpsw, scale)
+
+
+def parse_relocalization_name(name: str) -> tuple[str | None, str] | None:
+    """Return source and target recording of a file name; the source may be omitted."""
+    for pattern in _RELOCALIZATION_NAMES:
+        if found := pattern.fullmatch(name):
+            parts = found.groupdict()
+            return parts.get("source"), parts["target"]
+    return None
+
+
+def read_relocalization(path: Path) -> list[RelativePose]:
+    rows: dict[tuple[int, int], RelativePose] = {}
+    for line in read_lines(path, comments=True):
+        fields = line.comma_fields
+        line.expect(fields, (2, 9), "reference query [tx ty tz qx qy qz qw]")
+        reference, query = (_timestamp(line, field) for field in fields[:2])
+        pose = _transform(line, fields[2:]) if len(fields) == 9 else None
+        rows.setdefault((reference, query), RelativePose(reference, query, pose))
+    require(rows, "no pair in the file", path=path)
+    return list(rows.values())
+
 
 CAMERAS = ("cam0", "cam1")
 CALIBRATION_FOLDERS = ("calibration", "Calibration")
@@ -51,9 +235,6 @@ class Recording:
         """Return the name of an image below the dataset's root."""
         return f"{self.name}/{_IMAGES}/{camera}/{timestamp}.png"
 
-    def file_of(self, image: str) -> Path:
-        return self.folder / image.removeprefix(f"{self.name}/")
-
     def image_file(self, timestamp: int, camera: str) -> Path:
         return self.folder / _IMAGES / camera / f"{timestamp}.png"
 
@@ -65,10 +246,6 @@ class Recording:
 
     def calibration(self, root: Path) -> StereoCalibration:
         return read_calibration(self.calibration_folder(root))
-
-    def calibration_files(self, root: Path) -> list[Path]:
-        folder = self.calibration_folder(root)
-        return [folder / name for name in (*CAMERA_FILES, STEREO_FILE)]
 
     def calibration_folder(self, root: Path) -> Path:
         for folder in (self.folder, root):
@@ -91,7 +268,7 @@ class RelocalizationFile:
     target: str
 
     @cached_property
-    def rows(self) -> list[RelocalizationRow]:
+    def rows(self) -> list[RelativePose]:
         return read_relocalization(self.path)
 
     def count(self) -> Count:
@@ -105,17 +282,12 @@ def find_recordings(root: Path) -> dict[str, Recording]:
         for folder in _folders(root)
         if any((folder / mark).exists() for mark in _MARKS)
     }
-    if not found:
-        raise DataError(
-            f"no recording here, a folder with {_IMAGES}/ or {GNSS_POSES} in it",
-            path=root,
-        )
+    require(found, f"no recording here, a folder with {_IMAGES}/ or {GNSS_POSES} in it", path=root)
     return found
 
 
 def _folders(root: Path) -> list[Path]:
-    if not root.is_dir():
-        raise DataError("no such folder", path=root)
+    require(root.is_dir(), "no such folder", path=root)
     return sorted(path for path in root.iterdir() if path.is_dir())
 
 
@@ -180,12 +352,12 @@ def select(
         targets = [name for name in recordings if name not in sources]
     missing.files += [root / name for name in (*sources, *targets) if name not in recordings]
     sources, targets = ([n for n in names if n in recordings] for names in (sources, targets))
-    if not sources:
-        raise DataError(
-            f"{len(recordings)} recordings, none for the map; needed are one with published poses "
-            "(GNSSPoses.txt or poses.txt) and another for the queries",
-            path=root,
-        )
+    require(
+        sources,
+        f"{len(recordings)} recordings, none for the map; needed are one with published poses "
+        "(GNSSPoses.txt or poses.txt) and another for the queries",
+        path=root,
+    )
     if not targets:
         missing.files.append(root / ANOTHER_RECORDING)
     return Selection(

@@ -6,15 +6,12 @@ a nearby keyframe to each query.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field
 
-from megloc_kapture.datasets.formats.fourseasons_files import (
-    StereoCalibration,
-)
 from megloc_kapture.datasets.fourseasons import (
     CAMERAS,
     GNSS_POSES,
@@ -23,6 +20,7 @@ from megloc_kapture.datasets.fourseasons import (
     Recording,
     RelocalizationFile,
     Selection,
+    StereoCalibration,
     select,
 )
 from megloc_kapture.datasets.fourseasons.images import (
@@ -38,7 +36,6 @@ from megloc_kapture.datasets.official import (
     DatasetCard,
     Missing,
     OfficialDataset,
-    ground_truth_files,
     read_ground_truth,
     with_poses,
 )
@@ -103,21 +100,6 @@ class FourSeasons:
         chosen = self._select(root, Missing(root))
         for recording in (*chosen.references, *chosen.queries):
             recording.calibration(root)
-
-    def input_files(self, root: Path) -> Iterator[Path]:
-        dataset = self.read(root, allow_missing=True)
-        chosen = self._select(root, Missing(root))
-        yield from (file.path for file in chosen.files)
-        recordings = (*chosen.references, *chosen.queries)
-        yield from dict.fromkeys(f for r in recordings for f in r.calibration_files(root))
-        for recording in recordings:
-            for name in (GNSS_POSES, TRANSFORMATIONS, POSES):
-                if (recording.folder / name).is_file():
-                    yield recording.folder / name
-        for data in (dataset.mapping, dataset.query):
-            for image in data.image_names():
-                yield chosen.recordings[image.partition("/")[0]].file_of(image)
-        yield from ground_truth_files(root)
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
         missing = Missing(root)

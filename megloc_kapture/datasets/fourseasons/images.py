@@ -12,12 +12,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from megloc_kapture.datasets.formats.fourseasons_files import (
-    StereoCalibration,
-    read_gnss_poses,
-    read_poses,
-    read_transformations,
-)
 from megloc_kapture.datasets.fourseasons import (
     CAMERAS,
     GNSS_POSES,
@@ -25,9 +19,13 @@ from megloc_kapture.datasets.fourseasons import (
     TRANSFORMATIONS,
     Recording,
     RelocalizationFile,
+    StereoCalibration,
+    read_gnss_poses,
+    read_poses,
+    read_transformations,
 )
 from megloc_kapture.datasets.official import Missing
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.dataset_tables import RelocalizationPair, SimilarityTransform, World
 from megloc_kapture.io.kapture import KaptureData, Sensor
 from megloc_kapture.values import RigidTransform
@@ -175,8 +173,7 @@ class LocalFrame:
         official_from_local = scene @ RigidTransform((1.0, 0.0, 0.0, 0.0), self.origin)
         return World(
             official_from_local=SimilarityTransform(
-                quat_wxyz=official_from_local.quat_wxyz,
-                translation=official_from_local.translation,
+                quat_wxyz=official_from_local.quat_wxyz, translation=official_from_local.translation
             )
         )
 
@@ -209,16 +206,15 @@ def _gnss_poses(recording: Recording, min_fusion_quality: int) -> KeyframePoses:
         scale = transformations.gnss_scale if row.scale is None else row.scale
         if scale is None:
             raise DataError(
-                "the pose has no scale, and Transformations.txt has none either",
-                path=path,
+                "the pose has no scale, and Transformations.txt has none either", path=path
             )
         x, y, z = (scale * value for value in row.slam_from_cam.translation)
         metric = RigidTransform(row.slam_from_cam.quat_wxyz, (x, y, z))
         poses[timestamp] = scene_from_slam @ metric
-    if not poses:
-        raise DataError(
-            f"none of its {len(dropped)} poses has a fusion quality of {min_fusion_quality} or "
-            "better; lower min_fusion_quality takes them",
-            path=path,
-        )
+    require(
+        poses,
+        f"none of its {len(dropped)} poses has a fusion quality of {min_fusion_quality} or "
+        "better; lower min_fusion_quality takes them",
+        path=path,
+    )
     return KeyframePoses(poses, transformations.e_from_gpsw, dropped)

@@ -8,17 +8,17 @@ pose of the scan in its floor.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.formats.text_lines import Line, read_lines
 from megloc_kapture.datasets.official import Missing
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import named
+from megloc_kapture.io.text_lines import Line, read_lines
 from megloc_kapture.values import RigidTransform
 
 FLOORS = ("DUC1", "DUC2")
@@ -71,19 +71,9 @@ class Cutout:
         The camera looks along the scan's -x axis (z up), rotated by the yaw to the right and by the
         pitch upwards.
         """
-        yaw, pitch = np.radians(-self.yaw_deg), np.radians(-self.pitch_deg)
         pano_from_scan = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
-        about_x = np.array(
-            [
-                [1, 0, 0],
-                [0, np.cos(pitch), -np.sin(pitch)],
-                [0, np.sin(pitch), np.cos(pitch)],
-            ]
-        )
-        about_y = np.array(
-            [[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]]
-        )
-        return RigidTransform.from_matrix(about_x @ about_y @ pano_from_scan, np.zeros(3))
+        turn = Rotation.from_euler("yx", [-self.yaw_deg, -self.pitch_deg], degrees=True)
+        return RigidTransform.from_matrix(turn.as_matrix() @ pano_from_scan, np.zeros(3))
 
 
 def parse_cutout_name(name: str) -> Cutout:
@@ -97,10 +87,11 @@ def read_transformation(path: Path | str) -> RigidTransform:
     """Read ``floor_from_scan``: the second 4x4 matrix of the file, after refinement."""
     path = Path(path)
     rows = [line for line in read_lines(path) if _has_four_numbers(line)]
-    if len(rows) != 8:
-        raise DataError(
-            f"{len(rows)} rows of four numbers; expected two matrices of four rows each", path=path
-        )
+    require(
+        len(rows) == 8,
+        f"{len(rows)} rows of four numbers; expected two matrices of four rows each",
+        path=path,
+    )
     matrix = np.array([row.numbers_of(row.fields, "matrix element") for row in rows[4:]])
     return rows[7].rigid_transform(matrix)
 
@@ -142,8 +133,7 @@ class Layout:
 
     @classmethod
     def find(cls, root: Path) -> Layout:
-        if not root.is_dir():
-            raise DataError("no such folder", path=root)
+        require(root.is_dir(), "no such folder", path=root)
         for name in _ROOTS:
             cutouts, alignments, query = (
                 _first(root / name, names) for names in (_CUTOUTS, _ALIGNMENTS, _QUERIES)
@@ -175,17 +165,6 @@ class Layout:
     def wrong_scans(self, floor: str) -> frozenset[str]:
         path = _first(self.alignment(floor), _WRONG_SCANS)
         return frozenset() if path is None else read_wrong_scans(path)
-
-    def input_files(self, floors: tuple[str, ...], *, with_points: bool) -> Iterator[Path]:
-        for floor in floors:
-            alignments = self.alignment(floor)
-            yield from sorted(alignments.glob("transformations/*.txt"))
-            yield from (alignments / n for n in _WRONG_SCANS if (alignments / n).is_file())
-            yield from sorted((self.cutouts / floor).glob("[0-9][0-9][0-9]/*.jpg"))
-            if with_points:
-                pattern = f"[0-9][0-9][0-9]/*.jpg{POINTS_SUFFIX}"
-                yield from sorted((self.cutouts / floor).glob(pattern))
-        yield from (self.query / name for name in self.queries())
 
     def _scan(self, floor: str, number: str, missing: Missing) -> Scan:
         folder = self.cutouts / floor / number

@@ -6,7 +6,7 @@ its scan in the floor; its depth comes from the scanned points.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -31,11 +31,10 @@ from megloc_kapture.datasets.official import (
     DatasetCard,
     Missing,
     OfficialDataset,
-    ground_truth_files,
     last_part,
     read_ground_truth,
 )
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.dataset_tables import ImageGroup, World
 from megloc_kapture.io.images import image_size, write_depth_map
@@ -51,9 +50,6 @@ _CUTOUT_FOCAL_SHARE = 3**0.5 / 2
 # the 277 scans of the paper's 9,972 cutouts, with the floors published by the authors
 _PUBLISHED_SCANS = {"DUC1": 50, "DUC2": 80, "CSE3": 7, "CSE4": 75, "CSE5": 65}
 _PUBLISHED_QUERIES = 356
-# points of a wrong image are off by a large part of its width
-_MAX_OFFSET = 0.03
-_CHECKED_EVERY = 8  # rows and columns
 
 
 class InLocOptions(Options):
@@ -97,11 +93,6 @@ class InLoc:
         if not any((layout.cutouts / floor).is_dir() for floor in self.floors):
             raise DataError(f"none of {', '.join(self.floors)} is there", path=layout.cutouts)
 
-    def input_files(self, root: Path) -> Iterator[Path]:
-        layout = Layout.find(root)
-        yield from layout.input_files(self.floors, with_points=self.options.depth)
-        yield from ground_truth_files(root)
-
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
         self.check(root)
         layout, missing = Layout.find(root), Missing(root)
@@ -114,12 +105,12 @@ class InLoc:
                     left_out.append(scan.location)
                 else:
                     map_.add(scan, missing)
-        if self.options.depth and map_.groups and not (map_.depth_jobs or allow_missing):
-            raise DataError(
-                f"no cutout has its points (.jpg{POINTS_SUFFIX}); the download without "
-                "them is imported with the option depth = false",
-                path=layout.cutouts,
-            )
+        require(
+            not self.options.depth or not map_.groups or map_.depth or allow_missing,
+            f"no cutout has its points (.jpg{POINTS_SUFFIX}); the download without "
+            "them is imported with the option depth = false",
+            path=layout.cutouts,
+        )
         names = [f"{QUERIES}/{name}" for name in layout.queries()]
         query = _queries(names, layout.query)
         truth, true_groups = read_ground_truth(root, query, World())
@@ -136,9 +127,7 @@ class InLoc:
             summary=self._summary(map_, groups),
             remarks=[f"Omitted, wrongly placed: scans {', '.join(left_out)}."] if left_out else [],
             missing=missing,
-            write_more=lambda output: write_depth_maps(
-                map_.depth_jobs, self.options.depth_step, output / records
-            ),
+            write_more=lambda output: map_.write_depth_maps(output / records),
         )
 
     def _summary(self, map_: _Map, groups: Mapping[str, ImageGroup]) -> list[Count]:
@@ -149,7 +138,7 @@ class InLoc:
             Count("query images", len(groups), _PUBLISHED_QUERIES),
         ]
         if self.options.depth:
-            counts.append(Count("map images with depth", len(map_.depth_jobs)))
+            counts.append(Count("map images with depth", len(map_.depth)))
         for floor in self.floors:
             scans = {g.location for g in map_.groups.values() if g.frame == floor}
             counts.append(Count(f"scans of {floor}", len(scans), _PUBLISHED_SCANS[floor]))
@@ -167,7 +156,8 @@ class _Map:
     options: InLocOptions
     data: KaptureData = field(default_factory=KaptureData)
     groups: dict[str, ImageGroup] = field(default_factory=dict)
-    depth_jobs: list[DepthJob] = field(default_factory=list)
+    # record of a depth map -> file of points, and its cutout and camera
+    depth: dict[str, tuple[Path, Cutout, Camera]] = field(default_factory=dict)
 
     def add(self, scan: Scan, missing: Missing) -> None:
         without = [c.image for c in scan.cutouts if c.image not in scan.with_points]
@@ -192,7 +182,11 @@ class _Map:
                 record = f"{DEPTH}/{scan.location}/{cutout.image.removesuffix('.jpg')}.depth"
                 self.data.records_depth[timestamp, _depth(sensor)] = record
                 points = scan.folder / f"{cutout.image}{POINTS_SUFFIX}"
-                self.depth_jobs.append(DepthJob(points, cutout, camera, record))
+                self.depth[record] = points, cutout, camera
+
+    def write_depth_maps(self, records: Path) -> None:
+        for record, job in self.depth.items():
+            write_depth_map(records / record, cutout_depth(*job, self.options.depth_step))
 
     def _sensor(self, camera: Camera) -> str:
         sensor = f"cutout_{camera.width}x{camera.height}"
@@ -239,16 +233,6 @@ def _queries(names: list[str], folder: Path) -> KaptureData:
 # ----------------------------------------------------------------------------------- depth
 
 
-@dataclass(frozen=True)
-class DepthJob:
-    """A depth map to be written from a cutout's points."""
-
-    points: Path
-    cutout: Cutout
-    camera: Camera
-    record: str
-
-
 def depth_camera(camera: Camera, step: int) -> Camera:
     """Return the camera of every ``step``-th row and column; kept pixels keep their centres."""
     focal, cx, cy = camera.params
@@ -260,37 +244,8 @@ def depth_camera(camera: Camera, step: int) -> Camera:
     )
 
 
-def cutout_depth(job: DepthJob, step: int) -> NDArray[np.float32]:
+def cutout_depth(path: Path, cutout: Cutout, camera: Camera, step: int) -> NDArray[np.float32]:
     """Return the depth along the optical axis, float32 (H, W), metres; 0 without measurement."""
-    camera = job.camera
-    points = read_cutout_points(job.points, camera.width, camera.height)
-    rotation = job.cutout.cam_from_scan().rotation_matrix()
-    _check_place(job, points[::_CHECKED_EVERY, ::_CHECKED_EVERY] @ rotation.T)
-    z = points[::step, ::step] @ rotation[2]
+    points = read_cutout_points(path, camera.width, camera.height)
+    z = points[::step, ::step] @ cutout.cam_from_scan().rotation_matrix()[2]
     return np.where(np.isfinite(z) & (z > 0), z, 0.0).astype(np.float32)
-
-
-def write_depth_maps(jobs: Sequence[DepthJob], step: int, records: Path) -> None:
-    for job in jobs:
-        write_depth_map(records / job.record, cutout_depth(job, step))
-
-
-def _check_place(job: DepthJob, in_camera: NDArray[np.float64]) -> None:
-    """Raise DataError if the points do not project to their pixels."""
-    focal, cx, cy = job.camera.params
-    rows, columns = (np.arange(n) * _CHECKED_EVERY + 0.5 for n in in_camera.shape[:2])
-    seen = np.isfinite(in_camera).all(axis=2)
-    if not seen.any():
-        return
-    x, y, z = in_camera[seen].T
-    at_x = np.broadcast_to(columns, seen.shape)[seen] - cx
-    at_y = np.broadcast_to(rows[:, None], seen.shape)[seen] - cy
-    with np.errstate(all="ignore"):
-        offset = np.hypot(focal * x / z - at_x, focal * y / z - at_y)
-    offset_px = float(np.median(np.where((z > 0) & np.isfinite(offset), offset, np.inf)))
-    if offset_px > _MAX_OFFSET * job.camera.width:
-        raise DataError(
-            f"its points lie {offset_px:.0f} px (median) from their pixels in {job.cutout.image}: "
-            "not the scan of this image",
-            path=job.points,
-        )

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
-from megloc_kapture.datasets.formats.nvm import read_nvm
-from megloc_kapture.datasets.formats.text_lines import Line, read_lines, shown
+from megloc_kapture.datasets.nvm import read_nvm
 from megloc_kapture.datasets.official import Missing
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import SparsePoints, colmap_model_files, read_colmap_model
+from megloc_kapture.io.text_lines import Line, read_lines, shown
 from megloc_kapture.values import RigidTransform
 
 CAMERAS = ("left", "rear", "right")
@@ -53,14 +53,6 @@ class ImageKey:
         return f"{self.condition}/{self.camera}/{self.stem}"
 
 
-class ListedImage(NamedTuple):
-    """A listed image with its line and its pose (the identity in lists without poses)."""
-
-    image: ImageKey
-    line: Line
-    cam_from_world: RigidTransform
-
-
 def parse_image(text: str) -> ImageKey | None:
     """Parse an image name, with or without condition; return None for other names."""
     found = _IMAGE.fullmatch(text.removeprefix("./"))
@@ -81,48 +73,49 @@ def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
     return fx, fy, cx, cy
 
 
-def read_query_location(path: Path) -> list[ListedImage]:
+def read_query_location(path: Path) -> list[tuple[ImageKey, Line]]:
     """Read ``queries_location_NNN.txt``."""
-    return [_listed(line, line.text) for line in _some_lines(path)]
+    return [(_image_of(line, line.text), line) for line in _some_lines(path)]
 
 
-def read_test_list(path: Path) -> list[ListedImage]:
+def read_test_list(path: Path) -> list[tuple[ImageKey, Line]]:
     """Read ``robotcar_v2_test.txt``; its names have no condition (``rear/1.png``)."""
-    listed: dict[tuple[str, str], ListedImage] = {}
+    listed: dict[tuple[str, str], tuple[ImageKey, Line]] = {}
     for line in _some_lines(path):
-        entry = _listed(line, line.text, conditions=False)
-        if listed.setdefault((entry.image.camera, entry.image.stem), entry) is not entry:
-            raise line.error(f"{line.text!r} is listed twice")
+        image = _image_of(line, line.text, conditions=False)
+        line.require((image.camera, image.stem) not in listed, f"{line.text!r} is listed twice")
+        listed[image.camera, image.stem] = image, line
     return list(listed.values())
 
 
-def read_train_poses(path: Path) -> list[ListedImage]:
-    """Read ``robotcar_v2_train.txt``: a name and the 4x4 matrix ``world_from_cam`` per line."""
-    listed: dict[ImageKey, ListedImage] = {}
+def read_train_poses(path: Path) -> list[tuple[ImageKey, Line, RigidTransform]]:
+    """Read ``robotcar_v2_train.txt``, ``world_from_cam``; return image, line, ``cam_from_world``.
+
+    A line is a name and the 16 elements of a 4x4 matrix.
+    """
+    listed: dict[ImageKey, tuple[ImageKey, Line, RigidTransform]] = {}
     for line in _some_lines(path):
         line.expect(line.fields, 17, "a name and 16 matrix elements")
-        image = _listed(line, line.fields[0]).image
-        if image in listed:
-            raise line.error(f"{line.fields[0]!r} is given twice")
+        image = _image_of(line, line.fields[0])
+        line.require(image not in listed, f"{line.fields[0]!r} is given twice")
         values = line.numbers_of(line.fields[1:], "matrix element")
         world_from_cam = line.rigid_transform(np.array(values).reshape(4, 4))
-        listed[image] = ListedImage(image, line, world_from_cam.inverse())
+        listed[image] = image, line, world_from_cam.inverse()
     return list(listed.values())
 
 
 def _some_lines(path: Path) -> list[Line]:
     lines = read_lines(path)
-    if not lines:
-        raise DataError("no image in the list", path=path)
+    require(lines, "no image in the list", path=path)
     return lines
 
 
-def _listed(line: Line, text: str, *, conditions: bool = True) -> ListedImage:
+def _image_of(line: Line, text: str, *, conditions: bool = True) -> ImageKey:
     image = parse_image(text)
     if image is None or (conditions and not image.condition):
         form = "condition/camera/time.jpg" if conditions else "camera/time.png"
         raise line.error(f"expected {form}, got {shown(text)}")
-    return ListedImage(image, line, RigidTransform.identity())
+    return image
 
 
 class Layout:
@@ -177,17 +170,10 @@ class Layout:
         folders = self.individual_models().values()
         return [file for folder in folders for file in colmap_model_files(folder)]
 
-    def image_files(self) -> Iterator[Path]:
-        for condition in _sorted_names(self.images):
-            for camera in CAMERAS:
-                folder = self.images / condition / camera
-                for name in _sorted_names(folder):
-                    if name.endswith(_FILE_TYPES):
-                        yield folder / name
-
     def num_reference_images(self) -> int:
-        files = self.image_files()
-        return sum(path.parent.parent.name == REFERENCE_CONDITION for path in files)
+        folders = (self.images / REFERENCE_CONDITION / camera for camera in CAMERAS)
+        names = (name for folder in folders for name in _sorted_names(folder))
+        return sum(name.endswith(_FILE_TYPES) for name in names)
 
 
 def image_finder(layout: Layout, missing: Missing) -> Callable[[ImageKey], str | None]:
@@ -299,22 +285,22 @@ def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missin
     locations: dict[ImageKey, tuple[str, ...]] = {}
     at_time: dict[tuple[str, int], ImageKey] = {}
     for location, path in lists.items():
-        for entry in read_query_location(path):
-            note_time(entry.image, at_time, entry.line.error)
-            others = locations.get(entry.image, ())
+        for image, line in read_query_location(path):
+            note_time(image, at_time, line.error)
+            others = locations.get(image, ())
             if location not in others:
-                locations[entry.image] = (*others, location)
+                locations[image] = (*others, location)
     train: dict[ImageKey, RigidTransform] = {}
     test: dict[ImageKey, str] = {}
     unlisted = 0
     # optional for version 1
     wanted = version == 2 and missing.require(layout.train_list)
     if wanted or layout.train_list.is_file():
-        for entry in read_train_poses(layout.train_list):
-            known = _scored_query(entry, at_time, allow_missing)
+        for image, line, cam_from_world in read_train_poses(layout.train_list):
+            known = _scored_query(image, line, at_time, allow_missing)
             unlisted += known is None
             if known is not None:
-                train[known] = entry.cam_from_world
+                train[known] = cam_from_world
     if version == 2 and missing.require(layout.test_list):
         test, more = read_test_names(layout.test_list, at_time, train, allow_missing=allow_missing)
         unlisted += more
@@ -331,20 +317,17 @@ def read_test_names(
     """Read version 2's test list: query -> its text in the list; count unknown entries."""
     test: dict[ImageKey, str] = {}
     unlisted = 0
-    for entry in read_test_list(path):
-        known = _scored_query(entry, at_time, allow_missing)
+    for image, line in read_test_list(path):
+        known = _scored_query(image, line, at_time, allow_missing)
         unlisted += known is None
-        if known in train:
-            raise entry.line.error(f"{entry.line.text!r} is a training image too")
+        line.require(known not in train, f"{line.text!r} is a training image too")
         if known is not None:
-            test[known] = entry.line.text
+            test[known] = line.text
     return test, unlisted
 
 
 def note_time(
-    image: ImageKey,
-    at_time: dict[tuple[str, int], ImageKey],
-    error: Callable[[str], DataError],
+    image: ImageKey, at_time: dict[tuple[str, int], ImageKey], error: Callable[[str], DataError]
 ) -> None:
     """Register camera and time of an image; raise ``error`` if another image has both."""
     if image.camera not in CAMERAS:
@@ -356,19 +339,18 @@ def note_time(
 
 
 def _scored_query(
-    entry: ListedImage, at_time: Mapping[tuple[str, int], ImageKey], allow_missing: bool
+    image: ImageKey, line: Line, at_time: Mapping[tuple[str, int], ImageKey], allow_missing: bool
 ) -> ImageKey | None:
-    image = entry.image
-    if image.camera != SCORED_CAMERA:
-        raise entry.line.error(
-            f"an image of camera {image.camera!r}, expected {SCORED_CAMERA!r} only"
-        )
+    line.require(
+        image.camera == SCORED_CAMERA,
+        f"an image of camera {image.camera!r}, expected {SCORED_CAMERA!r} only",
+    )
     found = at_time.get((image.camera, image.timestamp))
     if found is not None and image.condition in ("", found.condition):
         return found
     if allow_missing:
         return None
-    raise entry.line.error(
+    raise line.error(
         f"{image.camera}/{image.stem} is in no list of queries_per_location; "
         "--allow-missing leaves it out"
     )

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from megloc_kapture.datasets.kapture_form import KaptureForm
 from megloc_kapture.datasets.official import (
     Count,
     DatasetCard,
+    KaptureForm,
     Missing,
     OfficialDataset,
-    ground_truth_files,
     read_ground_truth,
 )
 from megloc_kapture.datasets.reference_map import ReferenceModel, check_model_files
@@ -43,7 +42,7 @@ from megloc_kapture.datasets.robotcar.images import (
     reference_of_kapture,
     select,
 )
-from megloc_kapture.errors import OptionError
+from megloc_kapture.errors import check_option
 from megloc_kapture.evaluation.protocols import protocol_of
 from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.dataset_tables import ImageGroup, World
@@ -92,12 +91,6 @@ class RobotCarOptions(Options):
         "the benchmark permits to know; false: with all",
     )
 
-    @model_validator(mode="after")
-    def _usable(self) -> RobotCarOptions:
-        if self.train_as_map and self.queries == "train":
-            raise ValueError("train_as_map leaves nothing for queries=train")
-        return self
-
 
 class RobotCar:
     """Adapter of RobotCar Seasons: all locations form one map in one metric frame.
@@ -112,12 +105,7 @@ class RobotCar:
         published_at="https://data.ciirc.cvut.cz/public/projects/2020VisualLocalization/"
         "RobotCar-Seasons/",
         size="tens of GB, much of it a feature database that only the reference model needs",
-        folders=(
-            "RobotCar-Seasons",
-            "RobotCar_Seasons",
-            "robotcar_seasons",
-            "RobotCar_Seasons-v2",
-        ),
+        folders=("RobotCar-Seasons", "RobotCar_Seasons", "robotcar_seasons", "RobotCar_Seasons-v2"),
         layout="images/<condition>/{left,rear,right}/*.jpg (archives extracted in place), "
         "intrinsics/, extrinsics/, 3D-models/all-merged/all.nvm, "
         "3D-models/individual/{queries_per_location,colmap_reconstructions}/ and, for version 2, "
@@ -136,23 +124,6 @@ class RobotCar:
             raise self.card.without(root, absent)
         elif self.options.reference_model:
             check_model_files(Layout(root).points_files(self.options.model))
-
-    def input_files(self, root: Path) -> Iterator[Path]:
-        layout = Layout(root)
-        if (form := _kapture_form(root)) is not None:
-            yield from (path for path in [layout.test_list] if path.is_file())
-            yield from form.input_files()
-        else:
-            single = [of(name) for of in (layout.intrinsics, layout.extrinsics) for name in CAMERAS]
-            single += [layout.train_list, layout.test_list, layout.merged_model]
-            if self.options.reference_model:
-                single.append(layout.feature_database)
-            yield from (path for path in single if path.is_file())
-            yield from layout.query_lists().values()
-            for folder in layout.individual_models().values():
-                yield from sorted(path for path in folder.iterdir() if path.is_file())
-            yield from layout.image_files()
-        yield from ground_truth_files(Path(root))
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
         self.check(root)
@@ -251,11 +222,11 @@ class RobotCar:
         )
 
     def _check_version(self, version: int) -> None:
-        if version == 1 and (self.options.train_as_map or self.options.queries != "all"):
-            raise OptionError(
-                "train_as_map and queries are about version 2, whose lists are not there or not "
-                "wanted (version=2)"
-            )
+        check_option(
+            version == 2 or not (self.options.train_as_map or self.options.queries != "all"),
+            "train_as_map and queries are about version 2, whose lists are not there or not wanted "
+            "(version=2)",
+        )
 
 
 def _kapture_form(root: Path) -> KaptureForm | None:

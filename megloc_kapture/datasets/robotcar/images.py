@@ -9,9 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from megloc_kapture.datasets.formats.text_lines import read_rigid_matrix
-from megloc_kapture.datasets.kapture_form import KaptureForm, KaptureImage
-from megloc_kapture.datasets.official import Missing, with_poses
+from megloc_kapture.datasets.official import KaptureForm, KaptureImage, Missing, with_poses
 from megloc_kapture.datasets.robotcar import (
     CAMERAS,
     REFERENCE_CONDITION,
@@ -25,11 +23,12 @@ from megloc_kapture.datasets.robotcar import (
     read_intrinsics,
     read_test_names,
 )
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.geometry.poses import rotation_angles_deg, stack_poses
 from megloc_kapture.io.files import named
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureData, Sensor
+from megloc_kapture.io.text_lines import read_rigid_matrix
 from megloc_kapture.values import Camera, RigidTransform
 
 RIG_ID = "car"
@@ -215,12 +214,12 @@ def read_kapture_images(form: KaptureForm, missing: Missing) -> dict[ImageKey, K
                 f"image {image.name!r}; expected condition/camera/time.jpg", path=image.file
             )
         note_time(key, at_time, partial(DataError, path=image.file))
-        if cameras.setdefault(key.camera, image.camera) != image.camera:
-            raise DataError(
-                f"camera {key.camera} is not that of other images; all of RobotCar's images are "
-                "rectified to one for each side",
-                path=image.file,
-            )
+        require(
+            cameras.setdefault(key.camera, image.camera) == image.camera,
+            f"camera {key.camera} is not that of other images; all of RobotCar's images are "
+            "rectified to one for each side",
+            path=image.file,
+        )
         found[key] = image
     return found
 

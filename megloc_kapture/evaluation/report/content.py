@@ -5,26 +5,29 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from megloc_kapture.evaluation.confidence import Confidence
-from megloc_kapture.evaluation.metrics import RecallAt, RecallRow, Threshold, pose_errors
-from megloc_kapture.evaluation.scoring import CovarianceCheck, Evaluation
-from megloc_kapture.evaluation.statistics import (
+from megloc_kapture.evaluation.comparison import (
     NUM_RESAMPLES,
     SIGNIFICANCE,
+    AgreementRow,
     Comparison,
     MedianDifference,
     PairedTest,
-)
-from megloc_kapture.evaluation.without_truth import (
-    AgreementRow,
     WithoutTruth,
     inliers_quartiles,
 )
+from megloc_kapture.evaluation.metrics import (
+    Confidence,
+    RecallAt,
+    RecallRow,
+    Threshold,
+    pose_errors,
+)
+from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.io.tables import ConsistencyRow
 from megloc_kapture.values import MIN_CONFIDENCE
 
@@ -69,8 +72,9 @@ def format_interval(at: RecallAt) -> str:
     return f"{format_percent(at.low)}-{format_percent(at.high)}"
 
 
-def counted(number: int, one: str, many: str = "") -> str:
-    return f"{number} {one if number == 1 else many or f'{one}s'}"
+def counted(number: int, noun: str, plural: str = "") -> str:
+    regular = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
+    return f"{number} {noun if number == 1 else plural or regular}"
 
 
 def bounds(thresholds: Sequence[Threshold]) -> str:
@@ -96,7 +100,7 @@ def notes(evaluation: Evaluation) -> list[str]:
     kinds = {query.fallback for query in evaluation.queries} - {"none"}
     if row.num_fallback:
         whose = " or the one ".join(_FALLBACK_POSES[kind] for kind in sorted(kinds))
-        without = counted(row.num_fallback, "query", "queries")
+        without = counted(row.num_fallback, "query")
         sentences.append(
             f"{without} could not be localized and got the pose {whose} instead; recall and the "
             "median of all count it like any pose"
@@ -146,11 +150,9 @@ def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[st
     return sentences
 
 
-def covariance_sentence(check: CovarianceCheck) -> str:
-    return (
-        f"{check.num_within} of {counted(check.num_poses, 'error lies', 'errors lie')} within the "
-        "claimed 95 % region"
-    )
+def covariance_sentence(check: Mapping[str, int]) -> str:
+    errors = counted(check["num_poses"], "error lies", "errors lie")
+    return f"{check['num_within']} of {errors} within the claimed 95 % region"
 
 
 def consistency_sentence(row: ConsistencyRow) -> str:
@@ -173,7 +175,7 @@ def agreement_sentence(row: AgreementRow, found: WithoutTruth) -> str:
         return "The same queries have a pose in both."
     first, second = found.evaluations[row.first].label, found.evaluations[row.second].label
     return (
-        f"Only {first} has a pose for {counted(row.num_only_first, 'query', 'queries')}, "
+        f"Only {first} has a pose for {counted(row.num_only_first, 'query')}, "
         f"only {second} for {row.num_only_second}."
     )
 
@@ -236,7 +238,7 @@ def _verdict(test: PairedTest) -> str:
 
 
 def _queries(number: int) -> str:
-    return "no query" if number == 0 else counted(number, "query", "queries")
+    return "no query" if number == 0 else counted(number, "query")
 
 
 def _signed(metres: float) -> str:

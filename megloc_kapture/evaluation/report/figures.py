@@ -18,9 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
-from megloc_kapture.evaluation.confidence import Confidence
-from megloc_kapture.evaluation.report.map_view import top_view
-from megloc_kapture.evaluation.report.queries import ShownQuery, frame_of_query
+from megloc_kapture.evaluation.metrics import Confidence
+from megloc_kapture.evaluation.report.queries import ShownQuery, frame_of_query, top_view
 from megloc_kapture.evaluation.results import Poses
 from megloc_kapture.evaluation.scoring import Evaluation
 from megloc_kapture.geometry.poses import camera_centers, stack_poses
@@ -203,10 +202,10 @@ def _from_above(queries: Sequence[ShownQuery], mapped: list[RigidTransform], uni
     # a wrong estimate must not shrink the map to a dot
     spanning = mapped + true or [query.estimated for query in posed if query.estimated]
     quats, translations = stack_poses(spanning)
-    view = top_view(quats, camera_centers(quats, translations))
+    axes_of_page, labels = top_view(quats, camera_centers(quats, translations))
 
     def seen(poses: Sequence[RigidTransform | None]) -> NDArray[np.float64]:
-        return view.project(camera_centers(*stack_poses([pose for pose in poses if pose])))
+        return camera_centers(*stack_poses([pose for pose in poses if pose])) @ axes_of_page.T
 
     points = seen(spanning)
     low, high = points.min(axis=0), points.max(axis=0)
@@ -241,6 +240,6 @@ def _from_above(queries: Sequence[ShownQuery], mapped: list[RigidTransform], uni
         dots(lost, 30, "truth, no pose", c=_MISS, marker="+")
         axes.set_aspect("equal")
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        axes.set(xlabel=f"{view.labels[0]} ({unit})", ylabel=f"{view.labels[1]} ({unit})")
+        axes.set(xlabel=f"{labels[0]} ({unit})", ylabel=f"{labels[1]} ({unit})")
         figure.legend(loc="outside lower center", ncols=5)
         return _svg(figure)

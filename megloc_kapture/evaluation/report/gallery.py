@@ -1,4 +1,4 @@
-"""Pictures of a report: the worst queries beside map images, masks, and depth."""
+"""Pictures of the worst queries of a report beside map images."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import base64
 import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from markupsafe import Markup, escape
@@ -14,11 +13,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.report.content import counted
-from megloc_kapture.evaluation.report.queries import (
-    ShownQuery,
-    query_facts,
-    spread,
-)
+from megloc_kapture.evaluation.report.queries import ShownQuery, query_facts, spread
 from megloc_kapture.evaluation.results import Poses, ResultContext
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px
 from megloc_kapture.io.images import read_image_rgb
@@ -29,15 +24,13 @@ from megloc_kapture.values import Camera, RigidTransform
 Pixels = NDArray[np.uint8]
 Points = NDArray[np.float64]
 
-_QUERY_BOX, _SMALL_BOX = (400, 300), (256, 256)
+_BOX = (400, 300)
 _GAP_PX, _MAX_LINES = 6, 120
 # candidates that are searched for the one with most matches
 _CANDIDATES_COMPARED = 50
 # distance of a match from its epipolar line
 _MAX_ERROR_PX = 8.0
 AGREES, DISAGREES, UNKNOWN = "#12a150", "#e02424", "#f2b705"
-_NUM_IMAGES = 6  # of masks, and of depth
-_SHADE = np.array([214.0, 32.0, 120.0])
 
 
 @dataclass(frozen=True)
@@ -106,7 +99,7 @@ def _beside(
     map_poses: Poses,
     readers: _Readers | None,
 ) -> Picture:
-    left, scale = _read(folder, query.image, _QUERY_BOX)
+    left, scale = _read(folder, query.image)
     matches = _stored_matches(readers, query.image, query.candidates[:_CANDIDATES_COMPARED])
     best = max(matches, key=lambda image: len(matches[image][0]), default="")
     pose, which = (query.truth, "true") if query.truth else (query.estimated, "estimated")
@@ -116,7 +109,7 @@ def _beside(
     facts = query_facts(query)
     if context.mapping is None or not best:
         return Picture(query.name, ", ".join(facts), image_tag(left, query.image))
-    right, right_scale = _read(context.mapping, best, _QUERY_BOX)
+    right, right_scale = _read(context.mapping, best)
     query_px, map_px = matches.get(best, (np.zeros((0, 2)), np.zeros((0, 2))))
     facts.append(f"right: {best}, {counted(len(query_px), 'match', 'matches')}")
     colors = np.full(len(query_px), UNKNOWN)
@@ -154,52 +147,6 @@ def fits_poses(
     return np.asarray(~(off * focal_px(query_camera) > _MAX_ERROR_PX))
 
 
-def mask_pictures(folders: Sequence[KaptureFolder]) -> list[Picture]:
-    """Draw a few images with their masks shaded."""
-    pictures = []
-    for folder in folders:
-        masks = folder.root / "sensors" / "masks"
-        names = [n for n in folder.read().image_names() if (masks / f"{n}.png").is_file()]
-        for at in spread(len(names), _NUM_IMAGES) if names else ():
-            with contextlib.suppress(DataError):
-                small, _ = _read(folder, names[at], _SMALL_BOX)
-                mask = read_image_rgb(masks / f"{names[at]}.png")[:, :, 0]
-                shares = np.where(_nearest(mask, small)[..., None] > 0, 0.0, 0.62)
-                shaded = np.round(small + shares * (_SHADE - small)).astype(np.uint8)
-                facts = f"{100 * float(np.mean(mask == 0)):.1f} % masked"
-                pictures.append(Picture(names[at], facts, image_tag(shaded, names[at])))
-    return pictures
-
-
-def depth_pictures(mapping: KaptureFolder | None) -> list[Picture]:
-    """Draw a few map images beside their depth by stereo."""
-    import cv2
-
-    from megloc_kapture.stages.scene import depth_records, read_depth
-    from megloc_kapture.stages.stereo_depth import stereo_images
-
-    pictures: list[Picture] = []
-    with contextlib.suppress(DataError):
-        names = [] if mapping is None else list(stereo_images(mapping))
-        for at in spread(len(names), _NUM_IMAGES) if names else ():
-            assert mapping is not None
-            record = depth_records(mapping.read())[names[at]]
-            small, _ = _read(mapping, names[at], _SMALL_BOX)
-            depth = _nearest(read_depth(mapping, record), small)
-            known = depth > 0
-            # inverse depth keeps the shades of near surfaces
-            near = np.where(known, 1 / np.where(known, depth, 1), 0)
-            low, high = np.quantile(near[known], (0.02, 0.98)) if known.any() else (0.0, 1.0)
-            share = ((near - low) / max(high - low, 1e-12)).clip(0, 1)
-            levels = np.round(255 * share).astype(np.uint8)
-            colors = cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[:, :, ::-1]
-            shown = np.where(known[..., None], colors, np.uint8(46)).astype(np.uint8)
-            facts = f"depth on {100 * float(known.mean()):.0f} % of the pixels"
-            tag = image_tag(np.hstack([small, shown]), names[at])
-            pictures.append(Picture(names[at], facts, tag))
-    return pictures
-
-
 def image_tag(pixels: Pixels, name: str) -> Markup:
     height, width = pixels.shape[:2]
     return Markup('<img src="{}" width="{}" height="{}" alt="{}">').format(
@@ -228,20 +175,13 @@ def side_by_side(
     return Markup("".join([*parts, "</svg>"]))
 
 
-def _read(folder: KaptureFolder, image: str, box: tuple[int, int]) -> tuple[Pixels, float]:
+def _read(folder: KaptureFolder, image: str) -> tuple[Pixels, float]:
     import cv2  # slow import
 
     pixels = read_image_rgb(folder.image_path(image))
-    scale = min(box[0] / pixels.shape[1], box[1] / pixels.shape[0], 1.0)
+    scale = min(_BOX[0] / pixels.shape[1], _BOX[1] / pixels.shape[0], 1.0)
     size = (max(round(pixels.shape[1] * scale), 1), max(round(pixels.shape[0] * scale), 1))
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8), scale
-
-
-def _nearest(values: NDArray[Any], pixels: Pixels) -> NDArray[Any]:
-    import cv2
-
-    size = pixels.shape[1], pixels.shape[0]
-    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT))
 
 
 def _jpeg(pixels: Pixels) -> str:

@@ -1,4 +1,4 @@
-"""Queries in reports and the 3D view: order, colours, facts, and stored inliers."""
+"""Queries in reports and the 3D view: order, colours, facts, and stored inliers; the top view."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from megloc_kapture.evaluation.report.content import format_degrees, format_metr
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
 from megloc_kapture.geometry.cameras import project
+from megloc_kapture.geometry.poses import invert_quats, rotate
 from megloc_kapture.io.kapture import FeatureReader, MatchesReader
 from megloc_kapture.localization.map_index import MapIndex, TypedMatches
 from megloc_kapture.matching.guided_pyramid import base_type
@@ -192,3 +193,41 @@ class StoredInliers:
 def spread(number: int, most: int) -> NDArray[np.int64]:
     """Return at most ``most`` of ``number`` positions, evenly spread."""
     return np.unique(np.linspace(0, number - 1, min(number, most)).round().astype(np.int64))
+
+
+# length of the mean "down" below which cameras agree on no vertical
+_MIN_AGREEMENT = 0.5
+# a vertical this close to a world axis is snapped to it, for labels x, y and z
+_AXIS_COSINE = float(np.cos(np.deg2rad(15.0)))
+
+
+def top_view(
+    quats_wxyz: NDArray[np.float64], centers: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], tuple[str, str]]:
+    """Look down on cameras ``cam_from_world`` (N, 4) with centres (N, 3), N at least 1.
+
+    Vertical is the mean downward direction of the images, or without agreement the direction in
+    which the centres spread least. Returns directions (2, 3) of the world that are right and up on
+    the page, orthonormal, and labels of these axes.
+    """
+    down = rotate(invert_quats(quats_wxyz), np.array([0.0, 1.0, 0.0])).mean(axis=0)
+    length = float(np.linalg.norm(down))
+    spread = centers - centers.mean(axis=0)
+    axes = np.linalg.eigh(spread.T @ spread)[1].T[::-1]
+    upward = -down / length if length >= _MIN_AGREEMENT else _signed(axes[2])
+    nearest = int(np.argmax(np.abs(upward)))
+    if abs(upward[nearest]) >= _AXIS_COSINE:
+        first, second = (nearest + 1) % 3, (nearest + 2) % 3
+        if upward[nearest] < 0:  # swapped, so that the page is not mirrored
+            first, second = second, first
+        return np.eye(3)[[first, second]], ("xyz"[first], "xyz"[second])
+    right = axes[0] - (axes[0] @ upward) * upward
+    if np.linalg.norm(right) < 1e-6:  # the cameras stand on one vertical line
+        right = np.eye(3)[int(np.argmin(np.abs(upward)))]
+        right = right - (right @ upward) * upward
+    right = _signed(right / np.linalg.norm(right))
+    return np.stack([right, np.cross(upward, right)]), ("along the map", "across the map")
+
+
+def _signed(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    return direction if direction[int(np.argmax(np.abs(direction)))] > 0 else -direction

@@ -17,6 +17,15 @@ from markupsafe import Markup
 from pydantic import BaseModel
 
 from megloc_kapture.errors import DataError
+from megloc_kapture.evaluation.comparison import (
+    CAUTION,
+    AgreementRow,
+    Comparison,
+    MedianDifference,
+    PairedTest,
+    WithoutTruth,
+    inliers_quartiles,
+)
 from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.evaluation.report import content
 from megloc_kapture.evaluation.report.queries import (
@@ -27,13 +36,6 @@ from megloc_kapture.evaluation.report.queries import (
 )
 from megloc_kapture.evaluation.results import Poses, first_map_poses
 from megloc_kapture.evaluation.scoring import Evaluation, Reported
-from megloc_kapture.evaluation.statistics import Comparison, MedianDifference, PairedTest
-from megloc_kapture.evaluation.without_truth import (
-    CAUTION,
-    AgreementRow,
-    WithoutTruth,
-    inliers_quartiles,
-)
 from megloc_kapture.io.files import write_bytes, write_json
 from megloc_kapture.values import MIN_CONFIDENCE
 
@@ -262,22 +264,9 @@ def render_report(
         sections.append(_error_curves(evaluations))
     for evaluation in evaluations:
         sections += _sections_of(evaluation, map_poses, several=len(evaluations) > 1)
-    # slow import
-    from megloc_kapture.evaluation.report.gallery import depth_pictures, mask_pictures
-
-    context, shaded = evaluations[0].context, "Masked regions are shaded."
-    sections += [
-        Section("Masks", [shaded], pictures=mask_pictures(context.masked)),
-        Section(
-            "Depth of map images by stereo",
-            ["Yellow is near, purple is far, dark is unknown."],
-            pictures=depth_pictures(context.mapping),
-        ),
-    ]
     values = dict(provenance or {})
     return template("report.html").render(
         title=" and ".join(evaluation.label for evaluation in evaluations) or "Evaluation",
-        numbers=_numbers(reported) if isinstance(reported, Evaluation) else [],
         view=VIEW_HTML if has_view else "",
         steps=values.pop("steps", []),
         sections=[s for s in sections if s.body or s.pictures or not s.heading],
@@ -297,23 +286,6 @@ def template(name: str) -> Template:
         lstrip_blocks=True,
     )
     return environment.get_template(name)
-
-
-def _numbers(evaluation: Evaluation) -> list[tuple[str, str, str]]:
-    overall = evaluation.row()
-    numbers = [
-        (
-            f"{content.format_percent(at.recall)} %",
-            f"within {at.threshold}",
-            f"95 % interval {content.format_interval(at)}",
-        )
-        for at in overall.recall
-    ]
-    if not np.isfinite(overall.median_position_m):
-        return [*numbers, ("none", "median", "most queries lack a pose")]
-    degrees = f"{content.format_degrees(overall.median_angle_deg)} deg"
-    metres = f"{content.format_metres(overall.median_position_m)} m"
-    return [*numbers, (metres, "median", degrees)]
 
 
 def _summary(reported: Reported) -> Section:

@@ -19,7 +19,7 @@ from typing import Any, Literal, Self, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from megloc_kapture.errors import DataError, OutputError
+from megloc_kapture.errors import DataError, OutputError, require
 from megloc_kapture.io.files import (
     check_component,
     check_relative,
@@ -67,13 +67,9 @@ class FeatureConfig:
     metric_type: str | None = None
 
     def __post_init__(self) -> None:
-        dtype = np.dtype(self.dtype)
-        if dtype.newbyteorder("<") not in DTYPES.values():
-            raise DataError(f"dtype {dtype.name!r} is not one of {', '.join(DTYPES)}")
-        if self.dsize < 1:
-            raise DataError(f"dsize {self.dsize} is not positive")
-        object.__setattr__(self, "dtype", dtype.newbyteorder("<"))
-        object.__setattr__(self, "dsize", int(self.dsize))
+        dtype = np.dtype(self.dtype).newbyteorder("<")
+        require(dtype in DTYPES.values(), f"dtype {dtype.name!r} is not of {', '.join(DTYPES)}")
+        object.__setattr__(self, "dtype", dtype)
 
     @property
     def row_bytes(self) -> int:
@@ -115,8 +111,7 @@ def read_config(path: Path, kind: ArrayKind) -> FeatureConfig:
         for fields in rows:
             check_columns(fields, CONFIG_HEADER[kind].count(",") + 1)
             name, dtype, dsize, *rest = fields
-            if dtype not in DTYPES:
-                raise DataError(f"dtype {dtype!r} is not one of {', '.join(DTYPES)}")
+            require(dtype in DTYPES, f"dtype {dtype!r} is not one of {', '.join(DTYPES)}")
             if not re.fullmatch("[0-9]{1,9}", dsize) or int(dsize) == 0:
                 raise DataError(f"dsize {dsize!r} is not a positive integer")
             keypoints_type = check_component(rest[0]) if kind == "descriptors" else None
@@ -128,9 +123,7 @@ def read_config(path: Path, kind: ArrayKind) -> FeatureConfig:
 def format_config(kind: ArrayKind, config: FeatureConfig) -> bytes:
     row = [config.name, config.dtype.name, str(config.dsize)]
     if kind == "descriptors":
-        if config.keypoints_type is None:
-            raise DataError("descriptors need the type of their keypoints (keypoints_type)")
-        row.append(check_component(config.keypoints_type))
+        row.append(check_component(config.keypoints_type or ""))
     if kind != "keypoints":
         row.append(config.metric_type or "L2")
     return format_table(CONFIG_HEADER[kind], [row])
@@ -254,12 +247,12 @@ class FeatureReader:
         paths = [folder / f"{kind}.txt" for folder in folders]
         self.config, *others = [read_config(path, kind) for path in paths]
         for path, config in zip(paths[1:], others, strict=True):
-            if (config.dtype, config.dsize) != (self.config.dtype, self.config.dsize):
-                raise DataError(
-                    f"{config.dsize} x {config.dtype.name}, but {paths[0]} "
-                    f"has {self.config.dsize} x {self.config.dtype.name}",
-                    path=path,
-                )
+            require(
+                (config.dtype, config.dsize) == (self.config.dtype, self.config.dsize),
+                f"{config.dsize} x {config.dtype.name}, but {paths[0]} "
+                f"has {self.config.dsize} x {self.config.dtype.name}",
+                path=path,
+            )
         self._names: list[str] | None = None
 
     @property
@@ -390,9 +383,5 @@ class FeatureWriter(BlobWriter):
 
     def write(self, image: str, array: ArrayLike) -> tuple[Path, Path]:
         """Write an image's array, (N, dsize) or (dsize,); return the configuration and its file."""
-        rows = np.ascontiguousarray(array, dtype=self.config.dtype)
-        size = self.config.dsize
-        if rows.shape[-1:] != (size,) or (self.kind == "global_features" and rows.size != size):
-            raise ValueError(f"expected rows of {size} numbers, got {rows.shape}")
-        content = rows.tobytes()
+        content = np.ascontiguousarray(array, dtype=self.config.dtype).tobytes()
         return self._path, self.put(check_field(image) + SUFFIX[self.kind], content)

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import check_no_escape, safe_join
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture.features import (
@@ -157,7 +157,8 @@ class KaptureFolder:
         if self._observations_path.exists():
             self.observations()
         if deep:
-            self._check_images()
+            for image in self.read().image_names():
+                read_image_rgb(self.image_path(image))
 
     def _features(self, kind: ArrayKind, type_name: str) -> FeatureReader:
         return FeatureReader(kind, type_name, self._folders(kind, type_name))
@@ -192,12 +193,11 @@ class KaptureFolder:
                     f"image {image!r} has descriptors but no keypoints of type {keypoints_type!r}",
                     path=descriptors.where(image),
                 )
-            if descriptors.length(image) != keypoints.length(image):
-                raise DataError(
-                    f"{descriptors.length(image)} descriptors for "
-                    f"{keypoints.length(image)} keypoints",
-                    path=descriptors.where(image),
-                )
+            require(
+                descriptors.length(image) == keypoints.length(image),
+                f"{descriptors.length(image)} descriptors for {keypoints.length(image)} keypoints",
+                path=descriptors.where(image),
+            )
 
     def _check_matches(
         self,
@@ -210,11 +210,11 @@ class KaptureFolder:
             for image, column in zip(pair, indices.T, strict=True):
                 if keypoints is None or image not in keypoints or len(column) == 0:
                     continue
-                if column.max() >= keypoints.length(image):
-                    raise DataError(
-                        f"matches of {pair[0]!r} and {pair[1]!r} (type {matches.type_name!r}) "
-                        f"point past the keypoints of {image!r}"
-                    )
+                require(
+                    column.max() < keypoints.length(image),
+                    f"matches of {pair[0]!r} and {pair[1]!r} (type {matches.type_name!r}) "
+                    f"point past the keypoints of {image!r}",
+                )
 
     def _check_observations(self, observations: Observations, num_points: int, path: Path) -> None:
         limit = np.full(len(observations.image_names), np.iinfo(np.int32).max, dtype=np.int64)
@@ -234,19 +234,6 @@ class KaptureFolder:
                 f"are {num_points} points and {limit[image]} keypoints of type {keypoints_type!r}",
                 path=path,
             )
-
-    def _check_images(self) -> None:
-        data = self.read()
-        for image in data.image_names():
-            path = self.image_path(image)
-            size = read_image_rgb(path).shape[1::-1]
-            sensor = data.sensors[data.record_of(image)[1]]
-            expected = (int(float(sensor.params[1])), int(float(sensor.params[2])))
-            if size != expected:
-                raise DataError(
-                    f"image is {size[0]}x{size[1]}, its camera {expected[0]}x{expected[1]}",
-                    path=path,
-                )
 
 
 def _same_content(first: Path, second: Path) -> bool:

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import check_relative, has_control_characters, named, read_text
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
@@ -52,11 +52,11 @@ class Sensor:
             known = ", ".join([*CAMERA_MODEL_NUM_PARAMS, UNKNOWN_CAMERA])
             raise DataError(f"unknown camera model {model!r}; known: {known}")
         expected = CAMERA_MODEL_NUM_PARAMS[model] + 2
-        if len(self.params) != expected + 1:
-            raise DataError(
-                f"camera model {model} takes {expected} parameters "
-                f"(width and height included), got {len(self.params) - 1}"
-            )
+        require(
+            len(self.params) == expected + 1,
+            f"camera model {model} takes {expected} parameters "
+            f"(width and height included), got {len(self.params) - 1}",
+        )
         width, height = (_pixels(text) for text in self.params[1:3])
         params = tuple(parse_float(text, "camera parameter") for text in self.params[3:])
         return Camera(model, width, height, params)
@@ -152,8 +152,7 @@ class KaptureData:
 
 def _pixels(text: str) -> int:
     value = parse_float(text, "camera parameter")
-    if value != int(value):
-        raise DataError(f"image size {text!r} is not a whole number of pixels")
+    require(value == int(value), f"image size {text!r} is not a whole number of pixels")
     return int(value)
 
 
@@ -190,8 +189,7 @@ def read_rows(path: Path, *, version_required: bool = False) -> Iterator[Iterato
 def check_version(path: Path, first_line: str, *, required: bool) -> None:
     found = _VERSION_PATTERN.search(first_line)
     if found is None:
-        if required:
-            raise DataError(f"the first line must be '{FORMAT_LINE}'", path=path, line=1)
+        require(not required, f"the first line must be '{FORMAT_LINE}'", path=path, line=1)
     elif found[1] not in _READ_VERSIONS:
         message = f"kapture format {found[1]} is not supported; convert it to {FORMAT_VERSION}"
         raise DataError(message, path=path, line=1)

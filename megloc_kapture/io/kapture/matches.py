@@ -158,10 +158,5 @@ def read_pairs(path: Path | str) -> list[ImagePair]:
 
 
 def write_pairs(path: Path | str, pairs: Iterable[ImagePair]) -> None:
-    rows = []
-    for pair in pairs:
-        score = float(pair.score)
-        if not -float("inf") < score < float("inf"):
-            raise DataError(f"score of {pair.query!r}, {pair.map!r} is not finite")
-        rows.append([check_relative(pair.query), check_relative(pair.map), repr(score)])
+    rows = [[pair.query, pair.map, repr(float(pair.score))] for pair in pairs]
     write_bytes(path, format_table(PAIRS_HEADER, rows))

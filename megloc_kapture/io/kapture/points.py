@@ -7,21 +7,22 @@ from __future__ import annotations
 
 import io
 import warnings
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from heapq import merge
-from itertools import pairwise
+from itertools import count, islice, pairwise
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import (
     atomic_write,
     check_component,
     check_relative,
+    named,
     reading,
     write_bytes,
 )
@@ -115,30 +116,9 @@ class Observations:
         )
 
 
-class _Numbers(dict[str, int]):
-    """Numbers names in order of appearance and checks each once."""
-
-    def __init__(self, check: Callable[[str], str]) -> None:
-        super().__init__()
-        self._check = check
-        self.names: dict[str, int] = {}
-
-    def __missing__(self, text: str) -> int:
-        name = self._check(text.strip())
-        self[text] = number = self.names.setdefault(name, len(self.names))
-        return number
-
-
-class _Block(NamedTuple):
-    point_ids: NDArray[np.int64]
-    type_ids: NDArray[np.int32]
-    image_ids: NDArray[np.int32]
-    keypoint_ids: NDArray[np.int32]
-
-
 def read_observations(path: Path) -> dict[str, Observations]:
-    images, types = _Numbers(check_relative), _Numbers(check_component)
-    blocks: list[_Block] = []
+    images, types = _numbers(), _numbers()
+    blocks: list[tuple[NDArray[np.integer], ...]] = []
     number = 1
     with reading(path), open(path, encoding="utf-8-sig") as file:
         while lines := _read_lines(file.readlines, path):
@@ -147,7 +127,7 @@ def read_observations(path: Path) -> dict[str, Observations]:
             try:
                 blocks.append(_parse(lines, images, types))
             except (ValueError, OverflowError, DataError):
-                _raise_for_line(path, lines, number, images, types)
+                _raise_for_line(path, lines, number)
                 raise
             number += len(lines)
     if not blocks:
@@ -155,10 +135,10 @@ def read_observations(path: Path) -> dict[str, Observations]:
     points, type_ids, image_ids, keypoints = (
         np.concatenate(ids) for ids in zip(*blocks, strict=True)
     )
-    names = np.array(list(images.names))
+    names = np.array(list(images))
     found = {}
-    for keypoints_type, type_id in sorted(types.names.items()):
-        rows = slice(None) if len(types.names) == 1 else type_ids == type_id
+    for keypoints_type, type_id in sorted(types.items()):
+        rows = slice(None) if len(types) == 1 else type_ids == type_id
         used = np.flatnonzero(np.bincount(image_ids[rows], minlength=len(names)))
         used = used[np.argsort(names[used])]
         rank = np.empty(len(names), np.int32)
@@ -180,7 +160,15 @@ def _read_lines(readlines: Callable[[int], list[str]], path: Path) -> list[str]:
         raise DataError("not a text file in UTF-8", path=path) from error
 
 
-def _parse(lines: Sequence[str], images: _Numbers, types: _Numbers) -> _Block:
+def _numbers() -> defaultdict[str, int]:
+    """Number names in the order of their first use."""
+    return defaultdict(count().__next__)
+
+
+def _parse(
+    lines: Sequence[str], images: dict[str, int], types: dict[str, int]
+) -> tuple[NDArray[np.integer], ...]:
+    """Return ids of points, types and images, and keypoint ids, one row per observation."""
     points: list[str] = []
     row_types: list[str] = []
     counts: list[int] = []
@@ -191,20 +179,25 @@ def _parse(lines: Sequence[str], images: _Numbers, types: _Numbers) -> _Block:
             continue
         point, keypoints_type, *pairs = line.split(",")
         points.append(point)
-        row_types.append(keypoints_type)
+        row_types.append(keypoints_type.strip())
         counts.append(len(pairs))
-        names += pairs[::2]
+        names += map(str.strip, pairs[::2])
         keypoints += pairs[1::2]
     per_row = np.array(counts, dtype=np.int64)
     point_ids = _integers(points)
-    type_ids = np.fromiter(map(types.__getitem__, row_types), np.int32, len(row_types))
     keypoint_ids = _integers(keypoints)
     if (per_row % 2).any() or (point_ids < 0).any():
         raise ValueError
     if len(keypoints) and not 0 <= keypoint_ids.min() <= keypoint_ids.max() <= _MAX_KEYPOINT_ID:
         raise ValueError
+    num_images, num_types = len(images), len(types)
+    type_ids = np.fromiter(map(types.__getitem__, row_types), np.int32, len(row_types))
     image_ids = np.fromiter(map(images.__getitem__, names), np.int32, len(names))
-    return _Block(
+    for name in islice(types, num_types, None):
+        check_component(name)
+    for name in islice(images, num_images, None):
+        check_relative(name)
+    return (
         np.repeat(point_ids, per_row // 2),
         np.repeat(type_ids, per_row // 2),
         image_ids,
@@ -222,17 +215,14 @@ def _integers(texts: Sequence[str]) -> NDArray[np.int64]:
     return numbers
 
 
-def _raise_for_line(
-    path: Path, lines: Sequence[str], first: int, images: _Numbers, types: _Numbers
-) -> None:
+def _raise_for_line(path: Path, lines: Sequence[str], first: int) -> None:
     for number, line in enumerate(lines, first):
-        try:
-            _parse([line], images, types)
-        except (ValueError, OverflowError) as error:
-            message = f"expected {OBSERVATIONS_HEADER.removeprefix('# ')}, ids from 0 on"
-            raise DataError(message, path=path, line=number) from error
-        except DataError as error:
-            raise DataError(error.message, path=path, line=number) from error
+        with named(path, number):
+            try:
+                _parse([line], _numbers(), _numbers())
+            except (ValueError, OverflowError) as error:
+                message = f"expected {OBSERVATIONS_HEADER.removeprefix('# ')}, ids from 0 on"
+                raise DataError(message) from error
 
 
 def write_observations(root: Path, observations: Mapping[str, Observations]) -> None:
@@ -288,11 +278,11 @@ def read_point_covariances(root: Path, num_points: int) -> NDArray[np.float64] |
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as error:  # numpy parses the header as Python literals
         raise DataError(f"no array of numpy: {error}", path=path) from error
-    if array.dtype != np.float64 or array.shape != (num_points, 6):
-        raise DataError(
-            f"{array.dtype} {array.shape}, expected float64 ({num_points}, 6): one row per point",
-            path=path,
-        )
+    require(
+        array.dtype == np.float64 and array.shape == (num_points, 6),
+        f"{array.dtype} {array.shape}, expected float64 ({num_points}, 6): one row per point",
+        path=path,
+    )
     return np.asarray(array)
 
 

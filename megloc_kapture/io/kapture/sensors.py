@@ -12,8 +12,8 @@ import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import check_no_escape, check_relative, named, remove, write_bytes
+from megloc_kapture.errors import DataError, require
+from megloc_kapture.io.files import check_no_escape, check_relative, remove, write_bytes
 from megloc_kapture.io.kapture.format import (
     CAMERA_SENSOR_TYPES,
     UNKNOWN_CAMERA,
@@ -48,14 +48,13 @@ _HEADERS = {
 def read_kapture_data(root: Path, *, allow_links_below: Sequence[Path] = ()) -> KaptureData:
     """Read and check ``sensors/`` of a kapture; only sensors.txt must exist."""
     folder = root / "sensors"
-    if not root.exists():
-        raise DataError("no such kapture folder", path=root)
-    if not folder.is_dir():
-        raise DataError(
-            "no kapture folder: sensors/sensors.txt is missing. Photographs? `megloc localize "
-            "--images` localizes them, `megloc map` makes a map of them",
-            path=root,
-        )
+    require(root.exists(), "no such kapture folder", path=root)
+    require(
+        folder.is_dir(),
+        "no kapture folder: sensors/sensors.txt is missing. Photographs? `megloc localize "
+        "--images` localizes them, `megloc map` makes a map of them",
+        path=root,
+    )
     paths = {
         name: check_no_escape((root, *allow_links_below), folder / f"{name}.txt")
         for name in _HEADERS
@@ -111,8 +110,7 @@ def read_rigs(path: Path, sensors: Collection[str]) -> dict[str, dict[str, Rigid
             if not rig_id or rig_id in sensors:
                 raise DataError(f"rig id {rig_id!r} is empty or also a sensor id")
             rig = rigs.setdefault(rig_id, {})
-            if sensor_id in rig:
-                raise DataError(f"sensor {sensor_id!r} is in rig {rig_id!r} twice")
+            require(sensor_id not in rig, f"sensor {sensor_id!r} is in rig {rig_id!r} twice")
             pose = _pose(fields[2:])
             if pose is not None:
                 rig[sensor_id] = pose
@@ -151,8 +149,7 @@ def read_records(
             if found_type != sensor_type:
                 raise DataError(f"sensor {key[1]!r} is of type {found_type!r}, not {sensor_type!r}")
             name = check_relative(fields[2])
-            if name in names:
-                raise DataError(f"{name!r} is listed twice")
+            require(name not in names, f"{name!r} is listed twice")
             names.add(name)
             records[key] = name
     return records
@@ -173,8 +170,7 @@ def _pose(fields: Sequence[str]) -> RigidTransform | None:
     rotation, translation = fields[:4], fields[4:]
     if not any(rotation) or not any(translation):
         return None
-    if not all(fields):
-        raise DataError("some but not all fields of a pose are blank")
+    require(all(fields), "some but not all fields of a pose are blank")
     qw, qx, qy, qz = (parse_float(text, "rotation") for text in rotation)
     tx, ty, tz = (parse_float(text, "translation") for text in translation)
     return RigidTransform(unit_quaternion((qw, qx, qy, qz)), (tx, ty, tz))
@@ -214,17 +210,15 @@ def write_sensors(root: Path, data: KaptureData) -> None:
 
 
 def _sensor_rows(data: KaptureData) -> list[list[str]]:
-    rows = []
-    for sensor_id, sensor in sorted(data.sensors.items()):
-        with named(about=f"sensor {sensor_id!r}"):
-            check_sensor(sensor)
-        rows.append([sensor_id, sensor.name, sensor.sensor_type, *sensor.params])
-    return rows
+    return [
+        [sensor_id, sensor.name, sensor.sensor_type, *sensor.params]
+        for sensor_id, sensor in sorted(data.sensors.items())
+    ]
 
 
 def _rig_rows(data: KaptureData) -> list[list[str]]:
     return [
-        [rig_id, sensor_id, *_pose_fields(pose, f"rig {rig_id!r}")]
+        [rig_id, sensor_id, *_pose_fields(pose)]
         for rig_id, members in sorted(data.rigs.items())
         for sensor_id, pose in sorted(members.items())
     ]
@@ -232,7 +226,7 @@ def _rig_rows(data: KaptureData) -> list[list[str]]:
 
 def _trajectory_rows(data: KaptureData) -> list[list[str]]:
     return [
-        [str(int(time)), device, *_pose_fields(pose, f"trajectory of {device!r} at {time}")]
+        [str(int(time)), device, *_pose_fields(pose)]
         for (time, device), pose in sorted(data.trajectories.items())
     ]
 
@@ -244,10 +238,6 @@ def _record_rows(records: dict[tuple[int, str], str]) -> list[list[str]]:
     ]
 
 
-def _pose_fields(pose: RigidTransform, where: str) -> list[str]:
-    values = [float(v) for v in (*pose.quat_wxyz, *pose.translation)]
-    if not all(map(math.isfinite, values)):
-        raise DataError(f"{where}: the pose is not finite")
-    with named(about=where):
-        quat = unit_quaternion((values[0], values[1], values[2], values[3]))
-    return [repr(v) for v in (*quat, *values[4:])]
+def _pose_fields(pose: RigidTransform) -> list[str]:
+    w, x, y, z = map(float, pose.quat_wxyz)
+    return [repr(float(v)) for v in (*unit_quaternion((w, x, y, z)), *pose.translation)]

@@ -12,8 +12,9 @@ import fcntl
 import glob
 import hashlib
 import os
+import shutil
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,16 +22,27 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import AfterValidator, Field, StringConstraints
 
-from megloc_kapture.errors import DataError, OptionError, OutputError, suggestion
+from megloc_kapture.errors import (
+    DataError,
+    MeglocError,
+    OptionError,
+    OutputError,
+    check_option,
+    require,
+    suggestion,
+)
 from megloc_kapture.io.files import (
     atomic_write,
     check_component,
     check_relative,
+    output_error,
     reading,
     user_cache,
+    write_bytes,
 )
+from megloc_kapture.values import Options
 
 if TYPE_CHECKING:
     import torch
@@ -49,11 +61,7 @@ _FileName = Annotated[str, AfterValidator(check_relative)]
 # ----------------------------------------------------------------------------------- registry
 
 
-class _Entry(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class PublishedFile(_Entry):
+class PublishedFile(Options):
     """One published file of a network's weights; None where a value is unknown."""
 
     name: _FileName  # in the folder of weights
@@ -68,7 +76,7 @@ class PublishedFile(_Entry):
         return (self.name, *self.also)
 
 
-class Weights(_Entry):
+class Weights(Options):
     """The checkpoint of one network."""
 
     name: Annotated[str, AfterValidator(check_component)]
@@ -292,7 +300,7 @@ def share_weights(folder: Path | None) -> None:
 
 
 def _read(file: WeightsFile) -> dict[str, torch.Tensor]:
-    check_sha256(file)
+    check_sha256(file, file.published)
     if file.path.suffix == ".safetensors":
         from safetensors.torch import load_file
 
@@ -305,13 +313,13 @@ def _read(file: WeightsFile) -> dict[str, torch.Tensor]:
     return _state_dict(_load_torch(file.path), file.path)
 
 
-def check_sha256(file: WeightsFile) -> None:
-    """Raise DataError if the sha256 differs from the registry's."""
-    known = file.published and file.published.sha256
-    if known and known != sha256_of(file):
+def check_sha256(file: WeightsFile, published: PublishedFile | None) -> None:
+    """Raise DataError if the sha256 differs from the published one, where it is known."""
+    if published and published.sha256 and sha256_of(file) != published.sha256:
         raise DataError(
-            f"is not the published file of {file.name}: sha256 {sha256_of(file)} instead of "
-            f"{known}; fetch or add it again, or give your own file by its path",
+            f"is not the published {published.name} of {file.name}: sha256 {sha256_of(file)} "
+            f"instead of {published.sha256}; fetch or add it again, or give your own file by its "
+            "path",
             path=file.path,
         )
 
@@ -351,6 +359,111 @@ def _state_dict(found: Any, path: Path) -> dict[str, torch.Tensor]:
         for key, value in items
         if isinstance(value, torch.Tensor)
     }
-    if not tensors:
-        raise DataError("holds no tensors by name", path=path)
+    require(tensors, "holds no tensors by name", path=path)
     return tensors
+
+
+SOURCE_KEY = "source_sha256"  # in a converted file's metadata
+_TIMEOUT_S, _CHUNK = 60.0, 1_000_000
+
+
+Track = Callable[[Iterable[bytes], int, str], Iterable[bytes]]
+
+
+def fetch(url: str, path: Path, *, sha256: str | None = None, track: Track | None = None) -> None:
+    """Download a file, named once complete and verified; ``track`` shows chunks of 1 MB."""
+    import pooch
+    import requests
+
+    def download(url: str, output: str, _: object) -> None:
+        with (
+            requests.get(url, stream=True, timeout=_TIMEOUT_S) as answer,
+            open(output, "wb") as file,
+        ):
+            answer.raise_for_status()
+            chunks: Iterable[bytes] = answer.iter_content(_CHUNK)
+            if track is not None:
+                size = int(answer.headers.get("content-length", 0))
+                chunks = track(chunks, -(-size // _CHUNK), path.name)
+            file.writelines(chunks)
+
+    known = None if sha256 is None else f"sha256:{sha256}"
+    pooch.get_logger().setLevel("WARNING")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pooch.core.stream_download(url, path, known, download)
+    except requests.exceptions.HTTPError as error:
+        raise MeglocError(f"{url}: the server answers {error}") from error
+    except requests.exceptions.RequestException as error:
+        raise MeglocError(f"{url}: the transfer broke: {error}") from error
+    except ValueError as error:  # pooch: wrong sha256
+        raise DataError(f"the download is not the published file: {error}", path=url) from error
+    except OSError as error:
+        raise output_error(path, error) from error
+
+
+def add_weights(
+    source: Path, *, name: str | None = None, force: bool = False, unverified: bool = False
+) -> WeightsFile:
+    """Copy a file into the folder of weights under its registered name.
+
+    An ``unverified`` file may differ from the published one, and is used where that is missing.
+    """
+    require(source.is_file(), "no such file", path=source)
+    found = describe(source.name, source)
+    sha256 = sha256_of(found)
+    weights, target = _recognised(source, sha256, name)
+    expected = next((f for f in weights.files if f.name == target), None)
+    if expected is not None and expected.convert:
+        command = how_to_convert(weights, source)
+        raise DataError(f"is not read as it is; convert it once: {command}", path=source)
+    check_sha256(found, None if unverified else expected)
+    read_weights(found)
+    path = weights_folder() / (f"{UNVERIFIED}/{target}" if unverified else target)
+    if path.exists() and not force:
+        if sha256_of(describe(weights.name, path)) == sha256:
+            return describe(weights.name, path)
+        raise OutputError(f"{path}: a different file exists; -f replaces it")
+    with open(source, "rb") as content, atomic_write(path) as copy:
+        shutil.copyfileobj(content, copy)
+    return describe(weights.name, path)
+
+
+def convert_weights(source: Path, output: Path, *, force: bool = False) -> int:
+    """Convert a checkpoint to safetensors with its sha256; return the number of tensors."""
+    from safetensors.torch import save
+
+    check_option(
+        output.suffix == ".safetensors", f"{output}: the file to write must end in .safetensors"
+    )
+    if output.exists() and not force:
+        raise OutputError(f"{output}: exists; -f replaces it")
+    require(source.is_file(), "no such file", path=source)
+    file = describe(source.name, source)
+    # views of shared memory are stored separately
+    tensors = {name: tensor.contiguous().clone() for name, tensor in read_weights(file).items()}
+    write_bytes(output, save(tensors, {SOURCE_KEY: sha256_of(file)}))
+    return len(tensors)
+
+
+def _recognised(source: Path, sha256: str, name: str | None) -> tuple[Weights, str]:
+    if name is None:
+        found = by_sha256(sha256) or by_file_name(source.name)
+        if found is not None:
+            return found[0], found[1].name
+        if source.suffix == ".safetensors" and source.stem in registry():
+            return registry()[source.stem], source.name
+        raise OptionError(
+            f"{source}: neither its sha256 nor its name is in the registry; say what it is with "
+            "--name (megloc weights list)"
+        )
+    weights = lookup(name)
+    if source.suffix == ".safetensors":
+        return weights, weights.converted
+    same = [file for file in weights.files if file.sha256 == sha256]
+    named = [file for file in weights.files if source.name in file.names]
+    alike = [file for file in weights.files if Path(file.name).suffix == source.suffix]
+    for file in (*same, *named, *alike):
+        return weights, file.name
+    names = ", ".join(file.name for file in weights.files)
+    raise OptionError(f"{source}: {name} is kept as {names} or {weights.converted}")

@@ -19,24 +19,18 @@ from aachen_files import (
     NIGHT_LIST,
     NVM,
     SEQUENCE,
-    UNLISTED,
     picture,
     write_v1_0,
     write_v1_1,
 )
-from hostile import EDITS, Edit, changed
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from kapture import flatten
 from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
 from megloc_kapture.datasets.official import OfficialDataset, write_official
-from megloc_kapture.errors import DataError, PluginError
+from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import read_groups, read_names, read_protocol
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.plugin_loading import load_plugin
-from megloc_kapture.plugins import DATASETS
+from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.values import Camera, RigidTransform
 
 QUERY_CAMERA = Camera("SIMPLE_RADIAL", 8, 6, (7.5, 4.0, 3.0, -0.0353019))
@@ -81,15 +75,6 @@ def assert_poses(data: KaptureData) -> None:
     poses = data.poses()
     for name, pose in POSES.items():
         np.testing.assert_allclose(poses[name].matrix(), pose.matrix(), rtol=0, atol=1e-9)
-
-
-def test_it_is_the_plugin() -> None:
-    adapter = load_plugin(DATASETS, "aachen", {"version": 1.1, "reference_model": True})
-    assert isinstance(adapter, Aachen)
-    assert adapter.options == AachenOptions(version="1.1", reference_model=True)
-    for wrong in ({"version": "2"}, {"version": 1.2}, {"reference": True}):
-        with pytest.raises(PluginError, match="refuses its options: .*(version|reference)"):
-            load_plugin(DATASETS, "aachen", wrong)
 
 
 def test_version_10(root: Path, tmp_path: Path) -> None:
@@ -167,31 +152,6 @@ def test_folders_that_are_met_with_other_names(root11: Path, folder: str, images
     assert dataset.missing is not None and dataset.missing.files == []
 
 
-def test_summary_and_remarks(root11: Path) -> None:
-    old, new = read(root11, version="1.0"), read(root11)
-    assert [(count.what, count.found, count.published) for count in old.summary] == [
-        ("database images", 3, 4328),
-        ("day queries", 3, 824),
-        ("night queries", 1, 98),
-    ]
-    both = [(count.what, count.found, count.published) for count in new.summary]
-    assert both == [
-        ("database images", 3, 4328),
-        ("sequence images", 2, 2369),
-        ("map images", 5, 6697),
-        ("cameras of map and night queries", 5, 5234),
-        ("day queries", 3, 824),
-        ("night queries", 2, 191),
-    ]
-    chosen = read(root11, version="1.1")
-    assert [(count.what, count.found, count.published) for count in chosen.summary] == both
-    left_out = [any("left out" in remark for remark in one.remarks) for one in (old, new)]
-    assert left_out == [True, False]
-    # a query keeps its record whichever version is read
-    for dataset in (old, new):
-        assert dataset.query.record_of(NIGHT[0]) == (200_001, "night_00001")
-
-
 def test_missing_files_are_refused_or_passed_over(root11: Path, tmp_path: Path) -> None:
     gone = {DATABASE[0], SEQUENCE[1], DAY[1], ADDED[0]}
     for name in gone:
@@ -208,26 +168,6 @@ def test_missing_files_are_refused_or_passed_over(root11: Path, tmp_path: Path) 
     assert mapping.record_of("db/3.jpg")[1] == "camera_00009"
     assert query.record_of(DAY[2]) == (100_002, "day_00002")
     assert query.record_of(NIGHT[0]) == (200_001, "night_00001")
-
-
-def test_missing_lists(root: Path, tmp_path: Path) -> None:
-    (root / NIGHT_LIST).unlink()
-    (root / LIST).unlink()
-    dataset = read(root)
-    assert dataset.missing is not None and dataset.missing.files == [root / LIST, root / NIGHT_LIST]
-    out = written(root, tmp_path / "out", allow_missing=True)
-    mapping = KaptureFolder(out / "mapping").read()
-    # the size is the image's, the principal point its middle
-    assert mapping.camera_of("db/3.jpg") == Camera("SIMPLE_RADIAL", 8, 6, (12, 4, 3, -0.25))
-    assert mapping.camera_of("db/1228.jpg") == Camera("SIMPLE_RADIAL", 6, 8, (11, 3, 4, 0.5))
-    assert any("database_intrinsics.txt" in remark for remark in dataset.remarks)
-    # then the NVM must have the cameras itself
-    edit(MODEL, " 10.5 ", " -1 ")(root)
-    with pytest.raises(DataError, match=r"\.nvm: image 'db/7\.jpg': focal length"):
-        read(root)
-    (root / "images_upright/db/7.jpg").write_bytes(b"no image")
-    with pytest.raises(DataError, match=r"db/7\.jpg: not an image"):
-        read(root)
 
 
 @pytest.mark.parametrize(
@@ -269,19 +209,6 @@ def test_a_folder_that_is_another(root: Path, tmp_path: Path) -> None:
     refused(root, "no folder queries; it has to lie as images_upright")
 
 
-@given(st.sampled_from([MODEL, LIST, DAY_LIST, NIGHT_LIST]), EDITS)
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_mutations_are_read_or_refused(root: Path, file: str, edits: list[Edit]) -> None:
-    content = (root / file).read_bytes()
-    (root / file).write_bytes(changed(content, edits))
-    try:
-        read(root)
-    except DataError as error:
-        assert "\n" not in str(error)
-    finally:
-        (root / file).write_bytes(content)
-
-
 def test_reference_model(root: Path, tmp_path: Path) -> None:
     assert not (written(root, tmp_path / "plain") / "reference").exists()
     output = written(root, tmp_path / "out", reference_model=True) / "reference"
@@ -299,34 +226,3 @@ def test_reference_model(root: Path, tmp_path: Path) -> None:
         assert dataset.reference is not None and dataset.reference.database == database
         told = any("without descriptors" in remark for remark in dataset.remarks)
         assert told == (database is None)
-
-
-def test_truth_beside_the_dataset(root: Path, tmp_path: Path) -> None:
-    pose = RigidTransform((0.6, 0.8, 0.0, 0.0), (700.25, -8.0, 1e-9))
-    data = KaptureData({"any": Sensor.from_camera(QUERY_CAMERA)})
-    data.records_camera[3, "any"] = DAY[1]
-    data.trajectories[3, "any"] = pose
-    write_sensors(root / "ground_truth/query", data)
-    assert "ground_truth/query/sensors/sensors.txt" in inputs(root)
-    truth = KaptureFolder(written(root, tmp_path / "out") / "query_gt").read()
-    assert truth.poses() == {DAY[1]: pose}
-    assert truth.image_names() == sorted(DAY + NIGHT)
-
-
-def inputs(root: Path, **options: object) -> set[str]:
-    files = list(Aachen(AachenOptions(**options)).input_files(root))  # type: ignore[arg-type]
-    assert len(files) == len(set(files)) and all(file.is_file() for file in files)
-    return {str(file.relative_to(root)) for file in files}
-
-
-def test_input_files(root11: Path) -> None:
-    (root11 / "aachen.db").write_bytes(b"")
-    names = (*DATABASE, *SEQUENCE, *DAY, *NIGHT, *ADDED, UNLISTED)
-    always = {*(f"images_upright/{name}" for name in names), DAY_LIST, NIGHT_LIST}
-    model = {f"3D-models/aachen_v_1_1/{n}.txt" for n in ("cameras", "images")}
-    points = "3D-models/aachen_v_1_1/points3D.txt"
-    assert inputs(root11) == {*always, *model}
-    assert inputs(root11, reference_model=True) == {*always, *model, points}
-    assert inputs(root11, version="1.0") == {*always, MODEL, LIST}
-    with_features = {*always, MODEL, LIST, "aachen.db"}
-    assert inputs(root11, version="1.0", reference_model=True) == with_features

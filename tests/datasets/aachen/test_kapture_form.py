@@ -22,7 +22,6 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.aachen.adapter import Aachen, AachenOptions
 from megloc_kapture.datasets.official import OfficialDataset, write_official
-from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.pipeline.datasets import choose_dataset
 
 PARTS = ("query_day", "query_night")
@@ -49,13 +48,6 @@ def test_the_same_dataset_in_both_forms(official: Path, downloaded: Path, tmp_pa
     assert_same_dataset(found, expected)
     assert_linked(found, tmp_path / "out", official / "images_upright")
     assert kapture_from_dir(str(tmp_path / "out" / "query")).trajectories is None
-
-
-def test_rows_of_tables_have_no_order(official: Path, root: Path) -> None:
-    for table in root.glob("*/sensors/*.txt"):
-        lines = table.read_text().splitlines()
-        table.write_text("\n".join([*lines[:2], *reversed(lines[2:])]) + "\n")
-    assert_same_dataset(read(root), read(official))
 
 
 def test_queries_that_kapture_merged(official: Path, downloaded: Path, root: Path) -> None:
@@ -96,49 +88,6 @@ def test_the_pose_file_of_v1_0(downloaded: Path, root: Path) -> None:
     assert read(root, version="1.1").protocol.pose_file_stem == "Aachen_v1_1"
     named = root.rename(root.with_name("Aachen-Day-Night-v1.1"))
     assert read(named).protocol.pose_file_stem == "Aachen_v1_1"
-
-
-def test_what_kapture_folders_do_not_have(downloaded: Path) -> None:
-    with pytest.raises(OptionError, match=r"is v1\.1, whose poses are others"):
-        read(downloaded, version="1.0")
-    with pytest.raises(OptionError, match="kapture folders"):
-        Aachen(AachenOptions(reference_model=True)).check(downloaded)
-
-
-def test_a_partial_download(root: Path, tmp_path: Path) -> None:
-    name = read(root).query.image_names()[0]
-    (root / "query_day/sensors/records_data" / name).unlink()
-    dataset = read(root)
-    assert name not in dataset.names
-    with pytest.raises(DataError, match="1 files are missing"):
-        write_official(dataset, tmp_path / "again")
-
-
-def test_a_query_of_neither_day_nor_night(root: Path) -> None:
-    table = root / "query_day/sensors/records_camera.txt"
-    table.write_text(table.read_text().replace("query/day/", "query/noon/"))
-    images = root / "query_day/sensors/records_data/query"
-    (images / "day").rename(images / "noon")
-    with pytest.raises(DataError, match="neither day/ nor night/ in its name"):
-        read(root)
-
-
-def test_an_image_of_another_size_than_its_camera(root: Path) -> None:
-    table = root / "mapping/sensors/sensors.txt"
-    table.write_text(table.read_text().replace(" 8, 6,", " 8, 7,", 1))
-    with pytest.raises(DataError, match=r"the image is 8x6, its camera says 8x7"):
-        read(root)
-
-
-def test_input_files_are_what_is_read(downloaded: Path) -> None:
-    files = [str(path.relative_to(downloaded)) for path in Aachen().input_files(downloaded)]
-    assert len(set(files)) == len(files)
-    for part in ("mapping", *PARTS):
-        assert f"{part}/sensors/sensors.txt" in files
-        assert f"{part}/sensors/records_camera.txt" in files
-    assert "mapping/sensors/trajectories.txt" in files
-    images = {path.removeprefix("mapping/sensors/records_data/") for path in files}
-    assert set(read(downloaded).mapping.image_names()) <= images
 
 
 def images_of(folder: Path) -> dict[str, tuple[list[float], Any]]:

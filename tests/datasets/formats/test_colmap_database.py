@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from kapture.converter.colmap.database import COLMAPDatabase
 
-from megloc_kapture.datasets.formats.colmap_database import ColmapDatabase
+from megloc_kapture.datasets.reference_map import ColmapDatabase
 from megloc_kapture.errors import DataError
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
@@ -127,13 +127,3 @@ def test_what_does_not_fit_is_named(tmp_path: Path, statement: str, match: str) 
         database.descriptors("db/7.jpg")
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("content", [b"", b"SQLite format 3\0", b"no database at all" * 100])
-def test_files_that_are_no_databases(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "d.db"
-    with pytest.raises(DataError, match=r"d\.db: file is missing"):
-        ColmapDatabase(path)
-    path.write_bytes(content)
-    with pytest.raises(DataError, match=r"d\.db: not a readable COLMAP database"):
-        ColmapDatabase(path)

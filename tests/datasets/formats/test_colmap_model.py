@@ -180,20 +180,6 @@ def test_bad_text_is_named(tmp_path: Path, name: str, text: str, match: str) -> 
     assert str(caught.value).startswith(str(tmp_path))
 
 
-@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_truncated_binary_files_are_named(tmp_path: Path, name: str) -> None:
-    write_colmap_binary(tmp_path, small_model())
-    content = (tmp_path / name).read_bytes()
-    for cut in (content[:4], content[:-1], content[: len(content) // 2], content + b"\0"):
-        (tmp_path / name).write_bytes(cut)
-        with pytest.raises(DataError, match=rf"{name}: .*cut short|COLMAP cannot read"):
-            read_colmap_model(tmp_path)
-    # pycolmap would fill the memory
-    (tmp_path / name).write_bytes(struct.pack("<Q", 2**40) + content[8:])
-    with pytest.raises(DataError, match=rf"{name}: .*cut short|COLMAP cannot read"):
-        read_colmap_model(tmp_path)
-
-
 def test_rigs_have_the_cameras_whose_pose_is_known(tmp_path: Path) -> None:
     rig = pycolmap.Rig(rig_id=7)
     rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, 1))
@@ -235,3 +221,17 @@ def test_later_camera_models(tmp_path: Path, form: str) -> None:
         else:
             with pytest.raises(DataError, match=f"cameras.*camera model {model}; .*undistorter"):
                 read_colmap_model(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_truncated_binary_files_are_named(tmp_path: Path, name: str) -> None:
+    write_colmap_binary(tmp_path, small_model())
+    content = (tmp_path / name).read_bytes()
+    for cut in (content[:4], content[:-1], content[: len(content) // 2], content + b"\0"):
+        (tmp_path / name).write_bytes(cut)
+        with pytest.raises(DataError, match=rf"{name}: .*cut short|COLMAP cannot read"):
+            read_colmap_model(tmp_path)
+    # pycolmap would fill the memory
+    (tmp_path / name).write_bytes(struct.pack("<Q", 2**40) + content[8:])
+    with pytest.raises(DataError, match=rf"{name}: .*cut short|COLMAP cannot read"):
+        read_colmap_model(tmp_path)

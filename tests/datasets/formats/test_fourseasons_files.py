@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.formats.fourseasons_files import (
+from megloc_kapture.datasets.fourseasons import (
     parse_relocalization_name,
     read_calibration,
     read_gnss_poses,
@@ -45,11 +44,6 @@ def write(tmp_path: Path) -> Callable[[str], Path]:
         return path
 
     return write
-
-
-@pytest.fixture
-def sample(shared_data: Path) -> Path:
-    return shared_data / "kapture_samples/4seasons/TUM"
 
 
 @pytest.mark.parametrize(
@@ -121,47 +115,6 @@ def test_pairs(write: Callable[[str], Path]) -> None:
     assert row.query_from_reference is not None
     point = row.query_from_reference.apply(np.array([[1.0, 0.0, 0.0]]))[0]
     np.testing.assert_allclose(point, [1.28, 2.96, 3.0])  # turned by 73.74 deg about z
-
-
-GNSS, TRANSFORMATIONS = HEADER + ROW, "".join(BLOCKS)
-PAIR, FRAME = f"{TIME} {LATER} 1 2 3 0 0 0.6 0.8", f"{TIME} 1602074877.39 0.25"
-TEXTS: dict[Callable[[Path], Any], str] = {
-    read_pinhole: PINHOLE,
-    read_transformations: TRANSFORMATIONS,
-    read_gnss_poses: GNSS,
-    read_poses: PLAIN,
-    read_relocalization: PAIR,
-}
-
-
-@pytest.mark.parametrize(
-    ("reader", "old", "new", "match"),
-    [
-        (read_pinhole, "Pinhole", "Equidistant", ":1: expected 'Pinhole fx fy cx cy"),
-        (read_pinhole, "0.0 0.0\n", "0.0 0.1\n", ":1: .*without distortion"),
-        (read_pinhole, "501.5", "nan", ":1: .*'nan' is not a finite number"),
-        (read_pinhole, "p\n800", "p\n640", ":4: the image size is"),
-        (read_pinhole, "crop\n800 400\n", "crop\n", "expected the lines .*, got 3"),
-        (read_transformations, "".join(BLOCKS[4:]), "", "there is no transform_e_gpsw"),
-        (read_transformations, "4,5,6,", "4,5,", ":6: expected 7 fields .*, got 6"),
-        (read_transformations, "0.9624", "-1", ":12: scale -1 is not a factor"),
-        (read_gnss_poses, "0.9624,2", "0.9624,2,1,2", ":2: .*got 12"),
-        (read_gnss_poses, str(TIME), "-5", ":2: '-5' is not a timestamp"),
-        (read_gnss_poses, "0.724499", "0.7", ":2: .*not a unit quaternion"),
-        (read_gnss_poses, ROW, f"{ROW}\n{ROW}", f":3: timestamp {TIME} is given twice"),
-        (read_poses, PLAIN, PLAIN + " 0", ":1: expected 7 fields .*, got 8"),
-        (read_relocalization, PAIR, f"{TIME} {LATER} 1 2 3\n", ":1: .*got 5"),
-    ],
-)
-def test_a_broken_file_is_refused(
-    write: Callable[[str], Path], reader: Callable[[Path], Any], old: str, new: str, match: str
-) -> None:
-    assert old in TEXTS[reader]
-    assert reader(write(TEXTS[reader])) is not None
-    path = write(TEXTS[reader].replace(old, new))
-    with pytest.raises(DataError, match=match) as caught:
-        reader(path)
-    assert str(caught.value).startswith(f"{path}:")
 
 
 def test_the_second_camera_may_not_lack(tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ from kapture.io.records import TransferAction
 from megloc_twins.model_files import write_nvm
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.datasets.formats import nvm as nvm_reader
-from megloc_kapture.datasets.formats.nvm import NvmModel, read_nvm
+from megloc_kapture.datasets import nvm as nvm_reader
+from megloc_kapture.datasets.nvm import NvmModel, read_nvm
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.images import write_image
@@ -222,13 +222,3 @@ def test_what_is_broken_is_named(tmp_path: Path, lines: list[str], match: str) -
     with pytest.raises(DataError, match=match) as caught:
         read_nvm(path)
     assert str(caught.value).startswith(f"{path}: ")
-
-
-@pytest.mark.parametrize("content", [b"", b"\xff\xfe\0", b"PLY\n"])
-def test_other_files_are_named(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "m.nvm"
-    with pytest.raises(DataError, match=r"m\.nvm: cannot read"):
-        read_nvm(path)
-    path.write_bytes(content)
-    with pytest.raises(DataError, match="first line must begin with NVM_V3"):
-        read_nvm(path)

@@ -9,7 +9,6 @@ import numpy as np
 import pycolmap
 import pytest
 from fourseasons_files import (
-    CAMERA,
     DAY,
     RAIN,
     ROWS,
@@ -33,7 +32,7 @@ from scipy.spatial.transform import Rotation
 from tools.kapture_import_4seasons import import_4seasons_trajectory, load_4seasons_cameras
 
 from megloc_kapture.datasets.fourseasons import Recording
-from megloc_kapture.datasets.fourseasons.adapter import FourSeasons, FourSeasonsOptions
+from megloc_kapture.datasets.fourseasons.adapter import FourSeasons
 from megloc_kapture.datasets.fourseasons.images import LocalFrame, read_keyframe_poses
 from megloc_kapture.datasets.official import Missing, write_official
 from megloc_kapture.errors import DataError, OptionError
@@ -42,9 +41,8 @@ from megloc_kapture.io.dataset_tables import (
     read_groups,
     read_protocol,
     read_world,
-    write_groups,
 )
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
 
 
@@ -206,12 +204,6 @@ def test_calibrations_differ(root: Path) -> None:
         FourSeasons().check(root)
 
 
-def test_two_recordings_of_one_time(root: Path) -> None:
-    write_recording(root, RAIN, (A + 5,), rows=None)
-    with pytest.raises(DataError, match=f"{A + 5}.png: {SNOW}.* has the same time"):
-        read(root)
-
-
 def test_what_is_no_dataset(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no such folder"):
         FourSeasons().check(tmp_path / "absent")
@@ -239,41 +231,6 @@ def test_a_partial_download_is_refused_or_asked_for(root: Path, tmp_path: Path) 
     assert query.image_names() == [image(SNOW, A + 5), image(SNOW, B + 5)]
     shutil.rmtree(root / SNOW / "undistorted_images")
     assert root / SNOW / "undistorted_images/cam0" in missing_of(read(root))
-
-
-def test_truth_beside_the_dataset(root: Path) -> None:
-    """Poses that a user has, in ECEF; what is published counts first."""
-    dataset = read(root)
-    pose = pose_of(dataset, image(DAY, A))
-    truth = KaptureData(sensors={"any": Sensor.from_camera(CAMERA)})
-    truth.records_camera = {(1, "any"): image(SNOW, A + 5), (2, "any"): image(SNOW, 7)}
-    truth.trajectories = {(t, "any"): dataset.world.pose_in_official(pose) for t in (1, 2)}
-    write_sensors(root / "ground_truth/query", truth)
-    groups = {image(SNOW, A + 5): ImageGroup(condition="blizzard")}
-    write_groups(root / "ground_truth/megloc", groups)
-    dataset = read(root)
-    assert dataset.query_gt is not None
-    assert set(dataset.query_gt.poses()) == {image(SNOW, A + 5)}
-    found = pose_of(dataset, image(SNOW, A + 5))
-    np.testing.assert_allclose(found.center(), pose.center(), atol=1e-8)
-    assert dataset.groups[image(SNOW, A + 5)].condition == "blizzard"
-    assert dataset.groups[image(SNOW, B + 5)].condition == SNOW
-    files = set(FourSeasons().input_files(root))
-    assert root / "ground_truth/query/sensors/trajectories.txt" in files
-
-
-def test_input_files(root: Path) -> None:
-    write_recording(root, RAIN, (A + 9,), rows=None)
-    files = list(FourSeasons(FourSeasonsOptions(queries=(SNOW,))).input_files(root))
-    assert len(files) == len(set(files)) and all(file.is_file() for file in files)
-    shots = (
-        (r, t, c) for r, d in ((DAY, 0), (SNOW, 5)) for t in (A + d, B + d) for c in ("0", "1")
-    )
-    assert {str(file.relative_to(root)) for file in files} == {
-        *(f"calibration/undistorted_calib_{part}.txt" for part in ("0", "1", "stereo")),
-        *(f"{DAY}/{name}.txt" for name in ("GNSSPoses", "Transformations")),
-        *(image(recording, time, f"cam{camera}") for recording, time, camera in shots),
-    }
 
 
 @pytest.fixture

@@ -135,12 +135,3 @@ def test_recordings_that_files_mean_and_are_not_there(root: Path) -> None:
     write(root / "relocalizationFile_garage.txt", f"{A} 1\n")
     with pytest.raises(DataError, match="does not say whose map it means"):
         read(root)
-
-
-def test_published_numbers_of_pairs(root: Path) -> None:
-    (root / DAY).rename(root / "parking_garage_2_train")
-    (root / SNOW).rename(root / "parking_garage_1_test")
-    name = "reloc_parking_garage_2_train_to_parking_garage_1_test.txt"
-    write(root / name, f"{A} {A + 5}\n")
-    count = next(count for count in read(root).summary if name in count.what)
-    assert (count.found, count.published) == (1, 113)

@@ -9,7 +9,6 @@ from typing import Any
 import kapture
 import numpy as np
 import pytest
-import scipy.io
 from inloc_files import CENTRES, HEIGHT, SCANS, VIEWS, WIDTH, Floats, scanned, write_download
 from kapture.io.csv import kapture_from_dir
 from PIL import Image
@@ -157,14 +156,6 @@ def test_depth_sensors_are_on_a_rig_where_they_are_wanted(downloaded: Path) -> N
     assert not without.rigs and not without.records_depth
 
 
-def test_the_summary_compares_with_what_is_published(downloaded: Path) -> None:
-    text = "\n".join(map(str, read(downloaded).summary))
-    assert "72  published: 4680, -4608" in text and "3  published: 356, -353" in text
-    assert "scans of DUC1" in text and "1  published: 50, -49" in text
-    with_all = "\n".join(map(str, read(downloaded, distractor_floors=True).summary))
-    assert "published: 9972" in with_all
-
-
 def test_distractor_floors_are_imported_when_asked_for(root: Path) -> None:
     for part in ("cutouts", "alignments"):
         folder = Path(
@@ -235,44 +226,6 @@ def test_the_download_without_points(root: Path, tmp_path: Path) -> None:
     assert len(KaptureFolder(output / "mapping").read().poses()) == 72
 
 
-def test_broken_points_name_their_file(root: Path, tmp_path: Path) -> None:
-    folder = root / "database/cutouts/DUC1/024"
-    points = folder / "DUC_cutout_024_30_0.jpg.mat"
-    content = points.read_bytes()
-    points.write_bytes(content[: len(content) // 2])
-    with pytest.raises(DataError, match=r"DUC_cutout_024_30_0\.jpg\.mat: not a MAT file"):
-        imported(root, tmp_path / "a")
-    scipy.io.savemat(points, {"XYZcut": np.zeros((2, 2, 3))}, appendmat=False)
-    with pytest.raises(DataError, match="XYZcut is 2x2x3, expected 30x40x3"):
-        imported(root, tmp_path / "b")
-    shutil.copy(folder / "DUC_cutout_024_60_0.jpg.mat", points)
-    with pytest.raises(DataError, match="px .median. from their pixels .* not the scan of this"):
-        imported(root, tmp_path / "c")
-    scipy.io.savemat(points, {"XYZcut": np.full((30, 40, 3), np.nan)}, appendmat=False)
-    imported(root, tmp_path / "d")
-
-
-def test_images_of_other_names_are_refused(root: Path) -> None:
-    name = "DUC_cutout_024_0.jpg"
-    folder = root / "database/cutouts/DUC1/024"
-    (folder / "DUC_cutout_024_0_0.jpg").rename(folder / name)
-    with pytest.raises(DataError, match=rf"{name}: .*is not named <BUILDING>_cutout"):
-        read(root)
-
-
-def test_broken_files_are_refused(root: Path) -> None:
-    path = root / "database/alignments/DUC1/transformations/DUC_trans_024.txt"
-    text = path.read_text()
-    path.write_text(text.replace("0 0 0 1\n\nAfter", "0 0 0 1\nAfter") + "0\n")
-    with pytest.raises(DataError, match=r"DUC_trans_024\.txt:10: the last row of the matrix is"):
-        read(root)
-    path.write_text(text)
-    query = root / "query" / "iphone7" / "IMG_0804.JPG"
-    query.write_bytes(b"\xff\xd8 no image")
-    with pytest.raises(DataError, match=r"IMG_0804\.JPG: not an image"):
-        read(root)
-
-
 def test_what_is_no_inloc_is_refused_quickly(tmp_path: Path, root: Path) -> None:
     (tmp_path / "empty").mkdir()
     layout = "is missing; InLoc lies as database"
@@ -288,19 +241,3 @@ def test_what_is_no_inloc_is_refused_quickly(tmp_path: Path, root: Path) -> None
             shutil.rmtree(root / folder)
         with pytest.raises(DataError, match=message):
             InLoc().check(place)
-
-
-def test_input_files_are_all_that_is_read(root: Path) -> None:
-    read_so = {path for path in root.rglob("*") if path.is_file()}
-    read_so -= {root / "query/iphone7" / name for name in ("._IMG_0801.JPG", "readme.txt")}
-    assert set(InLoc().input_files(root)) == read_so and len(read_so) == 2 * 72 + 2 + 3
-    without = {path for path in read_so if path.suffix != ".mat"}
-    assert set(InLoc(InLocOptions(depth=False)).input_files(root)) == without
-    more = [
-        root / "database/alignments/DUC1/know_incorrect.txt",
-        root / "ground_truth/megloc/groups.csv",
-    ]
-    more[1].parent.mkdir(parents=True)
-    for path in more:
-        path.write_text("image, condition, frame, location, scored\n")
-    assert set(InLoc().input_files(root)) == {*read_so, *more}

@@ -6,12 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.io
 
 from megloc_kapture.datasets.inloc import (
     Cutout,
     parse_cutout_name,
-    read_cutout_points,
     read_transformation,
     read_wrong_scans,
 )
@@ -44,19 +42,6 @@ def test_names_say_what_they_show() -> None:
     assert cutout.transformation == "cse_trans_000.txt"
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        *(f"DUC_cutout_{n}.jpg" for n in ("24_0_0", "024_0", "024_360_0", "024_0_91", "024_-30_0")),
-        *("DUC_cutout_024_0_0.png", "DUC_cutout_024_0_0.jpg.mat", "DUC_cutout_024_0_0.jpg\n"),
-        *("DUC_scan_024_0_0.jpg", "a/DUC_cutout_024_0_0.jpg", ""),
-    ],
-)
-def test_other_names_are_refused(name: str) -> None:
-    with pytest.raises(DataError, match="is not named"):
-        parse_cutout_name(name)
-
-
 def test_the_second_matrix_counts(path: Path) -> None:
     for text in (TRANSFORMATION, f"what it says:{TRANSFORMATION}\nfitness 0.1\n"):
         path.write_text(text)
@@ -87,11 +72,3 @@ def test_broken_transformations_name_the_line(path: Path, old: str, new: str, ma
 def test_lists_of_wrong_scans(path: Path) -> None:
     path.write_text("known wrong:\n\n008\nDUC_scan_12.ptx 31\r\n2017\n")
     assert read_wrong_scans(path) == {"008", "012", "031"}
-
-
-def test_points_of_another_size_are_refused(path: Path) -> None:
-    scipy.io.savemat(path, {"XYZcut": np.zeros((3, 4, 3))}, appendmat=False)
-    assert read_cutout_points(path, 4, 3).shape == (3, 4, 3)
-    for width, height in ((3, 4), (4, 4)):
-        with pytest.raises(DataError, match=f"3x4x3, expected {height}x{width}x3"):
-            read_cutout_points(path, width, height)

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from robotcar_files import CAMERAS, QUERIES, REFERENCE, TEST, TRAIN, put, ts, write_layout
+from robotcar_files import CAMERAS, QUERIES, REFERENCE, TEST, TRAIN, ts, write_layout
 
 from megloc_kapture.datasets.official import OfficialDataset, write_official
 from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
-from megloc_kapture.errors import DataError, OptionError, PluginError
+from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.dataset_tables import read_groups, read_names, read_priors, read_protocol
-from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
-from megloc_kapture.plugin_loading import load_plugin
-from megloc_kapture.plugins import DATASETS
 from megloc_kapture.values import Camera, RigidTransform
 
 PER_CAMERA = {"dawn": 483, "night": 438, "rain": 421}  # as published
@@ -41,15 +37,6 @@ def query_name(number: int, camera: str = "rear") -> str:
 
 def scored(dataset: OfficialDataset) -> set[str]:
     return {name for name, group in dataset.groups.items() if group.scored}
-
-
-def test_it_is_a_registered_plugin(downloaded: Path) -> None:
-    adapter = load_plugin(DATASETS, "robotcar", {"version": 1})
-    assert isinstance(adapter, RobotCar) and len(adapter.read(downloaded).names) == 4
-    with pytest.raises(PluginError, match="queries"):
-        load_plugin(DATASETS, "robotcar", {"queries": "some"})
-    with pytest.raises(PluginError, match="train_as_map leaves nothing"):
-        load_plugin(DATASETS, "robotcar", {"queries": "train", "train_as_map": True})
 
 
 @pytest.mark.parametrize("model", ["auto", "merged", "individual"])
@@ -217,41 +204,6 @@ def test_truth_that_lies_beside_is_joined_with_the_public_one(root: Path) -> Non
     np.testing.assert_allclose(center, [11.0, 5.0, -2.0], atol=1e-12)
 
 
-def test_the_file_type_is_that_on_disk(root: Path) -> None:
-    for name in (f"overcast-reference/left/{ts(1)}", query_name(11)[:-4]):
-        write_image(root / f"images/{name}.png", np.full((6, 8, 3), 1, np.uint8))
-        (root / f"images/{name}.jpg").unlink()
-    dataset = read(root)
-    assert dataset.missing is not None and not dataset.missing.files
-    assert dataset.mapping.records_camera[ts(1), "left"].endswith(".png")
-    assert query_name(11)[:-4] + ".png" in dataset.query.image_names()
-
-
-def test_stray_files_do_not_matter(root: Path) -> None:
-    before = read(root)
-    models = "3D-models/individual"
-    for file in (
-        *("intrinsics/README.txt", "extrinsics/.DS_Store", "images/dawn.zip"),
-        *("images/dawn/rear/Thumbs.db", f"{models}/queries_per_location/notes.txt"),
-        *("images/dawn/rear/5.jpg", f"{models}/colmap_reconstructions/001_aligned.zip"),
-    ):
-        put(root / file, "x")
-    after = read(root)
-    assert (after.mapping, after.query) == (before.mapping, before.query)
-
-
-def test_every_file_that_counts_is_an_input(root: Path) -> None:
-    adapter, database = RobotCar(RobotCarOptions(reference_model=True)), "overcast-reference.db"
-    assert any("without descriptors" in remark for remark in adapter.read(root).remarks)
-    found = set(RobotCar().input_files(root))
-    assert found == {path for path in root.rglob("*") if path.is_file()}
-    put(root / "3D-models" / database, "")
-    assert set(RobotCar().input_files(root)) == found
-    assert set(adapter.input_files(root)) == found | {root / "3D-models" / database}
-    for same in (adapter, RobotCar()):
-        assert not any("descriptors" in remark for remark in same.read(root).remarks)
-
-
 def test_what_is_not_robotcar_is_refused_quickly(tmp_path: Path) -> None:
     for place in (tmp_path, tmp_path / "nowhere"):
         for refuse in (RobotCar().check, partial(RobotCar().read, allow_missing=True)):
@@ -284,86 +236,3 @@ def test_missing_files(
     KaptureFolder(tmp_path / "out/mapping").validate(deep=True)
     names = {*dataset.mapping.image_names(), *dataset.query.image_names()}
     assert read_groups(tmp_path / "out/megloc").keys() == names
-
-
-@pytest.mark.parametrize("gone", ["3D-models/all-merged", "3D-models/individual", "images"])
-def test_what_cannot_be_done_without(root: Path, tmp_path: Path, gone: str) -> None:
-    shutil.rmtree(root / gone)
-    if gone == "images":
-        (root / gone).mkdir()
-    if gone == "3D-models/all-merged":  # then the individual models are taken
-        assert len(read(root).mapping.trajectories) == 9
-        shutil.rmtree(root / "3D-models/individual/colmap_reconstructions")
-    with pytest.raises(DataError, match="missing|queries_per_location"):
-        write_official(read(root), tmp_path / "out")
-    part = RobotCar().read(root, allow_missing=True)
-    if gone == "3D-models/individual":  # they name the queries; the map is there without them
-        assert not part.query.records_camera
-        write_official(part, tmp_path / "out", allow_missing=True)
-        return
-    with pytest.raises(DataError, match="is left to import"):
-        write_official(part, tmp_path / "out", allow_missing=True)
-
-
-def append(text: str) -> Callable[[str], str]:
-    return lambda content: f"{content.rstrip()}\n{text}\n"
-
-
-def replaced(old: str, new: str) -> Callable[[str], str]:
-    return lambda content: content.replace(old, new)
-
-
-NVM, LISTS = "3D-models/all-merged/all.nvm", "3D-models/individual/queries_per_location"
-TRAIN_LIST, TEST_LIST = "robotcar_v2_train.txt", "robotcar_v2_test.txt"
-LIST_002 = f"{LISTS}/queries_location_002.txt"
-
-
-@pytest.mark.parametrize(
-    ("file", "change", "line", "message"),
-    [
-        (TEST_LIST, append("rear/5.png"), 2, "in no list of queries_per_location"),
-        (TEST_LIST, append(f"left/{ts(13)}.png"), 2, "expected 'rear' only"),
-        (TEST_LIST, append(f"rear/{ts(11)}.png"), 2, "is a training image too"),
-        (TEST_LIST, append(f"night/rear/{ts(14)}.png"), 2, "in no list"),
-        (TRAIN_LIST, append("dawn/rear/5.png 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"), 3, "in no list of"),
-        (LIST_002, append("dawn/front/5.jpg"), 7, "camera 'front'"),
-        (LIST_002, append(f"snow/rear/{ts(11)}.jpg"), 7, "are of one camera and time"),
-        (NVM, replaced("/left/", "/front/"), None, "camera one of left, rear"),
-        (NVM, replaced("overcast-reference/", ""), None, "expected condition/"),
-        (NVM, replaced(str(ts(1)), f"0{ts(2)}"), None, "of one camera and time"),
-        (NVM, replaced(f"{ts(1)}.png", f"{ts(2)}.jpg"), None, "are one image"),
-        ("intrinsics/rear_intrinsics.txt", replaced("10.5", "-1"), None, "focal"),
-        ("extrinsics/rear_extrinsics.txt", replaced("0,0,0,1", "0"), None, "four numbers"),
-    ],
-)
-def test_what_is_wrong_is_named(
-    root: Path, file: str, change: Callable[[str], str], line: int | None, message: str
-) -> None:
-    path = root / file
-    path.write_text(change(path.read_text()))
-    with pytest.raises(DataError) as caught:
-        read(root)
-    assert message in caught.value.message
-    assert (caught.value.path, caught.value.line) == (path, line)
-    assert "\n" not in str(caught.value)
-
-
-def test_unlisted_images_are_left_out_where_that_is_allowed(root: Path) -> None:
-    for name in ("train", "test"):
-        path = root / f"robotcar_v2_{name}.txt"
-        path.write_text(path.read_text().replace(str(ts(11)), "5").replace(str(ts(12)), "6"))
-    dataset = RobotCar().read(root, allow_missing=True)
-    assert not dataset.names
-    assert dataset.query_gt is not None and len(dataset.query_gt.poses()) == 1
-    assert any(remark.startswith("2 images of version 2's lists") for remark in dataset.remarks)
-
-
-def test_images_that_are_none_and_a_camera_without_any(root: Path) -> None:
-    path = root / f"images/overcast-reference/left/{ts(1)}.jpg"
-    path.write_text("a page that says 404")
-    with pytest.raises(DataError, match=f"{ts(1)}.jpg: not an image"):
-        read(root)
-    shutil.rmtree(root / "images")
-    (root / "images").mkdir()
-    sensors = RobotCar().read(root, allow_missing=True).mapping.sensors
-    assert sensors["rear"].camera() == Camera("PINHOLE", 1024, 1024, (10.5, 10.0, 4.25, 3.5))

@@ -1,4 +1,4 @@
-"""Pictures of the report: the worst queries beside what they match, masks."""
+"""Pictures of the report: the worst queries beside what they match."""
 
 from __future__ import annotations
 
@@ -15,16 +15,14 @@ from megloc_kapture.evaluation.report.gallery import (
     AGREES,
     DISAGREES,
     fits_poses,
-    mask_pictures,
     worst_pictures,
 )
 from megloc_kapture.evaluation.report.queries import ShownQuery, shown_queries
-from megloc_kapture.evaluation.report.reports import render_report
 from megloc_kapture.evaluation.results import ResultContext, context_of
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.dataset_tables import Protocol, write_protocol
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder, MatchesWriter
+from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, MatchesWriter
 from megloc_kapture.io.tables import QueryStatus
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -124,15 +122,3 @@ def test_what_is_missing_is_left_out(run: Run, shown: ShownQuery) -> None:
     shutil.rmtree(run.workspace / "matches")
     shutil.rmtree(run.workspace / "mapping/sensors/records_data")
     assert worst_pictures([shown], context_of(run.workspace / "localized"), poses) == []
-
-
-def test_masked_images_are_shaded(run: Run) -> None:
-    mask = np.full((480, 640, 3), 255, np.uint8)
-    mask[:120] = 0
-    write_image(run.workspace / f"query/sensors/masks/{QUERY}.png", mask)
-    (picture,) = mask_pictures([KaptureFolder(run.workspace / "query")])
-    assert (picture.name, picture.facts) == (QUERY, "25.0 % masked")
-    found = context_of(run.workspace / "localized")
-    evaluation = evaluate_poses({}, {QUERY: POSES[QUERY]})
-    page = render_report(replace(evaluation, context=found))
-    assert "Masked regions are shaded." in page and "25.0 % masked" in page

@@ -27,7 +27,7 @@ from megloc_kapture.evaluation.report.queries import (
 )
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation
-from megloc_kapture.evaluation.view import Scene, corner_rays, render_view, scene_of
+from megloc_kapture.evaluation.view import Scene, render_view, scene_of
 from megloc_kapture.io.dataset_tables import ImageGroup, write_groups
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
@@ -151,22 +151,6 @@ def test_a_foreign_map_of_rigs(shared_data: Path) -> None:
         check_corners(read.camera_of(name), read.poses()[name], frustum)
 
 
-@pytest.mark.parametrize(
-    "camera",
-    [
-        # beyond 90 degrees, beyond where the polynomial turns, and not to be inverted at all
-        Camera("OPENCV_FISHEYE", 800, 800, (200.0, 200.0, 400.0, 400.0, 0.0, 0.0, 0.0, 0.0)),
-        Camera("SIMPLE_RADIAL", 2000, 1500, (500.0, 1000.0, 750.0, -0.4)),
-        Camera("FOV", 640, 480, (5.0, 5.0, 320.0, 240.0, 1e-12)),
-    ],
-    ids=lambda c: c.model,
-)
-def test_corners_of_extreme_lenses_stay_finite(camera: Camera) -> None:
-    rays = corner_rays(camera)
-    assert rays.shape == (4, 3) and np.isfinite(rays).all() and np.abs(rays).max() < 10
-    assert (np.sign(rays[:, :2]) == [[-1, -1], [1, -1], [1, 1], [-1, 1]]).all()
-
-
 def test_many_points_and_cameras_are_drawn_in_part(make_map: Any, monkeypatch: Any) -> None:
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.normal(0, 5, (90_000, 3)), rng.integers(0, 256, (90_000, 3))])
@@ -232,24 +216,6 @@ def test_queries_estimates_and_truths(world: Any, make_map: Any) -> None:
     assert errors == sorted(errors, reverse=True)
     used = legend(list(shown))
     assert [m for _, m in used][-1] == "no pose" and len({c for c, _ in used}) == len(used)
-
-
-def test_of_many_queries_the_worst_are_shown(worlds: Any, make_map: Any) -> None:
-    root = make_map()
-    world = worlds(num_queries=3000)
-    evaluation = evaluate_poses(world.estimated, world.truth, statuses=world.statuses)
-    scene = drawn(root, shown_queries(evaluation))
-    assert len(scene.queries) == 2000
-    assert scene.notes == ("The worst 2000 of 3000 queries are drawn and listed.",)
-    assert len(render_view(scene)) < 3_000_000
-
-
-def test_a_map_without_colours_is_shaded_by_height(make_map: Any) -> None:
-    points = np.zeros((50, 6))
-    points[:, 2] = np.arange(50)
-    root = make_map(points=points)
-    scene = drawn(root)
-    assert (np.diff(scene.colors.astype(int).sum(axis=1)) >= 0).all() and scene.colors.std() > 20
 
 
 def test_coordinate_frames_are_kept_apart(world: Any, make_map: Any) -> None:

@@ -14,7 +14,6 @@ from megloc_kapture.io.kapture import (
     FeatureWriter,
     KaptureData,
     KaptureFolder,
-    KaptureVectors,
     MatchesWriter,
     Observations,
     Sensor,
@@ -185,28 +184,6 @@ def test_observations_of_images_taken_out_of_the_map_are_left_alone(root: Path) 
     for path in (root / "reconstruction").rglob("c.jpg.*"):
         path.unlink()
     KaptureFolder(root).validate()
-
-
-def test_matches_past_the_keypoints_and_broken_images_are_found_by_a_deep_check(root: Path) -> None:
-    image = root / "sensors/records_data/a.jpg"
-    image.write_bytes(image.read_bytes()[: image.stat().st_size // 2])
-    KaptureFolder(root).validate()
-    refuse(root, r"a\.jpg: not an image", deep=True)
-    write_image(image, np.zeros((6, 9, 3), np.uint8))
-    refuse(root, r"a\.jpg: image is 9x6, its camera 8x6", deep=True)
-    with MatchesWriter(root, "T") as matches:
-        matches.write(*IMAGES, np.array([[0, 5]]), np.ones(1))
-    KaptureFolder(root).validate()
-    refuse(root, r"point past the keypoints of 'b/c\.jpg'", deep=True)
-
-
-def test_features_that_are_not_finite_are_found_without_a_deep_check(root: Path) -> None:
-    with FeatureWriter(root, "global_features", "G", FeatureConfig("g", FLOAT, 3)) as features:
-        features.write("a.jpg", np.array([1, np.nan, 2]))
-    refuse(root, r"a\.jpg\.gfeat: not all values are finite")
-    vectors = KaptureVectors(KaptureFolder(root).global_features("G"), ["a.jpg"])
-    with pytest.raises(DataError, match=r"a\.jpg\.gfeat: not all values are finite"):
-        vectors.read(0, 1)
 
 
 @pytest.mark.slow

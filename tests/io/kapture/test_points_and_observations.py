@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,12 +51,6 @@ def test_no_points_are_none(tmp_path: Path, content: str) -> None:
     assert read.shape == (0, 6)
 
 
-def test_unusual_but_good_points_are_read(tmp_path: Path) -> None:
-    content = "\ufeff" + POINTS + " +1. ,\t.5,-1e+2\r\n\r\n#\n1,2,3\n00001,2E0,3"
-    read = read_points3d(file(tmp_path / "p.txt", content))
-    assert read[:, :3].tolist() == [[1, 0.5, -100], [1, 2, 3], [1, 2, 3]]
-
-
 @pytest.mark.parametrize(
     ("row", "match"),
     [
@@ -93,31 +85,6 @@ def test_covariances_are_read_as_written_and_cannot_be_changed(tmp_path: Path) -
     np.testing.assert_array_equal(np.load(tmp_path / COVARIANCES_FILE), values)
 
 
-@pytest.mark.parametrize(
-    ("content", "match"),
-    [
-        (VALUES[:2], r"expected float64 \(3, 6\)"),
-        (VALUES[:, :5], r"expected float64 \(3, 6\)"),
-        (VALUES.astype(np.float32), r"expected float64 \(3, 6\)"),
-        (np.array([object()] * 3), "no array"),  # a pickle
-        (b"", "no array"),
-        (b"no array", "no array"),
-        (b"\x93NUMPY\x01\x00", "no array"),
-    ],
-)
-def test_covariances_of_another_map_and_what_is_no_array_are_refused(
-    tmp_path: Path, content: np.ndarray | bytes, match: str
-) -> None:
-    path = tmp_path / COVARIANCES_FILE
-    path.parent.mkdir()
-    if isinstance(content, bytes):
-        path.write_bytes(content)
-    else:
-        np.save(path, content, allow_pickle=True)
-    with pytest.raises(DataError, match=match):
-        read_point_covariances(tmp_path, 3)
-
-
 # ---------------------------------------------------------------------------------------------- PLY
 
 XYZ = np.random.default_rng(0).normal(size=(100, 3))
@@ -133,19 +100,6 @@ def test_colmap_reads_what_was_written(tmp_path: Path) -> None:
     # COLMAP keeps them in single precision
     np.testing.assert_allclose([point.xyz for point in points], XYZ, rtol=1e-6)
     np.testing.assert_array_equal([point.color for point in points], COLOURS)
-
-
-def test_points_far_from_the_origin_keep_their_digits(tmp_path: Path) -> None:
-    far = XYZ + [4.2e6, 6.6e5, 4.7e6]
-    write_ply(tmp_path / "points.ply", far, COLOURS, deviation=np.arange(100), kept=np.ones(100))
-    header, _, body = (tmp_path / "points.ply").read_bytes().partition(b"end_header\n")
-    names = [line.split()[-1] for line in header.decode().splitlines() if "property" in line]
-    assert names == ["x", "y", "z", "red", "green", "blue", "deviation", "kept"]
-    rows = np.frombuffer(body, np.dtype("<f8, <f8, <f8, u1, u1, u1, <f4, <f4"))
-    np.testing.assert_array_equal(np.stack([rows[f"f{k}"] for k in range(3)], axis=1), far)
-    np.testing.assert_array_equal(rows["f6"], np.arange(100))
-    write_ply(tmp_path / "points.ply", np.zeros((0, 3)), np.zeros((0, 3)))
-    assert b"element vertex 0\n" in (tmp_path / "points.ply").read_bytes()
 
 
 # -------------------------------------------------------------------------------- observations
@@ -173,17 +127,6 @@ def plain(observations: dict[str, Observations]) -> dict[str, list[tuple[int, st
         ]
         assert {image for _, image, _ in found[keypoints_type]} == set(of_type.image_names)
     return found
-
-
-@pytest.mark.parametrize("read", [read_points3d, read_observations])
-def test_files_that_cannot_be_read_are_named(tmp_path: Path, read: Callable[..., object]) -> None:
-    path = tmp_path / "f.txt"
-    with pytest.raises(DataError, match=r"f\.txt: cannot read: the file is missing"):
-        read(path)
-    with pytest.raises(DataError, match=r"f\.txt:1: kapture format 2\.0"):
-        read(file(path, "# kapture format: 2.0\n1, t\n"))
-    with pytest.raises(DataError, match=r"f\.txt: not a text file in UTF-8"):
-        read_observations(file(path, b"1, t, a, 1\n1, t, \xff\xfe, 1\n"))
 
 
 def random_observations(count: int, keypoints_type: str = "T 1") -> Observations:
@@ -216,61 +159,6 @@ def test_the_layout_of_observations_is_kapture_s(tmp_path: Path) -> None:
     assert (tmp_path / "reconstruction/observations.txt").read_text() == OBSERVATIONS
 
 
-def of_points(keypoints_type: str, image: str, points: range) -> Observations:
-    """Observations of some points, one each, by one image."""
-    zeros, rows = np.zeros(len(points), np.int32), np.arange(len(points), dtype=np.int32)
-    return Observations(keypoints_type, (image,), np.asarray(points), zeros, rows)
-
-
-def test_types_of_disjoint_points_over_many_blocks(tmp_path: Path) -> None:
-    """As maps of several keypoints types have them: each type's points behind the other's."""
-    from kapture.io.csv import observations_from_file
-
-    written = {
-        "aliked": of_points("aliked", "a.jpg", range(90_000)),
-        "sift": of_points("sift", "b.jpg", range(89_999, 180_000)),
-    }
-    none = Observations("none", (), *np.empty((3, 0), int))
-    write_observations(tmp_path, {**written, "none": none})
-    path = tmp_path / "reconstruction/observations.txt"
-    assert plain(read_observations(path)) == plain(written)
-    found = observations_from_file(str(path))
-    assert len(found) == 180_000
-    assert found[89_999] == {"aliked": [("a.jpg", 89_999)], "sift": [("b.jpg", 0)]}
-    assert found[179_999] == {"sift": [("b.jpg", 90_000)]}
-
-
-@pytest.mark.usefixtures("small_blocks")
-def test_unusual_but_good_observations_are_read(tmp_path: Path) -> None:
-    rows = [
-        "5,t,a b.jpg,0,c , 1\r",
-        "",
-        "# a comment, with, commas, and a very long text that does not fit into one chunk" * 3,
-        "3 ,  t\t,a b.jpg, 00007",
-        "9, lonely",
-        "4, t",
-        "5, t, " + "long/" * 60 + "x.jpg, 3, c, 2",
-    ]
-    path = file(tmp_path / "o.txt", "\ufeff" + OBSERVATIONS + "\n".join(rows))
-    assert plain(read_observations(path)) == {
-        "lonely": [],
-        "t": [
-            (3, "a b.jpg", 7),
-            (5, "a b.jpg", 0),
-            (5, "c", 1),
-            (5, "long/" * 60 + "x.jpg", 3),
-            (5, "c", 2),
-        ],
-    }
-
-
-@pytest.mark.parametrize("row", ["3, t\u2003, a, 1", "3, t, a\u00a0, 1", "+3, t, a, 1"])
-def test_rare_spaces_around_names_are_stripped(tmp_path: Path, row: str) -> None:
-    path = file(tmp_path / "o.txt", f"1, t, b, 1\n{row}\n")
-    found = plain(read_observations(path))
-    assert found == {"t": [(1, "b", 1), (3, "a", 1)]}
-
-
 @pytest.mark.parametrize(
     ("row", "match"),
     [
@@ -296,26 +184,3 @@ def test_bad_observations_name_file_and_line(tmp_path: Path, row: str, match: st
     with pytest.raises(DataError, match=match) as caught:
         read_observations(path)
     assert f"{path}:23: " in str(caught.value)
-
-
-@pytest.mark.usefixtures("small_blocks")
-def test_names_and_types_of_several_blocks(tmp_path: Path) -> None:
-    rows = [f"{i}, type{i % 300}, {'deep/' * (i % 9)}{i}.jpg, {i % 7}\n" for i in range(20_000)]
-    path = file(tmp_path / "o.txt", "".join(rows))
-    found = plain(read_observations(path))
-    assert len(found) == 300
-    assert found["type7"][0] == (7, "deep/" * 7 + "7.jpg", 0)
-    assert sum(map(len, found.values())) == 20_000
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("image_names", ("../a",)), ("image_names", ("a,b",)), ("keypoints_type", "a/b")],
-)
-def test_names_that_cannot_be_read_back_are_refused(
-    tmp_path: Path, field: str, value: object
-) -> None:
-    broken = replace(of_points("t", "a", range(2)), **{field: value})
-    with pytest.raises(DataError):
-        write_observations(tmp_path, {broken.keypoints_type: broken})
-    assert list(tmp_path.iterdir()) == []

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy.io import loadmat, savemat
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.weights import MissingWeightsError, find_weights, read_weights
-from megloc_kapture.io.weights.adding import add_weights
+from megloc_kapture.io.weights import MissingWeightsError, add_weights, find_weights, read_weights
 
 BUNDLES = Path(__file__).parent / "data" / "tensor_bundle"
 CONVOLUTIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)

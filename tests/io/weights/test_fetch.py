@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from megloc_kapture.errors import DataError
-from megloc_kapture.io.weights.adding import TransferError, fetch
+from megloc_kapture.errors import DataError, MeglocError
+from megloc_kapture.io.weights import fetch
 
 CONTENT = np.random.default_rng(0).bytes(300_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
@@ -69,23 +69,15 @@ def place(tmp_path: Path) -> Path:
     return tmp_path / "weights" / "net.pth"
 
 
-class Bar:
-    total, seen = 0, 0
-
-    def update(self, size: int) -> None:
-        self.seen += size
-
-    def reset(self) -> None:
-        self.seen = 0
-
-    def close(self) -> None:
-        pass
-
-
 def test_a_whole_file(server: Server, place: Path) -> None:
-    bar = Bar()
-    fetch(server.url, place, sha256=SHA256, progress=bar)
-    assert place.read_bytes() == CONTENT and bar.total == bar.seen == len(CONTENT)
+    seen = []
+
+    def track(chunks: Iterable[bytes], total: int, label: str) -> Iterable[bytes]:
+        seen.append((total, label))
+        return chunks
+
+    fetch(server.url, place, sha256=SHA256, track=track)
+    assert place.read_bytes() == CONTENT and seen == [(1, "net.pth")]
     assert [path.name for path in place.parent.iterdir()] == ["net.pth"]
 
 
@@ -93,9 +85,9 @@ def test_a_whole_file(server: Server, place: Path) -> None:
     ("change", "kind", "message"),
     [
         ({"content": b"another"}, DataError, "the download is not the published file: .*" + SHA256),
-        ({"break_after": 1000}, TransferError, "the transfer broke"),
-        ({"status": 404}, TransferError, "the server answers 404"),
-        ({"address": "http://127.0.0.1:9"}, TransferError, "the transfer broke"),
+        ({"break_after": 1000}, MeglocError, "the transfer broke"),
+        ({"status": 404}, MeglocError, "the server answers 404"),
+        ({"address": "http://127.0.0.1:9"}, MeglocError, "the transfer broke"),
     ],
     ids=["another file", "broken", "refused", "no server"],
 )

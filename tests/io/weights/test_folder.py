@@ -20,7 +20,10 @@ from safetensors.torch import save_file
 from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError
 from megloc_kapture.io import weights as weights_module
 from megloc_kapture.io.weights import (
+    SOURCE_KEY,
     MissingWeightsError,
+    add_weights,
+    convert_weights,
     describe,
     find_weights,
     read_weights,
@@ -29,9 +32,6 @@ from megloc_kapture.io.weights import (
     share_weights,
     weights_folder,
 )
-from megloc_kapture.io.weights.adding import SOURCE_KEY, add_weights, convert_weights
-from megloc_kapture.nets.runtime import load_strictly
-from megloc_kapture.pipeline.executors import open_executor
 
 COUNTS = {
     "aliked-t16": 192_588,
@@ -153,7 +153,8 @@ def test_a_file_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 def test_another_file_under_a_published_name_is_refused(folder: Path) -> None:
     path = write(folder / "superpoint_v1.pth")
     file, known = find_weights("superpoint_v1"), registry()["superpoint_v1"].files[0].sha256
-    told = f"{path}: is not the published file of superpoint_v1: sha256 {sha256_of(file)} instead"
+    told = f"{path}: is not the published superpoint_v1.pth of superpoint_v1: sha256 "
+    told += f"{sha256_of(file)} instead"
     with pytest.raises(DataError, match=re.escape(f"{told} of {known}; ")):
         read_weights(file)
 
@@ -163,12 +164,6 @@ def test_code_is_not_run(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"x\.pth: no file of weights .* would run code"):
         read_weights(find_weights(str(tmp_path / "x.pth")))
     assert not (tmp_path / "made").exists()
-
-
-def test_a_score_of_numpy_beside_the_weights(tmp_path: Path) -> None:
-    for score in (np.float64(0.7), np.float32(0.7)):
-        torch.save({"model_state": {"a": torch.ones(1)}, "best_score": score}, tmp_path / "x.pth")
-        assert read_weights(find_weights(str(tmp_path / "x.pth"))).keys() == {"a"}
 
 
 def test_looking_for_weights_does_not_import_torch() -> None:
@@ -232,7 +227,7 @@ def test_add_refuses_what_is_broken_and_on_request_takes_another_file(
     assert read_weights(found).keys() == read_weights(describe("own", own)).keys()
     # the published one comes first, and is checked
     shutil.copyfile(own, folder / "superpoint_v1.pth")
-    with pytest.raises(DataError, match="is not the published file"):
+    with pytest.raises(DataError, match="is not the published superpoint_v1.pth"):
         read_weights(find_weights("superpoint_v1"))
 
 
@@ -251,7 +246,7 @@ def test_convert_keeps_everything_and_is_deterministic(published: Path, tmp_path
     source = published / "r2d2" / "r2d2_WAF_N16.pt"
     before = source.read_bytes()
     places = [tmp_path / f"{row}.safetensors" for row in range(2)]
-    code = "import sys; from pathlib import Path; import megloc_kapture.io.weights.adding as c;"
+    code = "import sys; from pathlib import Path; import megloc_kapture.io.weights as c;"
     code += "c.convert_weights(Path(sys.argv[1]), Path(sys.argv[2]))"
     count = convert_weights(source, places[0])
     subprocess.run([sys.executable, "-c", code, source, places[1]], check=True)
@@ -285,23 +280,6 @@ def test_convert_views_of_one_memory_and_refuses(tmp_path: Path) -> None:
     convert_weights(source, place, force=True)
 
 
-def _is_mapped(path: Path) -> bool:
-    """True if a network's parameters are pages of the shared file, which the system keeps once."""
-    net = load_strictly(torch.nn.Linear(64, 1), read_weights(describe("own", path)), "own")
-    at, lines = net.weight.data_ptr(), Path("/proc/self/maps").read_text().splitlines()
-    spans = [line.split()[0].split("-") for line in lines if "/weights-" in line]
-    return any(int(first, 16) <= at < int(end, 16) for first, end in spans)
-
-
-@pytest.mark.skipif(not Path("/proc/self/maps").is_file(), reason="Linux tells it")
-def test_workers_have_one_copy(tmp_path: Path) -> None:
-    torch.save(torch.nn.Linear(64, 1).state_dict(), tmp_path / "own.pth")
-    assert not _is_mapped(tmp_path / "own.pth")
-    with open_executor("processes", 2) as executor:
-        assert executor is not None
-        assert all(executor.map(_is_mapped, [tmp_path / "own.pth"] * 4))
-
-
 def test_what_was_read_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "own.pth"
     tensors = {"a": torch.rand(3, 4), "half": torch.rand(5).half(), "t": torch.rand(4, 2).T}
@@ -323,3 +301,9 @@ def test_what_was_read_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         for name, tensor in tensors.items():
             assert torch.equal(found[name], tensor) and found[name].dtype == tensor.dtype
     assert second["a"].is_shared_file  # type: ignore[attr-defined]
+
+
+def test_a_score_of_numpy_beside_the_weights(tmp_path: Path) -> None:
+    for score in (np.float64(0.7), np.float32(0.7)):
+        torch.save({"model_state": {"a": torch.ones(1)}, "best_score": score}, tmp_path / "x.pth")
+        assert read_weights(find_weights(str(tmp_path / "x.pth"))).keys() == {"a"}

@@ -131,13 +131,12 @@
   }
   const size = () => usual * 2 ** Number(at("size").value);
   const white = [1, 1, 1], red = [1, 0.3, 0.3], grey = [0.56, 0.65, 0.75];
-  let dots, dense, cameras, lines, faces, allInliers, own = null; // own: of the chosen query
-  const numOwn = points.length / 3 - data.numDense; // the map's own come first
-  function cloud(from, to) {
+  let dots, cameras, lines, faces, allInliers, own = null; // own: of the chosen query
+  function cloud() {
     const mesh = new Mesh(gl.POINTS), colors = bytes(data.colors);
-    const rows = new Float32Array(10 * (to - from));
+    const rows = new Float32Array(10 * points.length / 3);
     let at = 0;
-    for (let i = from; i < to; i++) if (pointFrames[i] === frame) {
+    for (let i = 0; i < points.length / 3; i++) if (pointFrames[i] === frame) {
       rows.set(points.subarray(3 * i, 3 * i + 3), at);
       for (let k = 0; k < 3; k++) rows[at + 6 + k] = colors[3 * i + k] / 255;
       rows[at + 9] = 1; at += 10;
@@ -151,7 +150,7 @@
       mesh.line(centre(frusta, i), vector(inliers, k), rgb(q.color), alpha);
   }
   function build() {
-    dots = cloud(0, numOwn); dense = cloud(numOwn, points.length / 3); own = null;
+    dots = cloud(); own = null;
     [cameras, lines, allInliers] = [0, 1, 2].map(() => new Mesh(gl.LINES));
     faces = new Mesh(gl.TRIANGLES);
     for (let i = 0; i < cameraFrusta.length / 15; i++)
@@ -192,7 +191,6 @@
     gl.uniform1f(uniform.dot_px, 0.006 * few * data.radius * Math.min(w, h));
     const ticked = (id) => { const box = at(id); return box && box.checked; };
     if (ticked("show-points")) dots.draw();
-    if (ticked("show-dense")) dense.draw();
     if (ticked("show-cameras")) cameras.draw();
     lines.draw();
     if (own) own.lines.draw(1.15);
@@ -342,7 +340,7 @@
     else return;
     e.preventDefault(); flight = null; redraw();
   });
-  for (const id of ["show-points", "show-dense", "show-cameras", "show-inliers", "size"])
+  for (const id of ["show-points", "show-cameras", "show-inliers", "size"])
     if (at(id)) at(id).addEventListener("input", redraw);
   if (at("frame")) at("frame").addEventListener("change", () => enter(Number(at("frame").value)));
   at("home").addEventListener("click", () => go({ ...home }));

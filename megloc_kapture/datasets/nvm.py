@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.files import check_relative, named, reading
 from megloc_kapture.io.kapture.sensors import unit_quaternion
@@ -63,8 +63,7 @@ def read_nvm(path: Path, *, with_points: bool = True) -> NvmModel:
 
 def _count(rows: Iterator[str], what: str) -> int:
     text = next(rows, "").strip()
-    if not text.isdecimal():
-        raise DataError(f"expected the number of {what}, got {text[:40]!r}")
+    require(text.isdecimal(), f"expected the number of {what}, got {text[:40]!r}")
     return int(text)
 
 
@@ -83,8 +82,9 @@ def _read_cameras(rows: Iterator[str], count: int) -> tuple[tuple[str, ...], NDA
             if len(values) != 9 or not np.isfinite(values).all() or name in cameras:
                 raise DataError("expected 10 finite numbers, and each image once")
         cameras[name] = values
-    if not cameras or len(cameras) < count:
-        raise DataError(f"the file ends after {len(cameras)} of {count} cameras")
+    require(
+        cameras and len(cameras) >= count, f"the file ends after {len(cameras)} of {count} cameras"
+    )
     return tuple(cameras), np.array(list(cameras.values()))
 
 
@@ -94,8 +94,7 @@ def _read_points(rows: Iterator[str], count: int, images: int, with_points: bool
     while count:
         lines = list(islice(rows, min(_ROWS, count)))
         count -= len(lines)
-        if not lines:
-            raise DataError("the file ends before its last point")
+        require(lines, "the file ends before its last point")
         if with_points:
             parts.append(_parse_points(lines, images))
     return SparsePoints.joined(parts)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import named, read_text
 from megloc_kapture.values import RigidTransform
 
@@ -43,6 +43,10 @@ class Line:
     def error(self, message: str) -> DataError:
         return DataError(message, path=self.path, line=self.number)
 
+    def require(self, condition: object, message: str) -> None:
+        """Raise DataError with file and line unless the condition is true."""
+        require(condition, message, path=self.path, line=self.number)
+
     def named(self) -> AbstractContextManager[None]:
         """Add this line to DataErrors that name no file."""
         return named(self.path, self.number)
@@ -50,26 +54,25 @@ class Line:
     def expect(self, fields: Sequence[str], counts: int | Iterable[int], form: str) -> None:
         """Raise DataError for another number of fields; ``form`` lists their names."""
         expected = (counts,) if isinstance(counts, int) else tuple(counts)
-        if len(fields) not in expected:
-            raise self.error(
-                f"expected {' or '.join(map(str, expected))} fields ({form}), got {len(fields)}"
-            )
+        self.require(
+            len(fields) in expected,
+            f"expected {' or '.join(map(str, expected))} fields ({form}), got {len(fields)}",
+        )
 
     def number_of(self, text: str, what: str) -> float:
         try:
             value = float(text)
         except ValueError:
             value = math.nan
-        if not math.isfinite(value):
-            raise self.error(f"{what} {shown(text)} is not a finite number")
+        self.require(math.isfinite(value), f"{what} {shown(text)} is not a finite number")
         return value
 
     def numbers_of(self, texts: Iterable[str], what: str) -> list[float]:
         return [self.number_of(text, what) for text in texts]
 
     def count_of(self, text: str, what: str) -> int:
-        if not re.fullmatch("[0-9]{1,18}", text):
-            raise self.error(f"{what} {shown(text)} is not a whole number of at least 0")
+        whole = re.fullmatch("[0-9]{1,18}", text)
+        self.require(whole, f"{what} {shown(text)} is not a whole number of at least 0")
         return int(text)
 
     def rigid_transform(self, matrix: NDArray[np.float64]) -> RigidTransform:
@@ -77,8 +80,10 @@ class Line:
         error = np.abs(rotation.T @ rotation - np.eye(3)).max()
         if not (error < MAX_ROTATION_ERROR and np.linalg.det(rotation) > 0):
             raise self.error("the upper left 3x3 of the matrix is not a rotation matrix")
-        if not np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() < MAX_ROTATION_ERROR:
-            raise self.error("the last row of the matrix is not 0 0 0 1")
+        last_row_error = np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max()
+        self.require(
+            last_row_error < MAX_ROTATION_ERROR, "the last row of the matrix is not 0 0 0 1"
+        )
         return RigidTransform.from_matrix(rotation, position)
 
 

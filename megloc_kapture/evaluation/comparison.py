@@ -1,0 +1,322 @@
+"""Comparison of results on the same queries: paired tests, or agreement without true poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, compress
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from megloc_kapture.errors import OptionError, check_option, require
+from megloc_kapture.evaluation.metrics import (
+    LEVEL,
+    PoseErrors,
+    RecallAt,
+    Threshold,
+    pose_errors,
+    recall_row,
+    row_members,
+    within,
+)
+from megloc_kapture.evaluation.protocols import Benchmark
+from megloc_kapture.evaluation.results import Result
+from megloc_kapture.evaluation.scoring import Evaluation, Reported, query_result, recall_rows
+
+SIGNIFICANCE = 0.05
+NUM_RESAMPLES, _CHUNK = 2000, 250
+# with four queries the interval covers the true difference in 88 % of simulations, with six in 95 %
+MIN_RESAMPLED = 6
+
+
+@dataclass(frozen=True, slots=True)
+class PairedTest:
+    """Exact McNemar test of two results, by position, at one threshold.
+
+    ``only_first`` and ``only_second`` are the queries within the threshold in one result only;
+    ``both`` and ``neither`` count the others. ``p_adjusted`` has Holm's correction for all tests of
+    the comparison.
+    """
+
+    first: int
+    second: int
+    threshold: Threshold
+    both: int
+    neither: int
+    only_first: tuple[str, ...]
+    only_second: tuple[str, ...]
+    p_value: float
+    p_adjusted: float
+
+    @property
+    def is_real(self) -> bool:
+        return self.p_adjusted <= SIGNIFICANCE
+
+
+@dataclass(frozen=True, slots=True)
+class MedianDifference:
+    """Median position errors of two results, by position; infinite if most queries have no pose.
+
+    ``low_m`` to ``high_m`` is the 95 % interval of ``first_m - second_m`` from resampling the
+    queries; NaN for fewer than six.
+    """
+
+    first: int
+    second: int
+    first_m: float
+    second_m: float
+    low_m: float
+    high_m: float
+
+    @property
+    def is_real(self) -> bool:
+        return self.low_m > 0.0 or self.high_m < 0.0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Comparison(Reported):
+    """Results on the same queries, compared two by two."""
+
+    evaluations: tuple[Evaluation, ...]
+    tests: tuple[PairedTest, ...]
+    medians: tuple[MedianDifference, ...]
+
+
+def compare(evaluations: Sequence[Evaluation]) -> Comparison:
+    """Compare at least two results on the same queries, thresholds and conditions."""
+    _check_comparable(evaluations)
+    names = np.array(evaluations[0].errors.names, dtype=object)
+    tables, medians = [], []
+    resampled = [_resampled_medians(e.errors.position_m) for e in evaluations]
+    for i, j in combinations(range(len(evaluations)), 2):
+        for threshold in evaluations[0].thresholds:
+            a, b = (within(evaluations[k].errors, threshold) for k in (i, j))
+            tables.append((i, j, threshold, a, b))
+        first_m, second_m = (evaluations[k].row().median_position_m for k in (i, j))
+        interval_m = float("nan"), float("nan")
+        if len(names) >= MIN_RESAMPLED:
+            interval_m = difference_interval(resampled[i], resampled[j])
+        medians.append(MedianDifference(i, j, first_m, second_m, *interval_m))
+    p_values = [mcnemar(int((a & ~b).sum()), int((b & ~a).sum())) for *_, a, b in tables]
+    tests = tuple(
+        PairedTest(
+            first=i,
+            second=j,
+            threshold=threshold,
+            only_first=tuple(names[a & ~b].tolist()),
+            only_second=tuple(names[b & ~a].tolist()),
+            both=int((a & b).sum()),
+            neither=int((~a & ~b).sum()),
+            p_value=p_value,
+            p_adjusted=adjusted,
+        )
+        for (i, j, threshold, a, b), p_value, adjusted in zip(
+            tables, p_values, holm(p_values).tolist(), strict=True
+        )
+    )
+    return Comparison(tuple(evaluations), tests, tuple(medians))
+
+
+def _check_comparable(evaluations: Sequence[Evaluation]) -> None:
+    check_option(len(evaluations) >= 2, "at least two results are needed to compare")
+    first = evaluations[0]
+    labels = [evaluation.label for evaluation in evaluations]
+    if len(set(labels)) != len(labels):
+        raise OptionError(f"two results are called {max(labels, key=labels.count)!r}")
+    for other in evaluations[1:]:
+        for kind, ours, theirs in (
+            ("thresholds", first.thresholds, other.thresholds),
+            ("queries", first.errors.names, other.errors.names),
+            (
+                "conditions",
+                [query.condition for query in first.queries],
+                [query.condition for query in other.queries],
+            ),
+        ):
+            check_option(ours == theirs, f"{first.label} and {other.label} have different {kind}")
+
+
+def mcnemar(only_first: int, only_second: int) -> float:
+    """Two-sided p-value of the exact McNemar test.
+
+    Among queries that only one method finds, either method is as likely if both are equally good.
+    """
+    from scipy.special import bdtr
+
+    fewer, number = min(only_first, only_second), only_first + only_second
+    return min(2.0 * float(bdtr(float(fewer), number, 0.5)), 1.0)
+
+
+def holm(p_values: ArrayLike) -> NDArray[np.float64]:
+    """Adjust p-values (N,) by Holm's method for the chance of any false alarm among N tests."""
+    p = np.asarray(p_values, dtype=np.float64)
+    order = np.argsort(p, kind="stable")
+    adjusted = np.empty_like(p)
+    raised = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
+    adjusted[order] = np.minimum(raised, 1.0)
+    return adjusted
+
+
+def _resampled_medians(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return medians (2000,) of resampled values (N,), which may be infinite.
+
+    The same N draws the same positions, so results on the same queries stay paired.
+    """
+    rng, size = np.random.default_rng(0), (_CHUNK, len(values))
+    chunks = (values[rng.integers(len(values), size=size)] for _ in range(NUM_RESAMPLES // _CHUNK))
+    return np.concatenate([np.median(drawn, axis=1) for drawn in chunks])
+
+
+def difference_interval(
+    first: NDArray[np.float64], second: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Return the middle 95 % of the differences of paired medians; inf - inf counts as zero."""
+    with np.errstate(invalid="ignore"):
+        difference = first - second
+    difference[np.isnan(difference)] = 0.0
+    # interpolation between infinities would give NaN
+    tail = (1.0 - LEVEL) / 2.0
+    low = np.quantile(difference, tail, method="lower")
+    high = np.quantile(difference, 1.0 - tail, method="higher")
+    return float(low), float(high)
+
+
+CAUTION = "None of these figures is accuracy: results that share a mistake agree."
+
+
+Quartiles = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class AgreementRow:
+    """Agreement of the results at positions ``first`` and ``second`` in one row of the table.
+
+    ``within`` counts queries whose two poses differ by no more than a threshold, as a share of all
+    queries; the medians of the differences are over queries with a pose in both.
+    """
+
+    first: int
+    second: int
+    name: str
+    num_queries: int
+    num_both: int
+    num_only_first: int
+    num_only_second: int
+    within: tuple[RecallAt, ...]
+    median_m: float
+    median_deg: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class WithoutTruth(Reported):
+    """Results without true poses.
+
+    ``statement`` names the owner of the true poses; ``thresholds`` and ``agreement`` are for each
+    pair of results, as is ``apart``: the differences of their poses, infinite where one has none.
+    """
+
+    statement: str
+    thresholds: tuple[Threshold, ...]
+    evaluations: tuple[Evaluation, ...]
+    agreement: tuple[AgreementRow, ...]
+    apart: tuple[PoseErrors, ...]
+
+    def per_query(self) -> dict[str, list[Any]]:
+        columns = Reported.per_query(self)
+        labels = [result.label for result in self.evaluations]
+        for (first, second), apart in zip(combinations(labels, 2), self.apart, strict=True):
+            columns[f"{first} to {second}: position_m"] = apart.position_m.tolist()
+            columns[f"{first} to {second}: angle_deg"] = apart.angle_deg.tolist()
+        return columns
+
+
+def evaluate_without_truth(
+    results: Sequence[Result],
+    benchmark: Benchmark = Benchmark(),  # noqa: B008
+    *,
+    queries: Collection[str] | None = None,
+    thresholds: Sequence[Threshold] | None = None,
+) -> WithoutTruth:
+    """Count localized queries, and compare results in one frame with each other.
+
+    ``queries`` are by default all that any result names; ``thresholds`` limit the differences of
+    two results.
+    """
+    labels = [result.label for result in results]
+    if not results or len(set(labels)) != len(labels):
+        raise OptionError("results need different labels, and at least one is needed")
+    images = sorted({i for r in results for i in r.images} if queries is None else set(queries))
+    require(images, "no query: the results name no image")
+    conditions = benchmark.conditions(images)
+    members = row_members([conditions.get(image, "") for image in images], benchmark.protocol)
+    thresholds = tuple(thresholds or benchmark.thresholds())
+    agreement, apart = list[AgreementRow](), []
+    for i, j in combinations(range(len(results)), 2):
+        first, second = results[i].poses, results[j].poses
+        shared = {image: first[image] for image in images if image in first and image in second}
+        errors = pose_errors(shared, second, images)
+        apart.append(errors)
+        has_pose = [np.array([image in poses for image in images]) for poses in (first, second)]
+        for name, chosen in members.items():
+            row = recall_row(name, errors, thresholds, members=chosen)
+            agreement.append(
+                AgreementRow(
+                    first=i,
+                    second=j,
+                    name=name,
+                    num_queries=row.num_queries,
+                    num_both=int((has_pose[0] & has_pose[1] & chosen).sum()),
+                    num_only_first=int((has_pose[0] & ~has_pose[1] & chosen).sum()),
+                    num_only_second=int((has_pose[1] & ~has_pose[0] & chosen).sum()),
+                    within=row.recall,
+                    median_m=row.median_localized_position_m,
+                    median_deg=row.median_localized_angle_deg,
+                )
+            )
+    return WithoutTruth(
+        statement=benchmark.protocol.truth or "No true poses were given.",
+        thresholds=thresholds,
+        evaluations=tuple(_counted(result, images, conditions, members) for result in results),
+        agreement=tuple(agreement),
+        apart=tuple(apart),
+    )
+
+
+def _counted(
+    result: Result,
+    images: Sequence[str],
+    conditions: Mapping[str, str],
+    members: Mapping[str, NDArray[np.bool_]],
+) -> Evaluation:
+    queries = tuple(query_result(result, i, conditions, (math.nan, math.nan)) for i in images)
+    # rows count poses; without thresholds nothing depends on the errors
+    errors = pose_errors(result.poses, result.poses, images)
+    return Evaluation(
+        label=result.label,
+        thresholds=(),
+        rows=recall_rows(queries, errors, (), members),
+        members=members,
+        queries=queries,
+        errors=errors,
+        truth={},
+        estimated=result.poses,
+        without_truth=(),
+        not_scored=(),
+        context=result.context,
+    )
+
+
+def inliers_quartiles(evaluation: Evaluation, row: str) -> Quartiles | None:
+    """Return 25, 50 and 75 % of the inliers of localized queries; None if unknown."""
+    inliers = [
+        query.num_inliers
+        for query in compress(evaluation.queries, evaluation.members[row])
+        if query.outcome == "localized" and query.num_inliers is not None
+    ]
+    if not inliers:
+        return None
+    low, middle, high = np.quantile(inliers, (0.25, 0.5, 0.75)).tolist()
+    return low, middle, high
