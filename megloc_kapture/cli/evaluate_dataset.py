@@ -154,8 +154,7 @@ class Eval(Deciding, Working):
         statuses = read_status(workspace.path(LOCALIZED) / STATUS_FILE)
         if statuses and all(status.status == "failed" for status in statuses.values()):
             console.say("warning: no query was localized; reasons are in localized/status.csv")
-        remarks = (status.remarks for status in statuses.values())
-        if misfits := misfits_text(remarks, f"{LOCALIZED}/{STATUS_FILE}"):
+        if misfits := misfits_text(statuses.values(), f"{LOCALIZED}/{STATUS_FILE}"):
             console.say(misfits)
         for text in (RECALL_TEXT, AGREEMENT_TEXT):
             if (evaluation / text).is_file():

@@ -90,7 +90,7 @@ def _pose(text: str) -> RigidTransform:
     return RigidTransform((w, x, y, z), (a, b, c))
 
 
-def _pose_text(pose: RigidTransform) -> str:
+def pose_text(pose: RigidTransform) -> str:
     return " ".join(repr(float(value)) for value in (*pose.quat_wxyz, *pose.translation))
 
 
@@ -116,8 +116,17 @@ def list_of(separator: str) -> Column:
     )
 
 
-def number(format_spec: str) -> Column:
-    return Column("a number", float, lambda value: format(value, format_spec))
+def number(format_spec: str, most: float = math.inf) -> Column:
+    """Return a column of numbers; with ``most``, of those from 0 to it."""
+
+    def read(text: str) -> float:
+        value = float(text)
+        if most < math.inf and not 0 <= value <= most:
+            raise ValueError
+        return value
+
+    expected = f"a number from 0 to {most:g}" if most < math.inf else "a number"
+    return Column(expected, read, lambda value: format(value, format_spec))
 
 
 def or_empty(column: Column, empty: Any = None) -> Column:
@@ -136,7 +145,7 @@ _BY_TYPE: dict[Any, Column] = {
     # kapture forbids the comma in image names
     tuple[str, ...]: list_of(","),
     RigidTransform: Column(
-        "a pose qw qx qy qz tx ty tz: a unit quaternion and finite numbers", _pose, _pose_text
+        "a pose qw qx qy qz tx ty tz: a unit quaternion and finite numbers", _pose, pose_text
     ),
 }
 
@@ -189,12 +198,13 @@ class Table(Generic[RowT]):
         return self.read(path) if path.exists() else []
 
     def write(self, path: Path | str, rows: Iterable[Any]) -> None:
-        """Write records, or objects with their attributes, in the given order."""
+        """Write records, objects with their attributes or mappings, in the given order."""
         known: set[tuple[tuple[str, ...], ...]] = set()
         lines = []
         for row in rows:
             cells = {
-                name: column.write(getattr(row, name)) for name, column in self._columns.items()
+                name: column.write(row[name] if isinstance(row, Mapping) else getattr(row, name))
+                for name, column in self._columns.items()
             }
             self._check_keys(cells, known)
             lines.append(tuple(cells.values()))

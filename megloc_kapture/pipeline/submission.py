@@ -41,7 +41,7 @@ from megloc_kapture.io.dataset_tables import (
 )
 from megloc_kapture.io.files import read_text, safe_join, temporary_name, write_bytes, write_json
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder
-from megloc_kapture.io.tables import STATUS_FILE, QueryStatus, read_status
+from megloc_kapture.io.tables import STATUS_FILE, read_status
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,
     SYNTHETIC,
@@ -51,7 +51,7 @@ from megloc_kapture.pipeline.datasets import (
 )
 from megloc_kapture.pipeline.workspace import Manifest, read_manifest
 from megloc_kapture.stages import scene
-from megloc_kapture.values import Pose, RigidTransform
+from megloc_kapture.values import LocalizationResult, Pose, RigidTransform
 
 _log = logging.getLogger(__name__)
 
@@ -153,7 +153,7 @@ def write_submission(
 def poses_through_rig(
     data: KaptureData,
     poses: Mapping[str, RigidTransform],
-    statuses: Mapping[str, QueryStatus] = MappingProxyType({}),
+    statuses: Mapping[str, LocalizationResult] = MappingProxyType({}),
 ) -> dict[str, RigidTransform]:
     """Derive missing poses from the image of the same rig and timestamp with the most inliers.
 
@@ -163,9 +163,9 @@ def poses_through_rig(
     for image, pose in poses.items():
         status = statuses.get(image)
         if status is None:
-            localized[image] = Pose(pose, 0, 0)
+            localized[image] = Pose(pose)
         elif status.status == "localized":
-            localized[image] = Pose(pose, status.num_matches, status.num_inliers)
+            localized[image] = Pose(pose, num_inliers=status.num_inliers or 0)
     return {image: pose for image, (_, pose) in scene.poses_through_rig(data, localized).items()}
 
 

@@ -20,7 +20,6 @@ from pydantic import Field
 
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
-from megloc_kapture.io.tables import Fallback
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import (
     ClusterOptions,
@@ -59,7 +58,14 @@ from megloc_kapture.stages.work import (
     FolderSpec,
     Work,
 )
-from megloc_kapture.values import MIN_CONFIDENCE, Failure, Options, Pose, RigidTransform
+from megloc_kapture.values import (
+    MIN_CONFIDENCE,
+    Failure,
+    Fallback,
+    Options,
+    Pose,
+    RigidTransform,
+)
 
 _FIRST_TURN = 5
 # below this even the right pose can be decimetres off, which more candidates improve
@@ -156,7 +162,8 @@ def localize_unit(
             return [result]
         if isinstance(result, Pose) and problem is not None:
             return poses_of_cameras(views, result, problem)
-    return [localize([QueryView(v.name, v.camera, v.matches)])[0] for v in views]
+    results = [localize([QueryView(v.name, v.camera, v.matches)])[0] for v in views]
+    return [replace(result, name=v.name) for v, result in zip(views, results, strict=True)]
 
 
 def in_turn(
@@ -247,7 +254,7 @@ class _StoredQueries:
     options: LocalizationOptions
     ranker: PoseRanker
 
-    def __call__(self, job: _Job) -> list[tuple[str, Pose | Failure]]:
+    def __call__(self, job: _Job) -> list[Pose | Failure]:
         unit, candidate_lists, frame_of = job
         started = time.perf_counter()
         mapping, query = self.map.open(), self.query.open()
@@ -269,10 +276,7 @@ class _StoredQueries:
             ranker=self.ranker,
             scene=KaptureScene(mapping, query),
         )
-        return [
-            (image, _for_writing(result, reading_s))
-            for (image, _), result in zip(unit, results, strict=True)
-        ]
+        return [_for_writing(result, reading_s) for result in results]
 
     def _read(self, image: str, cam_from_rig: RigidTransform, images: Sequence[str]) -> QueryView:
         query, matches = self.query.open(), self.matches.open()
@@ -309,7 +313,7 @@ def localize_from_matches(
     restrictions: Restrictions = UNRESTRICTED,
     work: Work = HERE,
     scratch: Path | None = None,
-) -> Iterator[tuple[str, Pose | Failure]]:
+) -> Iterator[Pose | Failure]:
     """Localize every query from stored matches of ``local_types``; yield results sorted by unit.
 
     The map may use the base type of a guided pyramid type. ``scratch`` holds a temporary map index.

@@ -15,8 +15,7 @@ from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.evaluation.pose_files import write_pose_file, write_provenance
 from megloc_kapture.evaluation.report.reports import report_text, write_report
 from megloc_kapture.io.dataset_tables import read_nowhere, write_nowhere
-from megloc_kapture.io.tables import QueryStatus
-from megloc_kapture.values import Failure, Pose, RigidTransform
+from megloc_kapture.values import Failure, LocalizationResult, Pose, RigidTransform
 
 
 def at(x_m: float) -> RigidTransform:
@@ -46,10 +45,9 @@ def test_risk_by_hand() -> None:
     assert risk_by_score(np.ones(4), right).tolist() == [0.5, 0.5, 0.5, 0.5]
 
 
-def status(image: str, confidence: float | None, localized: bool = True) -> QueryStatus:
-    return QueryStatus(
-        image=image,
-        status="localized" if localized else "failed",
+def status(image: str, confidence: float | None, localized: bool = True) -> LocalizationResult:
+    return LocalizationResult(
+        name=image,
         reason="" if localized else "too little",
         num_inliers=10,
         confidence=confidence,
