@@ -40,6 +40,7 @@ MIN_CONFIDENCE = 0.6
 
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 """Where a network computes: auto (a GPU where there is one), cpu, cuda, or cuda:N."""
+Precision = Literal["full", "half"]
 
 
 def _is_list(annotation: Any) -> bool:

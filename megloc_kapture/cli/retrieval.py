@@ -44,7 +44,7 @@ class ExtractGlobal(Reading, StageCommand):
     def run(self, console: Console) -> None:
         choices = self.options(self.named("global_features", self.features)).global_features
         folders = [self.kapture_map(self.input), *map(self.kapture, self.query)]
-        extractors = {one.name: one.make() for one in choices if not one.is_vlad}
+        extractors = {one.name: one.make(self.placement()) for one in choices if not one.is_vlad}
         with self.staged(self.output, FEATURES, force=self.force, adds=True) as (out, work):
             for choice in choices:
                 if choice.is_vlad:

@@ -38,10 +38,15 @@ from megloc_kapture.matching.verification import KnownPoseOptions
 from megloc_kapture.pipeline.plan import run_plan
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
 from megloc_kapture.pipeline.workspace import Workspace
-from megloc_kapture.plugin_loading import load_plugin, option_fault, plugin_class
+from megloc_kapture.plugin_loading import (
+    Placement,
+    load_chosen,
+    load_plugin,
+    option_fault,
+    plugin_class,
+)
 from megloc_kapture.plugins import MATCHERS, STAGES, chosen_by_name
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.devices import with_device
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.map_points import triangulate_map
 from megloc_kapture.stages.matches import check_given_poses, match_pairs
@@ -70,9 +75,12 @@ class StageCommand(Choosing, Working):
     def options(self, changes: dict[str, object] | None = None) -> PipelineOptions:
         return options_of_preset(
             self.preset or DEFAULT_PRESET,
-            changes=[changes or {}, assigned(self.placement())],
+            changes=[changes or {}, assigned(self.placed())],
             assignments=self.set,
         )
+
+    def placement(self) -> Placement:
+        return self.options().placement
 
     def named(self, key: str, names: Sequence[str]) -> dict[str, object]:
         """Return changes that select plugins by name, with the preset's settings for them."""
@@ -164,7 +172,7 @@ class Match(Reading, StageCommand):
         options = self.options(changes)
         # --matcher applies even if the preset has another one for this type
         chosen = options.matching if self.matcher else options.matching_of(local_type)
-        matcher = load_plugin(MATCHERS, chosen.name, chosen.options)
+        matcher = load_chosen(MATCHERS, chosen, options.placement)
         first, verification = mapping, options.verify_mapping()
         if self.query is not None:
             first, verification = self.kapture(self.query), options.verify_queries()
@@ -309,10 +317,9 @@ class Preprocess(Linked, Computing, Working):
         }
         changes = tree.pop("masks", {})
         try:
-            options = PreprocessingOptions.model_validate({**tree, "masks": {**masks, **changes}})
+            return PreprocessingOptions.model_validate({**tree, "masks": {**masks, **changes}})
         except ValidationError as error:
             raise OptionError(f"option {option_fault(error, PreprocessingOptions)}") from error
-        return with_device(options, self.device or "auto", self.precision or "full")
 
     def _fixed_masks(self) -> Iterator[dict[str, Any]]:
         takes = "CAMERA=VALUE"

@@ -15,7 +15,7 @@ from megloc_kapture.localization.map_index import ImageMatches
 from megloc_kapture.matching.guided_pyramid import base_type, equivalent_types
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, plain_name
 from megloc_kapture.pipeline.queries import QueryImage
-from megloc_kapture.plugin_loading import load_plugin, plugin_names
+from megloc_kapture.plugin_loading import load_chosen, plugin_names
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
@@ -23,7 +23,7 @@ from megloc_kapture.plugins import (
     Matcher,
     PluginChoice,
 )
-from megloc_kapture.stages.devices import BATCH, with_device
+from megloc_kapture.stages.devices import BATCH
 from megloc_kapture.stages.given_map import rows_found_again
 from megloc_kapture.stages.guided_pyramid import PyramidMethod, retry_query
 from megloc_kapture.stages.local_features import extract_all, read_frame
@@ -76,7 +76,7 @@ class LocalType:
     def matcher(self) -> Matcher:
         own = None if self.choice is None else self.choice.matching
         chosen = own or self._options.matching
-        found: Matcher = load_plugin(MATCHERS, chosen.name, chosen.options)
+        found: Matcher = load_chosen(MATCHERS, chosen, self._options.placement)
         return found
 
     @cached_property
@@ -90,13 +90,15 @@ class LocalType:
                 f"them, write its name first into {self.name}/keypoints.txt",
                 path=self._map.folder.root,
             )
-        extractor: LocalFeatureExtractor = load_plugin(LOCAL_FEATURES, found.name, found.options)
+        extractor: LocalFeatureExtractor = load_chosen(
+            LOCAL_FEATURES, found, self._options.placement
+        )
         return extractor
 
     def brought(self) -> PluginChoice | None:
         found = self.first.extractor()
         if self.choice is None or (found is not None and found.name != self.choice.name):
-            return with_device(found, self._options.device, self._options.precision)
+            return found
         known = {} if found is None else found.options
         return PluginChoice(name=self.choice.name, options={**self.choice.options, **known})
 

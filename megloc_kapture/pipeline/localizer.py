@@ -30,7 +30,6 @@ from megloc_kapture.pipeline.queries import (
     Unit,
 )
 from megloc_kapture.pipeline.query_folders import KaptureQueries
-from megloc_kapture.stages.devices import Precision
 from megloc_kapture.stages.localized_folder import unreadable_image
 from megloc_kapture.stages.matches import FeatureCache
 from megloc_kapture.stages.options import PipelineOptions
@@ -38,7 +37,7 @@ from megloc_kapture.stages.pose_refinement import MapRefiners
 from megloc_kapture.stages.query_poses import localize_query
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import ordered_map
-from megloc_kapture.values import Camera, Device, Failure, Pose, RigidTransform
+from megloc_kapture.values import Camera, Device, Failure, Pose, Precision, RigidTransform
 
 _ALONE = RigidTransform.identity()
 
@@ -73,10 +72,13 @@ class Localizer:
             raise OptionError("give the device and the precision in the options")
         where = {"device": device, "precision": precision}
         self.options = options or options_of_preset(preset, changes=[where])
-        self._ranker = self.options.localization.make_ranker()
+        self._ranker = self.options.localization.make_ranker(self.options.placement)
         self._preprocessor = Preprocessor(self.options)
         self.refiners = MapRefiners(
-            kapture_map.folder, kapture_map.restrictions, self.options.pose_refinement
+            kapture_map.folder,
+            kapture_map.restrictions,
+            self.options.pose_refinement,
+            self.options.placement,
         )
         self.types = local_types_of(kapture_map, self.options, FeatureCache())
         for local in self.types:

@@ -122,7 +122,7 @@ class MapRetrieval:
             name = self._vlad_name(choice)
             return _GlobalType(name, choice.weight, name in self._stored_vocabularies, choice)
         try:
-            extractor = choice.make()
+            extractor = choice.make(self._options.placement)
         except MissingWeightsError:  # raised again on use
             stored = any(name.startswith(choice.name) for name in self._map.global_types())
             return _GlobalType(choice.name, choice.weight, stored, choice)
@@ -175,7 +175,7 @@ class MapRetrieval:
         if one.choice is None:
             return np.asarray(image.query.global_features[one.name])
         if not one.is_vlad:
-            return image.describe(one.extractor or one.choice.make())
+            return image.describe(one.extractor or one.choice.make(self._options.placement))
         vocabulary, settings = self._vlad(one)
         descriptors = features[self._position(settings.local_type)].descriptors
         return aggregate(descriptors, vocabulary, settings.options)
@@ -205,7 +205,7 @@ class MapRetrieval:
                 f"the map has no global features {one.name!r}, and no images to describe",
                 path=self._map.folder.root,
             )
-        extractor = one.extractor or one.choice.make()
+        extractor = one.extractor or one.choice.make(self._options.placement)
         return np.stack([self._map_image(name).describe(extractor) for name in images])
 
     def _map_image(self, name: str) -> QueryImage:

@@ -214,7 +214,7 @@ def _run(due: _Due, workspace: Workspace, work: Work) -> tuple[Manifest, int]:
     clock = time.perf_counter()
     with workspace.staging(stage.name, due.mark) as folder:
         finished = FinishedItems(folder / FINISHED, due.mark)
-        resumed = replace(work, finished=finished)
+        resumed = replace(work, finished=finished, placement=stage.placement)
         counts = dict(stage.run(StageWork(**vars(resumed), root=workspace.root, out=folder)))
         clear_temporary(folder)
         # without a manifest a stage killed below this line runs again

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.images import read_image_rgb, turned_upright
 from megloc_kapture.localization.focal_length import estimate_remark
-from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugin_loading import load_chosen
 from megloc_kapture.plugins import (
     SEGMENTERS,
     DepthView,
@@ -127,7 +127,7 @@ class Preprocessor:
         masks = self._options.preprocessing.masks
         if masks.segmenter is None:
             return None
-        segmenter = load_plugin(SEGMENTERS, masks.segmenter.name, masks.segmenter.options)
+        segmenter = load_chosen(SEGMENTERS, masks.segmenter, self._options.placement)
         return ClassMasks.of(segmenter, masks.dynamic)
 
 

@@ -32,7 +32,7 @@ from megloc_kapture.mvs.views import (
     stereo_view,
     with_pose_errors,
 )
-from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugin_loading import AUTO, Placement, load_chosen
 from megloc_kapture.plugins import (
     DEPTH_ESTIMATORS,
     DepthEstimate,
@@ -88,11 +88,9 @@ class DensifyOptions(Options):
     )
     max_size_px: int = Field(default=800, ge=64, description="longer side of the depth maps")
 
-    def make_estimator(self) -> DepthEstimator:
-        found: DepthEstimator = load_plugin(
-            DEPTH_ESTIMATORS, self.estimator.name, self.estimator.options
-        )
-        return found
+    def make_estimator(self, placement: Placement = AUTO) -> DepthEstimator:
+        made: DepthEstimator = load_chosen(DEPTH_ESTIMATORS, self.estimator, placement)
+        return made
 
 
 @dataclass(frozen=True)
@@ -141,7 +139,7 @@ def densify_map(
     in the options. ``link_features`` is as in
     :func:`~megloc_kapture.stages.map_refinement.refine_map`.
     """
-    estimator = estimator or options.make_estimator()
+    estimator = estimator or options.make_estimator(work.placement)
     data = source.read()
     _check(source, data)
     fit = fitted_to_poses(source, options.max_size_px)

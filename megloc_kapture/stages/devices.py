@@ -7,17 +7,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 from megloc_kapture.errors import MeglocError, PluginError
-from megloc_kapture.plugin_loading import option_models
-from megloc_kapture.plugins import PluginChoice
-from megloc_kapture.values import Device, Options
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-Value = TypeVar("Value")
-Precision = Literal["full", "half"]
 
 BATCH = 8  # for batch plugins without a device option
 MOST_AT_ONCE = {"cpu": 1, "cuda": 16}
@@ -107,34 +102,3 @@ def is_out_of_memory(error: BaseException) -> bool:
     return isinstance(error, torch.OutOfMemoryError) or any(
         text in str(error) for text in _OUT_OF_MEMORY
     )
-
-
-def with_device(value: Value, device: Device, precision: Precision) -> Value:
-    """Return options with device and precision set for the networks that name none."""
-    wanted: dict[str, Any] = {"device": device} if device != "auto" else {}
-    wanted |= {"half_precision": True} if precision != "full" else {}
-    given: Any = value
-    if wanted and isinstance(given, tuple):
-        given = tuple(with_device(one, device, precision) for one in given)
-    elif wanted and isinstance(given, Options):
-        given = type(given).model_validate(_filled(given.model_dump(), wanted))
-    return given
-
-
-def _filled(tree: Any, wanted: dict[str, Any]) -> Any:
-    if isinstance(tree, list | tuple):
-        return [_filled(one, wanted) for one in tree]
-    if not isinstance(tree, dict):
-        return tree
-    tree = {name: _filled(one, wanted) for name, one in tree.items()}
-    if not isinstance(options := tree.get("options"), dict):
-        return tree
-    for model in option_models(tree["name"]):
-        for name, field in model.model_fields.items():
-            if name in wanted:
-                options.setdefault(name, wanted[name])
-            elif field.annotation is PluginChoice:
-                plain = PluginChoice.model_validate(options.get(name, field.default)).model_dump()
-                if (filled := _filled(plain, wanted)) != plain:
-                    options[name] = filled
-    return tree

@@ -22,7 +22,14 @@ from megloc_kapture.features.vlad import (
 )
 from megloc_kapture.io.files import read_json_model, write_json_model
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
-from megloc_kapture.plugin_loading import checked_array, load_plugin, option_fault, plugin_names
+from megloc_kapture.plugin_loading import (
+    AUTO,
+    Placement,
+    checked_array,
+    load_chosen,
+    option_fault,
+    plugin_names,
+)
 from megloc_kapture.plugins import GLOBAL_FEATURES as PLUGINS
 from megloc_kapture.plugins import GlobalFeatureExtractor, PluginChoice
 from megloc_kapture.stages.devices import in_batches
@@ -198,13 +205,13 @@ class GlobalFeaturesChoice(PluginChoice):
             fault = option_fault(error, VladChoiceOptions)
             raise OptionError(f"global features {VLAD!r} refuse their options: {fault}") from error
 
-    def make(self) -> GlobalFeatureExtractor:
+    def make(self, placement: Placement = AUTO) -> GlobalFeatureExtractor:
         known = plugin_names(PLUGINS)
         if self.name not in known:
             raise OptionError(
                 f"unknown global features {self.name!r}; {suggestion(self.name, [VLAD, *known])}"
             )
-        extractor: GlobalFeatureExtractor = load_plugin(PLUGINS, self.name, self.options)
+        extractor: GlobalFeatureExtractor = load_chosen(PLUGINS, self, placement)
         return extractor
 
     def type_name(self, main_local_type: str) -> str:
@@ -327,7 +334,8 @@ class ExtractGlobalFeatures(PipelineStage):
         if self._trains():
             return found
         # image networks do not depend on local features
-        return {key: found[key] for key in ("global_features", "weights") if key in found}
+        keys = ("global_features", "weights", "precision")
+        return {key: found[key] for key in keys if key in found}
 
     def plugins(self) -> Sequence[object]:
         return [chosen.make() for chosen in self.options.global_features if not chosen.is_vlad]
@@ -343,6 +351,7 @@ class ExtractGlobalFeatures(PipelineStage):
                 found = extract_vlad(mapping, folders, name, work.out, vlad.of_vlad(), work=work)
             else:
                 folders = [work.folder(self.layout.mapping()), *queries]
-                found = extract_global_features(folders, chosen.make(), work.out, work=work)
+                extractor = chosen.make(work.placement)
+                found = extract_global_features(folders, extractor, work.out, work=work)
             counts[f"images_with_{chosen.name}"] = found["images"]
         return counts

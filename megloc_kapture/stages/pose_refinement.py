@@ -28,7 +28,7 @@ from megloc_kapture.io.tables import (
     read_status,
     write_consistency,
 )
-from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugin_loading import AUTO, Placement, load_chosen
 from megloc_kapture.plugins import (
     POSE_REFINERS,
     PluginChoice,
@@ -84,8 +84,8 @@ class PoseRefinementOptions(Options):
     def refines(self) -> bool:
         return bool(self.by)
 
-    def make_refiners(self) -> list[PoseRefiner]:
-        return [load_plugin(POSE_REFINERS, one.name, one.options) for one in self.by]
+    def make_refiners(self, placement: Placement = AUTO) -> list[PoseRefiner]:
+        return [load_chosen(POSE_REFINERS, chosen, placement) for chosen in self.by]
 
 
 class MapRefiners:
@@ -96,7 +96,11 @@ class MapRefiners:
     """
 
     def __init__(
-        self, mapping: KaptureFolder, restrictions: Restrictions, options: PoseRefinementOptions
+        self,
+        mapping: KaptureFolder,
+        restrictions: Restrictions,
+        options: PoseRefinementOptions,
+        placement: Placement = AUTO,
     ) -> None:
         if options.refines() and unit_of(mapping.root) != METRES:
             raise OptionError(
@@ -104,7 +108,7 @@ class MapRefiners:
                 "scale is not known; `megloc map --scale` makes a map in metres, `megloc import "
                 "colmap --unit m` says that a COLMAP model is in metres"
             )
-        self.refiners = tuple(options.make_refiners())
+        self.refiners = tuple(options.make_refiners(placement))
         self.map = FolderSpec(mapping)
         self._mapping, self._restrictions, self._options = mapping, restrictions, options
         self._verdicts: dict[str, list[Consistency | None]] = {}
@@ -245,7 +249,7 @@ def refine_poses(
     refiners need: images, masks, depth maps, points. ``refinement.csv`` has the measures of each
     refiner, ``map_consistency.csv`` those of each coordinate frame. Return counts for the log.
     """
-    refiners = MapRefiners(map_folder, restrictions, options)
+    refiners = MapRefiners(map_folder, restrictions, options, work.placement)
     data = localized.read()
     results = _read_results(localized)
     poses = {name: result for name, result in results.items() if isinstance(result, Pose)}

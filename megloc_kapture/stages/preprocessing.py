@@ -25,7 +25,7 @@ from megloc_kapture.io.files import (
 )
 from megloc_kapture.io.images import image_size, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugin_loading import Placement, load_chosen
 from megloc_kapture.plugins import SEGMENTERS, Segmenter
 from megloc_kapture.preprocessing.frames import FrameOptions, FramePlan, plan_frame
 from megloc_kapture.preprocessing.masks import UnchangingRegion
@@ -137,7 +137,7 @@ def preprocess_images(
     output = Path(output)
     if output.resolve().is_relative_to(folder.root.resolve()):
         raise OutputError(f"{output}: lies in the kapture that is read, which stays as it is")
-    classes = _class_masks(options.masks, segmenter)
+    classes = _class_masks(options.masks, segmenter, work.placement)
     data = folder.read()
     plans = _plans(data, options)
     images = data.image_names()
@@ -199,9 +199,11 @@ def preprocess_images(
     }
 
 
-def _class_masks(options: MaskOptions, segmenter: Segmenter | None) -> ClassMasks | None:
+def _class_masks(
+    options: MaskOptions, segmenter: Segmenter | None, placement: Placement
+) -> ClassMasks | None:
     if segmenter is None and options.segmenter is not None:
-        segmenter = load_plugin(SEGMENTERS, options.segmenter.name, options.segmenter.options)
+        segmenter = load_chosen(SEGMENTERS, options.segmenter, placement)
     if segmenter is not None:
         return ClassMasks.of(segmenter, options.dynamic)
     if options.dynamic is not None:
@@ -278,7 +280,7 @@ class Preprocess(PipelineStage):
 
     def plugins(self) -> Sequence[object]:
         chosen = self.options.preprocessing.masks.segmenter
-        return () if chosen is None else (load_plugin(SEGMENTERS, chosen.name, chosen.options),)
+        return () if chosen is None else (load_chosen(SEGMENTERS, chosen),)
 
     def external(self) -> Mapping[str, str]:
         masks = self.options.preprocessing.masks

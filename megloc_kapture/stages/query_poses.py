@@ -30,7 +30,7 @@ from megloc_kapture.localization.cluster_poses import (
 )
 from megloc_kapture.localization.map_index import PoseProblem, QueryView, TypedMatches
 from megloc_kapture.matching.guided_pyramid import base_type
-from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugin_loading import AUTO, Placement, load_chosen
 from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, PoseRanker, RankingScene
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.localized_folder import (
@@ -100,8 +100,8 @@ class LocalizationOptions(Options):
         "its pose through the rig",
     )
 
-    def make_ranker(self) -> PoseRanker:
-        ranker: PoseRanker = load_plugin(POSE_RANKERS, self.rank.name, self.rank.options)
+    def make_ranker(self, placement: Placement = AUTO) -> PoseRanker:
+        ranker: PoseRanker = load_chosen(POSE_RANKERS, self.rank, placement)
         return ranker
 
 
@@ -318,7 +318,7 @@ def localize_from_matches(
 
     The map may use the base type of a guided pyramid type. ``scratch`` holds a temporary map index.
     """
-    ranker = options.make_ranker()
+    ranker = options.make_ranker(work.placement)
     candidates = {name: tuple(images) for name, images in iterate_candidates(pairs)}
     units = query_units(query.read(), rigs=options.rigs)
     read = {name: index_map(map_folder, type_in_map(map_folder, name)) for name in local_types}

@@ -20,6 +20,7 @@ from uuid import uuid4
 
 from megloc_kapture.io.files import output_error
 from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.plugin_loading import AUTO, Placement
 from megloc_kapture.stages.devices import most_at_once, on_gpu
 
 
@@ -168,6 +169,7 @@ class Work:
     num_threads : for libraries with internal threads, such as COLMAP.
     finished : items finished by an interrupted run; None outside a workspace.
     force : continue despite contradictory input data.
+    placement : device and precision of networks.
     """
 
     executor: Executor | None = None
@@ -175,6 +177,7 @@ class Work:
     num_threads: int = 1
     finished: FinishedItems | None = None
     force: bool = False
+    placement: Placement = AUTO
 
     def map(
         self,
