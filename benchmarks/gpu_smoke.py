@@ -39,8 +39,7 @@ from megloc_kapture.localization.lpips import LpipsDistance
 from megloc_kapture.matching.networks import LightGlue, SuperGlue
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.preprocessing.deeplab import DeepLab
-from megloc_kapture.stages.devices import DeviceMemoryError, in_batches
-from megloc_kapture.stages.work import Work
+from megloc_kapture.stages.work import DeviceMemoryError, Work, in_batches
 from megloc_kapture.training.train import TrainingData, TrainingOptions, train
 from megloc_kapture.values import ImageFeatures, LocalFeatures
 

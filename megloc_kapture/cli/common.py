@@ -34,7 +34,7 @@ from megloc_kapture.values import Camera
 
 if TYPE_CHECKING:
     from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
-    from megloc_kapture.pipeline.workspace import Workspace
+    from megloc_kapture.pipeline.plan import Workspace
 
 Input = Annotated[Path, tyro.conf.arg(aliases=["-i"])]
 Inputs = Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["-i"]), tyro.conf.UseAppendAction]
@@ -243,7 +243,7 @@ class Linked:
     def kapture_map(self, root: Path) -> KaptureFolder:
         """Open the kapture folder of a map or workspace."""
         # the workspace takes long to import
-        from megloc_kapture.pipeline.workspace import map_of_workspace
+        from megloc_kapture.pipeline.plan import map_of_workspace
 
         return self.kapture(map_of_workspace(root))
 

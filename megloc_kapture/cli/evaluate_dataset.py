@@ -17,16 +17,15 @@ from megloc_kapture.io.tables import STATUS_FILE, read_status
 from megloc_kapture.localization.focal_length import misfits_text
 from megloc_kapture.pipeline.datasets import BenchmarkFile, DatasetChoice
 from megloc_kapture.pipeline.evaluation_plan import (
+    choose_run,
     explain,
     explained,
     plan_evaluation,
     recall_rows,
 )
-from megloc_kapture.pipeline.plan import all_kept, run_plan
+from megloc_kapture.pipeline.plan import Workspace, all_kept, run_plan
 from megloc_kapture.pipeline.presets import assigned
-from megloc_kapture.pipeline.run import choose_run
 from megloc_kapture.pipeline.submission import FOLDER, keep_submission
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.stage import EVALUATION, LOCALIZED
 
 BELOW_RECALL = 3

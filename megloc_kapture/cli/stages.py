@@ -35,9 +35,8 @@ from megloc_kapture.cli.common import (
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.matching.verification import KnownPoseOptions
-from megloc_kapture.pipeline.plan import run_plan
+from megloc_kapture.pipeline.plan import Workspace, run_plan
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.plugin_loading import (
     Placement,
     load_chosen,

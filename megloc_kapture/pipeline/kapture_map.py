@@ -24,7 +24,7 @@ from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.map_refinement import REPORT_FILE
-from megloc_kapture.stages.shared_index import index_map, observed_keypoints, with_noise
+from megloc_kapture.stages.scene import index_map, observed_keypoints, with_noise
 from megloc_kapture.values import Camera, RigidTransform
 
 PixelOriginChoice = Literal["auto", "corner", "centre"]

@@ -23,7 +23,6 @@ from megloc_kapture.plugins import (
     Matcher,
     PluginChoice,
 )
-from megloc_kapture.stages.devices import BATCH
 from megloc_kapture.stages.given_map import rows_found_again
 from megloc_kapture.stages.guided_pyramid import PyramidMethod, retry_query
 from megloc_kapture.stages.local_features import extract_all, read_frame
@@ -36,7 +35,7 @@ from megloc_kapture.stages.matches import (
     verified,
 )
 from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
-from megloc_kapture.stages.work import batched
+from megloc_kapture.stages.work import BATCH, batched
 
 _MIN_FOUND_AGAIN = 0.5
 _NO_MATCHES = VerifiedMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32), 0)

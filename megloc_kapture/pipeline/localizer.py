@@ -18,9 +18,8 @@ from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
-from megloc_kapture.pipeline.live_source import LiveSource, MapMatching
+from megloc_kapture.pipeline.live_source import LiveSource, MapMatching, MapRetrieval
 from megloc_kapture.pipeline.local_types import local_types_of
-from megloc_kapture.pipeline.map_retrieval import MapRetrieval
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import (
     Preprocessor,

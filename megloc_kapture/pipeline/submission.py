@@ -49,7 +49,7 @@ from megloc_kapture.pipeline.datasets import (
     check_known,
     dataset_names,
 )
-from megloc_kapture.pipeline.workspace import Manifest, read_manifest
+from megloc_kapture.pipeline.plan import Manifest, read_manifest
 from megloc_kapture.stages import scene
 from megloc_kapture.values import LocalizationResult, Pose, RigidTransform
 

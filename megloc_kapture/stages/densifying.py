@@ -41,11 +41,9 @@ from megloc_kapture.plugins import (
     StereoView,
 )
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.devices import is_out_of_memory
 from megloc_kapture.stages.given_map import copy_features
 from megloc_kapture.stages.local_features import read_frame
-from megloc_kapture.stages.scene import depth_records
-from megloc_kapture.stages.shared_index import index_map, with_noise, write_array
+from megloc_kapture.stages.scene import depth_records, index_map, with_noise, write_array
 from megloc_kapture.stages.stage import MAP, Layout, PipelineStage, StageWork
 from megloc_kapture.stages.stereo_depth import (
     DEPTH_FILE,
@@ -57,7 +55,7 @@ from megloc_kapture.stages.stereo_depth import (
     with_depth_sensors,
     write_points,
 )
-from megloc_kapture.stages.work import HERE, FolderSpec, Work
+from megloc_kapture.stages.work import HERE, FolderSpec, Work, is_out_of_memory
 from megloc_kapture.values import Camera, Options
 
 _NO_POINTS = np.zeros(0, np.int64)

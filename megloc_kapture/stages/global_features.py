@@ -32,7 +32,6 @@ from megloc_kapture.plugin_loading import (
 )
 from megloc_kapture.plugins import GLOBAL_FEATURES as PLUGINS
 from megloc_kapture.plugins import GlobalFeatureExtractor, PluginChoice
-from megloc_kapture.stages.devices import in_batches
 from megloc_kapture.stages.given_map import (
     MEAN_FILE,
     PROJECTION_FILE,
@@ -41,7 +40,7 @@ from megloc_kapture.stages.given_map import (
     described_images,
 )
 from megloc_kapture.stages.local_features import images_of, read_image_of
-from megloc_kapture.stages.shared_index import write_array
+from megloc_kapture.stages.scene import write_array
 from megloc_kapture.stages.stage import (
     FEATURES,
     GLOBAL_FEATURES,
@@ -50,7 +49,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, ordered_map
+from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, in_batches, ordered_map
 from megloc_kapture.values import Camera, Options
 
 

@@ -36,10 +36,9 @@ from megloc_kapture.matching.guided_pyramid import (
 from megloc_kapture.matching.pyramid_combination import Combined, KeypointUnion, combine
 from megloc_kapture.matching.verification import KnownPoseOptions, two_view_of_variants
 from megloc_kapture.plugins import LocalFeatureExtractor, Matcher
-from megloc_kapture.stages.devices import BATCH
 from megloc_kapture.stages.local_features import extract_all
 from megloc_kapture.stages.matches import Features, NoVerification, Verification, match_all
-from megloc_kapture.stages.work import batched
+from megloc_kapture.stages.work import BATCH, batched
 
 _log = logging.getLogger(__name__)
 

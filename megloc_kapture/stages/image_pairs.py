@@ -26,7 +26,7 @@ from megloc_kapture.mapping.pairs import (
     pairs_by_sequence,
 )
 from megloc_kapture.matching.guided_pyramid import base_type
-from megloc_kapture.retrieval.fusion import greedy_coverage
+from megloc_kapture.retrieval.search import greedy_coverage
 from megloc_kapture.stages.candidates import (
     UNRESTRICTED,
     Candidates,

@@ -26,7 +26,6 @@ from megloc_kapture.io.tables import write_mask_counts
 from megloc_kapture.plugin_loading import checked_array
 from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.preprocessing.masks import with_margin
-from megloc_kapture.stages.devices import in_batches
 from megloc_kapture.stages.given_map import check_given_type, has_descriptors
 from megloc_kapture.stages.stage import (
     LOCAL_FEATURES,
@@ -36,7 +35,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work
+from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, in_batches
 from megloc_kapture.values import Camera, LocalFeatures
 
 _SIZE = attrgetter("size")

@@ -33,7 +33,6 @@ from megloc_kapture.matching.verification import (
 )
 from megloc_kapture.plugin_loading import checked_array
 from megloc_kapture.plugins import Matcher
-from megloc_kapture.stages.devices import in_batches
 from megloc_kapture.stages.given_map import matched_images
 from megloc_kapture.stages.stage import (
     FEATURES,
@@ -45,7 +44,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, batched
+from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, batched, in_batches
 from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
 
 _log = logging.getLogger(__name__)

@@ -38,8 +38,15 @@ from megloc_kapture.stages.localized_folder import (
     write_localized,
 )
 from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.stages.scene import KaptureScene, Unit, query_units
-from megloc_kapture.stages.shared_index import index_map, open_index, shared_index, with_noise
+from megloc_kapture.stages.scene import (
+    KaptureScene,
+    Unit,
+    index_map,
+    open_index,
+    query_units,
+    shared_index,
+    with_noise,
+)
 from megloc_kapture.stages.stage import (
     FEATURES,
     LOCAL_FEATURES,

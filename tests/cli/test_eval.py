@@ -17,7 +17,7 @@ from aachen_files import write_v1_0
 from megloc_kapture.io.images import write_depth_map, write_image
 from megloc_kapture.io.kapture import KaptureFolder, Sensor, read_pairs, write_sensors
 from megloc_kapture.io.tables import read_status
-from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.values import RigidTransform
 
 Contents = Callable[[Path], dict[str, bytes]]

@@ -19,9 +19,9 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_refinement, read_status
+from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.results import Results
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.values import RigidTransform
 from tests.pipeline.runs import evaluated

@@ -24,8 +24,8 @@ from megloc_kapture.pipeline.datasets import (
     read_benchmark,
     twin_of,
 )
+from megloc_kapture.pipeline.evaluation_plan import choose_run
 from megloc_kapture.pipeline.presets import PRESETS, options_of_preset
-from megloc_kapture.pipeline.run import choose_run
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import DATASETS, RENDERED_DATASETS, DatasetAdapter, RenderedDataset
 from megloc_kapture.values import Camera, RigidTransform

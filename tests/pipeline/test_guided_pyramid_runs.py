@@ -12,8 +12,8 @@ import pytest
 from megloc_kapture import Camera, KaptureMap, Localizer
 from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.io.kapture import KaptureFolder, Sensor, write_sensors
+from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import RigidTransform
 from tests.pipeline.runs import errors, evaluated, recall, run_in

@@ -18,8 +18,8 @@ from megloc_kapture.io.kapture import (
     write_points3d,
 )
 from megloc_kapture.io.tables import read_status
+from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.workspace import Workspace
 from tests.pipeline.runs import evaluated, run_in
 
 pytestmark = pytest.mark.slow

@@ -14,8 +14,7 @@ from typing import Any
 import pytest
 
 from megloc_kapture.errors import DataError, OptionError, OutputError
-from megloc_kapture.pipeline.plan import StageReport, all_kept, describe, run_plan
-from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.pipeline.plan import StageReport, Workspace, all_kept, describe, run_plan
 from megloc_kapture.stages.stage import Stage, StageWork
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Options

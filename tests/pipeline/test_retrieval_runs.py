@@ -14,10 +14,10 @@ from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.nets.global_descriptors import VggNetVlad
+from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import Query
 from megloc_kapture.pipeline.query_folders import KaptureQueries
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.options import PipelineOptions
 from tests.pipeline.runs import evaluated, recall, run_in
 

@@ -12,9 +12,15 @@ from megloc_kapture.cli.main import main
 from megloc_kapture.errors import MeglocError
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.pipeline.datasets import DatasetChoice, find_benchmark
-from megloc_kapture.pipeline.evaluation_plan import StageLine, explain, explained, plan_evaluation
+from megloc_kapture.pipeline.evaluation_plan import (
+    Run,
+    StageLine,
+    choose_run,
+    explain,
+    explained,
+    plan_evaluation,
+)
 from megloc_kapture.pipeline.presets import check_weights, options_of_preset
-from megloc_kapture.pipeline.run import Run, choose_run
 
 MISSING = "3D-models/aachen_v_1_1/points3D.txt: missing"
 

@@ -35,8 +35,8 @@ from megloc_kapture.io.files import write_json_model
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.tables import write_status
 from megloc_kapture.pipeline.datasets import DatasetChoice
+from megloc_kapture.pipeline.evaluation_plan import Run
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.submission import (
     check_dataset,
     poses_through_rig,

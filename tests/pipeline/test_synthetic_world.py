@@ -12,7 +12,7 @@ import pytest
 from megloc_kapture.io.dataset_tables import read_groups
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
-from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.pipeline.plan import Workspace
 from tests.pipeline.runs import recall
 
 pytestmark = pytest.mark.slow

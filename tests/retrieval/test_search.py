@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.retrieval import search
-from megloc_kapture.retrieval.fusion import FusionOptions, fuse
-from megloc_kapture.retrieval.search import Found, FusedSearch
+from megloc_kapture.retrieval.search import Found, FusedSearch, FusionOptions, fuse
 
 
 def rank_fused(

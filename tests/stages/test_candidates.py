@@ -17,7 +17,7 @@ from megloc_kapture.io.kapture import (
     KaptureFolder,
     write_sensors,
 )
-from megloc_kapture.retrieval.fusion import FusionOptions, fuse
+from megloc_kapture.retrieval.search import FusionOptions, fuse
 from megloc_kapture.stages import candidates
 from megloc_kapture.stages.candidates import (
     UNRESTRICTED,

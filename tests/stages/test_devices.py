@@ -30,9 +30,8 @@ from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.plugin_loading import Placement, load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, POSE_RANKERS
-from megloc_kapture.stages import devices
+from megloc_kapture.stages import work as devices
 from megloc_kapture.stages import work as work_module
-from megloc_kapture.stages.devices import DeviceMemoryError, in_batches, is_out_of_memory
 from megloc_kapture.stages.local_features import (
     ExtractLocalFeatures,
     extract_all,
@@ -40,7 +39,7 @@ from megloc_kapture.stages.local_features import (
 )
 from megloc_kapture.stages.matches import MatchQueries, match_all, match_pairs
 from megloc_kapture.stages.stage import wanted_stages
-from megloc_kapture.stages.work import Work
+from megloc_kapture.stages.work import DeviceMemoryError, Work, in_batches, is_out_of_memory
 from megloc_kapture.values import ImageFeatures, LocalFeatures
 
 Image = NDArray[np.uint8]

@@ -14,7 +14,7 @@ from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.features.vlad import PcaWhitening, VladOptions, Vocabulary, aggregate
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.executors import single_threaded
-from megloc_kapture.stages import devices
+from megloc_kapture.stages import work as devices
 from megloc_kapture.stages.global_features import (
     MEAN_FILE,
     PROJECTION_FILE,

@@ -17,7 +17,7 @@ from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.io.kapture import KaptureFolder, write_observations, write_points3d
 from megloc_kapture.io.kapture.points import write_point_covariances
 from megloc_kapture.localization.map_index import MapIndex
-from megloc_kapture.stages.shared_index import (
+from megloc_kapture.stages.scene import (
     index_map,
     open_index,
     shared_index,

@@ -129,7 +129,7 @@ class StoredInliers:
     def _sources(self) -> list[tuple[FeatureReader, MatchesReader, MapIndex]]:
         # slow import
         from megloc_kapture.stages.query_poses import type_in_map
-        from megloc_kapture.stages.shared_index import index_map
+        from megloc_kapture.stages.scene import index_map
 
         sources: list[tuple[FeatureReader, MatchesReader, MapIndex]] = []
         queries, mapping = self.context.queries, self.context.mapping
