@@ -52,9 +52,7 @@ from megloc_kapture.stages.matches import check_given_poses, match_pairs
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.preprocessing import (
     PreprocessingOptions,
-    PreprocessingReport,
     preprocess_images,
-    read_report,
 )
 
 PREPROCESSED, FEATURES, MAP = "preprocessed", "features", "map"
@@ -296,10 +294,11 @@ class Preprocess(Linked, Computing, Working):
         source = self.kapture_map(self.input)
         sequences = [self.kapture(path) for path in existing(self.sequence)]
         with self.staged(self.output, PREPROCESSED, force=self.force) as (out, work):
-            preprocess_images(source, out, options, sequences=sequences, work=work)
-            report = read_report(out)
-        for line in () if report is None else report_lines(report):
-            console.say(line)
+            counts = preprocess_images(source, out, options, sequences=sequences, work=work)
+        console.say(f"{counts['images']} images, {counts['images_changed']} of them changed")
+        for source_of_masks, words in _SOURCES.items():
+            if (share := counts.get(f"masked_{source_of_masks}")) is not None:
+                console.say(f"masked by {words}: {100 * share:.2f} % of all pixels")
 
     def options(self) -> PreprocessingOptions:
         masks: dict[str, Any] = {
@@ -328,26 +327,3 @@ class Preprocess(Linked, Computing, Working):
             yield {"camera": camera, "polygon": [corner.split(",") for corner in value.split()]}
         for camera, value in assigned_pairs("--mask-file", self.mask_file, takes):
             yield {"camera": camera, "file": value}
-
-
-def report_lines(report: PreprocessingReport) -> list[str]:
-    """Format camera changes and the share of pixels masked by each source."""
-    lines = [f"{report.images} images, {report.images_changed} of them changed"]
-    changes: dict[str, int] = {}
-    for camera in report.cameras.values():
-        before, after = ("{} {}x{}".format(*row[:3]) for row in (camera.original, camera.processed))
-        change = before if camera.original == camera.processed else f"{before} -> {after}"
-        changes[change] = changes.get(change, 0) + 1
-    lines += [
-        f"{'cameras' if number > 1 else 'camera'}: {number} {change}"
-        for change, number in sorted(changes.items())
-    ]
-    lines += [f"remark: {remark}" for remark in report.remarks]
-    if report.images_masked:
-        lines.append(f"masks of {report.images_masked} images; share of all pixels masked:")
-        lines += [
-            f"  {_SOURCES[source]:24s}{100 * report.masked[source]:7.2f} %"
-            for source in _SOURCES
-            if source in report.masked
-        ]
-    return lines

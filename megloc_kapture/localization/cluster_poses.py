@@ -345,8 +345,7 @@ def poses_of_cameras(
 
     A camera without inliers fails, even though the rig has a pose.
     """
-    if rig.inliers is None:
-        raise ValueError("the inliers of the rig's pose are not known")
+    assert rig.inliers is not None
     cameras: list[Pose | Failure] = []
     end = 0
     for view, inliers in zip(views, problem.split(rig.inliers), strict=True):

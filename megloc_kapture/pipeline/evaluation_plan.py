@@ -6,7 +6,7 @@ import json
 import logging
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -211,27 +211,20 @@ def plan_evaluation(run: Run) -> list[Stage]:
     return stages
 
 
-@dataclass(frozen=True)
-class StageLine:
-    """A stage, its inclusion in a run, and the reason."""
-
-    name: str
-    on: bool
-    why: str
-
-
-def explain(options: PipelineOptions) -> list[StageLine]:
-    lines: dict[str, StageLine] = {}
+def explain(options: PipelineOptions) -> list[dict[str, Any]]:
+    """Return each stage's ``name``, ``on`` if the run includes it, and ``why``."""
+    rows: dict[str, dict[str, Any]] = {}
     for stage in (kind(options) for kind in PIPELINE):
-        if stage.is_wanted() or stage.name not in lines:  # alternative stages share a name
-            lines[stage.name] = StageLine(stage.name, stage.is_wanted(), stage.explain())
-    return list(lines.values())
+        on = stage.is_wanted()
+        if on or stage.name not in rows:  # alternative stages share a name
+            rows[stage.name] = {"name": stage.name, "on": on, "why": stage.explain()}
+    return list(rows.values())
 
 
-def explained(lines: Sequence[StageLine]) -> str:
-    width = max(len(line.name) for line in lines)
+def explained(rows: Sequence[Mapping[str, Any]]) -> str:
+    width = max(len(row["name"]) for row in rows)
     return "\n".join(
-        f"{line.name:{width}s}  {'on' if line.on else 'off':3s}  {line.why}" for line in lines
+        f"{row['name']:{width}s}  {'on' if row['on'] else 'off':3s}  {row['why']}" for row in rows
     )
 
 
@@ -285,10 +278,8 @@ class Render(_RunStage):
         return self._run.source.render_options()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        twin = self._run.source.twin
-        if twin is None:
-            raise ValueError(f"dataset {self._run.dataset} is given, not rendered")
-        return twin.write(work.out / WORLD, work)
+        assert self._run.source.twin is not None
+        return self._run.source.twin.write(work.out / WORLD, work)
 
 
 class Import(_RunStage):
@@ -366,7 +357,7 @@ class Evaluate(_RunStage):
     writes = (EVALUATION,)
 
     def settings(self) -> dict[str, Any]:
-        steps = list(map(asdict, explain(self.options)))
+        steps = explain(self.options)
         return {**self._run.provenance(), "steps": steps, PROTOCOL: self._protocol()}
 
     def run(self, work: StageWork) -> Mapping[str, float]:

@@ -173,12 +173,6 @@ class LocalType:
         stored = keypoints.keypoints_px(image)
         source = self if keypoints is self.first else keypoints
         descriptors = source.descriptors(image)
-        if len(stored) != len(descriptors):
-            raise DataError(
-                f"{image} has {len(stored)} keypoints and {len(descriptors)} descriptors of type "
-                f"{keypoints.name!r}",
-                path=self._map.folder.root,
-            )
         # keypoints without a point help no pose, but reject wrong matches in the mutual check
         return Features.of(self._map.camera(image), stored, descriptors)
 

@@ -18,7 +18,7 @@ from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
-from megloc_kapture.pipeline.live_source import LiveSource, MapMatching, MapRetrieval
+from megloc_kapture.pipeline.live_source import LiveSource, MapMatching
 from megloc_kapture.pipeline.local_types import local_types_of
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import (
@@ -82,8 +82,7 @@ class Localizer:
         self.types = local_types_of(kapture_map, self.options, FeatureCache())
         for local in self.types:
             local.prepare()
-        retrieval = MapRetrieval(kapture_map, self.options, self.types, self._preprocessor)
-        self.matching = MapMatching(kapture_map, self.options, self.types, retrieval)
+        self.matching = MapMatching(kapture_map, self.options, self.types, self._preprocessor)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _made_again, (self._key, *self.map.__reduce__(), self.options.model_dump_json())
@@ -249,7 +248,7 @@ class Localizer:
         options = self.options.query_pairs
         if options.by == "exhaustive" or len(self.map.images) <= options.top_k:
             return f"all {len(self.map.images)} map images"
-        return self.matching.retrieval.describe(global_types)
+        return self.matching.describe(global_types)
 
 
 def _query_of(image: Path | str | NDArray[np.uint8], camera: Camera) -> Query:

@@ -22,10 +22,10 @@ from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.io.files import (
     clear_leftovers,
     clear_temporary,
-    output_error,
     read_json_model,
     remove,
     write_json_model,
+    writing,
 )
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import claim_folder, replace_directory
@@ -89,10 +89,8 @@ class Workspace:
         that has no stage.
         """
         path = self.root / LOCK
-        try:
+        with writing(path):
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        except OSError as error:
-            raise output_error(path, error) from error
         try:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -134,12 +132,10 @@ class Workspace:
         Reuses the finished items of an interrupted run with the same fingerprint (``mark``).
         """
         place = self.partial_path(stage)
-        try:
+        with writing(place):
             if not is_resumable(place / FINISHED, mark):
                 remove(place)
             place.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise output_error(place, error) from error
         done = False
         try:
             yield place
@@ -151,12 +147,10 @@ class Workspace:
 
     def publish(self, staging: Path, outputs: tuple[str, ...]) -> None:
         """Move a stage's outputs into place and remove old ones that were not written."""
-        if not staging.is_dir():
-            raise OutputError(f"{self.root}: was deleted or moved while a run was working in it")
         self._published = True
         for output in outputs:
             new, place = staging / output, self.root / output
-            try:
+            with writing(place):
                 place.parent.mkdir(parents=True, exist_ok=True)
                 if new.is_dir():
                     replace_directory(new, place)
@@ -164,16 +158,12 @@ class Workspace:
                     os.replace(new, place)
                 else:
                     remove(place)
-            except OSError as error:
-                raise output_error(place, error) from error
 
     def remove(self, outputs: Iterable[str]) -> None:
         for output in outputs:
             place = self.root / output
-            try:
+            with writing(place):
                 remove(place)
-            except OSError as error:
-                raise output_error(place, error) from error
 
 
 class Manifest(Options):

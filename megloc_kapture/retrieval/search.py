@@ -39,8 +39,6 @@ VectorSource = VectorBlocks | NDArray[np.floating[Any]]
 
 class ArrayBlocks:
     def __init__(self, rows: NDArray[np.floating[Any]]) -> None:
-        if rows.ndim != 2:
-            raise DataError(f"global descriptors {rows.shape} are of different dimensions")
         self._rows = rows
 
     def __len__(self) -> int:
@@ -127,8 +125,6 @@ def _search(
     sources = [as_blocks(source) for source in database]
     vectors = [_checked(rows, source) for rows, source in zip(queries, sources, strict=True)]
     num_queries, num_rows = len(vectors[0]), common_length(sources)
-    if any(len(rows) != num_queries for rows in vectors):
-        raise DataError(f"features of {', '.join(str(len(rows)) for rows in vectors)} queries")
     step = _VECTOR_ELEMENTS // max(1, *(source.dimension for source in sources))
     step = max(1, min(step, _MOST_ROWS, _BLOCK_ELEMENTS))
     at_once = min(max(1, _BLOCK_ELEMENTS // step), num_queries)

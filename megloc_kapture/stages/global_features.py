@@ -125,8 +125,7 @@ def _aggregate(
 def _read_once(folder: Path, run: tuple[object, ...]) -> tuple[Vocabulary, VladSettings]:
     """Read a vocabulary once per process, as it may be too large to send with every image."""
     found = read_vocabulary(folder)
-    if found is None:
-        raise DataError("the vocabulary is gone", path=folder / VOCABULARY_FILE)
+    assert found is not None
     return found
 
 
@@ -148,20 +147,10 @@ def read_vocabulary(folder: Path) -> tuple[Vocabulary, VladSettings] | None:
         return None
     settings = read_json_model(folder / SETTINGS_FILE, VladSettings)
     centres = _read_array(path, "vocabulary")
-    if centres.ndim == 2:  # older format with a single vocabulary
-        centres = centres[None]
-    if centres.ndim != 3:
-        raise DataError(f"not a vocabulary: {centres.shape}", path=path)
     if settings.options.dimensions is None:
         return Vocabulary(centres), settings
     mean = _read_array(folder / MEAN_FILE, "whitening")
     projection = _read_array(folder / PROJECTION_FILE, "whitening")
-    if mean.shape != (centres.size,) or projection.shape[1:] != mean.shape:
-        raise DataError(
-            f"mean {mean.shape} and projection {projection.shape} do not fit the vocabulary "
-            f"{centres.shape}",
-            path=folder / PROJECTION_FILE,
-        )
     return Vocabulary(centres, PcaWhitening(mean, projection)), settings
 
 
@@ -269,7 +258,7 @@ def describe_images(
 
     def describe(batch: Sequence[NDArray[np.uint8]]) -> list[Any]:
         found = many.describe_many(batch) if len(batch) > 1 else [extractor.describe(batch[0])]
-        return list(_checked(extractor, found, len(batch), names[0]))
+        return _checked(extractor, found, names[0])
 
     bounded = [bounded_image(image) for image in images]
     return np.stack(
@@ -283,16 +272,11 @@ def describe_images(
     )
 
 
-def _checked(
-    extractor: GlobalFeatureExtractor, found: Any, count: int, label: str
-) -> NDArray[np.float32]:
+def _checked(extractor: GlobalFeatureExtractor, found: Any, label: str) -> list[NDArray[Any]]:
     who = f"plugin {extractor.name!r} on image {label}"
-    if len(found) != count:
-        raise PluginError(f"{who}: {len(found)} vectors for {count} images")
-    size = len(checked_array(who, found[0], (None,), "float32"))
-    vectors = np.stack([checked_array(who, vector, (size,), "float32") for vector in found])
-    norms = np.linalg.norm(vectors, axis=1)
-    if np.abs(norms - 1.0).max() > 1e-3:
+    vectors = [checked_array(who, vector, (None,), "float32") for vector in found]
+    norms = np.array([np.linalg.norm(vector) for vector in vectors])
+    if np.abs(norms - 1.0).max(initial=0) > 1e-3:
         raise PluginError(f"{who}: a vector of length {norms.max():.4g}, expected 1")
     return vectors
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import focal_px
-from megloc_kapture.io.files import atomic_write, output_error, owned_name, write_bytes
+from megloc_kapture.io.files import atomic_write, owned_name, write_bytes, writing
 from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Observations
 from megloc_kapture.io.kapture.points import read_point_covariances
@@ -111,11 +111,8 @@ def write_index(index: MapIndex, folder: Path) -> None:
 
 
 def open_index(folder: Path) -> MapIndex:
-    try:
-        names, images, others = json.loads((folder / "index.json").read_bytes())
-        files = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in names}
-    except (OSError, ValueError) as error:
-        raise DataError(f"cannot read a map's index: {error}", path=folder) from error
+    names, images, others = json.loads((folder / "index.json").read_bytes())
+    files = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in names}
     # compiled loops need plain arrays
     arrays: dict[str, Any] = {name: np.asarray(array) for name, array in files.items()}
     rows = {name: row for row, name in enumerate(images)}
@@ -128,12 +125,10 @@ def shared_index(
 ) -> Iterator[dict[str, Path]]:
     """Share indices by keypoints type as temporary folders; open indices stay valid afterwards."""
     where = tempfile.gettempdir() if scratch is None else scratch
-    try:
+    with writing(where):
         place = tempfile.TemporaryDirectory(
             prefix=f".{owned_name()}", dir=where, ignore_cleanup_errors=True
         )
-    except OSError as error:
-        raise output_error(where, error) from error
     with place as name:
         folders = {}
         for number, (keypoints_type, index) in enumerate(indices.items()):

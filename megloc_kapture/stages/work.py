@@ -16,11 +16,11 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import chain, groupby, islice
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 from uuid import uuid4
 
 from megloc_kapture.errors import MeglocError, PluginError
-from megloc_kapture.io.files import output_error
+from megloc_kapture.io.files import writing
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugin_loading import AUTO, Placement
 
@@ -143,13 +143,10 @@ class FinishedItems:
         return {name: values for (of, name), values in self._found.items() if of == kind}
 
     def add(self, kind: str, name: str, values: Any) -> None:
-        try:
-            with open(self._path, "a", encoding="utf-8") as file:
-                if file.tell() == 0:
-                    file.write(f"{self._fingerprint}\n")
-                file.write(json.dumps([kind, name, values]) + "\n")
-        except OSError as error:
-            raise output_error(self._path, error) from error
+        with writing(self._path), open(self._path, "a", encoding="utf-8") as file:
+            if file.tell() == 0:
+                file.write(f"{self._fingerprint}\n")
+            file.write(json.dumps([kind, name, values]) + "\n")
 
 
 def is_resumable(path: Path, fingerprint: str) -> bool:
@@ -178,10 +175,8 @@ class Items:
 _READERS = 4  # threads that read ahead for a GPU
 
 
-class Track(Protocol):
-    """Progress display: yields the items unchanged."""
-
-    def __call__(self, items: Iterable[Item], total: int, label: str) -> Iterator[Item]: ...
+Track = Callable[[Iterable[Any], int, str], Iterator[Any]]
+"""Progress display of items, their number and a label; yields the items unchanged."""
 
 
 def untracked(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:

@@ -140,12 +140,9 @@ def test_too_few_matches_fail_and_are_counted(localizer: Localizer, queries: lis
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (np.zeros((10, 10, 3), np.uint8), "the image is 10x10, its camera says 400x300"),
-        (
-            np.zeros((300, 400), np.uint8),
-            r"an image is uint8 \(H, W, 3\), got uint8 \(300, 400",
-        ),
-        (np.zeros((300, 400, 3)), r"an image is uint8 \(H, W, 3\), got float64"),
+        (np.zeros((10, 10, 3), np.uint8), r"is uint8 \(300, 400, 3\), got uint8 \(10, 10, 3\)"),
+        (np.zeros((300, 400), np.uint8), r"is uint8 \(300, 400, 3\), got uint8 \(300, 400\)"),
+        (np.zeros((300, 400, 3)), r"is uint8 \(300, 400, 3\), got float64"),
         ("nowhere.jpg", "nowhere.jpg: no such image"),
         (Path(__file__), "test_localizer.py: not an image"),
     ],
