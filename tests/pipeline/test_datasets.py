@@ -216,7 +216,6 @@ def test_a_benchmark_changes_what_it_names_of_a_protocol() -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, "b.toml: cannot be read: No such file"),
         (b"dataset = ", "b.toml: not TOML: "),
         (b"\xff\xfe", "b.toml: not TOML: "),
         (b"", "b.toml: dataset: "),
