@@ -43,7 +43,13 @@ from megloc_kapture.plugins import (
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.given_map import copy_features
 from megloc_kapture.stages.local_features import read_frame
-from megloc_kapture.stages.scene import depth_records, index_map, with_noise, write_array
+from megloc_kapture.stages.scene import (
+    check_points,
+    depth_records,
+    index_map,
+    with_noise,
+    write_array,
+)
 from megloc_kapture.stages.stage import MAP, Layout, PipelineStage, StageWork
 from megloc_kapture.stages.stereo_depth import (
     DEPTH_FILE,
@@ -171,12 +177,7 @@ def densify_map(
 
 
 def _check(source: KaptureFolder, data: KaptureData) -> None:
-    if not source.has_points():
-        raise DataError(
-            "no map to densify: depth is looked for around its points (reconstruction/points3d.txt "
-            "and observations.txt); triangulate first",
-            path=source.root,
-        )
+    check_points(source, "densify")
     if (source.root / "sensors" / "records_data" / FOLDER).exists():
         raise DataError(f"has images or depth maps in records_data/{FOLDER}", path=source.root)
     if any(f"{sensor}_mvs" in data.sensors for sensor in data.sensors):

@@ -21,7 +21,7 @@ from megloc_kapture.features.image_bound import (
     max_megapixels_of,
 )
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
+from megloc_kapture.io.kapture import FeatureConfig, FeatureReader, FeatureWriter, KaptureFolder
 from megloc_kapture.io.tables import write_mask_counts
 from megloc_kapture.plugin_loading import checked_array
 from megloc_kapture.plugins import LocalFeatureExtractor
@@ -127,6 +127,15 @@ def _extract(
 
 def mask_path(folder: KaptureFolder, image: str) -> Path:
     return folder.root / "sensors" / "masks" / f"{image}.png"
+
+
+def check_lengths(keypoints: FeatureReader, descriptors: FeatureReader, image: str) -> None:
+    """Raise DataError if an image has different numbers of descriptors and keypoints."""
+    expected, found = keypoints.length(image), descriptors.length(image)
+    if found != expected:
+        raise DataError(
+            f"{found} descriptors for {expected} keypoints", path=descriptors.where(image)
+        )
 
 
 def read_frame(folder: KaptureFolder, image: str, *, margin_px: float = 0.0) -> Frame:

@@ -32,6 +32,16 @@ _ARRAYS = ("xyz", "offsets", "keypoint_ids", "point_ids", "covariances")
 _SAMPLED_IMAGES = 32
 
 
+def check_points(folder: KaptureFolder, purpose: str) -> None:
+    """Raise DataError if a folder has no map points for a purpose, such as ``localize in``."""
+    if not folder.has_points():
+        raise DataError(
+            f"no map to {purpose}: reconstruction/points3d.txt or observations.txt is missing; "
+            "`megloc triangulate` makes one from images with poses",
+            path=folder.root,
+        )
+
+
 def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
     """Read points, uncertainties and observations of one keypoints type.
 

@@ -193,7 +193,7 @@ def test_images_that_have_depth_keep_it(densified: KaptureFolder, tmp_path: Path
 def test_what_cannot_be_densified_is_refused_with_its_name(
     world: Any, densified: KaptureFolder, tmp_path: Path
 ) -> None:
-    with pytest.raises(DataError, match="no map to densify.*triangulate first") as refused:
+    with pytest.raises(DataError, match="no map to densify.*megloc triangulate") as refused:
         densify_map(world.mapping(), tmp_path / "a", OPTIONS)
     assert str(world.mapping().root) in str(refused.value)
     with pytest.raises(DataError, match="records_data/mvs"):
