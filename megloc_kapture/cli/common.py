@@ -306,6 +306,12 @@ class Choosing(Computing):
     def assignments(self) -> tuple[str, ...]:
         return (*self.set, *self.placed())
 
+    def placement(self) -> Placement:
+        from megloc_kapture.pipeline.presets import assigned  # slow import
+
+        chosen = assigned(self.assignments())
+        return Placement(chosen.get("device", "auto"), chosen.get("precision") == "half")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Deciding(Choosing):

@@ -38,7 +38,6 @@ from megloc_kapture.matching.verification import KnownPoseOptions
 from megloc_kapture.pipeline.plan import Workspace, run_plan
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
 from megloc_kapture.plugin_loading import (
-    Placement,
     load_chosen,
     load_plugin,
     option_fault,
@@ -75,9 +74,6 @@ class StageCommand(Choosing, Working):
             changes=[changes or {}, assigned(self.placed())],
             assignments=self.set,
         )
-
-    def placement(self) -> Placement:
-        return self.options().placement
 
     def named(self, key: str, names: Sequence[str]) -> dict[str, object]:
         """Return changes that select plugins by name, with the preset's settings for them."""
