@@ -310,7 +310,7 @@ class PoseRefinement:
 Fallback = Literal["none", "retrieval", "rig"]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class LocalizationResult:
     """Outcome of localizing one query: a :class:`Pose` or a :class:`Failure`.
 

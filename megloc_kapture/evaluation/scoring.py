@@ -50,7 +50,7 @@ _COLUMNS = {
 }
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class QueryResult(LocalizationResult):
     """Result of one query against its true pose; the pose includes fallbacks.
 

@@ -72,7 +72,8 @@ def make_world(num_queries: int = 40, seed: int = 0) -> World:
             world.estimated[name] = displaced(world.truth[name], shift, 5 * error)
             inliers = int(rng.integers(12, 250))
             told = {"num_matches": 300, "num_inliers": inliers}
-        world.statuses[name] = LocalizationResult(name=name, **told)
+        counts = {"num_matches": 0, "num_inliers": 0}
+        world.statuses[name] = LocalizationResult(name=name, **counts | told)
     return world
 
 

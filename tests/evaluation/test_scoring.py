@@ -111,9 +111,9 @@ def test_statuses_tell_fallback_and_reason() -> None:
     evaluation = evaluate_poses({"a": HERE, "b": HERE}, truth, statuses=statuses)
     assert [(q.outcome, q.reason, q.num_inliers) for q in evaluation.queries] == [
         ("localized", "", 5),
-        ("fallback", "dark", 0),
-        ("missing", "blurred", 0),
-        ("missing", "status says localized, but the result has no pose", 0),
+        ("fallback", "dark", None),
+        ("missing", "blurred", None),
+        ("missing", "status says localized, but the result has no pose", None),
         ("missing", "no pose in the result", None),
     ]
 

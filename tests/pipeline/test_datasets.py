@@ -224,11 +224,8 @@ def test_a_benchmark_changes_what_it_names_of_a_protocol() -> None:
         (b'dataset = "x"\n[presets.megloc]\nset = 1\n', "b.toml: presets.megloc.set: "),
     ],
 )
-def test_a_broken_benchmark_file_is_named(
-    tmp_path: Path, content: bytes | None, message: str
-) -> None:
-    if content is not None:
-        (tmp_path / "b.toml").write_bytes(content)
+def test_a_broken_benchmark_file_is_named(tmp_path: Path, content: bytes, message: str) -> None:
+    (tmp_path / "b.toml").write_bytes(content)
     with pytest.raises(DataError, match=message):
         read_benchmark(tmp_path / "b.toml")
 

@@ -82,7 +82,7 @@ class Chosen(PoseRefinementOptions):
 
     refiners: tuple[Any, ...] = ()
 
-    def make_refiners(self) -> list[Any]:
+    def make_refiners(self, placement: Any = None) -> list[Any]:
         return list(self.refiners)
 
 

@@ -85,7 +85,7 @@ class Brightness:
 
 
 def test_a_ranker_sees_poses_and_images(world: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(LocalizationOptions, "make_ranker", lambda _: Brightness())
+    monkeypatch.setattr(LocalizationOptions, "make_ranker", lambda *_: Brightness())
     for result in world.localized():
         pixels = read_image_rgb(world.query().image_path(result.name))
         assert result.clusters[0].score == pytest.approx(pixels.mean())
