@@ -99,7 +99,7 @@ class DensifyOptions(Options):
 
 @dataclass(frozen=True)
 class StereoFit:
-    """What stereo of a map can confirm, given the accuracy of its poses.
+    """Limits of stereo in a map, given the accuracy of its poses.
 
     Attributes
     ----------
@@ -246,7 +246,7 @@ def _plan(
     for row, image in enumerate(images):
         blank = DepthRow(image, (), 0.0, 0.0, 0.0, "")
         if image in has_depth:
-            rows.append(replace(blank, reason="has depth of its own"))
+            rows.append(replace(blank, reason="already has depth"))
             continue
         if not source.image_path(image).is_file():
             rows.append(replace(blank, reason="there is no image file"))
@@ -360,7 +360,7 @@ def _scratch(job: _Job, image: str, kind: str) -> Path:
 
 
 class Densify(PipelineStage):
-    """Estimate depth of the map's images that have none."""
+    """Estimate the missing depth of the map's images."""
 
     name = "densify"
     version = 4

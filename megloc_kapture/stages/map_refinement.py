@@ -445,7 +445,7 @@ def _reject_uncertain(selection: MapSelection, max_robust_sigmas: float) -> None
 
 
 class RefineMap(PipelineStage):
-    """Take out of the map what its images or their depth contradict, and what is uncertain."""
+    """Remove points that the images or their depth contradict, and uncertain points."""
 
     name = "map"
     version = 3

@@ -75,7 +75,7 @@ class PipelineOptions(Options):
     query_pairs: QueryPairsOptions = QueryPairsOptions()
     reranking: RerankingOptions = RerankingOptions()
     matching: PluginChoice = Field(
-        default=PluginChoice(name="nn"), description="of types that name no matcher of their own"
+        default=PluginChoice(name="nn"), description="of types that name no other matcher"
     )
     verification: Literal["geometric", "mapping", "none"] = Field(
         default="geometric",

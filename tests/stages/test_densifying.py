@@ -184,7 +184,7 @@ def test_images_that_have_depth_keep_it(densified: KaptureFolder, tmp_path: Path
     counts = densify_map(KaptureFolder(kept), tmp_path / "out", OPTIONS)
     assert counts["images_with_depth"] == 4
     rows = {row.image: row for row in read_depth_rows(tmp_path / "out" / DEPTH_FILE)}
-    assert rows[first].reason == "has depth of its own"
+    assert rows[first].reason == "already has depth"
     out = KaptureFolder(tmp_path / "out")
     found = depth_records(out.read())[first]
     assert found.path == "own.depth" and read_depth(out, found).any()
