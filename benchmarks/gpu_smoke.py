@@ -42,8 +42,7 @@ from megloc_kapture.matching.networks import LightGlue, SuperGlue
 from megloc_kapture.nets.runtime import has_bfloat16
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.preprocessing.deeplab import DeepLab
-from megloc_kapture.stages.devices import DeviceMemoryError, in_batches
-from megloc_kapture.stages.work import Work
+from megloc_kapture.stages.work import DeviceMemoryError, Work, in_batches
 from megloc_kapture.training.train import TrainingData, TrainingOptions, train
 from megloc_kapture.values import ImageFeatures, LocalFeatures
 

@@ -34,6 +34,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import pandas
 from whole_preset_artefacts import artefacts
 from whole_preset_scene import (
     FREE_SCENE,
@@ -45,7 +46,7 @@ from whole_preset_scene import (
 from whole_preset_weights import write_random_weights
 
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
-from megloc_kapture.io.tables import STATUS_FILE, read_status
+from megloc_kapture.io.tables import STATUS_FILE
 
 sys.path.append(str(Path(__file__).resolve().parent / "speed"))
 from timing import table, timed_command  # noqa: E402
@@ -217,9 +218,9 @@ def refine_displaced(workspace: Path, megloc: Megloc, arguments: Sequence[str] =
 def reasons(localized: Path, title: str) -> str:
     """What ``status.csv`` says, without figures, and of how many queries."""
     told: Counter[str] = Counter()
-    for status in read_status(localized / STATUS_FILE).values():
-        said = [status.reason or status.status]
-        said += status.refinement.split("; ") if status.refinement else []
+    for row in pandas.read_csv(localized / STATUS_FILE, keep_default_na=False).itertuples():
+        said = [row.reason or row.status]
+        said += row.refinement.split("; ") if row.refinement else []
         told.update(_FIGURE.sub("#", text) for text in said)
     return table([(title, "queries"), *((text, str(n)) for text, n in told.most_common())])
 

@@ -21,7 +21,7 @@ from kapture.io.features import (
 )
 
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
-from megloc_kapture.pipeline.workspace import read_manifest
+from megloc_kapture.pipeline.plan import read_manifest
 
 # path of the artefact -> what is in it, in words; raises where it cannot be read
 Reader = Callable[[Path], str]

@@ -27,8 +27,8 @@ from megloc_twins.synthetic_kapture import (
 
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.io.tables import STATUS_FILE, QueryStatus, write_status
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.io.tables import STATUS_FILE, write_status
+from megloc_kapture.values import LocalizationResult, RigidTransform
 
 _STEP_M = 0.3  # to the side, between the images of a stop
 _BESIDE_M = (-0.15, 0.05, 0.0)  # of a query that is taken beside a map image, in its frame
@@ -158,7 +158,5 @@ def write_displaced_truth(query: KaptureFolder, truth: KaptureFolder, output: Pa
     data.records_depth.clear()
     write_sensors(output, data)
     link_images(query.root, output)
-    write_status(
-        output / STATUS_FILE, [QueryStatus(image=name, status="localized") for name in poses]
-    )
+    write_status(output / STATUS_FILE, [LocalizationResult(name=name) for name in poses])
     return len(poses)

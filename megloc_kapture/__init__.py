@@ -24,9 +24,18 @@ if sys.platform == "win32":
 
 if TYPE_CHECKING:
     __version__: str
-    from megloc_kapture.api import Map, build_map, map_photographs, open_map, run
+    from megloc_kapture.api import (
+        Map,
+        build_map,
+        extract,
+        map_photographs,
+        match,
+        open_map,
+        run,
+        solve_pose,
+        train,
+    )
     from megloc_kapture.evaluation.evaluate import evaluate
-    from megloc_kapture.parts import extract, match, solve_pose, train
     from megloc_kapture.pipeline.export import export
     from megloc_kapture.pipeline.kapture_map import KaptureMap
     from megloc_kapture.pipeline.localizer import Localizer
@@ -76,13 +85,13 @@ _LAZY = {
     "build_map": "megloc_kapture.api",
     "evaluate": "megloc_kapture.evaluation.evaluate",
     "export": "megloc_kapture.pipeline.export",
-    "extract": "megloc_kapture.parts",
+    "extract": "megloc_kapture.api",
     "map_photographs": "megloc_kapture.api",
-    "match": "megloc_kapture.parts",
+    "match": "megloc_kapture.api",
     "open_map": "megloc_kapture.api",
     "run": "megloc_kapture.api",
-    "solve_pose": "megloc_kapture.parts",
-    "train": "megloc_kapture.parts",
+    "solve_pose": "megloc_kapture.api",
+    "train": "megloc_kapture.api",
 }
 
 

@@ -17,20 +17,23 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, suggestion
 from megloc_kapture.evaluation.metrics import Threshold
 from megloc_kapture.evaluation.report.reports import REPORT_HTML
+from megloc_kapture.features.image_bound import extract_bounded
 from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.images import (
     guessed_camera,
     photo_of,
     pillow_pixels,
+    read_image_rgb,
     read_photo,
     turned_upright,
 )
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, recall_rows
+from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absolute_pose
+from megloc_kapture.pipeline.evaluation_plan import choose_run, plan_evaluation, recall_rows
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
 from megloc_kapture.pipeline.localizer import Localizer
@@ -41,21 +44,22 @@ from megloc_kapture.pipeline.map_making import (
     plan_photographs,
     structure_options,
 )
-from megloc_kapture.pipeline.plan import run_plan
-from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.plan import Workspace, run_plan
+from megloc_kapture.pipeline.presets import options_of_preset, options_with
 from megloc_kapture.pipeline.queries import Query
 from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.pipeline.results import Results
-from megloc_kapture.pipeline.run import choose_run
-from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.stage import EVALUATION, LOCALIZED, MAP, Stage
 from megloc_kapture.stages.work import Work
-from megloc_kapture.values import Camera, Failure, Pose
+from megloc_kapture.values import Camera, Failure, ImageFeatures, Pose
 
 if TYPE_CHECKING:
     import pandas as pd
     from PIL import Image
+
 
 Changes = Mapping[str, Any]
 # not Sequence, which includes str
@@ -191,18 +195,16 @@ class Map:
         many: KaptureFolder | Photographs
         if isinstance(query, KaptureFolder):
             if camera is not None:
-                raise OptionError(f"{query.root}: a kapture folder has cameras of its own")
+                raise OptionError(f"{query.root}: a kapture folder already has cameras")
             many = query
         elif isinstance(query, list | tuple):
             many = Photographs([Path(path) for path in query], camera)
         elif isinstance(query, Path) and query.is_dir():
             many = Photographs([query], camera)
         else:
-            if workers != 1:
-                raise OptionError("workers: one image is localized by one thread")
             return localizer.localize_query(_query_of(query, camera, prior))
         if prior is not None:
-            raise OptionError("prior is of one image; a kapture dataset's stand in its tables")
+            raise OptionError("prior is for one image; a dataset has priors in its tables")
         return Results(localizer, many, workers=workers)
 
 
@@ -427,3 +429,87 @@ def run(
     made = _run(plan_evaluation(chosen), place, workers, scheduler)
     pose_file = chosen.submission_below(made.root, made.path(SIDE_TABLES))
     return FinishedRun(made.root, pose_file, chosen.options)
+
+
+def extract(features: str, image: Path | str | NDArray[np.uint8], **options: Any) -> ImageFeatures:
+    """Extract local features of an image by the name of the extractor.
+
+    ``image`` is an image file or uint8 (H, W, 3) RGB; ``options`` are the extractor's. PluginError
+    or MissingWeightsError if the extractor cannot be loaded.
+    """
+    pixels = image if isinstance(image, np.ndarray) else read_image_rgb(Path(image))
+    found = extract_bounded(load_plugin(LOCAL_FEATURES, features, options), [(pixels, None)])[0]
+    height, width = pixels.shape[:2]
+    return ImageFeatures(found.keypoints_px, found.descriptors, width, height)
+
+
+def match(
+    matcher: str, first: ImageFeatures, second: ImageFeatures, **options: Any
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Match two images by the name of a matcher: int64 (K, 2) rows, and scores (K,).
+
+    PluginError or MissingWeightsError if the matcher cannot be loaded.
+    """
+    found: tuple[NDArray[np.int64], NDArray[np.float32]]
+    found = load_plugin(MATCHERS, matcher, options).match(first, second)
+    return found
+
+
+def solve_pose(
+    points_px: NDArray[Any],
+    points_world: NDArray[Any],
+    camera: Camera,
+    *,
+    max_error_px: float = 12.0,
+    min_inliers: int = 12,
+    seed: int = 0,
+) -> Pose | Failure:
+    """Estimate one image's pose from 2D-3D matches: LO-RANSAC, then refinement with covariance.
+
+    Parameters
+    ----------
+    points_px : (N, 2), first pixel's centre at (0.5, 0.5).
+    points_world : (N, 3).
+    max_error_px : inlier threshold of the reprojection error.
+    """
+    options = AbsolutePoseOptions(max_error_px=max_error_px, min_inliers=min_inliers, seed=seed)
+    return absolute_pose(points_px, np.asarray(points_world, np.float64), camera, options)
+
+
+def train(
+    task: str,
+    output: Path | str,
+    *,
+    kaptures: Sequence[Path | str] = (),
+    photographs: Sequence[Path | str] = (),
+    held_out: Sequence[Path | str] = (),
+    features: str = "superpoint",
+    set: Mapping[str, Any] | None = None,
+    threads: int = 1,
+    force: bool = False,
+) -> dict[str, float]:
+    """Train SuperGlue or descriptors as ``megloc train`` does; an interrupted run is resumed.
+
+    Returns the last row of the training curves by column.
+
+    Parameters
+    ----------
+    task : "matcher" or "descriptor".
+    output : ``X.safetensors``; for further files see :func:`megloc_kapture.training.train.train`.
+    kaptures, held_out : kapture folders with poses and depth, for training and for evaluation.
+    photographs : folders of images, for training with random homographies.
+    features : extractor of the matched features, or of the frozen detector.
+    set : options, ``{"steps": 20000}``.
+    """
+    from megloc_kapture.training.train import TASKS, TrainingData
+    from megloc_kapture.training.train import train as run_training
+
+    if task not in TASKS:
+        raise OptionError(f"unknown task {task!r}; {suggestion(task, TASKS)}")
+    options = options_with(TASKS[task], set or {}, {"features.name": features})
+    data = TrainingData(
+        [KaptureFolder(path) for path in kaptures],
+        [Path(path) for path in photographs],
+        [KaptureFolder(path) for path in held_out],
+    )
+    return run_training(options, data, Path(output), force=force, threads=threads)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import sys
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,17 +15,38 @@ from pydantic import ValidationError
 from megloc_kapture.errors import MeglocError, PluginError, missing_extra, suggestion
 from megloc_kapture.plugin_names import entry_points
 from megloc_kapture.plugin_names import plugin_names as plugin_names
-from megloc_kapture.plugins import PROTOCOLS
-from megloc_kapture.values import Options
+from megloc_kapture.plugins import PROTOCOLS, PluginChoice
+from megloc_kapture.values import Device, Options
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-def load_plugin(group: str, name: str, options: dict[str, Any] | None = None) -> Any:
+@dataclass(frozen=True)
+class Placement:
+    """Device and precision of networks whose own options name none; part of a run's context."""
+
+    device: Device = "auto"
+    half_precision: bool = False
+
+
+AUTO = Placement()
+
+
+def load_chosen(group: str, chosen: PluginChoice, placement: Placement = AUTO) -> Any:
+    return load_plugin(group, chosen.name, chosen.options, placement)
+
+
+def load_plugin(
+    group: str, name: str, options: dict[str, Any] | None = None, placement: Placement = AUTO
+) -> Any:
     """Make the plugin ``name`` of ``group``, with its options; PluginError if impossible."""
     kind = plugin_class(group, name)
     model: Any = getattr(kind, "Options", None)
+    wanted = {key: value for key, value in vars(placement).items() if value != getattr(AUTO, key)}
+    if model is not None:
+        known = {key: value for key, value in wanted.items() if key in model.model_fields}
+        options = {**known, **(options or {})}
     try:
         if model is None:
             if options:
@@ -101,15 +123,6 @@ def plugin_class(group: str, name: str) -> Any:
 
 
 @cache
-def option_models(name: str) -> tuple[type[Options], ...]:
-    """Return the option models of the plugins of a name, of any group."""
-    named = entry_points(name=name)
-    groups = sorted({one.group for one in named} & PROTOCOLS.keys())
-    models = [getattr(plugin_class(group, name), "Options", None) for group in groups]
-    return tuple(model for model in models if model is not None)
-
-
-@cache
 def code_of(kind: type) -> str:
     """Return package version and code hash of a class.
 
@@ -132,6 +145,11 @@ def code_of(kind: type) -> str:
 
 def is_ours(kind: type) -> bool:
     return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
+
+
+def has_precision(plugin: object) -> bool:
+    """Return whether a plugin computes by a network, alone or by plugins of its choice."""
+    return hasattr(getattr(plugin, "options", None), "half_precision")
 
 
 def weights_of(plugin: object) -> dict[str, str]:

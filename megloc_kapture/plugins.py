@@ -9,7 +9,7 @@ part of a stage's fingerprint and manifest.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -19,6 +19,7 @@ from pydantic import Field, model_validator
 
 from megloc_kapture.plugin_names import STAGES as STAGES
 from megloc_kapture.values import Camera, ImageFeatures, LocalFeatures, Options, RigidTransform
+from megloc_kapture.values import PoseRefinement as PoseRefinement
 
 LOCAL_FEATURES = "megloc_kapture.local_features"
 MATCHERS = "megloc_kapture.matchers"
@@ -296,28 +297,6 @@ class ImageDistance(Protocol):
         Lower is more similar; infinite for too few valid pixels.
         """
         ...
-
-
-@dataclass(frozen=True, eq=False)
-class PoseRefinement:
-    """Result of a pose refinement.
-
-    Attributes
-    ----------
-    cam_from_world : the refined pose, or the old one if rejected.
-    reason : of a rejection; empty if accepted.
-    measures : numbers by name for tables, such as residuals before and after.
-    covariance : as in :class:`~megloc_kapture.values.Pose`, or None.
-    """
-
-    cam_from_world: RigidTransform
-    reason: str = ""
-    measures: Mapping[str, float] = field(default_factory=dict)
-    covariance: NDArray[np.float64] | None = None
-
-    @property
-    def accepted(self) -> bool:
-        return not self.reason
 
 
 @runtime_checkable

@@ -39,7 +39,8 @@ ONE_FOCAL_MODELS = frozenset(
 MIN_CONFIDENCE = 0.6
 
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
-"""Where a network computes: auto (a GPU where there is one), cpu, cuda, or cuda:N."""
+"""Where a network computes: auto (a GPU if available), cpu, cuda, or cuda:N."""
+Precision = Literal["full", "half"]
 
 
 def _is_list(annotation: Any) -> bool:
@@ -278,97 +279,110 @@ class ImageFeatures:
     height: int
 
 
-@dataclass(frozen=True)
-class ClusterPose:
-    """Result of one cluster of a query's candidates.
+@dataclass(frozen=True, eq=False)
+class PoseRefinement:
+    """Result of a pose refinement.
 
     Attributes
     ----------
-    images : map images of the cluster that match the query, best first.
-    num_matches, num_inliers : of its 2D-3D matches.
-    cam_from_world : its pose before the final refinement, of a rig ``rig_from_world``; None without
-        a pose, with the ``reason``.
-    score : of the ranking, higher is better; None without a pose.
+    cam_from_world : the refined pose, or the old one if rejected.
+    reason : of a rejection; empty if accepted.
+    measures : numbers by name for tables, such as residuals before and after.
+    covariance : as in :class:`Pose`, or None.
+    method, before, moved_m, turned_deg : name of the refiner, initial ``cam_from_world`` and the
+        displacement from it, 0 if rejected; the stage sets them.
     """
 
-    images: tuple[str, ...]
-    num_matches: int = 0
-    num_inliers: int = 0
-    cam_from_world: RigidTransform | None = None
-    score: float | None = None
+    cam_from_world: RigidTransform
     reason: str = ""
-
-
-@dataclass(frozen=True)
-class RefinementRow:
-    """Result of one refiner for one query.
-
-    Attributes
-    ----------
-    image : name of the query.
-    method : name of the refiner.
-    reason : of a rejection; empty if the new pose is accepted.
-    moved_m, turned_deg : displacement by the refinement, unit of the map; 0 if rejected.
-    measures : ``name=value`` texts, e.g. of residuals before and after.
-    before : initial ``cam_from_world``.
-    """
-
-    image: str
-    method: str
-    reason: str
-    moved_m: float
-    turned_deg: float
-    measures: tuple[str, ...]
-    before: RigidTransform
+    measures: Mapping[str, float] = field(default_factory=dict)
+    covariance: NDArray[np.float64] | None = None
+    method: str = ""
+    before: RigidTransform | None = None
+    moved_m: float = 0.0
+    turned_deg: float = 0.0
 
     @property
     def accepted(self) -> bool:
         return not self.reason
 
 
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """A localized query; truthy.
+Fallback = Literal["none", "retrieval", "rig"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalizationResult:
+    """Outcome of localizing one query: a :class:`Pose` or a :class:`Failure`.
+
+    The rows of all tables are views of it (:mod:`megloc_kapture.io.tables`). Read from a status
+    table alone, it has neither pose nor arrays.
 
     Attributes
     ----------
-    cam_from_world : the pose, COLMAP axes.
-    num_matches, num_inliers : of the 2D-3D matches.
+    cam_from_world : the pose, COLMAP axes; None without one.
+    reason : why the query has no trusted pose; empty for a pose.
+    num_matches, num_inliers : of the 2D-3D matches; of a failure, of the cluster closest to a pose.
+        None if the result comes from a pose file.
+    confidence : probability that the pose before refinement, or the rejected pose of a failure, is
+        right; None if not requested.
+    candidates : matched map images of the result's cluster, best first.
+    clusters : results of all tried clusters of candidates before refinement, that of the best
+        candidate first.
+    cluster : index of the pose's cluster in ``clusters``.
+    score : of a cluster's pose in the ranking, higher is better.
+    refinements : results of the pose refiners, in their order.
+    remarks : skipped steps, with the missing data of query or map, and doubts about the focal
+        length.
+    fallback : pose that a failed query gets instead: ``retrieval``, that of its best candidate;
+        ``rig``, that of another camera through the rig.
+    seconds : by step, from feature extraction on.
+    name : of the query.
+    """
+
+    cam_from_world: RigidTransform | None = None
+    reason: str = ""
+    num_matches: int | None = None
+    num_inliers: int | None = None
+    confidence: float | None = None
+    candidates: tuple[str, ...] = ()
+    clusters: tuple[LocalizationResult, ...] = ()
+    cluster: int | None = None
+    score: float | None = None
+    refinements: tuple[PoseRefinement, ...] = ()
+    remarks: tuple[str, ...] = ()
+    fallback: Fallback = "none"
+    seconds: Mapping[str, float] = field(default_factory=dict, compare=False)
+    name: str = field(default="", compare=False)
+
+    @property
+    def status(self) -> Literal["localized", "failed"]:
+        return "failed" if self.reason else "localized"
+
+
+@dataclass(frozen=True, eq=False)
+class Pose(LocalizationResult):
+    """A localized query; truthy. See :class:`LocalizationResult`.
+
+    Attributes
+    ----------
     inliers : bool (num_matches,) or None.
     inlier_points_px, inlier_points_world : float64 (num_inliers, 2) and (num_inliers, 3), in the
         query's pixels and in the map; None if not kept.
     covariance : float64 (6, 6) or None: rotation in radians, then translation in the map's unit, of
         a left perturbation of ``cam_from_world``.
     camera : with the focal length estimated with the pose, and its deviation; None if known.
-    candidates : matched map images, best first.
-    clusters : all tried clusters of candidates, that of the best candidate first.
-    cluster : index of the pose's cluster in ``clusters``.
-    refinements : results of the pose refiners, in their order.
-    remarks : skipped steps, with the missing data of query or map, and doubts about the focal
-        length.
-    confidence : probability that the pose before refinement is right; None if not requested.
-    evidence : its terms, see :mod:`megloc_kapture.localization.confidence`.
-    name : of the query.
-    seconds : by step, from feature extraction on.
+    evidence : terms of the confidence, see :mod:`megloc_kapture.localization.confidence`.
     """
 
     cam_from_world: RigidTransform
-    num_matches: int
-    num_inliers: int
+    num_matches: int = 0
+    num_inliers: int = 0
     inliers: NDArray[np.bool_] | None = None
-    covariance: NDArray[np.float64] | None = None
-    camera: Camera | None = None
-    candidates: tuple[str, ...] = ()
-    clusters: tuple[ClusterPose, ...] = ()
-    cluster: int | None = None
-    refinements: tuple[RefinementRow, ...] = ()
-    remarks: tuple[str, ...] = ()
-    confidence: float | None = None
-    evidence: Mapping[str, float] = field(default_factory=dict)
-    seconds: Mapping[str, float] = field(default_factory=dict)
     inlier_points_px: NDArray[np.float64] | None = None
     inlier_points_world: NDArray[np.float64] | None = None
-    name: str = ""
+    covariance: NDArray[np.float64] | None = None
+    camera: Camera | None = None
+    evidence: Mapping[str, float] = field(default_factory=dict)
 
     def __bool__(self) -> Literal[True]:
         return True
@@ -380,25 +394,12 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class Failure:
-    """A query without a trusted pose; falsy, with a reason.
-
-    Attributes
-    ----------
-    num_matches, num_inliers, candidates : of the cluster closest to a pose.
-    confidence : of a rejected pose; None without one.
-    clusters, remarks, seconds, name : as in :class:`Pose`.
-    """
+class Failure(LocalizationResult):
+    """A query without a trusted pose; falsy, with a ``reason``. See :class:`LocalizationResult`."""
 
     reason: str
     num_matches: int = 0
     num_inliers: int = 0
-    candidates: tuple[str, ...] = ()
-    clusters: tuple[ClusterPose, ...] = ()
-    remarks: tuple[str, ...] = ()
-    confidence: float | None = None
-    seconds: Mapping[str, float] = field(default_factory=dict, compare=False)
-    name: str = field(default="", compare=False)
 
     def __bool__(self) -> Literal[False]:
         return False

@@ -16,11 +16,9 @@ from megloc_kapture.cli.main import main
 from megloc_kapture.errors import OptionError, PluginError
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.datasets import choose_dataset
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.plan import all_kept, run_plan
+from megloc_kapture.pipeline.evaluation_plan import Run, plan_evaluation
+from megloc_kapture.pipeline.plan import Workspace, all_kept, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.stage import Stage
 from megloc_kapture.stages.work import Work
 

@@ -119,7 +119,7 @@ def test_values_travel_between_processes_and_say_whether_they_are_poses() -> Non
     assert Pose(RigidTransform.identity(), num_matches=0, num_inliers=0)
     pose = random_transform(np.random.default_rng(0))
     camera = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.1))
-    for value in (pose, camera, Failure("why", 3, 1, ("a.jpg",))):
+    for value in (pose, camera, Failure("why", 3, 1, candidates=("a.jpg",))):
         assert pickle.loads(pickle.dumps(value)) == value
 
 

@@ -32,8 +32,8 @@ from megloc_kapture.evaluation.results import context_of
 from megloc_kapture.geometry.poses import unstack_poses
 from megloc_kapture.io.dataset_tables import ImageGroup, write_groups, write_names, write_protocol
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
-from megloc_kapture.io.tables import STATUS_FILE, QueryStatus, write_status
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.io.tables import STATUS_FILE, write_status
+from megloc_kapture.values import Camera, LocalizationResult, RigidTransform
 
 CANDIDATES = 20
 FIRST_TIME_US = 1_417_176_458_000_000
@@ -113,9 +113,8 @@ def generate(workspace: Path, num_queries: int, num_map_images: int) -> tuple[Po
         near = np.clip(places[i] + np.arange(CANDIDATES) - CANDIDATES // 2, 0, num_map_images - 1)
         localized = name in results[0]
         statuses.append(
-            QueryStatus(
-                image=name,
-                status="localized" if localized else "failed",
+            LocalizationResult(
+                name=name,
                 reason="" if localized else "6 inliers, 12 needed",
                 num_matches=300,
                 num_inliers=20 + i % 200 if localized else 6,

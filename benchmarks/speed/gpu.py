@@ -44,7 +44,7 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS
-from megloc_kapture.stages import devices
+from megloc_kapture.stages import work as devices
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import NoVerification, match_pairs
 from megloc_kapture.values import ImageFeatures, LocalFeatures

@@ -87,8 +87,8 @@ def ours(given: dict[str, Any]) -> dict[str, Any]:
             KaptureFolder(made), query, found, asked, [TYPE], LocalizationOptions()
         )
         return {
-            name: pose.cam_from_world.matrix()[:3].tolist()
-            for name, pose in results
+            pose.name: pose.cam_from_world.matrix()[:3].tolist()
+            for pose in results
             if isinstance(pose, Pose)
         }
 

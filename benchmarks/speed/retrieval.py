@@ -48,9 +48,9 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.io.kapture.features import KaptureVectors, feature_folder
-from megloc_kapture.retrieval.fusion import FusionOptions
 from megloc_kapture.retrieval.search import (
     FusedSearch,
+    FusionOptions,
 )
 from megloc_kapture.values import Camera, RigidTransform
 

@@ -27,13 +27,14 @@ from megloc_kapture.pipeline.executors import (
     open_executor,
     single_threaded,
 )
+from megloc_kapture.plugin_loading import AUTO, Placement
 from megloc_kapture.stages.stage import count_label
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera
 
 if TYPE_CHECKING:
     from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
-    from megloc_kapture.pipeline.workspace import Workspace
+    from megloc_kapture.pipeline.plan import Workspace
 
 Input = Annotated[Path, tyro.conf.arg(aliases=["-i"])]
 Inputs = Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["-i"]), tyro.conf.UseAppendAction]
@@ -178,6 +179,9 @@ class Working(Common):
     scheduler: str | None = None
     """Address of a running dask scheduler (tcp://HOST:8786); a local cluster unless given."""
 
+    def placement(self) -> Placement:
+        return AUTO
+
     def open_executor(self, output: Path) -> AbstractContextManager[Executor | None]:
         return open_executor(self.executor, self.workers, self.scheduler, output)
 
@@ -185,7 +189,12 @@ class Working(Common):
     def working(self, output: Path) -> Iterator[Work]:
         folder = output if output.is_dir() else output.absolute().parent
         with single_threaded(), self.open_executor(folder) as executor:
-            yield Work(executor, self.console().track, self.workers or available_cores())
+            yield Work(
+                executor,
+                self.console().track,
+                self.workers or available_cores(),
+                placement=self.placement(),
+            )
 
     @contextmanager
     def staged(
@@ -219,7 +228,7 @@ class Linked:
     def kapture_map(self, root: Path) -> KaptureFolder:
         """Open the kapture folder of a map or workspace."""
         # the workspace takes long to import
-        from megloc_kapture.pipeline.workspace import map_of_workspace
+        from megloc_kapture.pipeline.plan import map_of_workspace
 
         return self.kapture(map_of_workspace(root))
 
@@ -261,10 +270,13 @@ class Computing:
     precision: Literal["full", "half"] | None = None
     """Of networks; half: float16 on a GPU, bfloat16 on a processor. Full unless given."""
 
-    def placement(self) -> list[str]:
+    def placed(self) -> list[str]:
         """Return device and precision in ``--set`` syntax."""
         given = {"device": self.device, "precision": self.precision}
         return [f"{name}={value}" for name, value in given.items() if value is not None]
+
+    def placement(self) -> Placement:
+        return Placement(self.device or "auto", self.precision == "half")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,7 +289,13 @@ class Choosing(Computing):
     """Change an option: key.key=value; may be repeated."""
 
     def assignments(self) -> tuple[str, ...]:
-        return (*self.set, *self.placement())
+        return (*self.set, *self.placed())
+
+    def placement(self) -> Placement:
+        from megloc_kapture.pipeline.presets import assigned  # slow import
+
+        chosen = assigned(self.assignments())
+        return Placement(chosen.get("device", "auto"), chosen.get("precision") == "half")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,12 +16,16 @@ from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.tables import STATUS_FILE, read_status
 from megloc_kapture.localization.focal_length import misfits_text
 from megloc_kapture.pipeline.datasets import BenchmarkFile, DatasetChoice
-from megloc_kapture.pipeline.evaluation_plan import explain, explained, plan_evaluation, recall_rows
-from megloc_kapture.pipeline.plan import all_kept, run_plan
+from megloc_kapture.pipeline.evaluation_plan import (
+    choose_run,
+    explain,
+    explained,
+    plan_evaluation,
+    recall_rows,
+)
+from megloc_kapture.pipeline.plan import Workspace, all_kept, run_plan
 from megloc_kapture.pipeline.presets import assigned
-from megloc_kapture.pipeline.run import choose_run
 from megloc_kapture.pipeline.submission import FOLDER, keep_submission
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.stage import EVALUATION, LOCALIZED
 
 BELOW_RECALL = 3
@@ -150,8 +154,7 @@ class Eval(Deciding, Working):
         statuses = read_status(workspace.path(LOCALIZED) / STATUS_FILE)
         if statuses and all(status.status == "failed" for status in statuses.values()):
             console.say("warning: no query was localized; reasons are in localized/status.csv")
-        remarks = (status.remarks for status in statuses.values())
-        if misfits := misfits_text(remarks, f"{LOCALIZED}/{STATUS_FILE}"):
+        if misfits := misfits_text(statuses.values(), f"{LOCALIZED}/{STATUS_FILE}"):
             console.say(misfits)
         for text in (RECALL_TEXT, AGREEMENT_TEXT):
             if (evaluation / text).is_file():

@@ -24,8 +24,8 @@ from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.mapping.uncertainty import point_deviations
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, PixelOriginChoice
+from megloc_kapture.pipeline.live_source import MapMatching
 from megloc_kapture.pipeline.local_types import local_types_of
-from megloc_kapture.pipeline.map_retrieval import MapRetrieval
 from megloc_kapture.pipeline.presets import (
     BASIC_OPTIONS,
     DEFAULT_PRESET,
@@ -193,7 +193,7 @@ def describe_retrieval(console: Console, opened: KaptureMap) -> None:
             return
     options = options_of_preset(DEFAULT_PRESET)
     types = local_types_of(opened, options, FeatureCache())
-    retrieval = MapRetrieval(opened, options, types, Preprocessor(options))
+    retrieval = MapMatching(opened, options, types, Preprocessor(options))
     line(console, "retrieval", retrieval.describe_candidates(()))
     if brought := opened.global_types():
         text = retrieval.describe_candidates(brought)

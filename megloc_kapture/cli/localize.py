@@ -120,7 +120,7 @@ class Localize(Reading, Deciding, Common):
             console.say(f"left out of {remarks[remark]} queries: {remark}")
         if kapture_map.unit != METRES:
             console.say("positions are in units of the map, whose scale is not known")
-        if misfits := misfits_text(("; ".join(r.remarks) for _, r in named), STATUS_FILE):
+        if misfits := misfits_text(results.values(), STATUS_FILE):
             console.say(misfits)
         console.result(
             f"{counts['localized']} of {counts['queries']} queries localized in {seconds:.1f} s; "

@@ -32,10 +32,9 @@ from megloc_kapture.pipeline.map_making import (
     plan_photographs,
     structure_options,
 )
-from megloc_kapture.pipeline.plan import run_plan
+from megloc_kapture.pipeline.plan import Workspace, run_plan
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET
 from megloc_kapture.pipeline.query_folders import Photographs
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import POSE_REFINERS
 from megloc_kapture.stages.densifying import densify_map, fitted_to_poses

@@ -11,7 +11,7 @@ from megloc_kapture.cli.common import Console, Folders, Force, Input, Output, Ov
 from megloc_kapture.cli.stages import FEATURES, StageCommand, only_type, restrictions_beside
 from megloc_kapture.errors import OptionError, check_option
 from megloc_kapture.io.kapture import KaptureFolder, write_pairs
-from megloc_kapture.retrieval.fusion import FusionMethod
+from megloc_kapture.retrieval.search import FusionMethod
 from megloc_kapture.stages.candidates import Retrieval
 from megloc_kapture.stages.global_features import extract_global_features, extract_vlad, vlad_type
 from megloc_kapture.stages.image_pairs import (
@@ -44,7 +44,7 @@ class ExtractGlobal(Reading, StageCommand):
     def run(self, console: Console) -> None:
         choices = self.options(self.named("global_features", self.features)).global_features
         folders = [self.kapture_map(self.input), *map(self.kapture, self.query)]
-        extractors = {one.name: one.make() for one in choices if not one.is_vlad}
+        extractors = {one.name: one.make(self.placement()) for one in choices if not one.is_vlad}
         with self.staged(self.output, FEATURES, force=self.force, adds=True) as (out, work):
             for choice in choices:
                 if choice.is_vlad:

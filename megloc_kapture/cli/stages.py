@@ -35,22 +35,23 @@ from megloc_kapture.cli.common import (
 from megloc_kapture.errors import OptionError, check_option, require
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
 from megloc_kapture.matching.verification import KnownPoseOptions
-from megloc_kapture.pipeline.plan import run_plan
+from megloc_kapture.pipeline.plan import Workspace, run_plan
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, assigned, options_of_preset
-from megloc_kapture.pipeline.workspace import Workspace
-from megloc_kapture.plugin_loading import load_plugin, option_fault, plugin_class
+from megloc_kapture.plugin_loading import (
+    load_chosen,
+    load_plugin,
+    option_fault,
+    plugin_class,
+)
 from megloc_kapture.plugins import MATCHERS, STAGES, chosen_by_name
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.devices import with_device
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.map_points import triangulate_map
 from megloc_kapture.stages.matches import check_given_poses, match_pairs
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.preprocessing import (
     PreprocessingOptions,
-    PreprocessingReport,
     preprocess_images,
-    read_report,
 )
 
 PREPROCESSED, FEATURES, MAP = "preprocessed", "features", "map"
@@ -70,7 +71,7 @@ class StageCommand(Choosing, Working):
     def options(self, changes: dict[str, object] | None = None) -> PipelineOptions:
         return options_of_preset(
             self.preset or DEFAULT_PRESET,
-            changes=[changes or {}, assigned(self.placement())],
+            changes=[changes or {}, assigned(self.placed())],
             assignments=self.set,
         )
 
@@ -163,7 +164,7 @@ class Match(Reading, StageCommand):
         options = self.options(changes)
         # --matcher applies even if the preset has another one for this type
         chosen = options.matching if self.matcher else options.matching_of(local_type)
-        matcher = load_plugin(MATCHERS, chosen.name, chosen.options)
+        matcher = load_chosen(MATCHERS, chosen, options.placement)
         first, verification = mapping, options.verify_mapping()
         if self.query is not None:
             first, verification = self.kapture(self.query), options.verify_queries()
@@ -287,10 +288,11 @@ class Preprocess(Linked, Computing, Working):
         source = self.kapture_map(self.input)
         sequences = [self.kapture(path) for path in existing(self.sequence)]
         with self.staged(self.output, PREPROCESSED, force=self.force) as (out, work):
-            preprocess_images(source, out, options, sequences=sequences, work=work)
-            report = read_report(out)
-        for line in () if report is None else report_lines(report):
-            console.say(line)
+            counts = preprocess_images(source, out, options, sequences=sequences, work=work)
+        console.say(f"{counts['images']} images, {counts['images_changed']} of them changed")
+        for source_of_masks, words in _SOURCES.items():
+            if (share := counts.get(f"masked_{source_of_masks}")) is not None:
+                console.say(f"masked by {words}: {100 * share:.2f} % of all pixels")
 
     def options(self) -> PreprocessingOptions:
         masks: dict[str, Any] = {
@@ -307,10 +309,9 @@ class Preprocess(Linked, Computing, Working):
         }
         changes = tree.pop("masks", {})
         try:
-            options = PreprocessingOptions.model_validate({**tree, "masks": {**masks, **changes}})
+            return PreprocessingOptions.model_validate({**tree, "masks": {**masks, **changes}})
         except ValidationError as error:
             raise OptionError(f"option {option_fault(error, PreprocessingOptions)}") from error
-        return with_device(options, self.device or "auto", self.precision or "full")
 
     def _fixed_masks(self) -> Iterator[dict[str, Any]]:
         takes = "CAMERA=VALUE"
@@ -320,26 +321,3 @@ class Preprocess(Linked, Computing, Working):
             yield {"camera": camera, "polygon": [corner.split(",") for corner in value.split()]}
         for camera, value in assigned_pairs("--mask-file", self.mask_file, takes):
             yield {"camera": camera, "file": value}
-
-
-def report_lines(report: PreprocessingReport) -> list[str]:
-    """Format camera changes and the share of pixels masked by each source."""
-    lines = [f"{report.images} images, {report.images_changed} of them changed"]
-    changes: dict[str, int] = {}
-    for camera in report.cameras.values():
-        before, after = ("{} {}x{}".format(*row[:3]) for row in (camera.original, camera.processed))
-        change = before if camera.original == camera.processed else f"{before} -> {after}"
-        changes[change] = changes.get(change, 0) + 1
-    lines += [
-        f"{'cameras' if number > 1 else 'camera'}: {number} {change}"
-        for change, number in sorted(changes.items())
-    ]
-    lines += [f"remark: {remark}" for remark in report.remarks]
-    if report.images_masked:
-        lines.append(f"masks of {report.images_masked} images; share of all pixels masked:")
-        lines += [
-            f"  {_SOURCES[source]:24s}{100 * report.masked[source]:7.2f} %"
-            for source in _SOURCES
-            if source in report.masked
-        ]
-    return lines

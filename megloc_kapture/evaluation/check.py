@@ -17,8 +17,13 @@ from megloc_kapture.evaluation import pose_files
 from megloc_kapture.evaluation.pose_files import parse_pose, parse_timestamp
 from megloc_kapture.evaluation.protocols import PROTOCOLS, Benchmark, benchmark_of
 from megloc_kapture.evaluation.report.content import counted
-from megloc_kapture.geometry.conventions import CONVENTIONS, better_conventions
-from megloc_kapture.geometry.poses import camera_centers, rotation_matrices, stack_poses
+from megloc_kapture.geometry.poses import (
+    CONVENTIONS,
+    better_conventions,
+    camera_centers,
+    rotation_matrices,
+    stack_poses,
+)
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, PoseFileFormat, Protocol
 from megloc_kapture.io.files import read_text
 from megloc_kapture.io.kapture import KaptureFolder

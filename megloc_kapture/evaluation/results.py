@@ -28,9 +28,15 @@ from megloc_kapture.io.dataset_tables import (
     unit_of,
 )
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.io.tables import ConsistencyRow, QueryStatus
-from megloc_kapture.stages.localized_folder import query_status
-from megloc_kapture.values import Camera, Failure, Pose, RefinementRow, RigidTransform
+from megloc_kapture.io.tables import ConsistencyRow
+from megloc_kapture.values import (
+    Camera,
+    Failure,
+    LocalizationResult,
+    Pose,
+    PoseRefinement,
+    RigidTransform,
+)
 
 Read = TypeVar("Read")
 Poses = Mapping[str, RigidTransform]
@@ -60,7 +66,7 @@ class ResultContext:
     queries: KaptureFolder | None = None
     mapping: KaptureFolder | None = None
     side_tables: Path | None = None
-    refinements: Mapping[str, Sequence[RefinementRow]] = field(default_factory=dict)
+    refinements: Mapping[str, Sequence[PoseRefinement]] = field(default_factory=dict)
     consistency: Sequence[ConsistencyRow] = ()
     localized: Mapping[str, Pose] = field(default_factory=dict)
     cameras: Mapping[str, Camera] = field(default_factory=dict)
@@ -111,17 +117,18 @@ def context_of(result: Path | str, *, mapping: Path | str | None = None) -> Resu
     map_path = next((path for path in maps if (path / _SENSORS).is_file()), None)
     if mapping is not None:
         map_path = Path(mapping)
-    refinements: dict[str, list[RefinementRow]] = {}
-    for row in _if_there(tables.read_refinement, folder / tables.REFINEMENT_FILE) or ():
-        refinements.setdefault(row.image, []).append(row)
     return ResultContext(
         queries=None if queries is None else KaptureFolder(queries, features_dirs=features),
         mapping=None if map_path is None else KaptureFolder(map_path, features_dirs=features),
         side_tables=None if workspace is None else workspace / SIDE_TABLES,
-        refinements=refinements,
+        refinements=_if_there(_read_refinement, folder / tables.REFINEMENT_FILE) or {},
         consistency=_if_there(tables.read_consistency, folder / tables.CONSISTENCY_FILE) or (),
         unit=unit_of(result),
     )
+
+
+def _read_refinement(path: Path) -> dict[str, tuple[PoseRefinement, ...]]:
+    return tables.read_refinement(path, KaptureFolder(path.parent).read().poses())
 
 
 def _if_there(read: Callable[[Path], Read], path: Path) -> Read | None:
@@ -143,7 +150,7 @@ class Result:
     label: str
     poses: Poses
     images: tuple[str, ...]
-    statuses: Mapping[str, QueryStatus] = field(default_factory=dict)
+    statuses: Mapping[str, LocalizationResult] = field(default_factory=dict)
     confidences: Mapping[str, float] = field(default_factory=dict)
     covariances: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     by_pair: Mapping[RelocalizationPair, RigidTransform] | None = None
@@ -218,13 +225,13 @@ def result_in_memory(
     estimated: Mapping[str, Pose | Failure] | Mapping[str, RigidTransform], *, label: str = ""
 ) -> Result:
     poses: dict[str, RigidTransform] = {}
-    statuses: dict[str, QueryStatus] = {}
+    statuses: dict[str, LocalizationResult] = {}
     covariances = {}
     for image, pose in estimated.items():
         if isinstance(pose, RigidTransform):
             poses[image] = pose_files.checked_pose(pose.quat_wxyz, pose.translation, repr(image))
             continue
-        statuses[image] = query_status(image, pose)
+        statuses[image] = pose
         if isinstance(pose, Pose):
             poses[image] = pose.cam_from_world
             if pose.covariance is not None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -32,8 +32,8 @@ from megloc_kapture.evaluation.results import Poses, Result, ResultContext
 from megloc_kapture.geometry.poses import compose, invert, stack_poses
 from megloc_kapture.io.dataset_tables import ImageGroup, RelocalizationPair
 from megloc_kapture.io.files import write_bytes
-from megloc_kapture.io.tables import Fallback
 from megloc_kapture.refinement.acceptance import squared_distance
+from megloc_kapture.values import LocalizationResult, RigidTransform
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -51,25 +51,26 @@ _COLUMNS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class QueryResult:
-    """Outcome of one query: ``localized``, ``fallback`` (the pose is a guess) or ``missing``.
+@dataclass(frozen=True, kw_only=True)
+class QueryResult(LocalizationResult):
+    """Result of one query against its true pose; the pose includes fallbacks.
 
-    Errors are infinite without a pose and NaN without a true pose. ``reason`` is empty for a
-    localized query. Counts are None without a status table, ``confidence`` where it is not known.
+    Attributes
+    ----------
+    image : the query; in an evaluation of pairs, the name of the pair unless it is shown.
+    outcome : ``localized``, ``fallback`` (the pose is a guess) or ``missing``.
+    position_m, angle_deg : errors; infinite without a pose, NaN without a true pose.
+    truth, color, meaning : for reports, see ``shown_queries``.
     """
 
     image: str
     condition: str
     outcome: Outcome
-    reason: str
     position_m: float
     angle_deg: float
-    num_matches: int | None = None
-    num_inliers: int | None = None
-    fallback: Fallback = "none"
-    candidates: tuple[str, ...] = ()
-    confidence: float | None = None
+    truth: RigidTransform | None = None
+    color: str = ""
+    meaning: str = ""
 
 
 class Reported:
@@ -287,31 +288,28 @@ def query_result(
     result: Result, image: str, conditions: Mapping[str, str], errors: tuple[float, float]
 ) -> QueryResult:
     """Return the outcome of a query with errors in metres and degrees."""
-    has_pose, condition = image in result.poses, conditions.get(image, "")
+    pose = result.poses.get(image)
     status = result.statuses.get(image)
     if status is None:
-        outcome: Outcome = "localized" if has_pose else "missing"
-        reason = "" if has_pose else "no pose in the result"
-        confidence = result.confidences.get(image)
-        return QueryResult(image, condition, outcome, reason, *errors, confidence=confidence)
-    outcome, reason = "missing", status.reason
-    if has_pose and status.fallback == "none":
+        outcome: Outcome = "missing" if pose is None else "localized"
+        reason = "no pose in the result" if pose is None else ""
+        status = LocalizationResult(confidence=result.confidences.get(image))
+    elif pose is not None and status.fallback == "none":
         outcome, reason = "localized", ""
-    elif has_pose:
-        outcome = "fallback"
-    elif status.status == "localized":
-        reason = "status says localized, but the result has no pose"
+    elif pose is not None:
+        outcome, reason = "fallback", status.reason
+    else:
+        outcome = "missing"
+        reason = status.reason or "status says localized, but the result has no pose"
+    known = {each.name: getattr(status, each.name) for each in fields(LocalizationResult)}
+    known |= {"cam_from_world": pose, "reason": reason, "name": image}
     return QueryResult(
-        image,
-        condition,
-        outcome,
-        reason,
-        *errors,
-        status.num_matches,
-        status.num_inliers,
-        status.fallback if has_pose else "none",
-        status.candidates,
-        status.confidence,
+        **known | ({"fallback": "none"} if pose is None else {}),
+        image=image,
+        condition=conditions.get(image, ""),
+        outcome=outcome,
+        position_m=errors[0],
+        angle_deg=errors[1],
     )
 
 

@@ -27,7 +27,6 @@ from megloc_kapture.evaluation.evaluate import (
     results_without_truth,
 )
 from megloc_kapture.evaluation.report.queries import (
-    ShownQuery,
     StoredInliers,
     frame_of_query,
     legend,
@@ -38,7 +37,7 @@ from megloc_kapture.evaluation.report.queries import (
 )
 from megloc_kapture.evaluation.report.reports import plain, template
 from megloc_kapture.evaluation.results import Poses, ResultContext
-from megloc_kapture.evaluation.scoring import Evaluation
+from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.geometry.poses import camera_centers, stack_poses
 from megloc_kapture.io.files import write_bytes
@@ -89,7 +88,7 @@ class Scene:
     colors: NDArray[np.uint8]
     cameras: tuple[str, ...]
     camera_frusta: NDArray[np.float32]
-    queries: tuple[ShownQuery, ...]
+    queries: tuple[QueryResult, ...]
     frusta: NDArray[np.float32]
     true_frusta: NDArray[np.float32]
     inliers: NDArray[np.float32]
@@ -159,7 +158,9 @@ def _check_output(path: Path, *, force: bool) -> None:
         raise OutputError(f"{path}: exists and is no view; -f overwrites it")
 
 
-def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = ()) -> Scene | None:
+def scene_of(
+    title: str, stored: StoredInliers, queries: Sequence[QueryResult] = ()
+) -> Scene | None:
     """Return the scene of a map and of queries, worst first; None if no camera has a pose."""
     context, notes = stored.context, list[str]()
     rng = np.random.default_rng(_SEED)
@@ -185,7 +186,7 @@ def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = 
         queries = queries[:MAX_QUERIES]
     poses = [map_poses[name] for name in names]
     true = [query.truth for query in queries if query.truth is not None]
-    spanning = poses + true or [q.estimated for q in queries if q.estimated is not None]
+    spanning = poses + true or [q.cam_from_world for q in queries if q.cam_from_world is not None]
     if not spanning:
         return None
     quats, translations = stack_poses(spanning)
@@ -219,7 +220,7 @@ def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = 
         cameras=tuple(names),
         camera_frusta=_frusta(poses, _rays(mapping, names, {}), origin),
         queries=tuple(queries),
-        frusta=_frusta([query.estimated for query in queries], rays, origin),
+        frusta=_frusta([query.cam_from_world for query in queries], rays, origin),
         true_frusta=_frusta([query.truth for query in queries], rays, origin),
         inliers=(np.concatenate([np.zeros((0, 3)), *inliers]) - origin).astype(np.float32),
         num_inliers=tuple(map(len, inliers)),
@@ -234,7 +235,7 @@ def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = 
 
 def render_view(scene: Scene) -> str:
     """Render the page; it is self-contained and deterministic."""
-    failed = [query for query in scene.queries if query.estimated is None]
+    failed = [query for query in scene.queries if query.cam_from_world is None]
     arrays = {
         to_camel(field.name): _encoded(value)
         for field in fields(scene)

@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import (
     bearing_rays,
     focal_px,
@@ -55,18 +54,6 @@ class WarpSource:
     image_from_depth: RigidTransform = RigidTransform.identity()
     mask: NDArray[np.bool_] | None = None
 
-    def __post_init__(self) -> None:
-        shapes = [
-            ("image", self.image.shape[:2], self.camera),
-            ("depth map", self.depth_m.shape, self.depth_camera),
-        ]
-        if self.mask is not None:
-            shapes.append(("mask", self.mask.shape, self.camera))
-        for name, shape, camera in shapes:
-            size = camera.height, camera.width
-            if shape != size:
-                raise DataError(f"{name} has {shape} rows and columns, its camera {size}")
-
 
 @dataclass(frozen=True, eq=False)
 class WarpedView:
@@ -94,8 +81,6 @@ def warp_to_view(
     Of the references that see a surface, each pixel takes the one with the smallest angle between
     the rays and a distance not much larger; ties go to the first.
     """
-    if not scale > 0:
-        raise DataError(f"scale {scale:g} of a view is not positive")
     camera = scaled_camera(camera, scale)
     shape = camera.height, camera.width
     drawn = [_seen_depth(source, camera, cam_from_world) for source in sources]

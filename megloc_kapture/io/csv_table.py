@@ -90,7 +90,7 @@ def _pose(text: str) -> RigidTransform:
     return RigidTransform((w, x, y, z), (a, b, c))
 
 
-def _pose_text(pose: RigidTransform) -> str:
+def pose_text(pose: RigidTransform) -> str:
     return " ".join(repr(float(value)) for value in (*pose.quat_wxyz, *pose.translation))
 
 
@@ -116,8 +116,17 @@ def list_of(separator: str) -> Column:
     )
 
 
-def number(format_spec: str) -> Column:
-    return Column("a number", float, lambda value: format(value, format_spec))
+def number(format_spec: str, most: float = math.inf) -> Column:
+    """Return a column of numbers; with ``most``, of those from 0 to it."""
+
+    def read(text: str) -> float:
+        value = float(text)
+        if most < math.inf and not 0 <= value <= most:
+            raise ValueError
+        return value
+
+    expected = f"a number from 0 to {most:g}" if most < math.inf else "a number"
+    return Column(expected, read, lambda value: format(value, format_spec))
 
 
 def or_empty(column: Column, empty: Any = None) -> Column:
@@ -136,7 +145,7 @@ _BY_TYPE: dict[Any, Column] = {
     # kapture forbids the comma in image names
     tuple[str, ...]: list_of(","),
     RigidTransform: Column(
-        "a pose qw qx qy qz tx ty tz: a unit quaternion and finite numbers", _pose, _pose_text
+        "a pose qw qx qy qz tx ty tz: a unit quaternion and finite numbers", _pose, pose_text
     ),
 }
 
@@ -195,12 +204,11 @@ class Table(Generic[RowT]):
         return self.read(path) if path.exists() else []
 
     def write(self, path: Path | str, rows: Iterable[Any]) -> None:
-        """Write records, objects with their attributes, or plain tuples, in the given order."""
+        """Write records, objects with their attributes, mappings or tuples, in the given order."""
         known: set[tuple[tuple[str, ...], ...]] = set()
         lines = []
         for row in rows:
-            plain = type(row) is tuple
-            values = row if plain else [getattr(row, name) for name in self._columns]
+            values = row if type(row) is tuple else self._values_of(row)
             cells = {
                 name: column.write(value)
                 for (name, column), value in zip(self._columns.items(), values, strict=True)
@@ -208,6 +216,11 @@ class Table(Generic[RowT]):
             self._check_keys(cells, known)
             lines.append(tuple(cells.values()))
         write_csv_table(path, tuple(self._columns), lines)
+
+    def _values_of(self, row: Any) -> list[Any]:
+        if isinstance(row, Mapping):
+            return [row[name] for name in self._columns]
+        return [getattr(row, name) for name in self._columns]
 
     def _check_keys(
         self, cells: Mapping[str, str], known: set[tuple[tuple[str, ...], ...]]

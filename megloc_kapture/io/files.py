@@ -189,6 +189,15 @@ def output_error(path: Path | str, error: OSError) -> OutputError:
 
 
 @contextlib.contextmanager
+def writing(path: Path | str) -> Iterator[None]:
+    """Turn an ``OSError`` into the :class:`OutputError` of writing ``path``."""
+    try:
+        yield
+    except OSError as error:
+        raise output_error(path, error) from error
+
+
+@contextlib.contextmanager
 def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
     """Open a binary file that replaces ``path`` when the block succeeds; creates parent folders."""
     # not a Path: making one takes as long as writing the small file of a pair

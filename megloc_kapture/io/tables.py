@@ -1,4 +1,4 @@
-"""The tables of a workspace as records: one type, one reader and one writer each.
+"""The tables of a workspace: views of :class:`~megloc_kapture.values.LocalizationResult`, others.
 
 ==================== =============================================================================
 status.csv           outcome of every query, with the localized poses
@@ -17,14 +17,13 @@ Readers and writers take the file itself and keep its order, unless they say oth
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import (
@@ -34,11 +33,18 @@ from megloc_kapture.io.csv_table import (
     list_of,
     number,
     or_empty,
+    pose_text,
     read_csv_table,
     write_csv_table,
 )
 from megloc_kapture.io.files import named
-from megloc_kapture.values import ClusterPose, Options, Pose, RefinementRow, RigidTransform
+from megloc_kapture.values import (
+    Fallback,
+    LocalizationResult,
+    Pose,
+    PoseRefinement,
+    RigidTransform,
+)
 
 STATUS_FILE = "status.csv"
 COVARIANCE_FILE = "covariance.csv"
@@ -47,47 +53,64 @@ CLUSTERS_FILE = "clusters.csv"
 REFINEMENT_FILE = "refinement.csv"
 CONSISTENCY_FILE = "map_consistency.csv"
 
-Fallback = Literal["none", "retrieval", "rig"]
+
+def status_row(result: LocalizationResult) -> dict[str, Any]:
+    """Return a result as a row of ``status.csv``, by column."""
+    return {
+        "image": result.name,
+        "status": result.status,
+        "reason": result.reason,
+        "num_matches": result.num_matches or 0,
+        "num_inliers": result.num_inliers or 0,
+        "confidence": result.confidence,
+        "cluster": result.cluster,
+        "fallback": result.fallback,
+        "candidates": result.candidates,
+        "refinement": "; ".join(
+            f"{step.method}: {step.reason or 'accepted'}" for step in result.refinements
+        ),
+        "remarks": "; ".join(result.remarks),
+    }
 
 
-class QueryStatus(Options):
-    """One row of ``status.csv``.
-
-    Parameters
-    ----------
-    num_matches, num_inliers : 2D-3D matches of the solver and inliers of the pose.
-    confidence : probability that the pose, or the rejected pose of a failed query, is right.
-    cluster : index of the candidate cluster of the pose; None without clusters.
-    fallback : pose of a failed query: ``retrieval``, that of the best retrieved map image, a guess;
-        ``rig``, that of another camera through the rig.
-    candidates : map images that the pose comes from, best first.
-    refinement : acceptance or rejection of the refined pose, by method.
-    remarks : skipped steps for which the query or the map lacks data.
-    """
-
-    image: ImageName
-    status: Literal["localized", "failed"]
-    reason: str = ""
-    num_matches: int = Field(default=0, ge=0)
-    num_inliers: int = Field(default=0, ge=0)
-    confidence: Annotated[float | None, or_empty(number(".4f")), Field(ge=0, le=1)] = None
-    cluster: int | None = Field(default=None, ge=0)
-    fallback: Fallback = "none"
-    candidates: tuple[str, ...] = ()
-    refinement: str = ""
-    remarks: str = ""
-
-
-_STATUS = Table(QueryStatus, keys=[("image",)], later=("confidence", "remarks"))
+def _result_of_row(
+    image: ImageName,
+    status: Literal["localized", "failed"],
+    reason: str = "",
+    num_matches: int = 0,
+    num_inliers: int = 0,
+    confidence: Annotated[float | None, or_empty(number(".4f", most=1.0))] = None,
+    cluster: int | None = None,
+    fallback: Fallback = "none",
+    candidates: tuple[str, ...] = (),
+    refinement: str = "",
+    remarks: str = "",
+) -> LocalizationResult:
+    if status == "failed":
+        reason = reason or "no reason is given"
+    return LocalizationResult(
+        name=image,
+        reason=reason if status == "failed" else "",
+        num_matches=num_matches,
+        num_inliers=num_inliers,
+        confidence=confidence,
+        cluster=cluster,
+        fallback=fallback,
+        candidates=candidates,
+        remarks=tuple(remarks.split("; ")) if remarks else (),
+    )
 
 
-def read_status(path: Path | str) -> dict[str, QueryStatus]:
-    return {row.image: row for row in sorted(_STATUS.read(path), key=lambda row: row.image)}
+_STATUS = Table(_result_of_row, keys=[("image",)], later=("confidence", "remarks"))
 
 
-def write_status(path: Path | str, statuses: Iterable[QueryStatus]) -> None:
-    ordered = sorted(statuses, key=lambda status: status.image)
-    _STATUS.write(path, ordered)
+def read_status(path: Path | str) -> dict[str, LocalizationResult]:
+    """Read ``status.csv``: results by name, without poses and refinements."""
+    return {row.name: row for row in sorted(_STATUS.read(path), key=lambda row: row.name)}
+
+
+def write_status(path: Path | str, results: Iterable[LocalizationResult]) -> None:
+    _STATUS.write(path, sorted(map(status_row, results), key=lambda row: str(row["image"])))
 
 
 _UPPER = np.triu_indices(6)
@@ -112,78 +135,92 @@ def read_covariances(path: Path | str) -> dict[str, NDArray[np.float64]]:
     return found
 
 
-def write_covariances(path: Path, poses: Mapping[str, Pose]) -> None:
+def write_covariances(path: Path, results: Iterable[LocalizationResult]) -> None:
     """Write ``covariance.csv`` of the poses that have a covariance, sorted by image."""
     rows = [
-        (image, *map(repr, pose.covariance[_UPPER].tolist()))
-        for image, pose in sorted(poses.items())
-        if pose.covariance is not None
+        (pose.name, *map(repr, pose.covariance[_UPPER].tolist()))
+        for pose in sorted(results, key=lambda result: result.name)
+        if isinstance(pose, Pose) and pose.covariance is not None
     ]
     write_csv_table(path, _COVARIANCE_COLUMNS, rows)
 
 
-@dataclass(frozen=True)
-class ClusterRow:
-    """One row of ``clusters.csv``; the pose is that before the final refinement.
-
-    ``images`` are the cluster's map images that match the query, best first.
-    """
-
-    image: str
-    cluster: int
-    chosen: Literal["yes", "no"]
-    num_matches: int
-    num_inliers: int
-    score: Annotated[float | None, or_empty(number(".6g"))]
-    reason: str
-    images: tuple[str, ...]
-    cam_from_world: RigidTransform | None
-
-
-_CLUSTERS = Table(ClusterRow)
-
-
-def read_clusters(path: Path | str) -> dict[str, list[ClusterRow]]:
-    clusters: dict[str, list[ClusterRow]] = {}
-    for row in _CLUSTERS.read(path):
-        clusters.setdefault(row.image, []).append(row)
-    return clusters
-
-
-def write_clusters(
-    path: Path, rows: Iterable[tuple[str, tuple[ClusterPose, ...], int | None]]
-) -> None:
-    """Write ``clusters.csv`` from rows (image, its clusters, number of the chosen one)."""
-    records = [
-        ClusterRow(image, index, "yes" if index == chosen else "no", **vars(cluster))
-        for image, clusters, chosen in sorted(rows, key=lambda row: row[0])
-        for index, cluster in enumerate(clusters)
+def write_clusters(path: Path, results: Iterable[LocalizationResult]) -> None:
+    """Write ``clusters.csv``: the clusters of each result, sorted by image, poses unrefined."""
+    columns = ("image", "cluster", "chosen", "num_matches", "num_inliers", "score", "reason")
+    rows = [
+        (
+            result.name,
+            str(index),
+            "yes" if index == result.cluster else "no",
+            str(cluster.num_matches),
+            str(cluster.num_inliers),
+            "" if cluster.score is None else f"{cluster.score:.6g}",
+            cluster.reason,
+            ",".join(cluster.candidates),
+            "" if cluster.cam_from_world is None else pose_text(cluster.cam_from_world),
+        )
+        for result in sorted(results, key=lambda result: result.name)
+        for index, cluster in enumerate(result.clusters)
     ]
-    _CLUSTERS.write(path, records)
+    write_csv_table(path, (*columns, "images", "cam_from_world"), rows)
 
 
-_REFINEMENT: Table[Any] = Table(
-    {
-        **{"image": str, "method": str, "accepted": flag("yes", "no"), "reason": str},
-        **{"moved_m": number(".6f"), "turned_deg": number(".6f")},
-        **{"measures": list_of(";"), "before": RigidTransform},
-    }
-)
+def _refinement_row(
+    image: str,
+    method: str,
+    accepted: Annotated[bool, flag("yes", "no")],
+    reason: str,
+    moved_m: Annotated[float, number(".6f")],
+    turned_deg: Annotated[float, number(".6f")],
+    measures: Annotated[tuple[str, ...], list_of(";")],
+    before: RigidTransform,
+) -> tuple[str, PoseRefinement]:
+    named_values = (text.partition("=") for text in measures)
+    return image, PoseRefinement(
+        before,
+        reason,
+        {name: float(value) for name, _, value in named_values},
+        method=method,
+        before=before,
+        moved_m=moved_m,
+        turned_deg=turned_deg,
+    )
 
 
-def refinement_text(rows: Sequence[RefinementRow]) -> str:
-    return "; ".join(f"{row.method}: {'accepted' if row.accepted else row.reason}" for row in rows)
+_REFINEMENT = Table(_refinement_row)
 
 
-def read_refinement(path: Path | str) -> list[RefinementRow]:
-    """Read ``refinement.csv``; a row without a reason is accepted."""
-    return [RefinementRow(*row[:2], *row[3:]) for row in _REFINEMENT.read(path)]
+def read_refinement(
+    path: Path | str, refined: Mapping[str, RigidTransform]
+) -> dict[str, tuple[PoseRefinement, ...]]:
+    """Read ``refinement.csv``: steps by image, of which the last led to the ``refined`` pose."""
+    by_image: dict[str, list[PoseRefinement]] = {}
+    for image, step in _REFINEMENT.read(path):
+        by_image.setdefault(image, []).append(step)
+    found = {}
+    for image, steps in by_image.items():
+        ends = [*(step.cam_from_world for step in steps[1:]), refined.get(image)]
+        found[image] = tuple(
+            replace(step, cam_from_world=end) if step.accepted and end is not None else step
+            for step, end in zip(steps, ends, strict=True)
+        )
+    return found
 
 
-def write_refinement(path: Path, rows: Iterable[RefinementRow]) -> None:
+def write_refinement(path: Path, results: Iterable[LocalizationResult]) -> None:
     """Write ``refinement.csv`` sorted by image; the steps of an image stay in order."""
-    ordered = sorted(rows, key=lambda row: row.image)
-    _REFINEMENT.write(path, ordered)
+    rows = [
+        {
+            **vars(step),
+            "image": result.name,
+            "accepted": step.accepted,
+            "measures": tuple(f"{name}={value:.6g}" for name, value in step.measures.items()),
+        }
+        for result in sorted(results, key=lambda result: result.name)
+        for step in result.refinements
+    ]
+    _REFINEMENT.write(path, rows)
 
 
 _Median = Annotated[float, or_empty(number(".6g"), math.nan)]

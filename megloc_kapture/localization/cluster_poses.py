@@ -39,7 +39,7 @@ from megloc_kapture.localization.map_index import Correspondences, MapIndex, Pos
 from megloc_kapture.localization.ranking import poses_agree
 from megloc_kapture.localization.structure import displacements_rad
 from megloc_kapture.plugins import HypothesisView, PoseHypothesis, RankingScene
-from megloc_kapture.values import ClusterPose, Failure, Options, Pose
+from megloc_kapture.values import Failure, Options, Pose
 
 Rank = Callable[[Sequence[PoseHypothesis]], NDArray[np.float64]]
 Found = Sequence[Sequence[Correspondences]]
@@ -195,7 +195,7 @@ def localize_in_clusters(
     hypotheses = [each.hypothesis for each in attempts if each.hypothesis is not None]
     scores = iter(rank(hypotheses).tolist() if hypotheses else ())
     ranked = tuple(
-        each.as_cluster_pose(None if each.hypothesis is None else next(scores)) for each in attempts
+        each.result(None if each.hypothesis is None else next(scores)) for each in attempts
     )
     clock.lap("ranking")
     best = _best(ranked)
@@ -212,7 +212,7 @@ def localize_in_clusters(
         clock.lap("refinement")
         if min_confidence is not None and isinstance(result, Pose):
             found = attempts[best].found
-            sources = match_sources(views, found, ranked[best].images, centers or {})
+            sources = match_sources(views, found, ranked[best].candidates, centers or {})
             if scene is not None:
                 seen = partial(displacements_rad, problem, views, found, scene)
                 sources = replace(sources, displacements_rad=seen)
@@ -222,7 +222,9 @@ def localize_in_clusters(
                 problem, result, sources, options.max_error_px, min_confidence, misfit
             )
             clock.lap("confidence")
-    result = replace(result, candidates=ranked[best].images, clusters=ranked, seconds=clock.seconds)
+    result = replace(
+        result, candidates=ranked[best].candidates, clusters=ranked, seconds=clock.seconds
+    )
     if isinstance(result, Failure):
         return result, None
     pose = replace(
@@ -243,13 +245,12 @@ class _Attempt:
     estimate: PoseEstimate | Failure
     hypothesis: PoseHypothesis | None
 
-    def as_cluster_pose(self, score: float | None) -> ClusterPose:
-        images, estimate = self.cluster, self.estimate
+    def result(self, score: float | None) -> Pose | Failure:
+        estimate = self.estimate
         if isinstance(estimate, Failure):
-            counted = (estimate.num_matches, estimate.num_inliers)
-            return ClusterPose(images, *counted, reason=estimate.reason)
+            return replace(estimate, candidates=self.cluster)
         counted = (len(estimate.inliers), estimate.num_inliers)
-        return ClusterPose(images, *counted, estimate.rig_from_world, score)
+        return Pose(estimate.rig_from_world, *counted, candidates=self.cluster, score=score)
 
 
 def _join_agreeing(
@@ -283,7 +284,7 @@ def _join_agreeing(
     return found
 
 
-def _best(clusters: Sequence[ClusterPose]) -> int:
+def _best(clusters: Sequence[Pose | Failure]) -> int:
     """Return the index of the best score; without scores, that of the most inliers."""
 
     def key(at: int) -> tuple[bool, float, int, int, int]:
@@ -344,8 +345,7 @@ def poses_of_cameras(
 
     A camera without inliers fails, even though the rig has a pose.
     """
-    if rig.inliers is None:
-        raise ValueError("the inliers of the rig's pose are not known")
+    assert rig.inliers is not None
     cameras: list[Pose | Failure] = []
     end = 0
     for view, inliers in zip(views, problem.split(rig.inliers), strict=True):
@@ -359,6 +359,7 @@ def poses_of_cameras(
         px, points = rig.inlier_points_px, rig.inlier_points_world
         own = replace(
             rig,
+            name=view.name,
             cam_from_world=view.cam_from_rig @ rig.cam_from_world,
             clusters=clusters,
             num_matches=len(inliers),
@@ -372,6 +373,7 @@ def poses_of_cameras(
             own = replace(own, covariance=moved)
         failure = Failure(
             "no inlier in this camera; others of its rig were localized",
+            name=view.name,
             num_matches=len(inliers),
             candidates=rig.candidates,
             clusters=clusters,

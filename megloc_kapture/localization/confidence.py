@@ -86,8 +86,7 @@ def evidence_of(
     problem: PoseProblem, pose: Pose, sources: MatchSources, max_error_px: float
 ) -> dict[str, float]:
     """Return the terms of :data:`TERMS` for a refined pose with inliers and covariance."""
-    if pose.inliers is None or pose.covariance is None:
-        raise ValueError("evidence needs the inliers and the covariance of a pose")
+    assert pose.inliers is not None and pose.covariance is not None
     rig_from_world = pose.cam_from_world
     inliers = pose.inliers
     errors_px, _ = match_errors(problem, rig_from_world)

@@ -37,7 +37,7 @@ from megloc_kapture.localization.absolute_pose import (
     refine_pose,
 )
 from megloc_kapture.localization.map_index import PoseProblem, View
-from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
+from megloc_kapture.values import Camera, Failure, LocalizationResult, Pose, RigidTransform
 
 Floats = NDArray[np.float64]
 # map errors of neighbouring points are correlated: deviations that assume independent matches are
@@ -205,9 +205,9 @@ def _freed(
     )
 
 
-def misfits_text(remarks: Iterable[str], where: str) -> str | None:
-    """Summarize how many queries have a misfitting focal length, given their remarks."""
-    count = sum(_DOES_NOT_FIT in of_query for of_query in remarks)
+def misfits_text(results: Iterable[LocalizationResult], where: str) -> str | None:
+    """Summarize how many queries have a misfitting focal length."""
+    count = sum(any(_DOES_NOT_FIT in remark for remark in result.remarks) for result in results)
     if not count:
         return None
     return f"the given focal length {_DOES_NOT_FIT} in {count} queries: see the remarks in {where}"

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
 from megloc_kapture.values import Camera, RigidTransform
 
 Floats = NDArray[np.float64]
@@ -253,14 +252,6 @@ class View:
     points_px: NDArray[np.floating[Any]]
     points_world: Floats
     point_covariances: Floats | None = None
-
-    def __post_init__(self) -> None:
-        count = len(self.points_px)
-        if self.points_px.shape != (count, 2) or self.points_world.shape != (count, 3):
-            raise DataError(
-                f"pixels {self.points_px.shape} and points {self.points_world.shape} of a view "
-                "are not (N, 2) and (N, 3)"
-            )
 
 
 @dataclass(frozen=True, eq=False)

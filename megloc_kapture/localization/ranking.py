@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.geometry.warping import WarpedView, WarpSource, warp_to_view
-from megloc_kapture.plugin_loading import load_plugin, weights_of
+from megloc_kapture.plugin_loading import Placement, load_chosen, weights_of
 from megloc_kapture.plugins import (
     IMAGE_DISTANCES,
     ImageDistance,
@@ -27,7 +27,7 @@ from megloc_kapture.plugins import (
     PoseHypothesis,
     RankingScene,
 )
-from megloc_kapture.values import Camera, Options, RigidTransform
+from megloc_kapture.values import Camera, Device, Options, RigidTransform
 
 
 class InlierCount:
@@ -120,6 +120,8 @@ class PerceptualOptions(Options):
         default=PluginChoice(name="structure"),
         description="how different two aligned images look: structure, lpips, or another's",
     )
+    device: Device = Field(default="auto", description="of the distance: auto, cpu, cuda or cuda:N")
+    half_precision: bool = Field(default=False, description="of the distance")
     min_inlier_share: float = Field(
         default=0.05,
         ge=0,
@@ -160,8 +162,10 @@ class PerceptualRanker:
 
     def __init__(self, options: PerceptualOptions | None = None) -> None:
         self.options = options or PerceptualOptions()
-        choice = self.options.distance
-        self._distance: ImageDistance = load_plugin(IMAGE_DISTANCES, choice.name, choice.options)
+        placement = Placement(self.options.device, self.options.half_precision)
+        self._distance: ImageDistance = load_chosen(
+            IMAGE_DISTANCES, self.options.distance, placement
+        )
 
     def plugins(self) -> tuple[object, ...]:
         return (self._distance,)

@@ -23,7 +23,7 @@ from megloc_kapture.geometry.cameras import (
     project,
     scale_focal,
 )
-from megloc_kapture.geometry.conventions import CONVENTIONS
+from megloc_kapture.geometry.poses import CONVENTIONS
 from megloc_kapture.values import Camera, RigidTransform
 
 Origin = Literal["corner", "centre"]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.geometry.conventions import CONVENTIONS, better_conventions
+from megloc_kapture.geometry.poses import CONVENTIONS, better_conventions
 from megloc_kapture.matching.verification import Floats, KnownPoseOptions, verify_with_poses
 from megloc_kapture.values import RigidTransform
 

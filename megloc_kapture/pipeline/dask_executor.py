@@ -11,14 +11,13 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator
-from concurrent.futures import CancelledError, Executor
+from concurrent.futures import Executor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from distributed import Client, KilledWorker, LocalCluster, Worker, WorkerPlugin
-from distributed.comm.core import CommClosedError
 
 from megloc_kapture.errors import MeglocError, OptionError
 from megloc_kapture.evaluation.pose_files import installed_version
@@ -60,11 +59,6 @@ def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator
             raise MeglocError(
                 f"an item of work killed {_ALLOWED_FAILURES} workers, perhaps out of memory; "
                 "try fewer workers per machine"
-            ) from error
-        except (CancelledError, CommClosedError) as error:
-            raise MeglocError(
-                f"the scheduler {scheduler or 'of the local cluster'} has gone; run the same "
-                "command again to go on"
             ) from error
         except ModuleNotFoundError as error:
             if error.name != "megloc_kapture":

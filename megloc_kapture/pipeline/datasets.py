@@ -341,8 +341,6 @@ def read_benchmark(path: Path) -> BenchmarkFile:
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
         return BenchmarkFile.model_validate(content)
-    except OSError as error:
-        raise DataError(f"cannot be read: {error.strerror}", path=path) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise DataError(f"not TOML: {error}", path=path) from error
     except ValidationError as error:

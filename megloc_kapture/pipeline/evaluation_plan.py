@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import logging
+import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +16,20 @@ from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.evaluation.protocols import benchmark_of
 from megloc_kapture.evaluation.report.reports import RECALL_JSON, write_report
 from megloc_kapture.evaluation.results import context_of
-from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol
-from megloc_kapture.pipeline.datasets import DatasetChoice, with_model
+from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol, read_protocol
+from megloc_kapture.pipeline.datasets import (
+    KAPTURE,
+    TWIN_PREFIX,
+    BenchmarkFile,
+    DatasetChoice,
+    choose_dataset,
+    find_benchmark,
+    has_model,
+    read_benchmark,
+    with_model,
+)
 from megloc_kapture.pipeline.map_making import MAP_STAGES
-from megloc_kapture.pipeline.presets import check_weights
-from megloc_kapture.pipeline.run import Run
+from megloc_kapture.pipeline.presets import assigned, check_weights, options_of_preset
 from megloc_kapture.pipeline.submission import write_submission
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import STAGES
@@ -46,6 +57,121 @@ from megloc_kapture.stages.stage import (
     is_below,
     wanted_stages,
 )
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A dataset and its final options; ``usual`` are the options without the user's changes."""
+
+    source: DatasetChoice
+    preset: str
+    options: PipelineOptions
+    benchmark: BenchmarkFile = BenchmarkFile(dataset=KAPTURE)
+    usual: PipelineOptions | None = None
+
+    @property
+    def dataset(self) -> str:
+        return self.source.name
+
+    @property
+    def default_workspace(self) -> Path:
+        source, folder = self.source, ""
+        if source.root is not None and source.adapter is None:
+            folder = Path(os.path.abspath(source.root)).name
+        return Path("runs") / "-".join(filter(None, (self.dataset, folder, self.preset)))
+
+    @property
+    def label(self) -> str:
+        """Title of the result: ``kapture, classic with local_features=aliked``."""
+        changed = " and ".join(f"{key}={names}" for key, names in self._changed_features().items())
+        return f"{self.dataset}, {self.preset}{' with ' if changed else ''}{changed}"
+
+    def _changed_features(self) -> dict[str, str]:
+        usual, changed = self.usual or options_of_preset(self.preset), {}
+        for key in ("local_features", "global_features"):
+            names = [one.name for one in getattr(self.options, key)]
+            if names != [one.name for one in getattr(usual, key)]:
+                changed[key] = "+".join(names)
+        return changed
+
+    def submission_below(self, folder: Path, tables: Path) -> Path:
+        """Return the path of the pose file, or of the folder of several, below ``folder``.
+
+        The name is the server's, ``Aachen_v1_1_eval_METHOD.txt``, or begins with ``synthetic-``.
+        """
+        protocol = read_protocol(tables)
+        stem = self.dataset
+        if protocol.pose_file_stem and not stem.startswith(TWIN_PREFIX):
+            stem = protocol.pose_file_stem
+        end = "" if protocol.pose_file == "mlad" else ".txt"
+        method = "-".join(("megloc", self.preset, *self._changed_features().values()))
+        return folder / SUBMISSIONS / f"{stem}_eval_{method}{end}"
+
+    def provenance(self) -> dict[str, Any]:
+        options = self.options.model_dump(mode="json")
+        return {"dataset": self.dataset, "preset": self.preset, "options": options}
+
+
+def choose_run(
+    dataset: str,
+    root: Path | None = None,
+    *,
+    preset: str | None = None,
+    assignments: Sequence[str] | Mapping[str, Any] = (),
+    import_options: Mapping[str, Any] | None = None,
+    config: Path | None = None,
+    query_prefix: str = "",
+    allow_missing: bool = False,
+    find_root: bool = True,
+) -> Run:
+    """Return the run of ``megloc eval`` for a dataset.
+
+    Parameters
+    ----------
+    root : published dataset folder; searched below MEGLOC_DATA by default.
+    assignments : the user's changes: ``key.key=value`` texts, or ``key.key`` to values.
+    import_options : dataset options, applied after those of the benchmark file.
+    config : benchmark file that replaces the packaged one.
+    find_root : if false, an official dataset may lack a root and then cannot be imported.
+    """
+    benchmark = find_benchmark(dataset)
+    if config:
+        benchmark = read_benchmark(config)
+        if benchmark.dataset != dataset:
+            raise OptionError(f"{config} is for dataset {benchmark.dataset}, not {dataset}")
+    preset = preset or benchmark.preset
+    source = choose_dataset(
+        dataset,
+        root,
+        import_options=benchmark.import_options_of(preset) | dict(import_options or {}),
+        query_prefix=query_prefix,
+        allow_missing=allow_missing,
+        find_root=find_root,
+    )
+    source.check()
+    changes = benchmark.changes(
+        preset, map_depth=source.has_map_depth(), query_depth=source.has_query_depth()
+    )
+    usual = options_of_preset(preset, changes=changes)
+    options = options_of_preset(preset, changes=changes, assignments=assignments)
+    if "by" not in assigned(assignments).get("mapping_pairs", {}) and not has_model(source):
+        permitted = _without_covisibility(options)
+        if permitted != options:
+            _log.warning("no reference model in this data: no map pairs by co-visibility")
+        options = permitted
+    return Run(source, preset, options, benchmark, usual)
+
+
+def _without_covisibility(options: PipelineOptions) -> PipelineOptions:
+    """Drop pairs by co-visibility, which need a reference model, if other pairs remain."""
+    others = tuple(method for method in options.mapping_pairs.by if method != "covisibility")
+    if not others or not options.pairs_by_points():
+        return options
+    pairs = options.mapping_pairs.model_copy(update={"by": others})
+    return options.model_copy(update={"mapping_pairs": pairs})
+
 
 WORLD = "world"
 
@@ -85,27 +211,20 @@ def plan_evaluation(run: Run) -> list[Stage]:
     return stages
 
 
-@dataclass(frozen=True)
-class StageLine:
-    """A stage, its inclusion in a run, and the reason."""
-
-    name: str
-    on: bool
-    why: str
-
-
-def explain(options: PipelineOptions) -> list[StageLine]:
-    lines: dict[str, StageLine] = {}
+def explain(options: PipelineOptions) -> list[dict[str, Any]]:
+    """Return each stage's ``name``, ``on`` if the run includes it, and ``why``."""
+    rows: dict[str, dict[str, Any]] = {}
     for stage in (kind(options) for kind in PIPELINE):
-        if stage.is_wanted() or stage.name not in lines:  # alternative stages share a name
-            lines[stage.name] = StageLine(stage.name, stage.is_wanted(), stage.explain())
-    return list(lines.values())
+        on = stage.is_wanted()
+        if on or stage.name not in rows:  # alternative stages share a name
+            rows[stage.name] = {"name": stage.name, "on": on, "why": stage.explain()}
+    return list(rows.values())
 
 
-def explained(lines: Sequence[StageLine]) -> str:
-    width = max(len(line.name) for line in lines)
+def explained(rows: Sequence[Mapping[str, Any]]) -> str:
+    width = max(len(row["name"]) for row in rows)
     return "\n".join(
-        f"{line.name:{width}s}  {'on' if line.on else 'off':3s}  {line.why}" for line in lines
+        f"{row['name']:{width}s}  {'on' if row['on'] else 'off':3s}  {row['why']}" for row in rows
     )
 
 
@@ -159,10 +278,8 @@ class Render(_RunStage):
         return self._run.source.render_options()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        twin = self._run.source.twin
-        if twin is None:
-            raise ValueError(f"dataset {self._run.dataset} is given, not rendered")
-        return twin.write(work.out / WORLD, work)
+        assert self._run.source.twin is not None
+        return self._run.source.twin.write(work.out / WORLD, work)
 
 
 class Import(_RunStage):
@@ -240,7 +357,7 @@ class Evaluate(_RunStage):
     writes = (EVALUATION,)
 
     def settings(self) -> dict[str, Any]:
-        steps = list(map(asdict, explain(self.options)))
+        steps = explain(self.options)
         return {**self._run.provenance(), "steps": steps, PROTOCOL: self._protocol()}
 
     def run(self, work: StageWork) -> Mapping[str, float]:

@@ -98,9 +98,8 @@ def export_undistorted(scene: Scene, output: Path) -> None:
     """
     images = [replace(image, name=image.name.replace("/", "_")) for image in scene.images]
     for image in images:
-        if image.path is None or not image.path.is_file():
-            raise DataError(f"undistorting needs the file of {image.name!r}", path=image.path)
-        check_size(image_size(image.path), image.camera, image.path)
+        path = _file_of(image, "undistorting")
+        check_size(image_size(path), image.camera, path)
     with tempfile.TemporaryDirectory(prefix=".megloc-", dir=output) as scratch:
         model, links = Path(scratch) / "model", Path(scratch) / "images"
         export_colmap(Scene(images, scene.points), model)
@@ -114,10 +113,9 @@ def export_nerfstudio(scene: Scene, output: Path, *, beside: Path | None = None)
     """Write ``transforms.json``, with paths relative to ``beside``, and ``sparse_pc.ply``."""
     frames = []
     for image in scene.images:
-        if image.path is None or not image.path.is_file():
-            raise DataError(f"nerfstudio needs the file of {image.name!r}", path=image.path)
+        path = _file_of(image, "nerfstudio")
         world_from_cam = image.cam_from_world.inverse().matrix()
-        file = os.path.relpath(image.path.resolve(), (beside or output).resolve())
+        file = os.path.relpath(path.resolve(), (beside or output).resolve())
         frames.append(
             {
                 "file_path": Path(file).as_posix(),
@@ -130,6 +128,12 @@ def export_nerfstudio(scene: Scene, output: Path, *, beside: Path | None = None)
         write_ply(output / "sparse_pc.ply", scene.points[:, :3], scene.points[:, 3:])
         content["ply_file_path"] = "sparse_pc.ply"
     write_bytes(output / "transforms.json", (json.dumps(content, indent=1) + "\n").encode())
+
+
+def _file_of(image: PosedImage, who: str) -> Path:
+    if image.path is None or not image.path.is_file():
+        raise DataError(f"{who} needs the file of {image.name!r}", path=image.path)
+    return image.path
 
 
 def export_tum(scene: Scene, output: Path) -> None:

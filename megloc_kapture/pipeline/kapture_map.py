@@ -23,8 +23,9 @@ from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.local_features import check_lengths
 from megloc_kapture.stages.map_refinement import REPORT_FILE
-from megloc_kapture.stages.shared_index import index_map, observed_keypoints, with_noise
+from megloc_kapture.stages.scene import check_points, index_map, observed_keypoints, with_noise
 from megloc_kapture.values import Camera, RigidTransform
 
 PixelOriginChoice = Literal["auto", "corner", "centre"]
@@ -136,12 +137,7 @@ class KaptureMap:
             path, features_dirs=features_dirs, allow_links_below=allow_links_below
         )
         folder.read()
-        if not folder.has_points():
-            raise DataError(
-                "no map to localize in: reconstruction/points3d.txt or observations.txt is "
-                "missing; `megloc triangulate` makes one from images with poses",
-                path=folder.root,
-            )
+        check_points(folder, "localize in")
         indices = _read_indices(folder, keypoints_types)
         origins = _find_origins(folder, indices)
         if pixel_origin != "auto":
@@ -251,15 +247,6 @@ class KaptureMap:
             name
             for name, reader in readers.items()
             if all(image in reader for image in self.images)
-        )
-
-
-def check_lengths(keypoints: FeatureReader, descriptors: FeatureReader, image: str) -> None:
-    """Raise DataError if an image has different numbers of descriptors and keypoints."""
-    expected, found = keypoints.length(image), descriptors.length(image)
-    if found != expected:
-        raise DataError(
-            f"{found} descriptors for {expected} keypoints", path=descriptors.where(image)
         )
 
 

@@ -15,7 +15,7 @@ from megloc_kapture.localization.map_index import ImageMatches
 from megloc_kapture.matching.guided_pyramid import base_type, equivalent_types
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, plain_name
 from megloc_kapture.pipeline.queries import QueryImage
-from megloc_kapture.plugin_loading import load_plugin, plugin_names
+from megloc_kapture.plugin_loading import load_chosen, plugin_names
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
@@ -23,7 +23,6 @@ from megloc_kapture.plugins import (
     Matcher,
     PluginChoice,
 )
-from megloc_kapture.stages.devices import BATCH, with_device
 from megloc_kapture.stages.given_map import rows_found_again
 from megloc_kapture.stages.guided_pyramid import PyramidMethod, retry_query
 from megloc_kapture.stages.local_features import extract_all, read_frame
@@ -36,7 +35,7 @@ from megloc_kapture.stages.matches import (
     verified,
 )
 from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
-from megloc_kapture.stages.work import batched
+from megloc_kapture.stages.work import BATCH, batched
 
 _MIN_FOUND_AGAIN = 0.5
 _NO_MATCHES = VerifiedMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32), 0)
@@ -76,7 +75,7 @@ class LocalType:
     def matcher(self) -> Matcher:
         own = None if self.choice is None else self.choice.matching
         chosen = own or self._options.matching
-        found: Matcher = load_plugin(MATCHERS, chosen.name, chosen.options)
+        found: Matcher = load_chosen(MATCHERS, chosen, self._options.placement)
         return found
 
     @cached_property
@@ -90,13 +89,15 @@ class LocalType:
                 f"them, write its name first into {self.name}/keypoints.txt",
                 path=self._map.folder.root,
             )
-        extractor: LocalFeatureExtractor = load_plugin(LOCAL_FEATURES, found.name, found.options)
+        extractor: LocalFeatureExtractor = load_chosen(
+            LOCAL_FEATURES, found, self._options.placement
+        )
         return extractor
 
     def brought(self) -> PluginChoice | None:
         found = self.first.extractor()
         if self.choice is None or (found is not None and found.name != self.choice.name):
-            return with_device(found, self._options.device, self._options.precision)
+            return found
         known = {} if found is None else found.options
         return PluginChoice(name=self.choice.name, options={**self.choice.options, **known})
 
@@ -172,12 +173,6 @@ class LocalType:
         stored = keypoints.keypoints_px(image)
         source = self if keypoints is self.first else keypoints
         descriptors = source.descriptors(image)
-        if len(stored) != len(descriptors):
-            raise DataError(
-                f"{image} has {len(stored)} keypoints and {len(descriptors)} descriptors of type "
-                f"{keypoints.name!r}",
-                path=self._map.folder.root,
-            )
         # keypoints without a point help no pose, but reject wrong matches in the mutual check
         return Features.of(self._map.camera(image), stored, descriptors)
 

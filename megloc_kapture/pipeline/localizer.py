@@ -20,7 +20,6 @@ from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.live_source import LiveSource, MapMatching
 from megloc_kapture.pipeline.local_types import local_types_of
-from megloc_kapture.pipeline.map_retrieval import MapRetrieval
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import (
     Preprocessor,
@@ -30,7 +29,6 @@ from megloc_kapture.pipeline.queries import (
     Unit,
 )
 from megloc_kapture.pipeline.query_folders import KaptureQueries
-from megloc_kapture.stages.devices import Precision
 from megloc_kapture.stages.localized_folder import unreadable_image
 from megloc_kapture.stages.matches import FeatureCache
 from megloc_kapture.stages.options import PipelineOptions
@@ -38,7 +36,7 @@ from megloc_kapture.stages.pose_refinement import MapRefiners
 from megloc_kapture.stages.query_poses import localize_query
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import ordered_map
-from megloc_kapture.values import Camera, Device, Failure, Pose, RigidTransform
+from megloc_kapture.values import Camera, Device, Failure, Pose, Precision, RigidTransform
 
 _ALONE = RigidTransform.identity()
 
@@ -73,16 +71,18 @@ class Localizer:
             raise OptionError("give the device and the precision in the options")
         where = {"device": device, "precision": precision}
         self.options = options or options_of_preset(preset, changes=[where])
-        self._ranker = self.options.localization.make_ranker()
+        self._ranker = self.options.localization.make_ranker(self.options.placement)
         self._preprocessor = Preprocessor(self.options)
         self.refiners = MapRefiners(
-            kapture_map.folder, kapture_map.restrictions, self.options.pose_refinement
+            kapture_map.folder,
+            kapture_map.restrictions,
+            self.options.pose_refinement,
+            self.options.placement,
         )
         self.types = local_types_of(kapture_map, self.options, FeatureCache())
         for local in self.types:
             local.prepare()
-        retrieval = MapRetrieval(kapture_map, self.options, self.types, self._preprocessor)
-        self.matching = MapMatching(kapture_map, self.options, self.types, retrieval)
+        self.matching = MapMatching(kapture_map, self.options, self.types, self._preprocessor)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _made_again, (self._key, *self.map.__reduce__(), self.options.model_dump_json())
@@ -248,7 +248,7 @@ class Localizer:
         options = self.options.query_pairs
         if options.by == "exhaustive" or len(self.map.images) <= options.top_k:
             return f"all {len(self.map.images)} map images"
-        return self.matching.retrieval.describe(global_types)
+        return self.matching.describe(global_types)
 
 
 def _query_of(image: Path | str | NDArray[np.uint8], camera: Camera) -> Query:

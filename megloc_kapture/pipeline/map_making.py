@@ -52,7 +52,7 @@ from megloc_kapture.io.files import (
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.io.output_folders import replace_directory
 from megloc_kapture.pipeline.executors import single_threaded
-from megloc_kapture.pipeline.plan import run_plan
+from megloc_kapture.pipeline.plan import Workspace, map_of_workspace, run_plan
 from megloc_kapture.pipeline.presets import (
     DEFAULT_PRESET,
     PRESETS,
@@ -60,7 +60,6 @@ from megloc_kapture.pipeline.presets import (
     options_of_preset,
 )
 from megloc_kapture.pipeline.query_folders import Photographs
-from megloc_kapture.pipeline.workspace import Workspace, map_of_workspace
 from megloc_kapture.stages.densifying import Densify
 from megloc_kapture.stages.global_features import ExtractGlobalFeatures
 from megloc_kapture.stages.image_pairs import PairMapping

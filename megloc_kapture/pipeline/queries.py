@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.images import read_image_rgb, turned_upright
 from megloc_kapture.localization.focal_length import estimate_remark
-from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugin_loading import load_chosen
 from megloc_kapture.plugins import (
     SEGMENTERS,
     DepthView,
@@ -92,14 +92,11 @@ class Query:
             check_size(image.shape[1::-1], self.camera, self.image)
             return image
         image = np.asarray(self.image)
-        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+        shape = (self.camera.height, self.camera.width, 3)
+        if image.dtype != np.uint8 or image.shape != shape:
             raise DataError(
-                f"query {self.name}: an image is uint8 (H, W, 3), got {image.dtype} {image.shape}"
-            )
-        if image.shape[:2] != (self.camera.height, self.camera.width):
-            raise DataError(
-                f"query {self.name}: the image is {image.shape[1]}x{image.shape[0]}, its camera "
-                f"says {self.camera.width}x{self.camera.height}"
+                f"query {self.name}: an image of its camera is uint8 {shape}, got {image.dtype} "
+                f"{image.shape}"
             )
         return image
 
@@ -127,7 +124,7 @@ class Preprocessor:
         masks = self._options.preprocessing.masks
         if masks.segmenter is None:
             return None
-        segmenter = load_plugin(SEGMENTERS, masks.segmenter.name, masks.segmenter.options)
+        segmenter = load_chosen(SEGMENTERS, masks.segmenter, self._options.placement)
         return ClassMasks.of(segmenter, masks.dynamic)
 
 

@@ -46,11 +46,11 @@ from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, writab
 from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.output_folders import MARKER
 from megloc_kapture.matching.guided_pyramid import equivalent_types
-from megloc_kapture.pipeline.kapture_map import KaptureMap, check_lengths, plain_name
+from megloc_kapture.pipeline.kapture_map import KaptureMap, plain_name
 from megloc_kapture.pipeline.queries import Query, Unit
 from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.stages import scene
-from megloc_kapture.stages.local_features import mask_path
+from megloc_kapture.stages.local_features import check_lengths, mask_path
 from megloc_kapture.stages.scene import depth_of
 from megloc_kapture.values import Camera, LocalFeatures, RigidTransform
 

@@ -14,11 +14,11 @@ from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.dataset_tables import METRES, write_unit
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
-from megloc_kapture.io.tables import CONSISTENCY_FILE, write_consistency
+from megloc_kapture.io.tables import CONSISTENCY_FILE, status_row, write_consistency
 from megloc_kapture.localization.focal_length import solve_with_shared_camera
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.query_folders import KaptureQueries, Photographs, Queries
-from megloc_kapture.stages.localized_folder import query_status, unreadable_image, write_localized
+from megloc_kapture.stages.localized_folder import unreadable_image, write_localized
 from megloc_kapture.stages.stage import LOCALIZED
 from megloc_kapture.stages.work import Track, untracked
 from megloc_kapture.values import Failure, Pose, RigidTransform
@@ -95,7 +95,7 @@ class Results(Mapping[str, Pose | Failure]):
         fallback = self.localizer.options.localization.fallback
         best = self._best_candidates() if fallback == "retrieval" else {}
         counts = write_localized(
-            output, self.queries.data(), self.items(), fallback=fallback, first_candidates=best
+            output, self.queries.data(), self.values(), fallback=fallback, first_candidates=best
         )
         self.queries.write_images(output)
         if (unit := self.localizer.map.unit) != METRES:
@@ -110,8 +110,7 @@ class Results(Mapping[str, Pose | Failure]):
 
         rows = []
         for name, result in self.items():
-            row: dict[str, Any] = query_status(name, result).model_dump()
-            row["candidates"] = list(row["candidates"])
+            row = {**status_row(result), "image": name, "candidates": list(result.candidates)}
             if isinstance(result, Pose):
                 pose = result.cam_from_world
                 row |= dict(zip(("qw", "qx", "qy", "qz"), pose.quat_wxyz, strict=True))

@@ -7,7 +7,7 @@ import logging
 import os
 import shutil
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from types import MappingProxyType
@@ -41,7 +41,7 @@ from megloc_kapture.io.dataset_tables import (
 )
 from megloc_kapture.io.files import read_text, safe_join, temporary_name, write_bytes, write_json
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder
-from megloc_kapture.io.tables import STATUS_FILE, QueryStatus, read_status
+from megloc_kapture.io.tables import STATUS_FILE, read_status
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,
     SYNTHETIC,
@@ -49,9 +49,9 @@ from megloc_kapture.pipeline.datasets import (
     check_known,
     dataset_names,
 )
-from megloc_kapture.pipeline.workspace import Manifest, read_manifest
+from megloc_kapture.pipeline.plan import Manifest, read_manifest
 from megloc_kapture.stages import scene
-from megloc_kapture.values import Pose, RigidTransform
+from megloc_kapture.values import LocalizationResult, Pose, RigidTransform
 
 _log = logging.getLogger(__name__)
 
@@ -62,14 +62,8 @@ _DUMMY = RigidTransform.identity()
 _Content = tuple[Mapping[str, str], Sequence[str], Sequence[tuple[str, str]]]
 
 
-@dataclass(frozen=True)
-class _Result:
-    data: KaptureData
-    poses: Mapping[str, RigidTransform]
-    guesses: Collection[str]
-    from_rig: Collection[str]
-    doubtful: set[str]
-    confidences: Mapping[str, float]
+_Results = Mapping[str, LocalizationResult]
+"""Results by image, with the poses that are handed in, fallbacks included."""
 
 
 def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> None:
@@ -118,30 +112,34 @@ def write_submission(
     """
     beside = None if tables is None else tables.parent
     rules = Protocol() if tables is None else read_protocol(tables)
-    result = _read_result(localized, beside, from_rig=from_rig)
+    results = _read_results(localized, beside, from_rig=from_rig)
     unreadable = {} if tables is None else read_unreadable(tables)
     if rules.pose_file == "mlad" and tables is not None:
-        texts, posed, missing = _mlad(result, tables)
+        texts, posed, missing = _mlad(results, tables)
         for name, text in texts.items():
             write_bytes(safe_join(place, name), text.encode("ascii"))
     else:
-        texts, posed, missing = _ltvl(result, tables, rules, unreadable)
+        texts, posed, missing = _ltvl(results, tables, rules, unreadable)
         write_bytes(place, texts[""].encode("utf-8"))
     counts = {
-        "queries": len(result.data.records_camera) + len(unreadable),
+        "queries": len(results) + len(unreadable),
         "scored": len(posed) + len(missing),
         "poses": len(posed),
         "missing": len(missing),
-        "doubtful": len(result.doubtful.intersection(image for _, image in missing)),
-        "fallbacks": sum(image in result.guesses for image in posed),
-        "from_rig": sum(image in result.from_rig for image in posed),
+        "doubtful": len({image for _, image in missing if _is_doubtful(results.get(image))}),
+        "fallbacks": sum(results[image].fallback == "retrieval" for image in posed),
+        "from_rig": sum(results[image].fallback == "rig" for image in posed),
         "dummies": len(missing) if rules.pose_file == "mlad" else 0,
     }
     known = set(posed)
     entries = {
         **provenance,
         "weights": _weights(localized),
-        "confidence": {i: c for i, c in sorted(result.confidences.items()) if i in known},
+        "confidence": {
+            image: result.confidence
+            for image, result in sorted(results.items())
+            if image in known and result.status == "localized" and result.confidence is not None
+        },
         "dataset_fingerprint": _dataset_fingerprint(beside),
         "dummies" if rules.pose_file == "mlad" else "missing": [row for row, _ in missing],
     }
@@ -153,7 +151,7 @@ def write_submission(
 def poses_through_rig(
     data: KaptureData,
     poses: Mapping[str, RigidTransform],
-    statuses: Mapping[str, QueryStatus] = MappingProxyType({}),
+    statuses: Mapping[str, LocalizationResult] = MappingProxyType({}),
 ) -> dict[str, RigidTransform]:
     """Derive missing poses from the image of the same rig and timestamp with the most inliers.
 
@@ -163,13 +161,13 @@ def poses_through_rig(
     for image, pose in poses.items():
         status = statuses.get(image)
         if status is None:
-            localized[image] = Pose(pose, 0, 0)
+            localized[image] = Pose(pose)
         elif status.status == "localized":
-            localized[image] = Pose(pose, status.num_matches, status.num_inliers)
+            localized[image] = Pose(pose, num_inliers=status.num_inliers or 0)
     return {image: pose for image, (_, pose) in scene.poses_through_rig(data, localized).items()}
 
 
-def _read_result(localized: Path, beside: Path | None, *, from_rig: bool) -> _Result:
+def _read_results(localized: Path, beside: Path | None, *, from_rig: bool) -> _Results:
     own = KaptureFolder(localized).read()
     data = own
     query = None if beside is None else beside / QUERY
@@ -183,43 +181,44 @@ def _read_result(localized: Path, beside: Path | None, *, from_rig: bool) -> _Re
                 "this dataset?",
                 path=localized,
             )
-    path = localized / STATUS_FILE
+    path, poses = localized / STATUS_FILE, own.poses()
     statuses = read_status(path) if path.is_file() else {}
-    poses = own.poses()
-    derived: dict[str, RigidTransform] = {}
+    results = {
+        name: replace(statuses.get(name, LocalizationResult()), cam_from_world=poses.get(name))
+        for name in data.image_names()
+    }
     if from_rig:
         if not data.rigs:
             raise DataError(
                 "no pose can come from the rig: neither the queries nor the result have a rigs.txt",
                 path=localized,
             )
-        derived = poses_through_rig(data, poses, statuses)
-    guesses = {image for image, s in statuses.items() if s.fallback == "retrieval"}
-    by_stage = {image for image, s in statuses.items() if s.fallback == "rig"}
-    doubtful = {
-        image for image, s in statuses.items() if s.status == "failed" and s.confidence is not None
-    }
-    confidences = {
-        image: s.confidence
-        for image, s in statuses.items()
-        if s.confidence is not None and s.status == "localized"
-    }
-    from_rigs = by_stage | derived.keys()
-    guesses -= derived.keys()
-    return _Result(data, poses | derived, guesses, from_rigs, doubtful, confidences)
+        for image, pose in poses_through_rig(data, poses, statuses).items():
+            results[image] = replace(results[image], cam_from_world=pose, fallback="rig")
+    return results
+
+
+def _is_doubtful(result: LocalizationResult | None) -> bool:
+    return result is not None and result.status == "failed" and result.confidence is not None
+
+
+def _posed(results: _Results) -> dict[str, RigidTransform]:
+    poses = {image: result.cam_from_world for image, result in results.items()}
+    return {image: pose for image, pose in poses.items() if pose is not None}
 
 
 def _ltvl(
-    result: _Result, tables: Path | None, rules: Protocol, unreadable: Collection[str]
+    results: _Results, tables: Path | None, rules: Protocol, unreadable: Collection[str]
 ) -> _Content:
+    poses = _posed(results)
     names = {} if tables is None else read_names(tables)
     world = World() if tables is None else read_world(tables)
     images = list(names)
     if not names:
         groups = {} if tables is None else read_groups(tables)
-        every = sorted({*result.data.image_names(), *unreadable})
+        every = sorted({*results, *unreadable})
         images = [image for image in every if groups.get(image, ImageGroup()).scored]
-    posed = [image for image in images if image in result.poses]
+    posed = [image for image in images if image in poses]
     rule = rules.pose_file_names
     unnamed = [] if names else [i for i in posed if not is_name(name_by_rule(i, rule))]
     if unnamed:
@@ -227,13 +226,13 @@ def _ltvl(
         more = ", ..." if len(unnamed) > 1 else ""
         _log.warning(said, len(unnamed), repr(unnamed[0]), more)
         posed = sorted(set(posed) - set(unnamed))
-    official = {image: world.pose_in_official(result.poses[image]) for image in posed}
+    official = {image: world.pose_in_official(poses[image]) for image in posed}
     text = format_pose_file(official, names=names or rule)
     with_row = set(posed)
     return {"": text}, posed, [(image, image) for image in images if image not in with_row]
 
 
-def _mlad(result: _Result, tables: Path) -> _Content:
+def _mlad(results: _Results, tables: Path) -> _Content:
     """Return texts by file name, (row, image) with a pose, and those without."""
     pairs = read_relocalization(tables)
     if not pairs:
@@ -242,12 +241,13 @@ def _mlad(result: _Result, tables: Path) -> _Content:
             "relocalization files?",
             path=tables / RELOCALIZATION_FILE,
         )
+    poses = _posed(results)
     scale = read_world(tables).official_from_local.scale
     references = KaptureFolder(tables.parent / MAPPING).read().poses()
     rows: dict[str, list[RelativePose]] = {}
     posed, missing = [], []
     for pair in pairs:
-        query, reference = result.poses.get(pair.query), references.get(pair.reference)
+        query, reference = poses.get(pair.query), references.get(pair.reference)
         if query is None or reference is None:
             missing.append((f"{pair.file}: {pair.reference} {pair.query}", pair.query))
             pose = _DUMMY

@@ -77,8 +77,7 @@ class FixedMask(Options):
         """Return the mask bool (H, W), True = use, of the polygon or the bottom share."""
         if self.polygon is not None:
             return outside_polygon(np.array(self.polygon), width, height)
-        if self.bottom_share is None:
-            raise ValueError("the mask is a file, it is not drawn")
+        assert self.bottom_share is not None
         rows = (np.arange(height) + 0.5) / height < 1 - self.bottom_share
         return np.repeat(rows[:, None], width, axis=1)
 
@@ -166,8 +165,7 @@ def find_unchanging_region(sequence: Iterable[Float32]) -> UnchangingRegion:
         length = np.linalg.norm(directions, axis=-1)
         total, lengths, squares = total + directions, lengths + length, squares + length**2
         count += 1
-    if count < MIN_IMAGES:
-        raise ValueError(f"{count} images; at least {MIN_IMAGES} are needed")
+    assert count >= MIN_IMAGES
     # sums over all pairs of different images: dot products, and products of lengths
     agreeing = np.square(total).sum(axis=-1) - squares
     present = np.square(lengths) - squares

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.retrieval.fusion import (
-    RANKED_IMAGES,
-    FusionOptions,
-    fuse,
-    fuse_rankings,
-    normalized_weights,
-)
+from megloc_kapture.values import Options
 
 _BLOCK_ELEMENTS = 1 << 24  # similarities held at once, per feature: 64 MiB of float32
 _VECTOR_ELEMENTS = 1 << 25  # of a block of database rows, per feature: 128 MiB of float32
@@ -44,8 +39,6 @@ VectorSource = VectorBlocks | NDArray[np.floating[Any]]
 
 class ArrayBlocks:
     def __init__(self, rows: NDArray[np.floating[Any]]) -> None:
-        if rows.ndim != 2:
-            raise DataError(f"global descriptors {rows.shape} are of different dimensions")
         self._rows = rows
 
     def __len__(self) -> int:
@@ -132,8 +125,6 @@ def _search(
     sources = [as_blocks(source) for source in database]
     vectors = [_checked(rows, source) for rows, source in zip(queries, sources, strict=True)]
     num_queries, num_rows = len(vectors[0]), common_length(sources)
-    if any(len(rows) != num_queries for rows in vectors):
-        raise DataError(f"features of {', '.join(str(len(rows)) for rows in vectors)} queries")
     step = _VECTOR_ELEMENTS // max(1, *(source.dimension for source in sources))
     step = max(1, min(step, _MOST_ROWS, _BLOCK_ELEMENTS))
     at_once = min(max(1, _BLOCK_ELEMENTS // step), num_queries)
@@ -193,3 +184,105 @@ def _first_best(scores: Float32, count: int) -> tuple[Float32, NDArray[np.int64]
         chosen[row, equal[len(equal) - surplus[row] :]] = False
     columns = np.nonzero(chosen)[1].reshape(height, count)
     return np.take_along_axis(scores, columns, axis=1), columns
+
+
+FusionMethod = Literal["ghm", "mean", "early", "reciprocal_rank"]
+_GAMMA = 0.5  # kapture-localization's default
+_RANK_CONSTANT = 60  # of Cormack et al.
+RANKED_IMAGES = 200  # per feature in reciprocal rank fusion
+Similarities = NDArray[np.floating[Any]]
+Ranking = tuple[NDArray[np.int64], NDArray[np.float32]]
+
+
+class FusionOptions(Options):
+    """Options of the fusion of several global features' similarities or rankings."""
+
+    method: FusionMethod = Field(
+        default="ghm",
+        description="ghm: generalized harmonic mean; early: of concatenated vectors; "
+        "reciprocal_rank: of ranks",
+    )
+
+    def fuses_ranks(self) -> bool:
+        return self.method == "reciprocal_rank"
+
+
+def fuse(
+    similarities: Sequence[Similarities],
+    options: FusionOptions,
+    weights: Sequence[float] | None = None,
+) -> Similarities:
+    """Fuse the similarities (Q, M) of several features; weights are equal by default."""
+    shares = normalized_weights(weights, len(similarities)).tolist()
+    total = np.zeros_like(similarities[0])
+    if options.method in ("mean", "early"):
+        for matrix, share in zip(similarities, shares, strict=True):
+            total += share * matrix
+        return total
+    with np.errstate(divide="ignore", over="ignore"):
+        for matrix, share in zip(similarities, shares, strict=True):
+            # 1 / 0 is infinite and makes the mean zero
+            total += (1 / len(similarities)) / np.maximum(_GAMMA + share * matrix, 0)
+        fused: Similarities = 1 / total
+    fused -= _GAMMA
+    return fused
+
+
+def normalized_weights(weights: Sequence[float] | None, count: int) -> NDArray[np.float64]:
+    """Return weights (count,) that sum to one, equal by default; OptionError if invalid."""
+    given = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)
+    if count == 0 or given.shape != (count,):
+        raise OptionError(f"{given.size} weights for {count} global features")
+    if not (np.isfinite(given).all() and (given > 0).all()):
+        raise OptionError(f"weights {given.tolist()} are not all finite and positive")
+    normalized: NDArray[np.float64] = given / given.sum()
+    return normalized
+
+
+def fuse_rankings(
+    lists: Sequence[NDArray[np.int64]], top_k: int, weights: Sequence[float] | None = None
+) -> Ranking:
+    """Fuse ranked lists, int64 (Q, K_i) per feature, by their reciprocal ranks.
+
+    Returns indices int64 (Q, top_k), best first, -1 if exhausted, and sums float32, -inf where -1.
+    Ties keep the order of images.
+    """
+    shares = normalized_weights(weights, len(lists)).tolist()
+    indices = np.full((len(lists[0]), top_k), -1, dtype=np.int64)
+    scores = np.full((len(lists[0]), top_k), -np.inf, dtype=np.float32)
+    points = [
+        share / (_RANK_CONSTANT + 1 + np.arange(ranked.shape[1]))
+        for ranked, share in zip(lists, shares, strict=True)
+    ]
+    for query, rankings in enumerate(zip(*lists, strict=True)):
+        images, rows = np.unique(np.concatenate(rankings), return_inverse=True)
+        sums = np.bincount(rows, np.concatenate(points), minlength=len(images))
+        sums, images = sums[images >= 0], images[images >= 0]
+        best = np.argsort(-sums, kind="stable")[:top_k]
+        indices[query, : len(best)] = images[best]
+        scores[query, : len(best)] = sums[best]
+    return indices, scores
+
+
+def greedy_coverage(
+    keypoint_ids: Sequence[NDArray[np.int64]], keep: int
+) -> tuple[list[int], list[int]]:
+    """Choose images one by one by the keypoints that the previous ones do not match.
+
+    The matches alone would prefer neighbours of the best image. Greedy maximum coverage (Nemhauser,
+    Wolsey and Fisher, 1978). ``keypoint_ids`` are each image's matched query keypoints. Returns at
+    most ``keep`` indices, and the number of keypoints that each adds.
+    """
+    size = max((int(ids.max()) + 1 for ids in keypoint_ids if len(ids)), default=0)
+    missing = np.ones(size, dtype=bool)
+    left = list(range(len(keypoint_ids)))
+    order: list[int] = []
+    added: list[int] = []
+    while left and len(order) < keep:
+        gains = {at: int(missing[keypoint_ids[at]].sum()) for at in left}
+        best = max(left, key=lambda at: (gains[at], len(keypoint_ids[at]), -at))
+        missing[keypoint_ids[best]] = False
+        left.remove(best)
+        order.append(best)
+        added.append(gains[best])
+    return order, added

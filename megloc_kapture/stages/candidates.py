@@ -17,10 +17,10 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.io.dataset_tables import ImageGroup, read_groups, read_priors
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
 from megloc_kapture.io.kapture.features import KaptureVectors
-from megloc_kapture.retrieval.fusion import FusionOptions
 from megloc_kapture.retrieval.search import (
     Found,
     FusedSearch,
+    FusionOptions,
     VectorBlocks,
     as_blocks,
     common_length,

@@ -32,7 +32,7 @@ from megloc_kapture.mvs.views import (
     stereo_view,
     with_pose_errors,
 )
-from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugin_loading import AUTO, Placement, load_chosen
 from megloc_kapture.plugins import (
     DEPTH_ESTIMATORS,
     DepthEstimate,
@@ -41,11 +41,15 @@ from megloc_kapture.plugins import (
     StereoView,
 )
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.devices import is_out_of_memory
 from megloc_kapture.stages.given_map import copy_features
 from megloc_kapture.stages.local_features import read_frame
-from megloc_kapture.stages.scene import depth_records
-from megloc_kapture.stages.shared_index import index_map, with_noise, write_array
+from megloc_kapture.stages.scene import (
+    check_points,
+    depth_records,
+    index_map,
+    with_noise,
+    write_array,
+)
 from megloc_kapture.stages.stage import MAP, Layout, PipelineStage, StageWork
 from megloc_kapture.stages.stereo_depth import (
     DEPTH_FILE,
@@ -57,7 +61,7 @@ from megloc_kapture.stages.stereo_depth import (
     with_depth_sensors,
     write_points,
 )
-from megloc_kapture.stages.work import HERE, FolderSpec, Work
+from megloc_kapture.stages.work import HERE, FolderSpec, Work, is_out_of_memory
 from megloc_kapture.values import Camera, Options
 
 _NO_POINTS = np.zeros(0, np.int64)
@@ -88,16 +92,14 @@ class DensifyOptions(Options):
     )
     max_size_px: int = Field(default=800, ge=64, description="longer side of the depth maps")
 
-    def make_estimator(self) -> DepthEstimator:
-        found: DepthEstimator = load_plugin(
-            DEPTH_ESTIMATORS, self.estimator.name, self.estimator.options
-        )
-        return found
+    def make_estimator(self, placement: Placement = AUTO) -> DepthEstimator:
+        made: DepthEstimator = load_chosen(DEPTH_ESTIMATORS, self.estimator, placement)
+        return made
 
 
 @dataclass(frozen=True)
 class StereoFit:
-    """What stereo of a map can confirm, given the accuracy of its poses.
+    """Limits of stereo in a map, given the accuracy of its poses.
 
     Attributes
     ----------
@@ -141,7 +143,7 @@ def densify_map(
     in the options. ``link_features`` is as in
     :func:`~megloc_kapture.stages.map_refinement.refine_map`.
     """
-    estimator = estimator or options.make_estimator()
+    estimator = estimator or options.make_estimator(work.placement)
     data = source.read()
     _check(source, data)
     fit = fitted_to_poses(source, options.max_size_px)
@@ -175,12 +177,7 @@ def densify_map(
 
 
 def _check(source: KaptureFolder, data: KaptureData) -> None:
-    if not source.has_points():
-        raise DataError(
-            "no map to densify: depth is looked for around its points (reconstruction/points3d.txt "
-            "and observations.txt); triangulate first",
-            path=source.root,
-        )
+    check_points(source, "densify")
     if (source.root / "sensors" / "records_data" / FOLDER).exists():
         raise DataError(f"has images or depth maps in records_data/{FOLDER}", path=source.root)
     if any(f"{sensor}_mvs" in data.sensors for sensor in data.sensors):
@@ -249,7 +246,7 @@ def _plan(
     for row, image in enumerate(images):
         blank = DepthRow(image, (), 0.0, 0.0, 0.0, "")
         if image in has_depth:
-            rows.append(replace(blank, reason="has depth of its own"))
+            rows.append(replace(blank, reason="already has depth"))
             continue
         if not source.image_path(image).is_file():
             rows.append(replace(blank, reason="there is no image file"))
@@ -363,7 +360,7 @@ def _scratch(job: _Job, image: str, kind: str) -> Path:
 
 
 class Densify(PipelineStage):
-    """Estimate depth of the map's images that have none."""
+    """Estimate the missing depth of the map's images."""
 
     name = "densify"
     version = 4

@@ -22,10 +22,16 @@ from megloc_kapture.features.vlad import (
 )
 from megloc_kapture.io.files import read_json_model, write_json_model
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
-from megloc_kapture.plugin_loading import checked_array, load_plugin, option_fault, plugin_names
+from megloc_kapture.plugin_loading import (
+    AUTO,
+    Placement,
+    checked_array,
+    load_chosen,
+    option_fault,
+    plugin_names,
+)
 from megloc_kapture.plugins import GLOBAL_FEATURES as PLUGINS
 from megloc_kapture.plugins import GlobalFeatureExtractor, PluginChoice
-from megloc_kapture.stages.devices import in_batches
 from megloc_kapture.stages.given_map import (
     MEAN_FILE,
     PROJECTION_FILE,
@@ -34,7 +40,7 @@ from megloc_kapture.stages.given_map import (
     described_images,
 )
 from megloc_kapture.stages.local_features import images_of, read_image_of
-from megloc_kapture.stages.shared_index import write_array
+from megloc_kapture.stages.scene import write_array
 from megloc_kapture.stages.stage import (
     FEATURES,
     GLOBAL_FEATURES,
@@ -43,7 +49,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, ordered_map
+from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, in_batches, ordered_map
 from megloc_kapture.values import Camera, Options
 
 
@@ -119,8 +125,7 @@ def _aggregate(
 def _read_once(folder: Path, run: tuple[object, ...]) -> tuple[Vocabulary, VladSettings]:
     """Read a vocabulary once per process, as it may be too large to send with every image."""
     found = read_vocabulary(folder)
-    if found is None:
-        raise DataError("the vocabulary is gone", path=folder / VOCABULARY_FILE)
+    assert found is not None
     return found
 
 
@@ -142,20 +147,10 @@ def read_vocabulary(folder: Path) -> tuple[Vocabulary, VladSettings] | None:
         return None
     settings = read_json_model(folder / SETTINGS_FILE, VladSettings)
     centres = _read_array(path, "vocabulary")
-    if centres.ndim == 2:  # older format with a single vocabulary
-        centres = centres[None]
-    if centres.ndim != 3:
-        raise DataError(f"not a vocabulary: {centres.shape}", path=path)
     if settings.options.dimensions is None:
         return Vocabulary(centres), settings
     mean = _read_array(folder / MEAN_FILE, "whitening")
     projection = _read_array(folder / PROJECTION_FILE, "whitening")
-    if mean.shape != (centres.size,) or projection.shape[1:] != mean.shape:
-        raise DataError(
-            f"mean {mean.shape} and projection {projection.shape} do not fit the vocabulary "
-            f"{centres.shape}",
-            path=folder / PROJECTION_FILE,
-        )
     return Vocabulary(centres, PcaWhitening(mean, projection)), settings
 
 
@@ -198,13 +193,13 @@ class GlobalFeaturesChoice(PluginChoice):
             fault = option_fault(error, VladChoiceOptions)
             raise OptionError(f"global features {VLAD!r} refuse their options: {fault}") from error
 
-    def make(self) -> GlobalFeatureExtractor:
+    def make(self, placement: Placement = AUTO) -> GlobalFeatureExtractor:
         known = plugin_names(PLUGINS)
         if self.name not in known:
             raise OptionError(
                 f"unknown global features {self.name!r}; {suggestion(self.name, [VLAD, *known])}"
             )
-        extractor: GlobalFeatureExtractor = load_plugin(PLUGINS, self.name, self.options)
+        extractor: GlobalFeatureExtractor = load_chosen(PLUGINS, self, placement)
         return extractor
 
     def type_name(self, main_local_type: str) -> str:
@@ -263,7 +258,7 @@ def describe_images(
 
     def describe(batch: Sequence[NDArray[np.uint8]]) -> list[Any]:
         found = many.describe_many(batch) if len(batch) > 1 else [extractor.describe(batch[0])]
-        return list(_checked(extractor, found, len(batch), names[0]))
+        return _checked(extractor, found, names[0])
 
     bounded = [bounded_image(image) for image in images]
     return np.stack(
@@ -277,16 +272,11 @@ def describe_images(
     )
 
 
-def _checked(
-    extractor: GlobalFeatureExtractor, found: Any, count: int, label: str
-) -> NDArray[np.float32]:
+def _checked(extractor: GlobalFeatureExtractor, found: Any, label: str) -> list[NDArray[Any]]:
     who = f"plugin {extractor.name!r} on image {label}"
-    if len(found) != count:
-        raise PluginError(f"{who}: {len(found)} vectors for {count} images")
-    size = len(checked_array(who, found[0], (None,), "float32"))
-    vectors = np.stack([checked_array(who, vector, (size,), "float32") for vector in found])
-    norms = np.linalg.norm(vectors, axis=1)
-    if np.abs(norms - 1.0).max() > 1e-3:
+    vectors = [checked_array(who, vector, (None,), "float32") for vector in found]
+    norms = np.array([np.linalg.norm(vector) for vector in vectors])
+    if np.abs(norms - 1.0).max(initial=0) > 1e-3:
         raise PluginError(f"{who}: a vector of length {norms.max():.4g}, expected 1")
     return vectors
 
@@ -327,7 +317,8 @@ class ExtractGlobalFeatures(PipelineStage):
         if self._trains():
             return found
         # image networks do not depend on local features
-        return {key: found[key] for key in ("global_features", "weights") if key in found}
+        keys = ("global_features", "weights", "precision")
+        return {key: found[key] for key in keys if key in found}
 
     def plugins(self) -> Sequence[object]:
         return [chosen.make() for chosen in self.options.global_features if not chosen.is_vlad]
@@ -343,6 +334,7 @@ class ExtractGlobalFeatures(PipelineStage):
                 found = extract_vlad(mapping, folders, name, work.out, vlad.of_vlad(), work=work)
             else:
                 folders = [work.folder(self.layout.mapping()), *queries]
-                found = extract_global_features(folders, chosen.make(), work.out, work=work)
+                extractor = chosen.make(work.placement)
+                found = extract_global_features(folders, extractor, work.out, work=work)
             counts[f"images_with_{chosen.name}"] = found["images"]
         return counts

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.files import hard_link
 from megloc_kapture.io.kapture import FeatureWriter, KaptureFolder
@@ -36,10 +35,9 @@ from megloc_kapture.matching.guided_pyramid import (
 from megloc_kapture.matching.pyramid_combination import Combined, KeypointUnion, combine
 from megloc_kapture.matching.verification import KnownPoseOptions, two_view_of_variants
 from megloc_kapture.plugins import LocalFeatureExtractor, Matcher
-from megloc_kapture.stages.devices import BATCH
-from megloc_kapture.stages.local_features import extract_all
+from megloc_kapture.stages.local_features import check_lengths, extract_all
 from megloc_kapture.stages.matches import Features, NoVerification, Verification, match_all
-from megloc_kapture.stages.work import batched
+from megloc_kapture.stages.work import BATCH, batched
 
 _log = logging.getLogger(__name__)
 
@@ -179,10 +177,7 @@ class PyramidFeatures:
         keypoints, descriptors = folder.keypoints(local_type), folder.descriptors(local_type)
         self._left = [image for image in sorted(folder.read().image_names()) if image in keypoints]
         for image in self._left:
-            lengths = descriptors.length(image), keypoints.length(image)
-            if lengths[0] != lengths[1]:
-                message = f"{lengths[0]} descriptors for {lengths[1]} keypoints"
-                raise DataError(message, path=descriptors.where(image))
+            check_lengths(keypoints, descriptors, image)
         # the files keep the method's name, which identifies the extractor
         configs = keypoints.config, replace(descriptors.config, keypoints_type=name)
         self._kinds = [

@@ -26,7 +26,7 @@ from megloc_kapture.mapping.pairs import (
     pairs_by_sequence,
 )
 from megloc_kapture.matching.guided_pyramid import base_type
-from megloc_kapture.retrieval.fusion import greedy_coverage
+from megloc_kapture.retrieval.search import greedy_coverage
 from megloc_kapture.stages.candidates import (
     UNRESTRICTED,
     Candidates,
@@ -37,6 +37,7 @@ from megloc_kapture.stages.candidates import (
 )
 from megloc_kapture.stages.given_map import described_images
 from megloc_kapture.stages.matches import VerifiedMatches, iterate_candidates
+from megloc_kapture.stages.scene import check_points
 from megloc_kapture.stages.stage import (
     FEATURES,
     GLOBAL_FEATURES,
@@ -74,8 +75,7 @@ def _seen_points(
     folder: KaptureFolder, images: Sequence[str]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the point ids and image rows (O,) of the observations."""
-    if not folder.has_points():
-        raise DataError("co-visibility needs a map's points", path=folder.root)
+    check_points(folder, "pair images by co-visibility")
     row_of = {image: row for row, image in enumerate(images)}
     points, seeing = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
     for _, observations in sorted(folder.observations().items()):

@@ -21,12 +21,11 @@ from megloc_kapture.features.image_bound import (
     max_megapixels_of,
 )
 from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
+from megloc_kapture.io.kapture import FeatureConfig, FeatureReader, FeatureWriter, KaptureFolder
 from megloc_kapture.io.tables import write_mask_counts
 from megloc_kapture.plugin_loading import checked_array
 from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.preprocessing.masks import with_margin
-from megloc_kapture.stages.devices import in_batches
 from megloc_kapture.stages.given_map import check_given_type, has_descriptors
 from megloc_kapture.stages.stage import (
     LOCAL_FEATURES,
@@ -36,7 +35,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work
+from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, in_batches
 from megloc_kapture.values import Camera, LocalFeatures
 
 _SIZE = attrgetter("size")
@@ -95,7 +94,7 @@ def images_of(folders: Sequence[KaptureFolder], purpose: str) -> dict[str, Kaptu
     named.sort(key=itemgetter(0))
     for (image, _), (other, _) in pairwise(named):
         if image == other:
-            raise DataError(f"image {image} stands in two kapture folders at once")
+            raise DataError(f"image {image} is in two of the kapture folders")
     if not named:
         raise DataError(f"there are no images to {purpose}")
     return dict(named)
@@ -128,6 +127,15 @@ def _extract(
 
 def mask_path(folder: KaptureFolder, image: str) -> Path:
     return folder.root / "sensors" / "masks" / f"{image}.png"
+
+
+def check_lengths(keypoints: FeatureReader, descriptors: FeatureReader, image: str) -> None:
+    """Raise DataError if an image has different numbers of descriptors and keypoints."""
+    expected, found = keypoints.length(image), descriptors.length(image)
+    if found != expected:
+        raise DataError(
+            f"{found} descriptors for {expected} keypoints", path=descriptors.where(image)
+        )
 
 
 def read_frame(folder: KaptureFolder, image: str, *, margin_px: float = 0.0) -> Frame:

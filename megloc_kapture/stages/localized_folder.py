@@ -6,7 +6,7 @@ Unreadable query images are set aside at import and reported as failures.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,9 +22,6 @@ from megloc_kapture.io.tables import (
     POSES_FILE,
     REFINEMENT_FILE,
     STATUS_FILE,
-    Fallback,
-    QueryStatus,
-    refinement_text,
     write_clusters,
     write_covariances,
     write_refinement,
@@ -33,13 +30,19 @@ from megloc_kapture.io.tables import (
 from megloc_kapture.stages.local_features import read_image_of
 from megloc_kapture.stages.scene import poses_through_rig
 from megloc_kapture.stages.work import FolderSpec, Work
-from megloc_kapture.values import Failure, Pose, RigidTransform
+from megloc_kapture.values import (
+    Failure,
+    Fallback,
+    LocalizationResult,
+    Pose,
+    RigidTransform,
+)
 
 
 def write_localized(
     output: Path,
     query: KaptureFolder | KaptureData,
-    results: Iterable[tuple[str, Pose | Failure]],
+    results: Iterable[Pose | Failure],
     *,
     fallback: Fallback = "none",
     first_candidates: dict[str, tuple[str, RigidTransform]] | None = None,
@@ -57,8 +60,8 @@ def write_localized(
     timing : optional file for seconds per query and step.
     """
     data = query.read() if isinstance(query, KaptureFolder) else query
-    named = sorted(results, key=lambda result: result[0])
-    found = {image: result for image, result in named if isinstance(result, Pose)}
+    ordered = sorted(results, key=lambda result: result.name)
+    found = {result.name: result for result in ordered if isinstance(result, Pose)}
     guesses: Mapping[str, tuple[str, RigidTransform]] = {}
     if fallback == "retrieval":
         guesses = first_candidates or {}
@@ -66,10 +69,9 @@ def write_localized(
         guesses = poses_through_rig(data, found)
     poses: dict[tuple[int, str], RigidTransform] = {}
     sensors, records = dict(data.sensors), dict(data.records_camera)
-    statuses = []
-    for image, result in named:
-        guess = None if result else guesses.get(image)
-        statuses.append(query_status(image, result, "none" if guess is None else fallback))
+    written: list[LocalizationResult] = []
+    for result in ordered:
+        image = result.name
         if isinstance(result, Pose):
             record = data.record_of(image)
             if result.camera is not None:
@@ -79,33 +81,35 @@ def write_localized(
                 records[record] = image
                 sensors[record[1]] = Sensor.from_camera(result.camera, name=given.name)
             poses[record] = result.cam_from_world
-        elif guess is not None:
-            poses[data.record_of(image)] = guess[1]
+        elif image in guesses:
+            poses[data.record_of(image)] = guesses[image][1]
+            result = replace(result, fallback=fallback)
+        written.append(result)
     localized = KaptureData(sensors=sensors, trajectories=poses, records_camera=records)
     write_sensors(output, localized)
-    write_poses(output / POSES_FILE, localized.poses())
     if isinstance(query, KaptureFolder):
         link_images(query.root, output)
-    write_status(output / STATUS_FILE, statuses)
-    write_covariances(output / COVARIANCE_FILE, found)
-    write_clusters(
-        output / CLUSTERS_FILE,
-        (
-            (image, result.clusters, found[image].cluster if result else None)
-            for image, result in named
-        ),
-    )
-    refinements = [row for pose in found.values() for row in pose.refinements]
-    if refinements:
-        write_refinement(output / REFINEMENT_FILE, refinements)
+    write_result_tables(output, localized.poses(), written)
+    write_clusters(output / CLUSTERS_FILE, written)
     if timing is not None:
-        write_timing(timing, named)
+        write_timing(timing, written)
     return {
-        "queries": len(named),
+        "queries": len(written),
         "localized": len(found),
-        "failed": len(named) - len(found),
+        "failed": len(written) - len(found),
         "fallbacks": len(poses) - len(found),
     }
+
+
+def write_result_tables(
+    output: Path, poses: Mapping[str, RigidTransform], results: Sequence[LocalizationResult]
+) -> None:
+    """Write tables of poses, status, covariances and, if there is one, refinement."""
+    write_poses(output / POSES_FILE, poses)
+    write_status(output / STATUS_FILE, results)
+    write_covariances(output / COVARIANCE_FILE, results)
+    if any(result.refinements for result in results):
+        write_refinement(output / REFINEMENT_FILE, results)
 
 
 def write_poses(path: Path, poses: Mapping[str, RigidTransform]) -> None:
@@ -118,29 +122,13 @@ def write_poses(path: Path, poses: Mapping[str, RigidTransform]) -> None:
     write_csv_table(path, (*columns, "center_x", "center_y", "center_z"), rows)
 
 
-def write_timing(path: Path, results: Iterable[tuple[str, Pose | Failure]]) -> None:
+def write_timing(path: Path, results: Iterable[LocalizationResult]) -> None:
     rows = (
-        (image, step, f"{seconds:.5f}")
-        for image, result in results
+        (result.name, step, f"{seconds:.5f}")
+        for result in results
         for step, seconds in result.seconds.items()
     )
     write_csv_table(path, ("image", "step", "seconds"), rows)
-
-
-def query_status(image: str, result: Pose | Failure, fallback: Fallback = "none") -> QueryStatus:
-    return QueryStatus(
-        image=image,
-        status="localized" if result else "failed",
-        reason="" if isinstance(result, Pose) else result.reason,
-        num_matches=result.num_matches,
-        num_inliers=result.num_inliers,
-        confidence=result.confidence,
-        cluster=result.cluster if isinstance(result, Pose) else None,
-        refinement=refinement_text(result.refinements) if isinstance(result, Pose) else "",
-        fallback=fallback,
-        candidates=result.candidates,
-        remarks="; ".join(result.remarks),
-    )
 
 
 def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, str]:
@@ -161,9 +149,9 @@ def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, 
     return reasons
 
 
-def unreadable_queries(tables: Path) -> Iterator[tuple[str, Failure]]:
+def unreadable_queries(tables: Path) -> Iterator[Failure]:
     for name, reason in read_unreadable(tables).items():
-        yield name, unreadable_image(name, reason)
+        yield unreadable_image(name, reason)
 
 
 def unreadable_image(name: str, reason: str) -> Failure:

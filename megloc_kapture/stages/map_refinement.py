@@ -48,7 +48,7 @@ from megloc_kapture.mapping.uncertainty import (
 )
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.given_map import copy_features
-from megloc_kapture.stages.scene import DepthRecord, depth_records, read_depth
+from megloc_kapture.stages.scene import DepthRecord, check_points, depth_records, read_depth
 from megloc_kapture.stages.stage import UNREFINED, Layout, PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 from megloc_kapture.values import Options, RigidTransform
@@ -226,11 +226,7 @@ def refine_map(
     as their point does. ``link_features`` allows hard links to the features inside the source
     folder, which must not be user data. Return counts for the log.
     """
-    if not source.has_points():
-        raise DataError(
-            "no map to refine: reconstruction/points3d.txt or observations.txt is missing",
-            path=source.root,
-        )
+    check_points(source, "refine")
     selection = MapSelection(source)
     _verify_depth(selection, options.depth, restrictions, work)
     if options.uncertainty.max_robust_sigmas is not None:
@@ -449,7 +445,7 @@ def _reject_uncertain(selection: MapSelection, max_robust_sigmas: float) -> None
 
 
 class RefineMap(PipelineStage):
-    """Take out of the map what its images or their depth contradict, and what is uncertain."""
+    """Remove points that the images or their depth contradict, and uncertain points."""
 
     name = "map"
     version = 3

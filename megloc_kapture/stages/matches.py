@@ -33,8 +33,8 @@ from megloc_kapture.matching.verification import (
 )
 from megloc_kapture.plugin_loading import checked_array
 from megloc_kapture.plugins import Matcher
-from megloc_kapture.stages.devices import in_batches
 from megloc_kapture.stages.given_map import matched_images
+from megloc_kapture.stages.local_features import check_lengths
 from megloc_kapture.stages.stage import (
     FEATURES,
     LOCAL_FEATURES,
@@ -45,7 +45,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, batched
+from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, batched, in_batches
 from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
 
 _log = logging.getLogger(__name__)
@@ -91,7 +91,7 @@ class Features(ImageFeatures):
 
 
 Verify = Callable[[Features, Features, NDArray[np.int64]], NDArray[np.bool_]]
-"""Which of the matches (K, 2) of two images, best first, are right, bool (K,)."""
+"""Returns the mask (K,) of the right ones among the matches (K, 2) of two images, best first."""
 
 
 _PairMatches = tuple[NDArray[np.int64], NDArray[np.float32]]
@@ -358,13 +358,9 @@ def cached_features(spec: FolderSpec, local_type: str, image: str) -> Features:
     def read() -> Features:
         folder = spec.open()
         keypoints, descriptors = folder.keypoints(local_type), folder.descriptors(local_type)
-        found, described = keypoints.read(image), descriptors.read(image)
-        if len(found) != len(described):
-            raise DataError(
-                f"{len(described)} descriptors for {len(found)} keypoints",
-                path=descriptors.where(image),
-            )
-        return Features.of(folder.read().camera_of(image), found, described)
+        check_lengths(keypoints, descriptors, image)
+        camera = folder.read().camera_of(image)
+        return Features.of(camera, keypoints.read(image), descriptors.read(image))
 
     return _cache.get((*spec.key, local_type, image), read)
 

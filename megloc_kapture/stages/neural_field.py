@@ -34,7 +34,7 @@ from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions, absol
 from megloc_kapture.mapping.depth import sample_depth
 from megloc_kapture.mapping.pairs import PairsByPosesOptions, pairs_by_poses
 from megloc_kapture.nets.runtime import NetworkOptions, load_strictly, pick_device
-from megloc_kapture.plugin_loading import load_plugin, weights_of
+from megloc_kapture.plugin_loading import Placement, load_chosen, weights_of
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
@@ -262,7 +262,8 @@ def render_along(
 
 class FieldRefinerOptions(Options):
     field: str = Field(default="", description="folder that megloc train-field wrote")
-    device: Device = Field(default="auto", description="of the field: auto, cpu, cuda or cuda:N")
+    device: Device = Field(default="auto", description="of all networks: auto, cpu, cuda or cuda:N")
+    half_precision: bool = Field(default=False, description="of features and matcher")
     features: PluginChoice = Field(
         default=PluginChoice(name="rootsift"), description="local features that are matched"
     )
@@ -282,7 +283,7 @@ class FieldRefinerOptions(Options):
 
 
 class FieldRefiner:
-    """Plugin ``field``: the query is matched with what a neural field shows at its pose.
+    """Plugin ``field``: the query is matched with a neural field's rendering at its pose.
 
     Features of query and rendering are matched and lifted by rendered depth, and the pose is solved
     (as in GS-CPR, Liu et al., ICLR 2025). New renderings are aligned with the query, and the pose
@@ -300,9 +301,11 @@ class FieldRefiner:
                 "the pose refiner field needs a field that megloc train-field wrote: --set "
                 '\'pose_refinement.by=[{name="field",options={field="FOLDER"}}]\''
             )
-        one, other = self.options.features, self.options.matcher
-        self._features: LocalFeatureExtractor = load_plugin(LOCAL_FEATURES, one.name, one.options)
-        self._matcher: Matcher = load_plugin(MATCHERS, other.name, other.options)
+        placement = Placement(self.options.device, self.options.half_precision)
+        self._features: LocalFeatureExtractor = load_chosen(
+            LOCAL_FEATURES, self.options.features, placement
+        )
+        self._matcher: Matcher = load_chosen(MATCHERS, self.options.matcher, placement)
 
     def plugins(self) -> tuple[object, ...]:
         return (self._features, self._matcher)

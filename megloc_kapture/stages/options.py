@@ -6,13 +6,13 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.matching.guided_pyramid import GuidedPyramidOptions, base_type, pyramid_type
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
-from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugin_loading import Placement, load_chosen
 from megloc_kapture.plugins import (
     LOCAL_FEATURES,
     MATCHERS,
@@ -20,10 +20,9 @@ from megloc_kapture.plugins import (
     Matcher,
     PluginChoice,
 )
-from megloc_kapture.retrieval.fusion import FusionOptions
+from megloc_kapture.retrieval.search import FusionOptions
 from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
 from megloc_kapture.stages.densifying import DensifyOptions
-from megloc_kapture.stages.devices import Precision, with_device
 from megloc_kapture.stages.global_features import GlobalFeaturesChoice
 from megloc_kapture.stages.image_pairs import MappingPairsOptions, RerankingOptions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
@@ -31,7 +30,7 @@ from megloc_kapture.stages.matches import NoVerification, Verification
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.query_poses import LocalizationOptions
-from megloc_kapture.values import Device, Options
+from megloc_kapture.values import Device, Options, Precision
 
 
 def _first_twice(names: Sequence[str]) -> str | None:
@@ -76,7 +75,7 @@ class PipelineOptions(Options):
     query_pairs: QueryPairsOptions = QueryPairsOptions()
     reranking: RerankingOptions = RerankingOptions()
     matching: PluginChoice = Field(
-        default=PluginChoice(name="nn"), description="of types that name no matcher of their own"
+        default=PluginChoice(name="nn"), description="of types that name no other matcher"
     )
     verification: Literal["geometric", "mapping", "none"] = Field(
         default="geometric",
@@ -104,24 +103,20 @@ class PipelineOptions(Options):
         description="stages of other packages that run as well, by name, with their options",
     )
 
-    @model_validator(mode="after")
-    def _placed(self) -> PipelineOptions:
-        """Set device and precision of networks whose options name none."""
-        for name in type(self).model_fields:
-            self.__dict__[name] = with_device(getattr(self, name), self.device, self.precision)
-        return self
+    @property
+    def placement(self) -> Placement:
+        return Placement(self.device, self.precision == "half")
 
     def make_extractors(self) -> list[LocalFeatureExtractor]:
         return [
-            load_plugin(LOCAL_FEATURES, chosen.name, chosen.options)
-            for chosen in self.local_features
+            load_chosen(LOCAL_FEATURES, chosen, self.placement) for chosen in self.local_features
         ]
 
     def make_given_extractor(self) -> LocalFeatureExtractor:
-        extractor: LocalFeatureExtractor = load_plugin(
-            LOCAL_FEATURES, self.given_features.name, self.given_features.options
+        made: LocalFeatureExtractor = load_chosen(
+            LOCAL_FEATURES, self.given_features, self.placement
         )
-        return extractor
+        return made
 
     def preprocesses(self) -> bool:
         return self.preprocessing != PreprocessingOptions()
@@ -203,8 +198,7 @@ class PipelineOptions(Options):
         return self.matching
 
     def make_matcher(self, local_type: str) -> Matcher:
-        chosen = self.matching_of(local_type)
-        matcher: Matcher = load_plugin(MATCHERS, chosen.name, chosen.options)
+        matcher: Matcher = load_chosen(MATCHERS, self.matching_of(local_type), self.placement)
         return matcher
 
     def verify_mapping(self) -> Verification:

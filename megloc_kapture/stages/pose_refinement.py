@@ -17,25 +17,18 @@ from megloc_kapture.errors import OptionError, PluginError
 from megloc_kapture.geometry.poses import movement
 from megloc_kapture.io.dataset_tables import METRES, SIDE_TABLES, unit_of
 from megloc_kapture.io.files import link_images
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, write_sensors
+from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.io.tables import (
     CLUSTERS_FILE,
     CONSISTENCY_FILE,
     COVARIANCE_FILE,
-    POSES_FILE,
-    REFINEMENT_FILE,
     STATUS_FILE,
     ConsistencyRow,
-    QueryStatus,
     read_covariances,
     read_status,
-    refinement_text,
     write_consistency,
-    write_covariances,
-    write_refinement,
-    write_status,
 )
-from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugin_loading import AUTO, Placement, load_chosen
 from megloc_kapture.plugins import (
     POSE_REFINERS,
     PluginChoice,
@@ -53,7 +46,7 @@ from megloc_kapture.refinement.references import (
     spread_names,
 )
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.localized_folder import write_poses, write_timing
+from megloc_kapture.stages.localized_folder import write_result_tables, write_timing
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.stage import (
     LOCALIZED,
@@ -65,7 +58,7 @@ from megloc_kapture.stages.stage import (
     StageWork,
 )
 from megloc_kapture.stages.work import HERE, FolderSpec, Work, ordered_map
-from megloc_kapture.values import Camera, Options, Pose, RefinementRow, RigidTransform
+from megloc_kapture.values import Camera, LocalizationResult, Options, Pose, RigidTransform
 
 # map images held out at once; a larger window wastes work after the last one needed
 _WINDOW = 4
@@ -91,8 +84,8 @@ class PoseRefinementOptions(Options):
     def refines(self) -> bool:
         return bool(self.by)
 
-    def make_refiners(self) -> list[PoseRefiner]:
-        return [load_plugin(POSE_REFINERS, one.name, one.options) for one in self.by]
+    def make_refiners(self, placement: Placement = AUTO) -> list[PoseRefiner]:
+        return [load_chosen(POSE_REFINERS, chosen, placement) for chosen in self.by]
 
 
 class MapRefiners:
@@ -103,7 +96,11 @@ class MapRefiners:
     """
 
     def __init__(
-        self, mapping: KaptureFolder, restrictions: Restrictions, options: PoseRefinementOptions
+        self,
+        mapping: KaptureFolder,
+        restrictions: Restrictions,
+        options: PoseRefinementOptions,
+        placement: Placement = AUTO,
     ) -> None:
         if options.refines() and unit_of(mapping.root) != METRES:
             raise OptionError(
@@ -111,7 +108,7 @@ class MapRefiners:
                 "scale is not known; `megloc map --scale` makes a map in metres, `megloc import "
                 "colmap --unit m` says that a COLMAP model is in metres"
             )
-        self.refiners = tuple(options.make_refiners())
+        self.refiners = tuple(options.make_refiners(placement))
         self.map = FolderSpec(mapping)
         self._mapping, self._restrictions, self._options = mapping, restrictions, options
         self._verdicts: dict[str, list[Consistency | None]] = {}
@@ -200,7 +197,7 @@ def refine_pose(
     ``references`` are map images that may overlap with the query, best first. ``distrusted`` has a
     reason not to use a refiner, or "", for each.
     """
-    rows, seconds = [], dict(pose.seconds)
+    steps, seconds = [], dict(pose.seconds)
     for refiner, reason in zip(refiners, distrusted, strict=True):
         started = time.perf_counter()
         before = pose.cam_from_world
@@ -208,36 +205,31 @@ def refine_pose(
             refined = PoseRefinement(before, reason)
         else:
             refined = refiner.refine(image, camera, before, references, scene)
-        rows.append(_row(refiner, image, before, refined))
+        if not isinstance(refined, PoseRefinement):
+            raise PluginError(
+                f"plugin {refiner.name!r} on image {image}: refine returned "
+                f"{type(refined).__name__}, not PoseRefinement"
+            )
+        after = before
         if refined.accepted:
             after = refined.cam_from_world
             w, x, y, z = map(float, after.quat_wxyz)
             t_x, t_y, t_z = map(float, after.translation)
             after = RigidTransform((w, x, y, z), (t_x, t_y, t_z))
             pose = replace(pose, cam_from_world=after, covariance=refined.covariance)
-        seconds[refiner.name] = time.perf_counter() - started
-    return replace(pose, refinements=tuple(rows), seconds=seconds)
-
-
-def _row(
-    refiner: PoseRefiner, image: str, before: RigidTransform, refined: PoseRefinement
-) -> RefinementRow:
-    if not isinstance(refined, PoseRefinement):
-        raise PluginError(
-            f"plugin {refiner.name!r} on image {image}: refine returned "
-            f"{type(refined).__name__}, not PoseRefinement"
+        moved_m, turned_deg = movement(before, after)
+        steps.append(
+            replace(
+                refined,
+                cam_from_world=after,
+                method=refiner.name,
+                before=before,
+                moved_m=moved_m,
+                turned_deg=turned_deg,
+            )
         )
-    after = refined.cam_from_world if refined.accepted else before
-    moved_m, turned_deg = movement(before, after)
-    return RefinementRow(
-        image=image,
-        method=refiner.name,
-        reason=refined.reason,
-        moved_m=moved_m,
-        turned_deg=turned_deg,
-        measures=tuple(f"{name}={value:.6g}" for name, value in refined.measures.items()),
-        before=before,
-    )
+        seconds[refiner.name] = time.perf_counter() - started
+    return replace(pose, refinements=tuple(steps), seconds=seconds)
 
 
 def refine_poses(
@@ -257,42 +249,35 @@ def refine_poses(
     refiners need: images, masks, depth maps, points. ``refinement.csv`` has the measures of each
     refiner, ``map_consistency.csv`` those of each coordinate frame. Return counts for the log.
     """
-    refiners = MapRefiners(map_folder, restrictions, options)
-    statuses = read_status(localized.root / STATUS_FILE)
+    refiners = MapRefiners(map_folder, restrictions, options, work.placement)
     data = localized.read()
-    covariances = {}
-    if (table := localized.root / COVARIANCE_FILE).is_file():
-        covariances = read_covariances(table)
-    poses = {
-        image: Pose(
-            pose,
-            row.num_matches,
-            row.num_inliers,
-            candidates=row.candidates,
-            covariance=covariances.get(image),
-        )
-        for image, row in statuses.items()
-        if row.status == "localized" and (pose := data.cam_from_world(image)) is not None
-    }
+    results = _read_results(localized)
+    poses = {name: result for name, result in results.items() if isinstance(result, Pose)}
     refiners.test(poses.values(), work=work)
-    uses = {image: refiners.uses(pose) for image, pose in poses.items()}
-    jobs = [(image, pose, *uses[image]) for image, pose in poses.items()]
+    jobs = [(image, pose, *refiners.uses(pose)) for image, pose in poses.items()]
     refine = partial(_refine, refiners.map, FolderSpec(query), refiners.refiners)
-    results = work.map(refine, jobs, "refining", plugins=refiners.refiners)
-    found = dict(zip(poses, results, strict=True))
-    _write(output, data, localized, statuses, found)
+    refined = list(work.map(refine, jobs, "refining", plugins=refiners.refiners))
+    results |= {pose.name: pose for pose in refined}
+    trajectories = {data.record_of(pose.name): pose.cam_from_world for pose in refined}
+    refined_data = replace(data, trajectories={**data.trajectories, **trajectories})
+    write_sensors(output, refined_data)
+    link_images(localized.root, output)
+    write_result_tables(output, refined_data.poses(), list(results.values()))
+    clusters = localized.root / CLUSTERS_FILE
+    if clusters.is_file():
+        shutil.copyfile(clusters, output / CLUSTERS_FILE)
     tested = refiners.tested()
     if tested:
         write_consistency(output / CONSISTENCY_FILE, tested)
     if timing is not None:
-        write_timing(timing, found.items())
+        write_timing(timing, refined)
     counts: dict[str, float] = {"queries": len(poses)}
     for refiner in refiners.refiners:
         counts[f"accepted_by_{refiner.name}"] = sum(
-            row.accepted
-            for refined in found.values()
-            for row in refined.refinements
-            if row.method == refiner.name
+            step.accepted
+            for pose in refined
+            for step in pose.refinements
+            if step.method == refiner.name
         )
     for row in tested:
         name = f"frames_where_{row.method}_is_trusted"
@@ -300,31 +285,18 @@ def refine_poses(
     return counts
 
 
-def _write(
-    output: Path,
-    data: KaptureData,
-    localized: KaptureFolder,
-    statuses: dict[str, QueryStatus],
-    found: dict[str, Pose],
-) -> None:
-    poses = dict(data.trajectories)
-    for image, refined in found.items():
-        poses[data.record_of(image)] = refined.cam_from_world
-    refined_data = replace(data, trajectories=poses)
-    write_sensors(output, refined_data)
-    write_poses(output / POSES_FILE, refined_data.poses())
-    link_images(localized.root, output)
-    for image, refined in found.items():
-        told = {"refinement": refinement_text(refined.refinements)}
-        statuses[image] = statuses[image].model_copy(update=told)
-    write_status(output / STATUS_FILE, statuses.values())
-    write_covariances(output / COVARIANCE_FILE, found)
-    clusters = localized.root / CLUSTERS_FILE
-    if clusters.is_file():
-        shutil.copyfile(clusters, output / CLUSTERS_FILE)
-    write_refinement(
-        output / REFINEMENT_FILE, (row for refined in found.values() for row in refined.refinements)
-    )
+def _read_results(localized: KaptureFolder) -> dict[str, LocalizationResult]:
+    """Read results by name: poses of localized queries with covariances, others by their status."""
+    results = read_status(localized.root / STATUS_FILE)
+    table = localized.root / COVARIANCE_FILE
+    covariances = read_covariances(table) if table.is_file() else {}
+    data = localized.read()
+    for image, row in results.items():
+        pose = data.cam_from_world(image) if row.status == "localized" else None
+        if pose is not None:
+            known = {**vars(row), "cam_from_world": pose}
+            results[image] = Pose(**known, covariance=covariances.get(image))
+    return results
 
 
 def _refine(

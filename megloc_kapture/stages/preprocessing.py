@@ -5,6 +5,7 @@ Names, poses, rigs, records and sensor ids stay. Unchanged files and depth maps 
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -12,20 +13,16 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from megloc_kapture.errors import DataError, OptionError, OutputError
 from megloc_kapture.io.files import (
     link_file,
     link_records,
-    output_error,
-    read_json_model,
     write_json,
-    write_json_model,
 )
 from megloc_kapture.io.images import image_size, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugin_loading import Placement, load_chosen
 from megloc_kapture.plugins import SEGMENTERS, Segmenter
 from megloc_kapture.preprocessing.frames import FrameOptions, FramePlan, plan_frame
 from megloc_kapture.preprocessing.masks import UnchangingRegion
@@ -52,7 +49,7 @@ from megloc_kapture.stages.stage import (
 from megloc_kapture.stages.work import HERE, Work
 
 CLASSES, CLASSES_FILE = "classes", "classes.json"
-REPORT_FILE = "preprocessing.json"
+_log = logging.getLogger(__name__)
 
 
 class PreprocessingOptions(FrameOptions):
@@ -91,34 +88,6 @@ def _process(
     return {source: float((~mask).mean()) for source, mask in masks.items()}
 
 
-class CameraReport(BaseModel):
-    """One camera before and after: model, width, height and parameters, as in sensors.txt."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    images: int
-    original: tuple[str, ...]
-    processed: tuple[str, ...]
-
-
-class PreprocessingReport(BaseModel):
-    """``sensors/preprocessing.json``; ``masked`` is the share of masked pixels by mask source."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    images: int
-    images_changed: int
-    images_masked: int
-    cameras: dict[str, CameraReport]
-    masked: dict[str, float]
-    remarks: tuple[str, ...]
-
-
-def read_report(root: Path) -> PreprocessingReport | None:
-    path = root / "sensors" / REPORT_FILE
-    return read_json_model(path, PreprocessingReport) if path.is_file() else None
-
-
 def preprocess_images(
     folder: KaptureFolder,
     output: Path,
@@ -128,7 +97,9 @@ def preprocess_images(
     sequences: Sequence[KaptureFolder] = (),
     work: Work = HERE,
 ) -> dict[str, float]:
-    """Write a kapture with pre-processed images, cameras and masks; return counts for the log.
+    """Write a kapture with pre-processed images, cameras and masks.
+
+    Return counts for the log, with the share of all pixels that each source of masks covers.
 
     ``sensors/masks/IMAGE.png`` (0 = ignore) exists for images with masked or invalid pixels,
     ``sensors/classes`` has the segmenter's labels. ``sequences`` are more folders for finding
@@ -137,7 +108,7 @@ def preprocess_images(
     output = Path(output)
     if output.resolve().is_relative_to(folder.root.resolve()):
         raise OutputError(f"{output}: lies in the kapture that is read, which stays as it is")
-    classes = _class_masks(options.masks, segmenter)
+    classes = _class_masks(options.masks, segmenter, work.placement)
     data = folder.read()
     plans = _plans(data, options)
     images = data.image_names()
@@ -174,34 +145,21 @@ def preprocess_images(
         num_masked += bool(found)
         shares.update(found)
     remarks += [f"a fixed mask fits no image: {one.camera}" for one in standing.unused()]
-    taken = Counter(sensor_id for _, sensor_id in data.records_camera)
-    report = PreprocessingReport(
-        images=len(images),
-        images_changed=sum(plans[s].changes_pixels for _, s in data.records_camera),
-        images_masked=num_masked,
-        cameras={
-            sensor_id: CameraReport(
-                images=taken[sensor_id],
-                original=Sensor.from_camera(plan.original).params,
-                processed=Sensor.from_camera(plan.processed).params,
-            )
-            for sensor_id, plan in plans.items()
-        },
-        masked={source: shares[source] / len(images) for source in sorted(shares)},
-        remarks=tuple(remarks),
-    )
-    write_json_model(output / "sensors" / REPORT_FILE, report)
+    for remark in remarks:
+        _log.warning("%s", remark)
     return {
-        "images": report.images,
-        "images_changed": report.images_changed,
-        "images_masked": report.images_masked,
-        **{f"masked_{source}": share for source, share in report.masked.items()},
+        "images": len(images),
+        "images_changed": sum(plans[s].changes_pixels for _, s in data.records_camera),
+        "images_masked": num_masked,
+        **{f"masked_{source}": shares[source] / len(images) for source in sorted(shares)},
     }
 
 
-def _class_masks(options: MaskOptions, segmenter: Segmenter | None) -> ClassMasks | None:
+def _class_masks(
+    options: MaskOptions, segmenter: Segmenter | None, placement: Placement
+) -> ClassMasks | None:
     if segmenter is None and options.segmenter is not None:
-        segmenter = load_plugin(SEGMENTERS, options.segmenter.name, options.segmenter.options)
+        segmenter = load_chosen(SEGMENTERS, options.segmenter, placement)
     if segmenter is not None:
         return ClassMasks.of(segmenter, options.dynamic)
     if options.dynamic is not None:
@@ -239,11 +197,8 @@ def _unlink_folders(output: Path) -> None:
     """Remove linked folders, through which user data would be overwritten."""
     for name in ("records_data", "masks", CLASSES):
         place = output / "sensors" / name
-        try:
-            if place.is_symlink():
-                place.unlink()
-        except OSError as error:
-            raise output_error(place, error) from error
+        if place.is_symlink():
+            place.unlink()
 
 
 def _link_records(folder: KaptureFolder, output: Path, plans: Mapping[str, FramePlan]) -> bool:
@@ -278,7 +233,7 @@ class Preprocess(PipelineStage):
 
     def plugins(self) -> Sequence[object]:
         chosen = self.options.preprocessing.masks.segmenter
-        return () if chosen is None else (load_plugin(SEGMENTERS, chosen.name, chosen.options),)
+        return () if chosen is None else (load_chosen(SEGMENTERS, chosen),)
 
     def external(self) -> Mapping[str, str]:
         masks = self.options.preprocessing.masks

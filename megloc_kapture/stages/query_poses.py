@@ -20,7 +20,6 @@ from pydantic import Field
 
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
-from megloc_kapture.io.tables import Fallback
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import (
     ClusterOptions,
@@ -31,7 +30,7 @@ from megloc_kapture.localization.cluster_poses import (
 )
 from megloc_kapture.localization.map_index import PoseProblem, QueryView, TypedMatches
 from megloc_kapture.matching.guided_pyramid import base_type
-from megloc_kapture.plugin_loading import load_plugin
+from megloc_kapture.plugin_loading import AUTO, Placement, load_chosen
 from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, PoseRanker, RankingScene
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.localized_folder import (
@@ -39,8 +38,15 @@ from megloc_kapture.stages.localized_folder import (
     write_localized,
 )
 from megloc_kapture.stages.matches import iterate_candidates
-from megloc_kapture.stages.scene import KaptureScene, Unit, query_units
-from megloc_kapture.stages.shared_index import index_map, open_index, shared_index, with_noise
+from megloc_kapture.stages.scene import (
+    KaptureScene,
+    Unit,
+    index_map,
+    open_index,
+    query_units,
+    shared_index,
+    with_noise,
+)
 from megloc_kapture.stages.stage import (
     FEATURES,
     LOCAL_FEATURES,
@@ -59,7 +65,14 @@ from megloc_kapture.stages.work import (
     FolderSpec,
     Work,
 )
-from megloc_kapture.values import MIN_CONFIDENCE, Failure, Options, Pose, RigidTransform
+from megloc_kapture.values import (
+    MIN_CONFIDENCE,
+    Failure,
+    Fallback,
+    Options,
+    Pose,
+    RigidTransform,
+)
 
 _FIRST_TURN = 5
 # below this even the right pose can be decimetres off, which more candidates improve
@@ -94,8 +107,8 @@ class LocalizationOptions(Options):
         "its pose through the rig",
     )
 
-    def make_ranker(self) -> PoseRanker:
-        ranker: PoseRanker = load_plugin(POSE_RANKERS, self.rank.name, self.rank.options)
+    def make_ranker(self, placement: Placement = AUTO) -> PoseRanker:
+        ranker: PoseRanker = load_chosen(POSE_RANKERS, self.rank, placement)
         return ranker
 
 
@@ -156,7 +169,8 @@ def localize_unit(
             return [result]
         if isinstance(result, Pose) and problem is not None:
             return poses_of_cameras(views, result, problem)
-    return [localize([QueryView(v.name, v.camera, v.matches)])[0] for v in views]
+    results = [localize([QueryView(v.name, v.camera, v.matches)])[0] for v in views]
+    return [replace(result, name=v.name) for v, result in zip(views, results, strict=True)]
 
 
 def in_turn(
@@ -247,7 +261,7 @@ class _StoredQueries:
     options: LocalizationOptions
     ranker: PoseRanker
 
-    def __call__(self, job: _Job) -> list[tuple[str, Pose | Failure]]:
+    def __call__(self, job: _Job) -> list[Pose | Failure]:
         unit, candidate_lists, frame_of = job
         started = time.perf_counter()
         mapping, query = self.map.open(), self.query.open()
@@ -269,10 +283,7 @@ class _StoredQueries:
             ranker=self.ranker,
             scene=KaptureScene(mapping, query),
         )
-        return [
-            (image, _for_writing(result, reading_s))
-            for (image, _), result in zip(unit, results, strict=True)
-        ]
+        return [_for_writing(result, reading_s) for result in results]
 
     def _read(self, image: str, cam_from_rig: RigidTransform, images: Sequence[str]) -> QueryView:
         query, matches = self.query.open(), self.matches.open()
@@ -309,12 +320,12 @@ def localize_from_matches(
     restrictions: Restrictions = UNRESTRICTED,
     work: Work = HERE,
     scratch: Path | None = None,
-) -> Iterator[tuple[str, Pose | Failure]]:
+) -> Iterator[Pose | Failure]:
     """Localize every query from stored matches of ``local_types``; yield results sorted by unit.
 
     The map may use the base type of a guided pyramid type. ``scratch`` holds a temporary map index.
     """
-    ranker = options.make_ranker()
+    ranker = options.make_ranker(work.placement)
     candidates = {name: tuple(images) for name, images in iterate_candidates(pairs)}
     units = query_units(query.read(), rigs=options.rigs)
     read = {name: index_map(map_folder, type_in_map(map_folder, name)) for name in local_types}

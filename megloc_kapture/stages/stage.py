@@ -17,7 +17,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.plugin_loading import code_of, is_ours, weights_of
+from megloc_kapture.plugin_loading import (
+    AUTO,
+    Placement,
+    code_of,
+    has_precision,
+    is_ours,
+    weights_of,
+)
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Options
 
@@ -172,9 +179,11 @@ class Stage(ABC):
     version : increase it when the output changes for the same options and inputs.
     reads, writes : paths in the workspace; a folder includes its contents.
     root : folder of user data to import, or None; the same for a whole workspace.
+    placement : device and precision of its networks, in the context of ``run``.
     """
 
     root: Path | None = None
+    placement: Placement = AUTO
     name: str
     version: ClassVar[int] = 1
     reads: Sequence[str] = ()
@@ -234,6 +243,7 @@ class PipelineStage(Stage):
 
     def __init__(self, options: PipelineOptions) -> None:
         self.options: PipelineOptions = options
+        self.placement = options.placement
         self.layout = Layout(options)
 
     @property
@@ -257,10 +267,13 @@ class PipelineStage(Stage):
             object_hook=lambda table: {k: v for k, v in table.items() if k != "device"},
         )
         chosen: dict[str, Any] = _selected(dump, [key.split(".") for key in self.uses])
-        weights = {
-            file: sha for plugin in self.plugins() for file, sha in weights_of(plugin).items()
-        }
-        return {**chosen, "weights": weights} if weights else chosen
+        plugins = self.plugins()
+        weights = {file: sha for plugin in plugins for file, sha in weights_of(plugin).items()}
+        if weights:
+            chosen["weights"] = weights
+        if self.placement.half_precision and any(map(has_precision, plugins)):
+            chosen["precision"] = "half"
+        return chosen
 
 
 def wanted_stages(

@@ -230,10 +230,7 @@ def _points(
     in_camera = pixels @ np.linalg.inv(pinhole_matrix(view.camera)).T * depth[new][:, None]
     sigma = read_beside(folder.root, image, "sigma")
     normals = read_beside(folder.root, image, "normals")
-    if sigma is None or normals is None or not sigma.shape == normals.shape[:2] == depth.shape:
-        raise DataError(
-            f"no deviations and normals of {image}, of the size of its depth", path=folder.root
-        )
+    assert sigma is not None and normals is not None
     return Cloud(
         view.cam_from_world.inverse().apply(in_camera),
         view.image[new].astype(np.float64),

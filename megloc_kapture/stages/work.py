@@ -1,4 +1,4 @@
-"""Ordered per-image and per-pair work with bounded memory and a progress bar.
+"""Context of a run: ordered work with bounded memory and a progress bar, batches of networks.
 
 Work runs on an executor with one core per process. Networks on a GPU of this machine run in this
 process only: threads read ahead, one thread computes batches, and the executor does the rest.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -16,12 +17,105 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import chain, groupby, islice
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 from uuid import uuid4
 
-from megloc_kapture.io.files import output_error
+from megloc_kapture.errors import MeglocError, PluginError
+from megloc_kapture.io.files import writing
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.stages.devices import most_at_once, on_gpu
+from megloc_kapture.plugin_loading import AUTO, Placement
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+BATCH = 8  # for batch plugins without a device option
+MOST_AT_ONCE = {"cpu": 1, "cuda": 16}
+
+
+class DeviceMemoryError(MeglocError):
+    """Out of memory for a single image or pair."""
+
+
+def on_gpu(plugin: object) -> bool:
+    return _device_of(plugin) not in (None, "cpu")
+
+
+def most_at_once(plugin: object, many: str) -> int:
+    """Return the batch size of a plugin; 1 without the batch method ``many``."""
+    if not hasattr(plugin, many):
+        return 1
+    device = _device_of(plugin)
+    return BATCH if device is None else MOST_AT_ONCE[device.partition(":")[0]]
+
+
+def _device_of(plugin: object) -> str | None:
+    """Return cpu, cuda or cuda:N; None if unspecified."""
+    wanted = getattr(getattr(plugin, "options", None), "device", None)
+    if wanted is None or wanted == "cpu":
+        return wanted
+    from megloc_kapture.nets.runtime import pick_device
+
+    return str(pick_device(wanted))
+
+
+_limits: dict[tuple[str, str, str], int] = {}  # batch sizes after running out of memory
+
+
+def in_batches(
+    plugin: object,
+    many: str,
+    run: Callable[[Sequence[Item]], Sequence[Result]],
+    items: Sequence[Item],
+    *,
+    name: Callable[[int], str],
+) -> list[Result]:
+    """Run a plugin on items in batches, halved when memory runs out.
+
+    Raise DeviceMemoryError if one item does not fit.
+    """
+    key = type(plugin).__qualname__, many, repr(getattr(plugin, "options", None))
+    found: list[Result] = []
+    while len(found) < len(items):
+        most = min(most_at_once(plugin, many), _limits.get(key, sys.maxsize))
+        batch = items[len(found) :][:most]
+        try:
+            results = run(batch)
+        except RuntimeError as error:
+            if not is_out_of_memory(error):
+                raise
+            if len(batch) == 1:
+                raise DeviceMemoryError(
+                    f"{name(len(found))}: there is not enough memory for it alone; make images "
+                    "smaller (max_megapixels, preprocessing.max_size_px), keep fewer keypoints, or "
+                    "compute on another device (--device)"
+                ) from error
+            _limits[key] = len(batch) // 2
+            continue
+        if len(results) != len(batch):
+            raise PluginError(f"{many} of {key[0]} gave {len(results)} for {len(batch)} items")
+        found += results
+    return found
+
+
+# of plain RuntimeErrors: allocation by the CPU, by CUDA contexts, cuBLAS and cuDNN
+_OUT_OF_MEMORY = (
+    "can't allocate memory",
+    "out of memory",
+    "CUBLAS_STATUS_ALLOC_FAILED",
+    "CUDNN_STATUS_ALLOC_FAILED",
+    "CUDNN_STATUS_INTERNAL_ERROR_HOST_ALLOCATION_FAILED",
+    "CUDNN_STATUS_INTERNAL_ERROR_DEVICE_ALLOCATION_FAILED",
+)
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return whether torch ran out of memory, on any device and in any library below it."""
+    torch: Any = sys.modules.get("torch")
+    if torch is None or not isinstance(error, RuntimeError):
+        return False
+    return isinstance(error, torch.OutOfMemoryError) or any(
+        text in str(error) for text in _OUT_OF_MEMORY
+    )
 
 
 class FinishedItems:
@@ -50,13 +144,10 @@ class FinishedItems:
         return {name: values for (of, name), values in self._found.items() if of == kind}
 
     def add(self, kind: str, name: str, values: Any) -> None:
-        try:
-            with open(self._path, "a", encoding="utf-8") as file:
-                if file.tell() == 0:
-                    file.write(f"{self._fingerprint}\n")
-                file.write(json.dumps([kind, name, values]) + "\n")
-        except OSError as error:
-            raise output_error(self._path, error) from error
+        with writing(self._path), open(self._path, "a", encoding="utf-8") as file:
+            if file.tell() == 0:
+                file.write(f"{self._fingerprint}\n")
+            file.write(json.dumps([kind, name, values]) + "\n")
 
 
 def is_resumable(path: Path, fingerprint: str) -> bool:
@@ -82,17 +173,13 @@ class Items:
             self.finished.add(self.kind, name, values)
 
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 # threads that read ahead for a GPU, and threads that share a plugin on one
 _READERS = min(os.cpu_count() or 1, 16)
 _THREADS = 4
 
 
-class Track(Protocol):
-    """Progress display: yields the items unchanged."""
-
-    def __call__(self, items: Iterable[Item], total: int, label: str) -> Iterator[Item]: ...
+Track = Callable[[Iterable[Any], int, str], Iterator[Any]]
+"""Progress display of items, their number and a label; yields the items unchanged."""
 
 
 def untracked(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
@@ -171,6 +258,7 @@ class Work:
     num_threads : for libraries with internal threads, such as COLMAP.
     finished : items finished by an interrupted run; None outside a workspace.
     force : continue despite contradictory input data.
+    placement : device and precision of networks.
     """
 
     executor: Executor | None = None
@@ -178,6 +266,7 @@ class Work:
     num_threads: int = 1
     finished: FinishedItems | None = None
     force: bool = False
+    placement: Placement = AUTO
 
     def map(
         self,

@@ -19,8 +19,8 @@ from megloc_kapture.io.dataset_tables import (
     write_relocalization,
 )
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.io.tables import QueryStatus, write_status
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.io.tables import write_status
+from megloc_kapture.values import Camera, LocalizationResult, RigidTransform
 
 NUM_QUERIES = 40
 IMAGES = [f"query/{'night' if i % 4 == 0 else 'day'}/{i:03d}.jpg" for i in range(NUM_QUERIES)]
@@ -40,9 +40,8 @@ def write_kapture(root: Path, images: list[str], poses: dict[str, RigidTransform
 def write_candidates(result: Path, number: int) -> None:
     """The best candidate of every query: that of its place, or of the ``number`` first of them."""
     rows = [
-        QueryStatus(
-            image=image,
-            status="localized",
+        LocalizationResult(
+            name=image,
             num_matches=99,
             num_inliers=50,
             candidates=(f"map/{min(i // 2, number - 1)}.jpg",),
@@ -156,11 +155,11 @@ def imported(scene: Path, tmp_path: Path) -> Path:
     images = truth.image_names()
     truth.trajectories.pop(truth.record_of(images[0]))
     write_sensors(root / "localized", truth)
-    failed = {"status": "failed", "reason": "no matches"}
+    failed = {"reason": "no matches"}
     rows = [
-        QueryStatus(image=images[0], **failed),
-        QueryStatus(image=images[1], fallback="retrieval", **failed),
-        *(QueryStatus(image=image, status="localized") for image in images[2:]),
+        LocalizationResult(name=images[0], **failed),
+        LocalizationResult(name=images[1], fallback="retrieval", **failed),
+        *(LocalizationResult(name=image) for image in images[2:]),
     ]
     write_status(root / "localized" / "status.csv", rows)
     write_protocol(root / "megloc", Protocol(dataset="aachen", pose_file_names="basename"))

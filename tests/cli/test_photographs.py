@@ -81,7 +81,7 @@ def test_photographs(megloc: Any, finished: Path, scene: Path, tmp_path: Path) -
     assert set(reasons) == {"cut.jpg", "empty.jpg", "phone.HEIC", "grey.png"}
     assert "broken" in reasons["cut.jpg"] and ".HEIC cannot be read" in reasons["phone.HEIC"]
     found = [row for row in statuses.values() if row.num_inliers]
-    assert all("focal length estimated" in row.remarks for row in found)
+    assert all("focal length estimated" in row.remarks[0] for row in found)
 
     # what is written is kapture with upright images, and the cameras that the poses go with
     theirs = kapture_from_dir(str(out))

@@ -165,7 +165,7 @@ def test_ways_to_pair(megloc: Any, finished: Path, tmp_path: Path) -> None:
     own = megloc("pairs-mapping", "-i", points, "-o", pairs, "--by", "covisibility", "-f")
     assert own.err == f"{shared} pairs\n"
     for arguments, words in (
-        (("covisibility", "-f"), "mapping: co-visibility needs a map's points"),
+        (("covisibility", "-f"), "mapping: no map to pair images by co-visibility"),
         (("sequence", "--covisibility-map", points, "-f"), "--covisibility-map is for --by covis"),
         (("exhaustive",), r"pairs\.txt exists; -f overwrites it"),
         (("retrieval", "-f"), "mapping: no global_features; give their folder with --features-dir"),

@@ -57,14 +57,14 @@ def test_inliers_lie_where_the_query_sees_their_points(finished: Path) -> None:
     camera = found.context.queries.read()
     for query in shown_queries(found):
         pixels, points = stored.of(query)
-        assert query.num_inliers and query.estimated is not None
+        assert query.num_inliers and query.cam_from_world is not None
         # the status counts those of the last estimate, by its own rule
         assert 0.9 * query.num_inliers <= len(points) <= 1.1 * query.num_inliers + 5
         own = camera.camera_of(query.image)
         theirs = pycolmap.Camera(
             model=own.model, width=own.width, height=own.height, params=own.params
         )
-        seen = theirs.img_from_cam(query.estimated.apply(points))
+        seen = theirs.img_from_cam(query.cam_from_world.apply(points))
         assert np.linalg.norm(seen - pixels, axis=1).max() <= 12.0
 
 

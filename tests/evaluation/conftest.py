@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
-from megloc_kapture.io.tables import QueryStatus
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import Camera, LocalizationResult, RigidTransform
 
 VOID_ELEMENTS = {"meta", "br", "img"}
 
@@ -25,7 +24,7 @@ class World:
     truth: dict[str, RigidTransform] = field(default_factory=dict)
     estimated: dict[str, RigidTransform] = field(default_factory=dict)
     conditions: dict[str, str] = field(default_factory=dict)
-    statuses: dict[str, QueryStatus] = field(default_factory=dict)
+    statuses: dict[str, LocalizationResult] = field(default_factory=dict)
     mapped: dict[str, RigidTransform] = field(default_factory=dict)
 
 
@@ -62,9 +61,9 @@ def make_world(num_queries: int = 40, seed: int = 0) -> World:
         world.truth[name] = upright_camera(on_ring(along) + rng.normal(size=3), along)
         world.conditions[name] = condition
         if i % 10 == 8:
-            told = {"status": "failed", "reason": "6 inliers, 12 needed", "num_inliers": 6}
+            told = {"reason": "6 inliers, 12 needed", "num_inliers": 6}
         elif i % 10 == 4:
-            told = {"status": "failed", "reason": "no matches", "fallback": "retrieval"}
+            told = {"reason": "no matches", "fallback": "retrieval"}
             world.estimated[name] = world.mapped[f"map/{i % 60:03d}.jpg"]
         else:
             error = 10 ** rng.normal(-1.5, 0.7)
@@ -72,8 +71,9 @@ def make_world(num_queries: int = 40, seed: int = 0) -> World:
             shift *= error / np.linalg.norm(shift)
             world.estimated[name] = displaced(world.truth[name], shift, 5 * error)
             inliers = int(rng.integers(12, 250))
-            told = {"status": "localized", "num_matches": 300, "num_inliers": inliers}
-        world.statuses[name] = QueryStatus(image=name, **told)
+            told = {"num_matches": 300, "num_inliers": inliers}
+        counts = {"num_matches": 0, "num_inliers": 0}
+        world.statuses[name] = LocalizationResult(name=name, **counts | told)
     return world
 
 

@@ -12,8 +12,7 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.evaluation.metrics import calibration_error, reliability, risk_by_score
 from megloc_kapture.evaluation.report.reports import report_text
-from megloc_kapture.io.tables import QueryStatus
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.values import LocalizationResult, RigidTransform
 
 
 def at(x_m: float) -> RigidTransform:
@@ -37,10 +36,9 @@ def test_risk_by_hand() -> None:
     assert risk_by_score(np.ones(4), right).tolist() == [0.5, 0.5, 0.5, 0.5]
 
 
-def status(image: str, confidence: float | None, localized: bool = True) -> QueryStatus:
-    return QueryStatus(
-        image=image,
-        status="localized" if localized else "failed",
+def status(image: str, confidence: float | None, localized: bool = True) -> LocalizationResult:
+    return LocalizationResult(
+        name=image,
         reason="" if localized else "too little",
         num_inliers=10,
         confidence=confidence,

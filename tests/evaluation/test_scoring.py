@@ -32,8 +32,7 @@ from megloc_kapture.io.dataset_tables import (
     write_protocol,
     write_relocalization,
 )
-from megloc_kapture.io.tables import QueryStatus
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.values import LocalizationResult, RigidTransform
 
 HERE = RigidTransform.identity()
 
@@ -100,18 +99,18 @@ def test_images_without_truth_or_not_scored_are_reported_and_not_counted() -> No
 
 def test_statuses_tell_fallback_and_reason() -> None:
     statuses = {
-        "a": QueryStatus(image="a", status="localized", num_matches=9, num_inliers=5),
-        "b": QueryStatus(image="b", status="failed", reason="dark", fallback="retrieval"),
-        "c": QueryStatus(image="c", status="failed", reason="blurred"),
-        "d": QueryStatus(image="d", status="localized"),
+        "a": LocalizationResult(name="a", num_matches=9, num_inliers=5),
+        "b": LocalizationResult(name="b", reason="dark", fallback="retrieval"),
+        "c": LocalizationResult(name="c", reason="blurred"),
+        "d": LocalizationResult(name="d"),
     }
     truth = dict.fromkeys("abcde", HERE)
     evaluation = evaluate_poses({"a": HERE, "b": HERE}, truth, statuses=statuses)
     assert [(q.outcome, q.reason, q.num_inliers) for q in evaluation.queries] == [
         ("localized", "", 5),
-        ("fallback", "dark", 0),
-        ("missing", "blurred", 0),
-        ("missing", "status says localized, but the result has no pose", 0),
+        ("fallback", "dark", None),
+        ("missing", "blurred", None),
+        ("missing", "status says localized, but the result has no pose", None),
         ("missing", "no pose in the result", None),
     ]
 
@@ -202,7 +201,7 @@ def test_pairs_count_and_files_are_conditions() -> None:
     asked = [(first, "r0", "q0"), (first, "r1", "q0"), (second, "r0", "q1"), (second, "r0", "q3")]
     asked += [(second, "r1", "unknown")]
     pairs = [RelocalizationPair(file, f"{r}.png", f"{q}.png") for file, r, q in asked]
-    statuses = {"q3.png": QueryStatus(image="q3.png", status="failed", reason="dark")}
+    statuses = {"q3.png": LocalizationResult(name="q3.png", reason="dark")}
     found = evaluate_pairs(
         Result("", estimated, tuple(estimated), statuses),
         truth,

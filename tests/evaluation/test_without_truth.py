@@ -29,8 +29,8 @@ from megloc_kapture.io.dataset_tables import (
     write_names,
     write_protocol,
 )
-from megloc_kapture.io.tables import QueryStatus, write_status
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.io.tables import write_status
+from megloc_kapture.values import LocalizationResult, RigidTransform
 
 THRESHOLDS = [Threshold(position_m=0.25, angle_deg=2.0), Threshold(position_m=5.0, angle_deg=10.0)]
 
@@ -40,9 +40,9 @@ def pose_at(x: float, turn_deg: float = 0.0) -> RigidTransform:
     return RigidTransform.from_matrix(rotation, -rotation @ np.array([x, 0.0, 0.0]))
 
 
-def status(image: str, outcome: str, inliers: int, *candidates: str, **other: Any) -> QueryStatus:
+def status(image: str, inliers: int, *candidates: str, **other: Any) -> LocalizationResult:
     counts = {"num_matches": 2 * inliers, "num_inliers": inliers, "candidates": candidates}
-    return QueryStatus(image=image, status=outcome, **counts, **other)
+    return LocalizationResult(name=image, **counts, **other)
 
 
 MAP = {"m/0.jpg": pose_at(0.0), "m/8.jpg": pose_at(8.0), "m/30.jpg": pose_at(30.0, 90.0)}
@@ -54,13 +54,13 @@ def first() -> Result:
     """One query at its first candidate, one beside another, a guess, and one without a pose."""
     guess = {"reason": "dark", "fallback": "retrieval"}
     rows = (
-        status("d/1.jpg", "localized", 100, "m/0.jpg", "m/8.jpg"),
-        status("d/2.jpg", "localized", 20, "m/30.jpg", "m/8.jpg", "m/gone.jpg"),
-        status("n/1.jpg", "failed", 0, "m/0.jpg", **guess),
-        status("n/2.jpg", "failed", 0, reason="no matches"),
+        status("d/1.jpg", 100, "m/0.jpg", "m/8.jpg"),
+        status("d/2.jpg", 20, "m/30.jpg", "m/8.jpg", "m/gone.jpg"),
+        status("n/1.jpg", 0, "m/0.jpg", **guess),
+        status("n/2.jpg", 0, reason="no matches"),
     )
     poses = {"d/1.jpg": pose_at(1.0, 20.0), "d/2.jpg": pose_at(9.0), "n/1.jpg": pose_at(0.0)}
-    return Result("A", poses, tuple(CONDITIONS), {row.image: row for row in rows})
+    return Result("A", poses, tuple(CONDITIONS), {row.name: row for row in rows})
 
 
 @pytest.fixture

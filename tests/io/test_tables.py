@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import pandas as pd
 import pytest
@@ -24,9 +24,7 @@ from megloc_kapture.io.csv_table import (
 )
 from megloc_kapture.io.tables import (
     ConsistencyRow,
-    QueryStatus,
     mask_counts_path,
-    read_clusters,
     read_consistency,
     read_refinement,
     read_status,
@@ -36,7 +34,13 @@ from megloc_kapture.io.tables import (
     write_refinement,
     write_status,
 )
-from megloc_kapture.values import ClusterPose, RefinementRow, RigidTransform
+from megloc_kapture.values import (
+    Failure,
+    LocalizationResult,
+    Pose,
+    PoseRefinement,
+    RigidTransform,
+)
 
 COLUMNS = ("image", "reason")
 
@@ -136,40 +140,41 @@ HEADER = (
     "image,status,reason,num_matches,num_inliers,confidence,cluster,fallback,candidates,"
     "refinement,remarks\n"
 )
-FAILED = QueryStatus(
-    image="q/a.jpg", status="failed", reason="7 inliers, 12 needed", fallback="retrieval"
-)
+FAILED = LocalizationResult(name="q/a.jpg", reason="7 inliers, 12 needed", fallback="retrieval")
 
 names = st.text(
     st.characters(exclude_characters="\0\\/,", exclude_categories=["Cc", "Cs"]), min_size=1
 ).filter(lambda name: name not in (".", ".."))
 statuses = st.one_of(
     st.builds(
-        QueryStatus,
-        image=names,
-        status=st.just("localized"),
+        LocalizationResult,
+        name=names,
         num_matches=st.integers(0, 10**6),
         num_inliers=st.integers(0, 10**6),
         cluster=st.none() | st.integers(0, 50),
         candidates=st.lists(names, max_size=4).map(tuple),
-        refinement=st.sampled_from(["", "icp: accepted", "icp: it, then, moved 1 m"]),
-        remarks=st.sampled_from(["", "guided pyramid matching: no image"]),
+        remarks=st.sampled_from([(), ("guided pyramid matching: no image",)]),
     ),
     st.builds(
-        QueryStatus,
-        image=names,
-        status=st.just("failed"),
+        LocalizationResult,
+        name=names,
+        num_matches=st.just(0),
+        num_inliers=st.just(0),
         reason=st.text(st.characters(exclude_characters="\0\r", codec="utf-8")).filter(str.strip),
         fallback=st.sampled_from(["none", "retrieval"]),
     ),
 )
 
 
-@given(st.lists(statuses, max_size=5, unique_by=lambda status: status.image))
-def test_reads_back(tmp_path_factory: pytest.TempPathFactory, written: list[QueryStatus]) -> None:
+@given(st.lists(statuses, max_size=5, unique_by=lambda status: status.name))
+def test_reads_back(
+    tmp_path_factory: pytest.TempPathFactory, written: list[LocalizationResult]
+) -> None:
     path = tmp_path_factory.getbasetemp() / "any_status.csv"
     write_status(path, written)
-    assert read_status(path) == {status.image: status for status in written}
+    assert {name: vars(status) for name, status in read_status(path).items()} == {
+        status.name: vars(status) for status in written
+    }
 
 
 def test_two_rows_for_one_query(tmp_path: Path) -> None:
@@ -182,35 +187,47 @@ def test_two_rows_for_one_query(tmp_path: Path) -> None:
 
 
 POSE = RigidTransform((0.5, -0.5, 0.1, 0.7), (1 / 3, -2e-9, 1e7))
-FOUND = ClusterPose(("m/1.png", "m/2.png"), 40, 30, POSE, 30.25)
-LOST = ClusterPose(("m/3.png",), 7, reason="7 2D-3D matches, at least 12 are needed")
+FOUND = Pose(POSE, 40, 30, candidates=("m/1.png", "m/2.png"), score=30.25)
+LOST = Failure("7 2D-3D matches, at least 12 are needed", 7, candidates=("m/3.png",))
 
 
-def test_what_is_written_is_read(tmp_path: Path) -> None:
+def test_clusters_of_each_query(tmp_path: Path) -> None:
     path = tmp_path / "clusters.csv"
-    write_clusters(path, [("b", (LOST,), None), ("a", (LOST, FOUND), 1), ("c", (), None)])
-    found = read_clusters(path)
-    assert list(found) == ["a", "b"]
-    lost, chosen = found["a"]
-    assert (lost.chosen, lost.score, lost.reason) == ("no", None, LOST.reason)
-    assert (chosen.chosen, chosen.cluster, chosen.score) == ("yes", 1, 30.25)
-    assert (chosen.num_matches, chosen.num_inliers, chosen.images) == (40, 30, FOUND.images)
-    assert found["b"][0].chosen == "no"
-    assert chosen.cam_from_world == FOUND.cam_from_world and lost.cam_from_world is None
+    chosen = LocalizationResult(name="a", clusters=(LOST, FOUND), cluster=1)
+    write_clusters(path, [Failure("none", name="b", clusters=(LOST,)), chosen, Failure("x")])
+    lost = ',no,7,0,,"7 2D-3D matches, at least 12 are needed",m/3.png,'
+    assert path.read_text().splitlines() == [
+        "image,cluster,chosen,num_matches,num_inliers,score,reason,images,cam_from_world",
+        f"a,0{lost}",
+        'a,1,yes,40,30,30.25,,"m/1.png,m/2.png",'
+        "0.5 -0.5 0.1 0.7 0.3333333333333333 -2e-09 10000000.0",
+        f"b,0{lost}",
+    ]
 
 
 START = RigidTransform((0.6, 0.0, 0.8, 0.0), (1.0, -2.0, 0.1))
-ROWS = [
-    RefinementRow("a.jpg", "rendering", "", 0.02, 0.1, ("cost=0.1", "points=900"), START),
-    RefinementRow("a.jpg", "icp", "the overlap fell, a bit", 0.0, 0.0, (), START),
-    RefinementRow("b.jpg", "rendering", "no depth", 0.0, 0.0, (), RigidTransform.identity()),
+
+
+def step(method: str, end: RigidTransform, reason: str = "", **known: Any) -> PoseRefinement:
+    return PoseRefinement(end, reason, method=method, before=START, **known)
+
+
+MOVED = step("rendering", POSE, measures={"cost": 0.1, "points": 900}, moved_m=0.02, turned_deg=0.1)
+RESULTS = [
+    LocalizationResult(name="b.jpg", refinements=(step("rendering", START, "no depth"),)),
+    LocalizationResult(
+        name="a.jpg", refinements=(step("icp", START, "the overlap fell, a bit"), MOVED)
+    ),
 ]
 
 
-def test_rows_read_back_by_image_with_their_steps_in_order(tmp_path: Path) -> None:
+def test_refinements_read_back_by_image_with_their_steps_in_order(tmp_path: Path) -> None:
     path = tmp_path / "refinement.csv"
-    write_refinement(path, [ROWS[2], *ROWS[:2]])
-    assert read_refinement(path) == ROWS
+    write_refinement(path, RESULTS)
+    read = read_refinement(path, {"a.jpg": POSE})
+    assert list(read) == ["a.jpg", "b.jpg"]
+    for result in RESULTS:
+        assert list(map(vars, read[result.name])) == list(map(vars, result.refinements))
 
 
 def test_counts_come_back(tmp_path: Path) -> None:
@@ -240,7 +257,7 @@ def test_a_table_of_before_confidences_reads(tmp_path: Path) -> None:
         "q/b.jpg,localized,,310,120,0,none,map/1.jpg,\n"
     )
     row = read_status(path)["q/b.jpg"]
-    assert row.confidence is None and row.remarks == "" and row.num_inliers == 120
+    assert row.confidence is None and row.remarks == () and row.num_inliers == 120
     path.write_text("image,status,confidence\nq/b.jpg,localized,0.5\n")
     with pytest.raises(DataError, match="the header must name the columns"):
         read_status(path)

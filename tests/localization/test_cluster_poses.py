@@ -107,7 +107,7 @@ def test_each_cluster_has_its_pose_and_the_best_is_kept(monkeypatch: pytest.Monk
     assert result.candidates == PLACES[0] and result.cluster == 0
     right, wrong = result.clusters
     assert (right.num_matches, right.num_inliers, right.score) == (90, 90, 90.0)
-    assert (wrong.num_matches, wrong.num_inliers, wrong.images) == (60, 60, PLACES[1])
+    assert (wrong.num_matches, wrong.num_inliers, wrong.candidates) == (60, 60, PLACES[1])
     assert wrong.cam_from_world is not None
     # the same view of the other place, 50 m away
     np.testing.assert_allclose(wrong.cam_from_world.center() - TRUTH.center(), FAR, atol=1e-3)
@@ -117,7 +117,7 @@ def test_each_cluster_has_its_pose_and_the_best_is_kept(monkeypatch: pytest.Monk
     # only the clusters with the most matches are tried
     monkeypatch.setattr(module, "MAX_CLUSTERS", 1)
     result, _ = localize(view(SHARES), clusters=PLACES[::-1])
-    assert [cluster.images for cluster in result.clusters] == [PLACES[0]]
+    assert [cluster.candidates for cluster in result.clusters] == [PLACES[0]]
 
 
 def test_the_ranker_has_the_last_word() -> None:
@@ -145,7 +145,10 @@ def test_clusters_of_one_place_are_one() -> None:
     split = [("right/2",), ("wrong/1",), ("right/1",)]
     result, _ = localize(query, clusters=split)
     assert isinstance(result, Pose) and result.num_inliers == 100
-    assert [cluster.images for cluster in result.clusters] == [("right/2", "right/1"), ("wrong/1",)]
+    assert [cluster.candidates for cluster in result.clusters] == [
+        ("right/2", "right/1"),
+        ("wrong/1",),
+    ]
     apart, _ = localize(query, clusters=split, frames=["a", "a", "b"])
     assert isinstance(apart, Pose) and len(apart.clusters) == 3
 

@@ -29,7 +29,7 @@ from megloc_kapture.localization.focal_length import (
     solve_with_shared_camera,
 )
 from megloc_kapture.localization.map_index import PoseProblem, View
-from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
+from megloc_kapture.values import Camera, Failure, LocalizationResult, Pose, RigidTransform
 
 Floats = NDArray[np.float64]
 ALONE = RigidTransform.identity()
@@ -69,7 +69,8 @@ def test_a_wrong_focal_length_is_estimated(factor: float, seed: int) -> None:
     assert abs(better - 1400) <= 3 * deviation
     # the camera is as much too near or too far, and 10 m away
     assert found.shift == pytest.approx(abs(factor - 1), rel=0.25, abs=0.02)
-    assert misfits_text([found.remark, "", found.remark], "status.csv") == (
+    results = [LocalizationResult(remarks=remarks) for remarks in (("no image", found.remark), ())]
+    assert misfits_text([results[0], *results], "status.csv") == (
         "the given focal length does not fit in 2 queries: see the remarks in status.csv"
     )
 

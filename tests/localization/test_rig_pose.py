@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import bearing_rays, project
 from megloc_kapture.geometry.poses import movement
 from megloc_kapture.localization.absolute_pose import (
@@ -246,14 +245,6 @@ def test_no_worse_a_minimum_than_colmaps(seed: int) -> None:
 
 
 # ---------------------------------------------------------------------------------- the problem
-
-
-@pytest.mark.parametrize("pixels, points", [((3, 3), (3, 3)), ((3, 2), (4, 3)), ((3, 2), (3, 2))])
-def test_arrays_that_do_not_belong_together_are_refused(
-    pixels: tuple[int, int], points: tuple[int, int]
-) -> None:
-    with pytest.raises(DataError):
-        View(PINHOLE, AT_ORIGIN, np.zeros(pixels), np.zeros(points))
 
 
 def test_views_are_stacked_and_taken_apart() -> None:

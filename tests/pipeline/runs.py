@@ -18,12 +18,10 @@ from megloc_kapture.pipeline.datasets import (
     find_benchmark,
     twin_of,
 )
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation, recall_rows
+from megloc_kapture.pipeline.evaluation_plan import Run, plan_evaluation, recall_rows
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
-from megloc_kapture.pipeline.plan import StageReport, run_plan
+from megloc_kapture.pipeline.plan import Manifest, StageReport, Workspace, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run
-from megloc_kapture.pipeline.workspace import Manifest, Workspace
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import RigidTransform

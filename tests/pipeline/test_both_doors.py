@@ -19,9 +19,9 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_refinement, read_status
+from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.results import Results
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.values import RigidTransform
 from tests.pipeline.runs import evaluated
@@ -163,10 +163,12 @@ def test_the_same_refined_poses(with_depth: Path, tmp_path: Path, by: str) -> No
     sets = (*FEW, f'pose_refinement.by=["{by}"]', "localization.rank=perceptual")
     workspace, localizer = both(with_depth, tmp_path / "workspace", *sets)
     poses = same_poses(workspace, localizer)
-    rows = read_refinement(workspace.path("localized/refinement.csv"))
-    assert [row.method for row in rows] == [by] * 4
-    for pose, row in zip(poses, rows, strict=True):
-        assert [one.reason for one in pose.refinements] == [row.reason]
+    final = workspace.folder("localized").read().poses()
+    stored = read_refinement(workspace.path("localized/refinement.csv"), final)
+    assert len(stored) == len(poses) == 4
+    for pose in poses:
+        ((own,), (step,)) = pose.refinements, stored[pose.name]
+        assert (step.method, step.reason) == (by, own.reason) and own.method == by
 
 
 @pytest.mark.parametrize("by", ["icp", pytest.param("rendering", marks=pytest.mark.slow)])

@@ -20,7 +20,7 @@ from distributed import Client
 from threadpoolctl import threadpool_info
 
 import megloc_kapture as megloc
-from megloc_kapture.errors import DataError, MeglocError, OptionError
+from megloc_kapture.errors import MeglocError, OptionError
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline import dask_executor
 from megloc_kapture.pipeline.executors import open_executor
@@ -73,19 +73,8 @@ def _threads(_: int) -> set[int]:
     return {pool["num_threads"] for pool in threadpool_info()}
 
 
-def _broken(path: Path) -> None:
-    raise DataError("expected so, got thus", path=path, line=3)
-
-
 def _read(path: Path) -> str:
     return path.read_text()
-
-
-def _die_once(place: Path) -> str:
-    if not place.exists():
-        place.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return "done"
 
 
 def test_results_come_in_order_from_workers_with_one_thread(cluster: str) -> None:
@@ -104,15 +93,6 @@ def test_relative_paths_start_where_the_run_started(
     with open_executor("dask", scheduler=cluster, shared=Path("out")) as executor:
         assert list(ordered_map(_read, [Path("here.txt")] * 3, executor)) == ["seen"] * 3
     assert list(Path("out").iterdir()) == []
-
-
-def test_what_an_item_raises_arrives_as_it_is(cluster: str) -> None:
-    with (
-        pytest.raises(DataError, match=r"^a/b.txt:3: expected so, got thus$") as error,
-        open_executor("dask", scheduler=cluster) as executor,
-    ):
-        list(ordered_map(_broken, [Path("a/b.txt")], executor))
-    assert error.value.path == Path("a/b.txt")
 
 
 @pytest.mark.parametrize(

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pandas
 import pytest
 
-from megloc_kapture.io.tables import read_status
 from megloc_kapture.pipeline.datasets import choose_dataset
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.plan import run_plan
+from megloc_kapture.pipeline.evaluation_plan import Run, plan_evaluation
+from megloc_kapture.pipeline.plan import Workspace, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run
-from megloc_kapture.pipeline.workspace import Workspace
 from tests.pipeline.runs import run_in
 
 
@@ -42,8 +40,8 @@ def test_refinement_is_turned_on_and_off_in_one_workspace(fountain: Path, tmp_pa
         assert len(outputs) == len(set(outputs))
         with workspace.lock():
             run_plan(stages, workspace)
-        statuses = read_status(workspace.path("localized/status.csv")).values()
-        said = {status.refinement for status in statuses}
+        table = pandas.read_csv(workspace.path("localized/status.csv"), keep_default_na=False)
+        said = set(table["refinement"])
         if options is refined:
             assert said == {"rendering: no map image with depth is seen by others from elsewhere"}
             assert folder_bytes(workspace.path("localized_unrefined")) == plain

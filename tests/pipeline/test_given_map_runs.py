@@ -11,10 +11,9 @@ import pytest
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.pipeline.datasets import DatasetChoice, choose_dataset, twin_of
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
+from megloc_kapture.pipeline.evaluation_plan import Run, plan_evaluation
+from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run
-from megloc_kapture.pipeline.workspace import Workspace
 from tests.pipeline.runs import evaluated, recall, run_in
 
 pytestmark = pytest.mark.slow

@@ -13,7 +13,6 @@ from megloc_kapture import Camera, KaptureMap, Localizer
 from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.io.kapture import KaptureFolder, Sensor, write_sensors
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import RigidTransform
 from tests.pipeline.runs import errors, evaluated, recall, run_in
@@ -95,12 +94,3 @@ def test_turned_queries_are_found_with_it_and_easy_pairs_are_not_tried(
     truth = KaptureFolder(turned / "query_gt").read().poses()
     for name, pose in localizer.localize_kapture(workspace.path("preprocessed/query")):
         assert errors(pose, truth[name])[0] < 0.25
-
-
-def test_upright_queries_are_left_alone(
-    fountain: Path, options: PipelineOptions, tmp_path: Path
-) -> None:
-    workspace = Workspace(tmp_path / "runs")
-    reports = run_in(workspace, fountain, pyramid(options, mode="max", min_matches=15))
-    counts = reports["query_pyramid"].counts
-    assert counts["xfeat pairs_tried"] == counts["xfeat images_extracted_again"] == 0

@@ -10,7 +10,6 @@ import pytest
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
-from megloc_kapture.io.images import write_image
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.local_types import extract_again, local_types_of
 from megloc_kapture.pipeline.presets import options_of_preset
@@ -51,15 +50,6 @@ def test_a_map_of_another_extractor_or_without_images_is_refused(stripped: Kaptu
     (stripped.folder.root / "sensors" / "records_data").unlink()
     with pytest.raises(DataError, match="no descriptors of type 'rootsift', and no images"):
         again(KaptureMap.open(stripped.folder.root))
-
-
-@pytest.mark.slow
-def test_masks_are_used_as_they_were(stripped: KaptureMap) -> None:
-    root = stripped.folder.root
-    for image in stripped.images:
-        write_image(root / "sensors" / "masks" / f"{image}.png", np.zeros((300, 400), np.uint8))
-    with pytest.raises(DataError, match=r"finds only 0 of \d+ observed keypoints"):
-        again(KaptureMap.open(root), max_keypoints=800)
 
 
 @pytest.mark.parametrize(

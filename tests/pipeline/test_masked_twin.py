@@ -15,7 +15,7 @@ from megloc_kapture.io.csv_table import read_csv_table
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import mask_counts_path
-from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.pipeline.plan import Workspace
 from tests.pipeline.runs import recall, run_twin
 
 SMALL = {"num_locations": 2, "size_px": 360, "moments_per_condition": 2}

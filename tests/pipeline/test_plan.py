@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -13,9 +12,8 @@ from typing import Any
 
 import pytest
 
-from megloc_kapture.errors import DataError, OptionError, OutputError
-from megloc_kapture.pipeline.plan import StageReport, all_kept, describe, run_plan
-from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.pipeline.plan import StageReport, Workspace, all_kept, describe, run_plan
 from megloc_kapture.stages.stage import Stage, StageWork
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Options
@@ -228,20 +226,6 @@ def test_rests_of_killed_runs_and_workers_do_not_get_into_the_output(kitchen: Ki
     assert [p.name for p in kitchen.workspace.path("b").iterdir()] == ["b.txt"]
 
 
-def test_a_workspace_that_is_deleted_while_a_stage_runs_is_an_error(kitchen: Kitchen) -> None:
-    def leave(out: Path) -> Mapping[str, float]:
-        shutil.rmtree(kitchen.workspace.root)
-        return {}
-
-    stages = [*kitchen.stages(), Step("d", ("c.txt",), ("d.txt",), leave)]
-    with (
-        pytest.raises(OutputError, match="was deleted or moved while a run was working in it"),
-        kitchen.workspace.lock(),
-    ):
-        run_plan(stages, kitchen.workspace)
-    assert not kitchen.workspace.root.exists()
-
-
 def test_data_of_another_root_do_not_replace_those_of_a_workspace(tmp_path: Path) -> None:
     roots = [tmp_path / name / "scene" for name in "ab"]
 
@@ -280,7 +264,7 @@ def test_first_and_last(kitchen: Kitchen) -> None:
     assert [(r.state, r.why) for r in reports] == [("skipped", ""), ("run", "asked for")]
     # what follows was asked for as well, and is still to be done
     assert [r.why for r in kitchen.cook()] == ["", "", "not done yet"]
-    with pytest.raises(OptionError, match="--until a stands before --from c"):
+    with pytest.raises(OptionError, match="--until a is before --from c"):
         kitchen.cook(first="c", last="a")
     with pytest.raises(OptionError, match="no stage 'd'; stages: a, b, c"):
         kitchen.cook(last="d")

@@ -17,10 +17,10 @@ from megloc_kapture.io.camera_list import read_cameras
 from megloc_kapture.io.images import image_size, read_image_rgb, read_photo, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.output_folders import claim_folder
+from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.query_folders import KaptureQueries, Photographs
 from megloc_kapture.pipeline.results import Results
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.preprocessing.frames import resized, scaled_camera
 from megloc_kapture.values import Camera, Pose, RigidTransform
 from tests.pipeline.runs import evaluated

@@ -11,15 +11,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import pytest
 
 from megloc_kapture.pipeline.datasets import choose_dataset
-from megloc_kapture.pipeline.evaluation_plan import plan_evaluation
-from megloc_kapture.pipeline.plan import StageReport, run_plan
+from megloc_kapture.pipeline.evaluation_plan import Run, plan_evaluation
+from megloc_kapture.pipeline.plan import StageReport, Workspace, run_plan
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.work import Work
 
 PLUGINS = '''
@@ -181,37 +178,6 @@ def test_a_stopped_run_goes_on_inside_the_stage(runs: Runs) -> None:
     assert reports["mapping_matches"].num_kept == 11
     assert reports["query_matches"].num_kept == 0
     runs.check_undisturbed()
-
-
-def test_vlad_goes_on_with_its_vocabulary(runs: Runs) -> None:
-    vlad = ("global_features=vlad", "global_features.vlad.options.num_clusters=8")
-    runs.options, runs.last = (*OPTIONS[:1], *vlad), "global_features"
-    runs.stopped("VLAD", 4)
-    assert runs.run()["global_features"].num_kept == 5
-    assert runs.told["VLAD"] == (7, "VLAD, 4 kept")
-    runs.check_undisturbed()
-
-
-def test_a_changed_input_or_option_keeps_nothing(runs: Runs) -> None:
-    runs.stopped("corners", 4)
-    path = runs.scene / "mapping/sensors/records_data/0003.jpg"
-    pixels = cv2.imread(str(path))
-    cv2.imwrite(str(path), 255 - pixels)
-    runs.stopped("corners", 4)
-    assert runs.told["corners"] == (11, "corners features")
-    runs.options = (*OPTIONS, "mask_margin_px=1.0")
-    assert runs.run()["local_features"].num_kept == 0
-    runs.check_undisturbed()
-
-
-def test_from_keeps_nothing(runs: Runs) -> None:
-    runs.run()
-    with pytest.raises(Stopped):
-        runs.run(first="local_features", stop_at=("corners", 6))
-    assert runs.told["corners"] == (11, "corners features")
-    reports = runs.run()
-    assert runs.told["corners"] == (5, "corners features, 6 kept")
-    assert reports["mapping_matches"].num_kept == 0
 
 
 def test_changed_code_of_a_plugin_makes_its_stage_run_again(runs: Runs, package: Path) -> None:

@@ -10,16 +10,15 @@ import torch
 
 from megloc_kapture import KaptureMap, Localizer
 from megloc_kapture.errors import OptionError
-from megloc_kapture.io.kapture import KaptureFolder, read_pairs
+from megloc_kapture.io.kapture import read_pairs
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.nets.global_descriptors import VggNetVlad
+from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import Query
-from megloc_kapture.pipeline.query_folders import KaptureQueries
-from megloc_kapture.pipeline.workspace import Workspace
 from megloc_kapture.stages.options import PipelineOptions
-from tests.pipeline.runs import evaluated, recall, run_in
+from tests.pipeline.runs import evaluated, recall
 
 pytestmark = pytest.mark.slow
 
@@ -70,43 +69,6 @@ def test_all_candidates_are_matched_once_and_the_best_are_localized_with(
     assert not finished.path("matches/query_candidates").exists()
     types = finished.folder("mapping", "").types("global_features")
     assert types == ["openibl-random", "vlad_rootsift"]
-
-
-def test_another_number_to_keep_matches_nothing_again(
-    finished: Workspace, fountain: Path, options: PipelineOptions
-) -> None:
-    reranking = options.reranking.model_copy(update={"keep": 2, "by": "verified"})
-    fewer = options.model_copy(update={"reranking": reranking})
-    reports = run_in(finished, fountain, fewer)
-    again = {name for name, report in reports.items() if report.state == "run"}
-    assert again == {"query_pairs", "localization", "submission", "evaluation"}
-    run_in(finished, fountain, options)
-
-
-def test_the_localizer_ranks_and_keeps_the_same_images(
-    finished: Workspace, options: PipelineOptions
-) -> None:
-    kept: dict[str, list[str]] = {}
-    for pair in read_pairs(finished.path("pairs/query.txt")):
-        kept.setdefault(pair.query, []).append(pair.map)
-    opened = KaptureMap.open(finished.path("map"), features_dirs=[finished.root])
-    localizer = Localizer(opened, options=options)
-    queries = KaptureFolder(finished.path("preprocessed/query"), features_dirs=[finished.root])
-    for query in KaptureQueries(queries, opened):
-        assert query.global_features.keys() == {"vlad_rootsift", "openibl-random"}
-        found = localizer.localize_query(query)
-        assert found, found
-        assert set(found.candidates) <= set(kept[query.name])
-        ranked = localizer.ranked(query)
-        assert set(kept[query.name]) <= set(ranked[:5])
-
-
-def test_a_map_with_whitened_vectors_can_be_localized_in(
-    finished: Workspace, fountain: Path, options: PipelineOptions
-) -> None:
-    only = options.model_copy(update={"global_features": options.global_features[:1]})
-    localizer = Localizer(KaptureMap.open(finished.path("map")), options=only)
-    assert all(found for _, found in localizer.localize_kapture(fountain / "query"))
 
 
 def test_vectors_that_the_map_lacks_are_made_from_its_images(

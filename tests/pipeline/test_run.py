@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from aachen_files import write_v1_0, write_v1_1
@@ -12,9 +13,14 @@ from megloc_kapture.cli.main import main
 from megloc_kapture.errors import MeglocError
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.pipeline.datasets import DatasetChoice, find_benchmark
-from megloc_kapture.pipeline.evaluation_plan import StageLine, explain, explained, plan_evaluation
+from megloc_kapture.pipeline.evaluation_plan import (
+    Run,
+    choose_run,
+    explain,
+    explained,
+    plan_evaluation,
+)
 from megloc_kapture.pipeline.presets import check_weights, options_of_preset
-from megloc_kapture.pipeline.run import Run, choose_run
 
 MISSING = "3D-models/aachen_v_1_1/points3D.txt: missing"
 
@@ -26,25 +32,29 @@ def run_of(dataset: str, preset: str, *assignments: str) -> Run:
     return Run(DatasetChoice(dataset, None), preset, options, benchmark)
 
 
-def lines_of(dataset: str, preset: str, *assignments: str) -> dict[str, StageLine]:
-    return {line.name: line for line in explain(run_of(dataset, preset, *assignments).options)}
+def lines_of(dataset: str, preset: str, *assignments: str) -> dict[str, dict[str, Any]]:
+    return {line["name"]: line for line in explain(run_of(dataset, preset, *assignments).options)}
 
 
 def test_each_stage_says_whether_it_is_on_and_why() -> None:
     lines = lines_of("aachen", "megloc")
-    off = {name for name, line in lines.items() if not line.on}
+    off = {name for name, line in lines.items() if not line["on"]}
     assert off == {"densify", "refine_poses"}
-    assert lines["local_features"].why == "local_features = superpoint + aslfeat"
-    assert "superpoint by superglue, aslfeat by nn" in lines["query_matches"].why
-    assert lines["mapping_pairs"].why.endswith("by = poses + covisibility + retrieval")
-    assert lines["query_pairs"].why == (
+    assert lines["local_features"]["why"] == "local_features = superpoint + aslfeat"
+    assert "superpoint by superglue, aslfeat by nn" in lines["query_matches"]["why"]
+    assert lines["mapping_pairs"]["why"].endswith("by = poses + covisibility + retrieval")
+    assert lines["query_pairs"]["why"] == (
         "reranking.by = verified, reranking.keep = 20, reranking.local_type = superpoint"
     )
-    assert "localization.min_confidence = 0.0" in lines["localization"].why
+    assert "localization.min_confidence = 0.0" in lines["localization"]["why"]
     changed = lines_of("aachen", "megloc", "guided_pyramid.mode=off")["query_pyramid"]
-    assert not changed.on and changed.why.startswith("guided_pyramid.mode = off")
+    assert not changed["on"] and changed["why"].startswith("guided_pyramid.mode = off")
     # of the stages that make points the one that runs is listed
-    assert lines_of("inloc", "megloc")["points"] == StageLine("points", True, "map = lift")
+    assert lines_of("inloc", "megloc")["points"] == {
+        "name": "points",
+        "on": True,
+        "why": "map = lift",
+    }
 
 
 def test_pairs_by_covisibility_are_off_where_the_data_have_no_model(

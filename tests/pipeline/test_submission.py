@@ -33,10 +33,10 @@ from megloc_kapture.io.dataset_tables import (
 )
 from megloc_kapture.io.files import write_json_model
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.io.tables import QueryStatus, write_status
+from megloc_kapture.io.tables import write_status
 from megloc_kapture.pipeline.datasets import DatasetChoice
+from megloc_kapture.pipeline.evaluation_plan import Run
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.run import Run
 from megloc_kapture.pipeline.submission import (
     check_dataset,
     poses_through_rig,
@@ -44,7 +44,7 @@ from megloc_kapture.pipeline.submission import (
     write_submission,
 )
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import Camera, LocalizationResult, RigidTransform
 from tests.pipeline.runs import manifest
 
 CAMERA = Sensor.from_camera(Camera("PINHOLE", 640, 480, (500, 500, 320, 240)))
@@ -104,10 +104,7 @@ class Dataset:
     def localize(self, images: list[str], statuses: Mapping[str, Mapping[str, Any]]) -> None:
         poses = {self.query.record_of(image): self.true_pose(image) for image in images}
         write_sensors(self.result, replace(self.query, rigs={}, trajectories=poses))
-        rows = [
-            QueryStatus(image=image, **{"status": "localized", **statuses.get(image, {})})
-            for image in images
-        ]
+        rows = [LocalizationResult(name=image, **statuses.get(image, {})) for image in images]
         write_status(self.result / "status.csv", rows)
 
 
@@ -116,7 +113,7 @@ def dataset(tmp_path: Path) -> Dataset:
     return Dataset(tmp_path / "workspace")
 
 
-FAILED = {"status": "failed", "reason": "no map image matches"}
+FAILED = {"reason": "no map image matches"}
 NONE = {"fallbacks": 0, "from_rig": 0, "dummies": 0, "doubtful": 0}
 
 
@@ -172,7 +169,7 @@ def test_doubtful_are_those_that_the_file_lacks(dataset: Dataset, tmp_path: Path
         "night/rear/30.jpg": doubted,
         "night/rear/40.jpg": FAILED,
     }
-    rows = [QueryStatus(image=image, **status) for image, status in statuses.items()]
+    rows = [LocalizationResult(name=image, **status) for image, status in statuses.items()]
     write_status(dataset.result / "status.csv", rows)
     counts, _ = submit(dataset, tmp_path / "poses.txt")
     assert (counts["poses"], counts["missing"], counts["fallbacks"]) == (2, 2, 1)
@@ -267,7 +264,7 @@ def test_the_sibling_with_most_inliers_counts(dataset: Dataset) -> None:
     poses = {"dawn/left/10.jpg": random_poses(1, 3)[0], "dawn/right/10.jpg": random_poses(1, 4)[0]}
     for best in poses:
         statuses = {
-            image: QueryStatus(image=image, status="localized", num_inliers=50 + (image == best))
+            image: LocalizationResult(name=image, num_inliers=50 + (image == best))
             for image in poses
         }
         found = poses_through_rig(dataset.query, poses, statuses)

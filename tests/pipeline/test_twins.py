@@ -10,8 +10,7 @@ import pytest
 from megloc_kapture.evaluation.check import check_submission, read_reference
 from megloc_kapture.pipeline.datasets import TWIN_PREFIX
 from megloc_kapture.pipeline.evaluation_plan import recall_rows
-from megloc_kapture.pipeline.plan import all_kept
-from megloc_kapture.pipeline.workspace import Workspace
+from megloc_kapture.pipeline.plan import Workspace, all_kept
 from tests.pipeline.runs import run_twin
 
 SMALL: dict[str, dict[str, Any]] = {

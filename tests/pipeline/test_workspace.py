@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.io.files import write_json_model
-from megloc_kapture.pipeline.workspace import Workspace, fingerprint, read_manifest
+from megloc_kapture.pipeline.plan import Workspace, fingerprint, read_manifest
 from megloc_kapture.stages.stage import files_fingerprint
 from tests.pipeline.runs import manifest
 
@@ -57,7 +57,7 @@ def test_one_run_at_a_time_also_of_two_processes(tmp_path: Path) -> None:
     code = (
         "import sys\nfrom pathlib import Path\n"
         "from megloc_kapture.errors import OutputError\n"
-        "from megloc_kapture.pipeline.workspace import Workspace\n"
+        "from megloc_kapture.pipeline.plan import Workspace\n"
         "try:\n    with Workspace(Path(sys.argv[1])).lock(): print('free')\n"
         "except OutputError as error: print(error)\n"
     )

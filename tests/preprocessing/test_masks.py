@@ -69,8 +69,6 @@ def test_it_is_for_a_sensor_or_a_pattern_of_images() -> None:
     by_name = FixedMask(camera="*/rear/*.jpg", bottom_share=0.1)
     names = ("day/rear/1.jpg", "day/left/1.jpg", "day/REAR/1.jpg")
     assert [by_name.is_for("c0", name) for name in names] == [True, False, False]
-    with pytest.raises(ValueError, match="is a file"):  # which is not drawn
-        FixedMask.model_validate({"camera": "c", "file": "a.png"}).drawn(4, 4)
 
 
 @pytest.mark.parametrize(
@@ -207,8 +205,6 @@ def test_a_plain_bonnet_without_texture_is_found_by_its_edge() -> None:
 def test_a_camera_that_stands_still_is_said_so() -> None:
     region = region_of([noise(0)] * MIN_IMAGES)
     assert not region and "hardly moves" in region.reason
-    with pytest.raises(ValueError, match=f"at least {MIN_IMAGES}"):
-        region_of([noise(k) for k in range(MIN_IMAGES - 1)])
 
 
 def test_the_mask_is_below_the_frontier() -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import OptionError
-from megloc_kapture.retrieval.fusion import FusionOptions, fuse, fuse_rankings, greedy_coverage
+from megloc_kapture.retrieval.search import FusionOptions, fuse, fuse_rankings, greedy_coverage
 
 needs_kapture_localization = pytest.mark.skipif(
     importlib.util.find_spec("kapture_localization") is None,

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.retrieval import search
-from megloc_kapture.retrieval.fusion import FusionOptions, fuse
-from megloc_kapture.retrieval.search import Found, FusedSearch
+from megloc_kapture.retrieval.search import Found, FusedSearch, FusionOptions, fuse
 
 
 def rank_fused(
@@ -141,29 +140,20 @@ def test_fused_ranking_is_that_of_the_whole_matrices(method: str) -> None:
         np.testing.assert_allclose(scores[row], np.sort(fused)[::-1][:10], atol=1e-6)
 
 
-def test_features_that_do_not_fit_are_refused() -> None:
-    one, more = np.zeros((2, 4)), np.zeros((3, 4))
-    for queries, database, match in [
-        ([one, more], [one, one], "2, 3 queries"),
-        ([one, one], [one, more], r"\[2, 3\] rows"),
-    ]:
-        with pytest.raises(DataError, match=match):
-            rank_fused(queries, database, 1, fusion=FusionOptions())
-    with pytest.raises(OptionError, match="2 global features of the queries, 1 of the map"):
-        rank_fused([one, one], [one], 1, fusion=FusionOptions())
-    with pytest.raises(OptionError, match="weights"):
-        rank_fused([one, one], [one, one], 1, fusion=FusionOptions(), weights=[1.0, 0.0])
+ONE, MORE, WIDE = np.zeros((2, 4)), np.zeros((3, 4)), np.zeros((3, 5))
 
 
 @pytest.mark.parametrize(
-    ("queries", "database", "match"),
+    ("queries", "database", "weights", "match"),
     [
-        (np.zeros((2, 4)), np.zeros((3, 5)), "different dimensions"),
-        (np.zeros(4), np.zeros((3, 4)), "different dimensions"),
+        ([ONE, ONE], [ONE, MORE], None, r"\[2, 3\] rows"),
+        ([ONE], [WIDE], None, "different dimensions"),
+        ([ONE, ONE], [ONE], None, "2 global features of the queries, 1 of the map"),
+        ([ONE, ONE], [ONE, ONE], [1.0, 0.0], "weights"),
     ],
 )
-def test_descriptors_of_different_dimensions_are_refused(
-    queries: Any, database: Any, match: str
+def test_features_that_do_not_fit_are_refused(
+    queries: Any, database: Any, weights: Any, match: str
 ) -> None:
-    with pytest.raises(DataError, match=match):
-        rank_by_similarity(queries, database, 1)
+    with pytest.raises((DataError, OptionError), match=match):
+        rank_fused(queries, database, 1, fusion=FusionOptions(), weights=weights)

@@ -86,7 +86,7 @@ class World:
 
     def localized(
         self, pairs: list[ImagePair] | None = None, **options: Any
-    ) -> list[tuple[str, Pose | Failure]]:
+    ) -> list[Pose | Failure]:
         """The queries, from the matches that are stored."""
         work = options.pop("work", HERE)
         chosen = LocalizationOptions(**options)

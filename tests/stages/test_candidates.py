@@ -17,7 +17,7 @@ from megloc_kapture.io.kapture import (
     KaptureFolder,
     write_sensors,
 )
-from megloc_kapture.retrieval.fusion import FusionOptions, fuse
+from megloc_kapture.retrieval.search import FusionOptions, fuse
 from megloc_kapture.stages import candidates
 from megloc_kapture.stages.candidates import (
     UNRESTRICTED,
@@ -26,7 +26,7 @@ from megloc_kapture.stages.candidates import (
     Retrieval,
     vectors_of,
 )
-from megloc_kapture.stages.image_pairs import MappingPairsOptions, pair_map_images, pair_queries
+from megloc_kapture.stages.image_pairs import pair_queries
 from megloc_kapture.stages.work import Work
 
 Folders = tuple[KaptureFolder, KaptureFolder]
@@ -70,20 +70,6 @@ def test_fused_pairs_are_those_of_the_fused_similarities(
     ]
     assert [(p.query, p.map) for p in found] == [(q, m) for q, m, _ in expected]
     np.testing.assert_allclose([p.score for p in found], [s for _, _, s in expected], atol=1e-6)
-
-
-def test_few_queries_at_a_time_give_the_same(
-    folders: Folders, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    retrieval = Retrieval(("short", "long"))
-    options = MappingPairsOptions(top_k=2)
-    everything = pair_map_images(folders[0], options, retrieval=retrieval)
-    monkeypatch.setattr(candidates, "_QUERY_ELEMENTS", 1)  # one row at a time
-    pairs = pair_map_images(folders[0], options, retrieval=retrieval)
-    names = [[(pair.query, pair.map) for pair in some] for some in (pairs, everything)]
-    assert names[0] == names[1]
-    scores = [[pair.score for pair in some] for some in (pairs, everything)]
-    np.testing.assert_allclose(*scores, atol=1e-6)
 
 
 @pytest.fixture

@@ -24,8 +24,7 @@ from megloc_kapture.mapping.uncertainty import point_deviations
 from megloc_kapture.mvs.views import Agreement
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.densifying import DensifyOptions, densify_map, fitted_to_poses
-from megloc_kapture.stages.scene import depth_records, read_depth
-from megloc_kapture.stages.shared_index import index_map
+from megloc_kapture.stages.scene import depth_records, index_map, read_depth
 from megloc_kapture.stages.stereo_depth import DEPTH_FILE, fuse_depth, read_beside, side_file
 from megloc_kapture.values import RigidTransform
 
@@ -178,7 +177,7 @@ def test_images_that_have_depth_keep_it(densified: KaptureFolder, tmp_path: Path
     counts = densify_map(KaptureFolder(kept), tmp_path / "out", OPTIONS)
     assert counts["images_with_depth"] == 4
     rows = {row.image: row for row in read_depth_rows(tmp_path / "out" / DEPTH_FILE)}
-    assert rows[first].reason == "has depth of its own"
+    assert rows[first].reason == "already has depth"
     out = KaptureFolder(tmp_path / "out")
     found = depth_records(out.read())[first]
     assert found.path == "own.depth" and read_depth(out, found).any()
@@ -187,7 +186,7 @@ def test_images_that_have_depth_keep_it(densified: KaptureFolder, tmp_path: Path
 def test_what_cannot_be_densified_is_refused_with_its_name(
     world: Any, densified: KaptureFolder, tmp_path: Path
 ) -> None:
-    with pytest.raises(DataError, match="no map to densify.*triangulate first") as refused:
+    with pytest.raises(DataError, match="no map to densify.*megloc triangulate") as refused:
         densify_map(world.mapping(), tmp_path / "a", OPTIONS)
     assert str(world.mapping().root) in str(refused.value)
     with pytest.raises(DataError, match="records_data/mvs"):

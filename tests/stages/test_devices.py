@@ -28,18 +28,18 @@ from megloc_kapture.nets.runtime import pick_device
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.plugin_loading import load_plugin
-from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS
-from megloc_kapture.stages import devices
+from megloc_kapture.plugin_loading import Placement, load_plugin
+from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS, POSE_RANKERS
+from megloc_kapture.stages import work as devices
 from megloc_kapture.stages import work as work_module
-from megloc_kapture.stages.devices import DeviceMemoryError, in_batches, is_out_of_memory
 from megloc_kapture.stages.local_features import (
     ExtractLocalFeatures,
     extract_all,
     extract_local_features,
 )
 from megloc_kapture.stages.matches import MatchQueries, match_all, match_pairs
-from megloc_kapture.stages.work import Work
+from megloc_kapture.stages.stage import wanted_stages
+from megloc_kapture.stages.work import DeviceMemoryError, Work, in_batches, is_out_of_memory
 from megloc_kapture.values import ImageFeatures, LocalFeatures
 
 Image = NDArray[np.uint8]
@@ -241,31 +241,24 @@ def test_one_process_has_the_gpu(
 # ------------------------------------------------------------------------------------ options
 
 
-def test_networks_are_told_and_those_that_say_so_themselves_stay() -> None:
-    options = options_of_preset(
-        "megloc",
-        assignments={
-            "device": "cuda:1",
-            "precision": "half",
-            "local_features.aslfeat.options.device": "cpu",
-            "localization.rank": {"name": "perceptual", "options": {"distance": "lpips"}},
-        },
-    )
-    points, aslfeat = options.local_features
-    assert points.options == {"device": "cuda:1", "half_precision": True}
-    assert aslfeat.options["device"] == "cpu" and aslfeat.options["half_precision"] is True
-    assert points.matching is not None and points.matching.options["device"] == "cuda:1"
-    assert aslfeat.matching is not None and "device" not in aslfeat.matching.options  # nn has none
-    assert {one.options["device"] for one in options.global_features} == {"cuda:1"}
-    distance = options.localization.rank.options["distance"]
-    assert distance["name"] == "lpips" and distance["options"]["half_precision"] is True
-    assert "device" not in options.localization.rank.options
+def test_the_run_places_networks_that_name_no_device() -> None:
+    placement = Placement("cuda:1", half_precision=True)
+    plain = load_plugin(MATCHERS, "nn", {"max_ratio": 0.9}, placement)  # has no such options
+    assert plain.options.max_ratio == 0.9
+    ranking = {"distance": {"name": "structure"}, "device": "cpu"}
+    ranker = load_plugin(POSE_RANKERS, "perceptual", ranking, placement)
+    assert (ranker.options.device, ranker.options.half_precision) == ("cpu", True)
+    options = options_of_preset("classic", assignments={"device": "cuda:1", "precision": "half"})
+    assert options.placement == placement
+    (stage, *_) = wanted_stages([ExtractLocalFeatures], options)
+    assert stage.placement == placement
 
 
 def test_where_it_was_done_is_no_part_of_what_was_done(monkeypatch: pytest.MonkeyPatch) -> None:
     stages = ExtractLocalFeatures, MatchQueries
+    network = SimpleNamespace(options=SimpleNamespace(half_precision=False))
     for stage in stages:
-        monkeypatch.setattr(stage, "plugins", lambda _: ())
+        monkeypatch.setattr(stage, "plugins", lambda _: (network,))
     plain, here, half = (
         [stage(options_of_preset("megloc", assignments=changes)).settings() for stage in stages]
         for changes in ({}, {"device": "cpu"}, {"precision": "half"})
@@ -304,10 +297,7 @@ def test_every_library_runs_out_of_memory_in_its_own_words(message: str, expecte
 def test_a_localizer_is_told(world: Any) -> None:
     opened = KaptureMap.open(world.root / "map", features_dirs=[world.features_dir])
     told = Localizer(opened, preset="modern", device="cpu", precision="half").options
-    assert told.device == "cpu" and told.local_features[0].options["half_precision"] is True
-    changes = {"global_features": ["netvlad"], "device": "cpu"}
-    options = options_of_preset("classic", assignments=changes)
-    chosen = Localizer(opened, options=options).options.global_features[0]
-    assert chosen.options == {"device": "cpu"}
+    assert told.placement == Placement("cpu", half_precision=True)
+    options = options_of_preset("classic", assignments={"device": "cpu"})
     with pytest.raises(OptionError, match="give the device and the precision in the options"):
         Localizer(opened, options=options, device="cuda")

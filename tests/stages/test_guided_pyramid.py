@@ -191,8 +191,8 @@ def recall(map_folder: KaptureFolder, query: KaptureFolder) -> float:
     with single_threaded():
         results = list(localize_from_matches(map_folder, query, query, pairs, types, options))
     near = [
-        isinstance(found, Pose) and movement(truth[image], found.cam_from_world)[0] < 0.2
-        for image, found in results
+        isinstance(found, Pose) and movement(truth[found.name], found.cam_from_world)[0] < 0.2
+        for found in results
     ]
     return float(np.mean(near))
 

@@ -136,7 +136,7 @@ def test_map_pairs_by_covisibility(world: Any, monkeypatch: pytest.MonkeyPatch) 
     assert names(found) == expected and {pair.score for pair in found} == {1.0}
     # images of one kapture, points of another
     assert paired(world.mapping(), world.map(), **options) == found
-    with pytest.raises(DataError, match="mapping: co-visibility needs a map's points"):
+    with pytest.raises(DataError, match="mapping: no map to pair images by co-visibility"):
         paired(world.mapping(), **options)
 
 

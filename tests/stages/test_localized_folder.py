@@ -18,7 +18,6 @@ from megloc_kapture.io.tables import (
     COVARIANCE_FILE,
     POSES_FILE,
     STATUS_FILE,
-    read_clusters,
     read_covariances,
     read_status,
 )
@@ -31,9 +30,10 @@ def test_localized_queries_are_a_kapture(world: Any, tmp_path: Path) -> None:
     write_localized(tmp_path, world.query(), results, timing=tmp_path / "timing.csv")
     folder = KaptureFolder(tmp_path)
     folder.validate(deep=True)  # the images are there too
-    assert folder.read().poses() == {image: found.cam_from_world for image, found in results}
+    assert folder.read().poses() == {found.name: found.cam_from_world for found in results}
     table = pandas.read_csv(tmp_path / POSES_FILE, index_col="image")
-    for image, found in results:
+    for found in results:
+        image = found.name
         rotation = Rotation.from_quat(
             table.loc[image, ["qx", "qy", "qz", "qw"]].to_numpy(copy=True)
         )
@@ -46,17 +46,17 @@ def test_localized_queries_are_a_kapture(world: Any, tmp_path: Path) -> None:
     theirs = kapture.io.csv.kapture_from_dir(str(tmp_path))
     assert len(theirs.trajectories) == 2 and len(list(theirs.records_camera.key_pairs())) == 2
     status = read_status(tmp_path / STATUS_FILE)
-    clusters = read_clusters(tmp_path / CLUSTERS_FILE)
-    for image, result in results:
-        row = status[image]
+    clusters = pandas.read_csv(tmp_path / CLUSTERS_FILE, index_col="image")
+    for result in results:
+        row = status[result.name]
         assert (row.status, row.reason, row.fallback) == ("localized", "", "none")
         assert (row.num_inliers, row.candidates) == (result.num_inliers, result.candidates)
-        (chosen,) = (row for row in clusters[image] if row.chosen == "yes")
-        assert row.cluster == chosen.cluster and chosen.images == result.candidates
-        assert chosen.score is not None and chosen.score > 100
+        ((_, chosen),) = clusters.loc[[result.name]].query("chosen == 'yes'").iterrows()
+        assert chosen.cluster == row.cluster and chosen.images == ",".join(result.candidates)
+        assert chosen.score > 100
     covariances = read_covariances(tmp_path / COVARIANCE_FILE)
     assert {image: c.tolist() for image, c in covariances.items()} == {
-        image: found.covariance.tolist() for image, found in results
+        found.name: found.covariance.tolist() for found in results
     }
     lines = (tmp_path / "timing.csv").read_text().splitlines()
     assert lines[0] == "image,step,seconds"
@@ -75,9 +75,9 @@ def test_a_covariance_that_is_none_is_refused_by_its_line(world: Any, tmp_path: 
             read_covariances(path)
 
 
-def half_failed(world: Any) -> list[tuple[str, Pose | Failure]]:
-    (first, _), second = world.localized()
-    return [(first, Failure("no map image matches")), second]
+def half_failed(world: Any) -> list[Pose | Failure]:
+    first, second = world.localized()
+    return [Failure("no map image matches", name=first.name), second]
 
 
 @pytest.mark.parametrize(

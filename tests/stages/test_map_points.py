@@ -17,8 +17,7 @@ from megloc_kapture.geometry.cameras import px_from_cam
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.map_points import lift_map
-from megloc_kapture.stages.scene import depth_records, read_depth
-from megloc_kapture.stages.shared_index import index_map
+from megloc_kapture.stages.scene import depth_records, index_map, read_depth
 from megloc_kapture.values import RigidTransform
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +35,6 @@ from megloc_kapture.stages.map_refinement import (
     RefinementReport,
     refine_map,
 )
-from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Camera("SIMPLE_RADIAL", 320, 240, (250.0, 160.0, 120.0, 0.02))
@@ -247,17 +245,6 @@ def test_a_map_without_poses_is_left_as_it_is(tmp_path: Path) -> None:
     covariances = read_point_covariances(tmp_path / "out", 66)
     assert covariances is not None
     assert np.isnan(covariances).all()
-
-
-def test_equal_bytes_whoever_works(
-    wall: KaptureFolder, tmp_path: Path, two_processes: Executor, folder_bytes: Any
-) -> None:
-    options = MapRefinementOptions.model_validate({"uncertainty": {"max_robust_sigmas": 1.0}})
-    before = folder_bytes(wall.root)
-    refine_map(wall, tmp_path / "one", options)
-    refine_map(wall, tmp_path / "two", options, work=Work(two_processes))
-    assert folder_bytes(tmp_path / "one") == folder_bytes(tmp_path / "two")
-    assert folder_bytes(wall.root) == before
 
 
 def lifted_from(wall: KaptureFolder, shares: Sequence[float]) -> KaptureFolder:

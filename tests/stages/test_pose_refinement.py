@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas
 import pytest
 
 from megloc_kapture.errors import PluginError
@@ -21,7 +22,6 @@ from megloc_kapture.io.tables import (
     read_consistency,
     read_covariances,
     read_refinement,
-    read_status,
 )
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import POSE_REFINERS, PluginChoice, PoseRefinement
@@ -82,8 +82,12 @@ class Chosen(PoseRefinementOptions):
 
     refiners: tuple[Any, ...] = ()
 
-    def make_refiners(self) -> list[Any]:
+    def make_refiners(self, placement: Any = None) -> list[Any]:
         return list(self.refiners)
+
+
+def status_table(localized: Path) -> pandas.DataFrame:
+    return pandas.read_csv(localized / "status.csv", index_col="image", keep_default_na=False)
 
 
 @pytest.fixture
@@ -92,9 +96,9 @@ def localized(world: Any, tmp_path: Path) -> KaptureFolder:
     first, second = sorted(world.query_poses)
     image = min(world.map_poses)
     pose = world.query_poses[first]
-    found = Pose(pose, 50, 40, candidates=(image,), covariance=COVARIANCE)
+    found = Pose(pose, 50, 40, name=first, candidates=(image,), covariance=COVARIANCE)
     folder = tmp_path / "localized"
-    write_localized(folder, world.query(), [(first, found), (second, Failure("too dark"))])
+    write_localized(folder, world.query(), [found, Failure("too dark", name=second)])
     return KaptureFolder(folder)
 
 
@@ -110,14 +114,14 @@ def test_poses_move_by_each_refiner_in_turn_and_failures_stay(
     expected = SHIFT @ SHIFT @ world.query_poses[first]
     assert refined.keys() == {first}
     np.testing.assert_allclose(refined[first].translation, expected.translation)
-    statuses = read_status(tmp_path / "out" / "status.csv")
+    status = status_table(tmp_path / "out")
     said = "shift: accepted; shift: nothing overlaps; shift: accepted"
-    assert statuses[first].refinement == said
-    assert (statuses[second].refinement, statuses[second].reason) == ("", "too dark")
-    rows = read_refinement(tmp_path / "out" / "refinement.csv")
-    assert [row.accepted for row in rows] == [True, False, True]
-    assert [row.moved_m for row in rows] == pytest.approx([0.25, 0, 0.25])
-    assert rows[1].measures == ("overlap=0.125",)
+    assert status.refinement[first] == said
+    assert (status.refinement[second], status.reason[second]) == ("", "too dark")
+    steps = read_refinement(tmp_path / "out" / "refinement.csv", refined)[first]
+    assert [step.accepted for step in steps] == [True, False, True]
+    assert [step.moved_m for step in steps] == pytest.approx([0.25, 0, 0.25])
+    assert steps[1].measures == {"overlap": 0.125}
     # what was localized is as it was
     assert localized.read().poses()[first] == world.query_poses[first]
     with ThreadPoolExecutor(2) as executor:
@@ -187,8 +191,8 @@ def test_every_registered_refiner_says_why_a_query_without_depth_stays(
         options = PoseRefinementOptions(by=(PluginChoice(name=name),))
         counts = refine_poses(world.mapping(), world.query(), localized, tmp_path / name, options)
         assert counts[f"accepted_by_{name}"] == 0
-        row = read_refinement(tmp_path / name / "refinement.csv")[0]
-        assert "depth" in row.reason, row
+        ((step,),) = read_refinement(tmp_path / name / "refinement.csv", {}).values()
+        assert "depth" in step.reason
         poses = KaptureFolder(tmp_path / name).read().poses()
         assert poses[first] == localized.read().poses()[first]
 
@@ -208,7 +212,7 @@ def folders(world: Any, small_kapture: Any, tmp_path: Path) -> tuple[KaptureFold
     )
     query = small_kapture({"a.png": pixels, "b.png": pixels}, name="query")
     found = [
-        (q, Pose(pose, 50, 40, candidates=(first,)))
+        Pose(pose, 50, 40, name=q, candidates=(first,))
         for q, first in (("a.png", "00.png"), ("b.png", "06.png"))
     ]
     write_localized(tmp_path / "localized", query, found)
@@ -227,11 +231,11 @@ def test_each_coordinate_frame_is_judged_by_itself(folders: Any, tmp_path: Path)
     assert counts == {
         "queries": 2, "accepted_by_sure": 1, "frames_where_sure_is_trusted": 1,
     }  # fmt: skip
-    statuses, rows = read_status(out / "status.csv"), read_refinement(out / "refinement.csv")
-    assert statuses["a.png"].refinement == "sure: accepted"
-    assert "sure: the map contradicts itself: 6 of 6" in statuses["b.png"].refinement
-    assert [row.accepted for row in rows] == [True, False]
-    assert rows[1].reason in statuses["b.png"].refinement
+    text = status_table(out).refinement
+    assert text["a.png"] == "sure: accepted"
+    assert "sure: the map contradicts itself: 6 of 6" in text["b.png"]
+    (first,), (second,) = read_refinement(out / "refinement.csv", {}).values()
+    assert (first.accepted, second.accepted) == (True, False) and second.reason in text["b.png"]
     poses = KaptureFolder(out).read().poses()
     assert poses["a.png"] == SHIFT and poses["b.png"] == RigidTransform.identity()
     bad, good = read_consistency(out / CONSISTENCY_FILE)

@@ -40,9 +40,9 @@ from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
 def test_queries_are_localized_where_they_are(world: Any, two_processes: Executor) -> None:
     results = world.localized()
-    assert [image for image, _ in results] == sorted(world.query_poses)
-    for image, result in results:
-        truth = world.query_poses[image]
+    assert [result.name for result in results] == sorted(world.query_poses)
+    for result in results:
+        truth = world.query_poses[result.name]
         assert isinstance(result, Pose) and result.covariance is not None
         error_m, error_deg = movement(truth, result.cam_from_world)
         assert error_m < 0.005 and error_deg < 0.05
@@ -54,19 +54,19 @@ def test_queries_are_localized_where_they_are(world: Any, two_processes: Executo
         # six degrees of freedom; the map's own errors are not in it, hence the room
         assert error @ np.linalg.solve(result.covariance, error) < 100
     there = world.localized(work=Work(two_processes))
-    for (_, a), (_, b) in zip(results, there, strict=True):
+    for a, b in zip(results, there, strict=True):
         assert (a.cam_from_world, a.num_inliers) == (b.cam_from_world, b.num_inliers)
 
 
 def test_a_query_without_candidates_fails_and_says_so(world: Any) -> None:
     only_b = [ImagePair("query/b.png", "right/2.png", 1.0)]
-    (_, first), (_, second) = world.localized(only_b)
+    first, second = world.localized(only_b)
     assert first == Failure("no map image is a candidate")
     assert isinstance(second, Pose) and second.candidates == ("right/2.png",)
 
 
 def test_a_query_with_too_few_inliers_fails_and_keeps_its_numbers(world: Any) -> None:
-    for _, result in world.localized(pose=AbsolutePoseOptions(min_inliers=5000)):
+    for result in world.localized(pose=AbsolutePoseOptions(min_inliers=5000)):
         assert isinstance(result, Failure)
         assert "at least 5000 are needed" in result.reason
         assert result.num_matches > 100 and result.candidates
@@ -85,9 +85,9 @@ class Brightness:
 
 
 def test_a_ranker_sees_poses_and_images(world: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(LocalizationOptions, "make_ranker", lambda _: Brightness())
-    for image, result in world.localized():
-        pixels = read_image_rgb(world.query().image_path(image))
+    monkeypatch.setattr(LocalizationOptions, "make_ranker", lambda *_: Brightness())
+    for result in world.localized():
+        pixels = read_image_rgb(world.query().image_path(result.name))
         assert result.clusters[0].score == pytest.approx(pixels.mean())
 
 
@@ -145,7 +145,7 @@ def test_real_photographs_are_localized_within_a_centimetre(
         match_pairs(query, made, pairs, "rootsift", matcher, how, output)
         options = LocalizationOptions()
         results = localize_from_matches(made, query, query, pairs, ["rootsift"], options)
-        errors = [movement(truth[image], found.cam_from_world)[0] for image, found in results]
+        errors = [movement(truth[found.name], found.cam_from_world)[0] for found in results]
     assert len(errors) == 4 and max(errors) < 0.01
 
 

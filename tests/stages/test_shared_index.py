@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import shutil
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -13,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from megloc_kapture.errors import DataError, OutputError
+from megloc_kapture.errors import DataError
 from megloc_kapture.io.kapture import KaptureFolder, write_observations, write_points3d
 from megloc_kapture.io.kapture.points import write_point_covariances
 from megloc_kapture.localization.map_index import MapIndex
-from megloc_kapture.stages.shared_index import (
+from megloc_kapture.stages.scene import (
     index_map,
     open_index,
     shared_index,
@@ -76,33 +75,6 @@ def test_another_process_finds_the_same_and_the_files_go_away() -> None:
     assert not any(folder.parent.exists() for folder in folders.values())
     # what is open stays whole
     assert opened.shared_points(NAMES).tolist() == found
-
-
-def test_the_files_go_away_after_an_error_too() -> None:
-    with pytest.raises(KeyError), shared_index({"sift": make_index()}) as folders:
-        raise KeyError
-    assert not folders["sift"].parent.exists()
-
-
-def cut(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:-10])
-
-
-@pytest.mark.parametrize("damage", [Path.unlink, cut])
-@pytest.mark.parametrize("file", ["point_ids.npy", "index.json"])
-def test_a_damaged_index_is_named(
-    damage: Callable[[Path], object], file: str, tmp_path: Path
-) -> None:
-    write_index(make_index(), tmp_path)
-    damage(tmp_path / file)
-    with pytest.raises(DataError, match=f"{tmp_path}.*cannot read a map's index"):
-        open_index(tmp_path)
-
-
-def test_a_place_that_cannot_be_written_to_is_named(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="file"):
-        write_index(make_index(), tmp_path / "file" / "index")
 
 
 def test_the_index_is_of_one_keypoints_type(world: Any) -> None:

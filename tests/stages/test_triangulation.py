@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 from concurrent.futures import Executor
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +21,8 @@ from megloc_kapture.io.kapture import (
     MatchesWriter,
     write_sensors,
 )
-from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
-from megloc_kapture.matching.verification import KnownPoseOptions
 from megloc_kapture.stages import map_points
 from megloc_kapture.stages.map_points import triangulate_map
-from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.work import Work
 
 
@@ -113,21 +108,6 @@ def test_kapture_reads_the_map(world: Any) -> None:
     for image, expected_pose in world.map_poses.items():
         pose = theirs.trajectories[ours.read().record_of(image)]
         np.testing.assert_allclose(pose.t_raw, expected_pose.translation, atol=1e-12)
-
-
-def test_two_runs_write_the_same_bytes(world: Any, tmp_path: Path, folder_bytes: Any) -> None:
-    for name, threads in (("one", 1), ("two", 2)):
-        counts = triangulate_map(
-            world.mapping(), world.with_matches("mapping"), "rootsift", tmp_path / name,
-            TriangulationOptions(), num_threads=threads,
-        )  # fmt: skip
-        assert counts["images"] == 5 and counts["pairs"] == 10
-        assert counts["points"] == len(world.map().points3d())
-        assert counts["mean_track_length"] >= 3
-        assert 0 < counts["mean_reprojection_error_px"] < 1
-    assert folder_bytes(tmp_path / "one") == folder_bytes(tmp_path / "two")
-    written = folder_bytes(tmp_path / "one" / "reconstruction")
-    assert written == folder_bytes(world.root / "map" / "reconstruction")
 
 
 def test_only_the_pairs_asked_for_are_used(world: Any, tmp_path: Path) -> None:
@@ -291,31 +271,3 @@ def observed(folder: KaptureFolder, name: str, offset: int = 0) -> list[Any]:
     seen = folder.observations()[name]
     columns = seen.point_ids - offset, seen.image_ids, seen.keypoint_ids
     return [seen.image_names, *(column.tolist() for column in columns)]
-
-
-@pytest.mark.slow
-def test_virtual_gallery_given_per_rig_and_per_camera(shared_data: Path, tmp_path: Path) -> None:
-    gallery = shared_data / "foreign_maps" / "virtual_gallery"
-    for name, sensors in (("rig", gallery / "mapping_rig"), ("camera", gallery / "map")):
-        whole = tmp_path / name
-        ignored = shutil.ignore_patterns("records_data")
-        shutil.copytree(sensors / "sensors", whole / "sensors", ignore=ignored)
-        (whole / "sensors" / "records_data").mkdir()
-        for kind in ("keypoints", "descriptors"):
-            place = Path("reconstruction", kind)
-            shutil.copytree(gallery / "map" / place, whole / place)
-        folder = KaptureFolder(whole)
-        pairs = [ImagePair(a, b, 1.0) for a, b in combinations(folder.read().image_names(), 2)]
-        found, matcher, how = tmp_path / f"{name}_matches", NearestNeighbours(), KnownPoseOptions()
-        match_pairs(folder, folder, pairs, "r2d2_500", matcher, how, found)
-        matches, options = folder.with_features([found]), TriangulationOptions()
-        triangulate_map(folder, matches, "r2d2_500", tmp_path / f"{name}_map", options)
-    of_rig, of_camera = (KaptureFolder(tmp_path / f"{name}_map") for name in ("rig", "camera"))
-    # the rig stays a rig
-    given = KaptureFolder(gallery / "mapping_rig").read()
-    assert of_rig.read().rigs == given.rigs and given.rigs and not of_camera.read().rigs
-    assert of_rig.read().trajectories == given.trajectories
-    # the two write the same poses with other digits
-    assert len(of_rig.points3d()) > 200
-    np.testing.assert_allclose(of_rig.points3d(), of_camera.points3d(), atol=1e-5)
-    assert observed(of_rig, "r2d2_500") == observed(of_camera, "r2d2_500")

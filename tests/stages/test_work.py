@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.stages.work import FinishedItems, FolderSpec, Work, ordered_map
 
 
@@ -64,21 +63,6 @@ def test_an_error_of_a_worker_comes_through_with_its_place() -> None:
             for value in ordered_map(fail_at_three, range(50), executor, window=4):
                 seen.append(value)
     assert seen == [0, 1, 4]
-
-
-def test_an_error_in_another_process_keeps_file_and_line(
-    two_processes: Executor, tmp_path: Path
-) -> None:
-    (tmp_path / "sensors").mkdir()
-    broken = tmp_path / "sensors" / "sensors.txt"
-    broken.write_text("# kapture format: 1.1\ncam, , camera, PINHOLE, 640\n")
-    (tmp_path / "sensors" / "records_camera.txt").write_text("# kapture format: 1.1\n")
-    with pytest.raises(DataError) as here:
-        KaptureFolder(tmp_path).read()
-    with pytest.raises(DataError) as there:
-        list(ordered_map(KaptureFolder.read, [KaptureFolder(tmp_path)], two_processes))
-    assert str(there.value) == str(here.value)
-    assert (there.value.path, there.value.line) == (here.value.path, here.value.line)
 
 
 def test_a_folder_is_opened_once_per_run(world: Any) -> None:

@@ -27,14 +27,13 @@ from megloc_kapture.evaluation.metrics import (
     Threshold,
     pose_errors,
 )
-from megloc_kapture.evaluation.scoring import Evaluation
+from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
 from megloc_kapture.io.tables import ConsistencyRow
-from megloc_kapture.values import MIN_CONFIDENCE
+from megloc_kapture.values import MIN_CONFIDENCE, PoseRefinement
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from megloc_kapture.evaluation.report.queries import ShownQuery
 
 INTERVALS = "95 % confidence intervals of recall, queries taken as independent (%)"
 CONFIDENT = f"Recall if poses with a confidence below {MIN_CONFIDENCE:g} are misses (%)"
@@ -330,7 +329,7 @@ def agreement_table(found: WithoutTruth, rows: Iterable[AgreementRow]) -> DataFr
     )
 
 
-def query_table(evaluation: Evaluation, queries: Sequence[ShownQuery]) -> DataFrame:
+def query_table(evaluation: Evaluation, queries: Sequence[QueryResult]) -> DataFrame:
     """Return one row per query, without columns that are empty."""
     centers = evaluation.by_center
     of_center = {} if centers is None else {q.image: q.position_m for q in centers.queries}
@@ -361,24 +360,23 @@ def query_table(evaluation: Evaluation, queries: Sequence[ShownQuery]) -> DataFr
 def refinement_table(evaluation: Evaluation) -> DataFrame | None:
     """Return the steps of pose refinement over all queries; None if nothing was refined."""
     estimated, truth = evaluation.estimated, evaluation.truth
-    steps: dict[str, list[tuple[Any, Any]]] = {}
-    for image, rows in sorted(evaluation.context.refinements.items()):
+    by_method: dict[str, list[tuple[str, PoseRefinement]]] = {}
+    for image, steps in sorted(evaluation.context.refinements.items()):
         if image in estimated:
-            # each step ends with the pose that the next begins with
-            ends = [*(row.before for row in rows[1:]), estimated[image]]
-            for row, after in zip(rows, ends, strict=True):
-                steps.setdefault(row.method, []).append((row, after))
+            for step in steps:
+                by_method.setdefault(step.method, []).append((image, step))
     table = []
-    for method, refined in steps.items():
-        accepted = [(row, after) for row, after in refined if row.accepted]
-        reasons = Counter(_NUMBER.sub("…", row.reason) for row, _ in refined if not row.accepted)
+    for method, refined in by_method.items():
+        accepted = [(image, step) for image, step in refined if step.accepted]
+        reasons = Counter(_NUMBER.sub("…", step.reason) for _, step in refined if step.reason)
         listed = (f"{count} x {reason}" for reason, count in reasons.most_common(_REASONS_SHOWN))
-        moved = [(row.moved_m, row.turned_deg) for row, _ in accepted]
+        moved = [(step.moved_m, step.turned_deg) for _, step in accepted]
         line: dict[str, Any] = {"step": method, "queries": len(refined), "accepted": len(accepted)}
         line |= {"moved by (median)": _medians(moved)}
         if truth:
-            names = [row.image for row, _ in accepted if row.image in truth]
-            old, new = {r.image: r.before for r, _ in accepted}, {r.image: p for r, p in accepted}
+            names = [image for image, _ in accepted if image in truth]
+            old = {image: step.before for image, step in accepted if step.before is not None}
+            new = {image: step.cam_from_world for image, step in accepted}
             for heading, poses in (("error before", old), ("error after", new)):
                 errors = pose_errors(poses, truth, names)
                 line[heading] = _medians(zip(errors.position_m, errors.angle_deg, strict=True))

@@ -19,9 +19,9 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
 from megloc_kapture.evaluation.metrics import Confidence
-from megloc_kapture.evaluation.report.queries import ShownQuery, frame_of_query, top_view
+from megloc_kapture.evaluation.report.queries import frame_of_query, top_view
 from megloc_kapture.evaluation.results import Poses
-from megloc_kapture.evaluation.scoring import Evaluation
+from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
 from megloc_kapture.geometry.poses import camera_centers, stack_poses
 from megloc_kapture.values import RigidTransform
 
@@ -176,7 +176,7 @@ def confidence_curves(confidence: Confidence) -> bytes:
 
 
 def views_from_above(
-    queries: Sequence[ShownQuery], map_poses: Poses, frames: Mapping[str, str], unit: str
+    queries: Sequence[QueryResult], map_poses: Poses, frames: Mapping[str, str], unit: str
 ) -> dict[str, bytes]:
     """Plot cameras of the map, truths and estimates from above, per coordinate frame.
 
@@ -191,16 +191,16 @@ def views_from_above(
     for name in names:
         here = [query for query, frame in zip(queries, of_query, strict=True) if frame == name]
         poses = [map_poses[image] for image, frame in mapped.items() if frame == name]
-        if any(query.estimated or query.truth for query in here):
+        if any(query.cam_from_world or query.truth for query in here):
             figures[name] = _from_above(here, poses, unit)
     return figures
 
 
-def _from_above(queries: Sequence[ShownQuery], mapped: list[RigidTransform], unit: str) -> bytes:
+def _from_above(queries: Sequence[QueryResult], mapped: list[RigidTransform], unit: str) -> bytes:
     true = [query.truth for query in queries if query.truth is not None]
-    posed = [query for query in queries if query.estimated is not None]
+    posed = [query for query in queries if query.cam_from_world is not None]
     # a wrong estimate must not shrink the map to a dot
-    spanning = mapped + true or [query.estimated for query in posed if query.estimated]
+    spanning = mapped + true or [query.cam_from_world for query in posed if query.cam_from_world]
     quats, translations = stack_poses(spanning)
     axes_of_page, labels = top_view(quats, camera_centers(quats, translations))
 
@@ -227,14 +227,14 @@ def _from_above(queries: Sequence[ShownQuery], mapped: list[RigidTransform], uni
         axes = figure.subplots()
         dots(mapped, 10, "map cameras", c="#b8c4d0")
         joined = [query for query in posed if query.truth is not None]
-        ends = [seen([getattr(q, kind) for q in joined]) for kind in ("truth", "estimated")]
+        ends = [seen([getattr(q, kind) for q in joined]) for kind in ("truth", "cam_from_world")]
         segments = list(np.stack(ends, axis=1))
         axes.add_collection(LineCollection(segments, colors=_MISS, rasterized=raster, alpha=0.6))
         green: dict[str, Any] = {"facecolors": "none", "edgecolors": "#009e73"}
         dots([query.truth for query in joined], 26, "truth", **green)
-        localized = [q.estimated for q in posed if q.outcome == "localized"]
-        guessed = [q.estimated for q in posed if q.outcome == "fallback"]
-        lost = [q.truth for q in queries if q.estimated is None and q.truth is not None]
+        localized = [q.cam_from_world for q in posed if q.outcome == "localized"]
+        guessed = [q.cam_from_world for q in posed if q.outcome == "fallback"]
+        lost = [q.truth for q in queries if q.cam_from_world is None and q.truth is not None]
         dots(localized, 7, "estimated", c=_PALETTE[0], linewidths=0)
         dots(guessed, 20, "fallback pose", c=_MISS, marker="x")
         dots(lost, 30, "truth, no pose", c=_MISS, marker="+")

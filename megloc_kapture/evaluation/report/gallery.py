@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.evaluation.report.content import counted
-from megloc_kapture.evaluation.report.queries import ShownQuery, query_facts, spread
+from megloc_kapture.evaluation.report.queries import query_facts, spread
 from megloc_kapture.evaluation.results import Poses, ResultContext
+from megloc_kapture.evaluation.scoring import QueryResult
 from megloc_kapture.geometry.cameras import bearing_rays, focal_px
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder, MatchesReader
@@ -43,7 +44,7 @@ class Picture:
 
 
 def worst_pictures(
-    queries: Sequence[ShownQuery], context: ResultContext, map_poses: Poses
+    queries: Sequence[QueryResult], context: ResultContext, map_poses: Poses
 ) -> list[Picture]:
     """Draw queries beside the candidate with most matches, else the map image nearest to the pose.
 
@@ -93,7 +94,7 @@ def _stored_matches(
 
 
 def _beside(
-    query: ShownQuery,
+    query: QueryResult,
     context: ResultContext,
     folder: KaptureFolder,
     map_poses: Poses,
@@ -102,7 +103,7 @@ def _beside(
     left, scale = _read(folder, query.image)
     matches = _stored_matches(readers, query.image, query.candidates[:_CANDIDATES_COMPARED])
     best = max(matches, key=lambda image: len(matches[image][0]), default="")
-    pose, which = (query.truth, "true") if query.truth else (query.estimated, "estimated")
+    pose, which = (query.truth, "true") if query.truth else (query.cam_from_world, "estimated")
     if not best and pose is not None and map_poses:
         center = pose.center()
         best = min(map_poses, key=lambda i: float(np.linalg.norm(map_poses[i].center() - center)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -21,7 +21,6 @@ from megloc_kapture.geometry.poses import invert_quats, rotate
 from megloc_kapture.io.kapture import FeatureReader, MatchesReader
 from megloc_kapture.localization.map_index import MapIndex, TypedMatches
 from megloc_kapture.matching.guided_pyramid import base_type
-from megloc_kapture.values import RigidTransform
 
 NUM_SHOWN = 10
 # threshold of an inlier, as in pose estimation
@@ -32,24 +31,6 @@ _SCALE = ("#4cc3f0", "#7fd17f", "#f4d35e", "#ff9f45", "#ff4d4d")
 NO_POSE_COLOR, UNKNOWN_COLOR = "#9aa5b1", "#c9a7ff"
 # lower bounds of confidence for these colours
 _CONFIDENCES = (0.95, 0.8, 0.6)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ShownQuery(QueryResult):
-    """A query with its name, poses, and the colour of its error or confidence."""
-
-    name: str
-    estimated: RigidTransform | None
-    truth: RigidTransform | None
-    color: str
-    meaning: str
-
-    def rank(self) -> tuple[float, float, float, str]:
-        """Sort the worst first: no pose, then by error, confidence, number of inliers, name."""
-        error = 0.0 if math.isnan(self.position_m) else self.position_m
-        confidence = self.confidence if self.confidence is not None else 1.0
-        badness = math.inf if self.estimated is None else error
-        return -badness, confidence, float(self.num_inliers or 0), self.name
 
 
 def query_facts(query: QueryResult) -> list[str]:
@@ -69,28 +50,35 @@ def query_facts(query: QueryResult) -> list[str]:
     return facts
 
 
-def shown_queries(evaluation: Evaluation) -> list[ShownQuery]:
-    """Return the queries of a result, the worst first."""
+def shown_queries(evaluation: Evaluation) -> list[QueryResult]:
+    """Return the queries with truth and colours, the worst first; ``image`` is an image's name."""
     shown = []
     for query in evaluation.queries:
-        name = query.image
-        known = asdict(query) | {"image": evaluation.image(name)}
-        if name in evaluation.pairs and not query.candidates:
-            known["candidates"] = (evaluation.pairs[name].reference,)
+        candidates = query.candidates
+        if query.name in evaluation.pairs and not candidates:
+            candidates = (evaluation.pairs[query.name].reference,)
         color, meaning = NO_POSE_COLOR, "no pose"
-        if name in evaluation.estimated:
+        if query.cam_from_world is not None:
             color, meaning = _color(query, evaluation.thresholds)
         shown.append(
-            ShownQuery(
-                **known,
-                name=name,
-                estimated=evaluation.estimated.get(name),
-                truth=evaluation.truth.get(name),
+            replace(
+                query,
+                image=evaluation.image(query.name),
+                candidates=candidates,
+                truth=evaluation.truth.get(query.name),
                 color=color,
                 meaning=meaning,
             )
         )
-    return sorted(shown, key=ShownQuery.rank)
+    return sorted(shown, key=_worst_first)
+
+
+def _worst_first(query: QueryResult) -> tuple[float, float, float, str]:
+    """Sort by no pose, then by error, confidence, number of inliers, name."""
+    error = 0.0 if math.isnan(query.position_m) else query.position_m
+    confidence = query.confidence if query.confidence is not None else 1.0
+    badness = math.inf if query.cam_from_world is None else error
+    return -badness, confidence, float(query.num_inliers or 0), query.name
 
 
 def _color(query: QueryResult, thresholds: Sequence[Threshold]) -> tuple[str, str]:
@@ -108,23 +96,23 @@ def _color(query: QueryResult, thresholds: Sequence[Threshold]) -> tuple[str, st
     return _SCALE[-1], f"confidence below {_CONFIDENCES[-1]:g}"
 
 
-def frame_of_query(query: ShownQuery, frames: Mapping[str, str]) -> str:
+def frame_of_query(query: QueryResult, frames: Mapping[str, str]) -> str:
     """Return the frame of a query or of its best candidate with one, else its condition."""
     known = (frames[image] for image in (query.image, *query.candidates) if image in frames)
     return next(known, query.condition)
 
 
-def legend(queries: Sequence[ShownQuery]) -> list[tuple[str, str]]:
+def legend(queries: Sequence[QueryResult]) -> list[tuple[str, str]]:
     """Return the colours in use and their meanings, from right to wrong."""
     used = {query.meaning: query.color for query in queries}
     order = [*_SCALE, UNKNOWN_COLOR, NO_POSE_COLOR]
     return [(used[m], m) for m in sorted(used, key=lambda m: order.index(used[m]))]
 
 
-def worst_queries(queries: Sequence[ShownQuery]) -> list[ShownQuery]:
+def worst_queries(queries: Sequence[QueryResult]) -> list[QueryResult]:
     """Return the first ten of ranked queries, half of them with a pose if possible."""
-    lost = [query for query in queries if query.estimated is None]
-    posed = [query for query in queries if query.estimated is not None]
+    lost = [query for query in queries if query.cam_from_world is None]
+    posed = [query for query in queries if query.cam_from_world is not None]
     num_posed = min(len(posed), max(NUM_SHOWN - len(lost), (NUM_SHOWN + 1) // 2))
     return posed[:num_posed] + lost[: NUM_SHOWN - num_posed]
 
@@ -142,7 +130,7 @@ class StoredInliers:
     def _sources(self) -> list[tuple[FeatureReader, MatchesReader, MapIndex]]:
         # slow import
         from megloc_kapture.stages.query_poses import type_in_map
-        from megloc_kapture.stages.shared_index import index_map
+        from megloc_kapture.stages.scene import index_map
 
         sources: list[tuple[FeatureReader, MatchesReader, MapIndex]] = []
         queries, mapping = self.context.queries, self.context.mapping
@@ -161,13 +149,13 @@ class StoredInliers:
     def known(self) -> bool:
         return bool(self._sources or self.context.localized)
 
-    def of(self, query: ShownQuery) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def of(self, query: QueryResult) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return pixels (K, 2) and world points (K, 3) of the inliers of a query's pose."""
         pose, queries = self.context.localized.get(query.image), self.context.queries
         if pose is not None and pose.inlier_points_world is not None:
             px, xyz = pose.inlier_points_px, pose.inlier_points_world
             return (np.zeros((len(xyz), 2)) if px is None else px), xyz
-        if query.estimated is None or query.outcome != "localized" or queries is None:
+        if query.cam_from_world is None or query.outcome != "localized" or queries is None:
             return _NOTHING
         inliers = [_NOTHING]
         with contextlib.suppress(DataError):
@@ -183,7 +171,7 @@ class StoredInliers:
                 if len(pixels) <= ids.keypoint_ids.max(initial=-1):
                     continue
                 px, xyz = pixels[ids.keypoint_ids], index.xyz[ids.point_ids]
-                errors_px = np.linalg.norm(project(camera, query.estimated, xyz) - px, axis=1)
+                errors_px = np.linalg.norm(project(camera, query.cam_from_world, xyz) - px, axis=1)
                 inliers.append((px[errors_px <= INLIER_PX], xyz[errors_px <= INLIER_PX]))
         return np.concatenate([px for px, _ in inliers]), np.concatenate(
             [xyz for _, xyz in inliers]

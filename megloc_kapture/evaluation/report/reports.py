@@ -29,13 +29,12 @@ from megloc_kapture.evaluation.comparison import (
 from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.evaluation.report import content
 from megloc_kapture.evaluation.report.queries import (
-    ShownQuery,
     StoredInliers,
     shown_queries,
     worst_queries,
 )
 from megloc_kapture.evaluation.results import Poses, first_map_poses
-from megloc_kapture.evaluation.scoring import Evaluation, Reported
+from megloc_kapture.evaluation.scoring import Evaluation, QueryResult, Reported
 from megloc_kapture.io.files import write_bytes, write_json
 from megloc_kapture.values import MIN_CONFIDENCE
 
@@ -346,7 +345,7 @@ def _sections_of(evaluation: Evaluation, map_poses: Poses, *, several: bool) -> 
     return sections
 
 
-def _query_list(evaluation: Evaluation, queries: Sequence[ShownQuery]) -> Section:
+def _query_list(evaluation: Evaluation, queries: Sequence[QueryResult]) -> Section:
     section = Section("Queries, the worst first")
     if len(queries) > _MAX_ROWS:
         section.paragraphs.append(f"The worst {_MAX_ROWS} of {len(queries)}.")

@@ -17,14 +17,14 @@ from megloc_kapture.evaluation.report.gallery import (
     fits_poses,
     worst_pictures,
 )
-from megloc_kapture.evaluation.report.queries import ShownQuery, shown_queries
+from megloc_kapture.evaluation.report.queries import shown_queries
 from megloc_kapture.evaluation.results import ResultContext, context_of
+from megloc_kapture.evaluation.scoring import QueryResult
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.dataset_tables import Protocol, write_protocol
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, MatchesWriter
-from megloc_kapture.io.tables import QueryStatus
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import Camera, LocalizationResult, RigidTransform
 
 CAMERA = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.02))
 # the query's true pose, and two map images: one beside it, one far away
@@ -79,8 +79,8 @@ def run(tmp_path: Path, kaptures: Callable[..., Path]) -> Run:
 
 
 @pytest.fixture
-def shown() -> ShownQuery:
-    status = QueryStatus(image=QUERY, status="localized", candidates=(FAR, NEAR))
+def shown() -> QueryResult:
+    status = LocalizationResult(name=QUERY, candidates=(FAR, NEAR))
     off = {QUERY: RigidTransform((1.0, 0.0, 0.0, 0.0), (5.0, 0.0, 0.0))}
     (query,) = shown_queries(evaluate_poses(off, {QUERY: POSES[QUERY]}, statuses={QUERY: status}))
     return query
@@ -98,7 +98,7 @@ def test_projections_of_one_point_fit_and_others_do_not(run: Run) -> None:
     assert fits_poses(*matches, same).all()
 
 
-def test_the_best_match_stands_beside_the_query(run: Run, shown: ShownQuery) -> None:
+def test_the_best_match_stands_beside_the_query(run: Run, shown: QueryResult) -> None:
     map_poses = run.context.map_poses()
     (picture,) = worst_pictures([shown], run.context, map_poses)
     # ranked second, but with more matches
@@ -115,7 +115,7 @@ def test_the_best_match_stands_beside_the_query(run: Run, shown: ShownQuery) -> 
     assert f"right: {NEAR}, 0 matches" in picture.facts
 
 
-def test_what_is_missing_is_left_out(run: Run, shown: ShownQuery) -> None:
+def test_what_is_missing_is_left_out(run: Run, shown: QueryResult) -> None:
     poses = run.context.map_poses()
     assert worst_pictures([replace(shown, image="query/other.jpg")], run.context, poses) == []
     assert worst_pictures([shown], ResultContext(), poses) == []

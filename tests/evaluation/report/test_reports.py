@@ -23,8 +23,7 @@ from megloc_kapture.evaluation.report.queries import shown_queries, worst_querie
 from megloc_kapture.evaluation.report.reports import render_report, report_text, write_report
 from megloc_kapture.evaluation.results import ResultContext
 from megloc_kapture.evaluation.scoring import Evaluation
-from megloc_kapture.io.tables import QueryStatus
-from megloc_kapture.values import RefinementRow, RigidTransform
+from megloc_kapture.values import LocalizationResult, PoseRefinement, RigidTransform
 
 HERE = RigidTransform.identity()
 
@@ -45,7 +44,7 @@ def test_names_are_escaped(world: Any, page_of: Any) -> None:
     name = f"query/{evil}.jpg"
     world.truth[name] = HERE
     world.conditions = {n: "<i>day & $night$" for n in world.truth}
-    world.statuses[name] = QueryStatus(image=name, status="failed", reason=f"why {evil}")
+    world.statuses[name] = LocalizationResult(name=name, reason=f"why {evil}")
     evaluation = evaluation_of(world)
     html = render_report(evaluation, provenance={"root": f"/data/{evil}"})
     assert not any(tag in html for tag in ("<script", "<i>day", "<b>bold"))
@@ -133,7 +132,7 @@ def test_queries_are_shown_the_worst_first(worlds: Callable[..., Any], page_of: 
     posed = dict(sorted(world.estimated.items())[:12])
     evaluation = evaluate_poses(posed, world.truth, statuses=world.statuses)
     ranked = shown_queries(evaluation)
-    assert [query.estimated is None for query in ranked] == [True] * 28 + [False] * 12
+    assert [query.cam_from_world is None for query in ranked] == [True] * 28 + [False] * 12
     errors = [query.position_m for query in ranked]
     assert errors == sorted(errors, reverse=True)
     # the gallery is not of queries without a pose alone
@@ -147,16 +146,16 @@ def test_refinement_before_and_after(displace: Any) -> None:
     truth = {name: HERE for name in "abcd"}
     off = {m: displace(HERE, np.array([m, 0.0, 0.0]), 0.0) for m in (0.4, 0.3, 0.2, 0.1, 0.02)}
 
-    def row(
-        image: str, method: str, before: float, reason: str = "", moved: float = 0.0
-    ) -> RefinementRow:
-        return RefinementRow(image, method, reason, moved, 0.0, (), off[before])
+    def row(method: str, before: float, reason: str = "", after: float = 0.0) -> PoseRefinement:
+        moved_m = before - after if after else 0.0
+        known = {"method": method, "before": off[before], "moved_m": abs(moved_m)}
+        return PoseRefinement(off[after or before], reason, **known)
 
     refinements = {
         # 0.4 -> 0.2 -> 0.02; 0.3 stays, -> 0.1; 0.1 -> 0.2, stays; d is not refined
-        "a": [row("a", "icp", 0.4, moved=0.2), row("a", "rendering", 0.2, moved=0.18)],
-        "b": [row("b", "icp", 0.3, "3.5 m apart"), row("b", "rendering", 0.3, moved=0.2)],
-        "c": [row("c", "icp", 0.1, moved=0.1), row("c", "rendering", 0.2, "covers 12 %")],
+        "a": [row("icp", 0.4, after=0.2), row("rendering", 0.2, after=0.02)],
+        "b": [row("icp", 0.3, "3.5 m apart"), row("rendering", 0.3, after=0.1)],
+        "c": [row("icp", 0.1, after=0.2), row("rendering", 0.2, "covers 12 %")],
     }
     estimated = {"a": off[0.02], "b": off[0.1], "c": off[0.2], "d": off[0.02]}
     evaluation = evaluate_poses(estimated, truth)

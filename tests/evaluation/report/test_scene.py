@@ -20,20 +20,18 @@ from scored import evaluate_poses
 
 from megloc_kapture.evaluation import view as scenes
 from megloc_kapture.evaluation.report.queries import (
-    ShownQuery,
     StoredInliers,
     legend,
     shown_queries,
 )
 from megloc_kapture.evaluation.results import ResultContext
-from megloc_kapture.evaluation.scoring import Evaluation
+from megloc_kapture.evaluation.scoring import Evaluation, QueryResult
 from megloc_kapture.evaluation.view import Scene, render_view, scene_of
 from megloc_kapture.io.dataset_tables import ImageGroup, write_groups
 from megloc_kapture.io.images import write_image
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
 from megloc_kapture.io.kapture.points import write_points3d
-from megloc_kapture.io.tables import QueryStatus
-from megloc_kapture.values import Camera, RigidTransform
+from megloc_kapture.values import Camera, LocalizationResult, RigidTransform
 
 EVIL = "</script><script>alert('\"&')</script>\u2028<!--.jpg"
 CAMERAS = (
@@ -110,7 +108,7 @@ def make_map(tmp_path: Path, upright: Any, kaptures: Any) -> Callable[..., Path]
     return make
 
 
-def drawn(root: Path, queries: Sequence[ShownQuery] = (), **context: Any) -> Scene:
+def drawn(root: Path, queries: Sequence[QueryResult] = (), **context: Any) -> Scene:
     mapping = KaptureFolder(root)
     scene = scene_of(EVIL, StoredInliers(ResultContext(mapping=mapping, **context)), queries)
     assert scene is not None
@@ -172,7 +170,7 @@ def test_names_cannot_leave_the_data(world: Any, make_map: Any, upright: Any) ->
     name = f"query/{EVIL}"
     world.truth[name] = world.estimated[name] = upright(np.zeros(3), 0.0)
     world.conditions = dict.fromkeys(world.truth, EVIL)
-    world.statuses[name] = QueryStatus(image=name, status="failed", reason=EVIL)
+    world.statuses[name] = LocalizationResult(name=name, reason=EVIL)
     evaluation = evaluation_of(world)
     scene = drawn(root, shown_queries(evaluation))
     page = render_view(replace(scene, cameras=(EVIL, "m/1.jpg")))
