@@ -104,7 +104,7 @@ class MapMatching:
 class LiveSource:
     """Matches of one camera, computed with as many candidates as are asked for.
 
-    Reranking and guided pyramids need the matches with all candidates first.
+    Reranking, a second matcher and guided pyramids need the matches with all candidates first.
     """
 
     def __init__(
