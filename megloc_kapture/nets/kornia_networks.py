@@ -22,6 +22,8 @@ from megloc_kapture.nets.runtime import batch_counters, load_strictly
 
 Tensors = Mapping[str, torch.Tensor]
 _BLOCK = re.compile(r"^(self_attn|cross_attn)\.(\d+)\.")
+# of DISK's LightGlue; the published code does not read it
+_UNUSED = re.compile(r"^log_assignment\.\d+\.r$")
 # the authors' file of LighterGlue also contains its XFeat
 _MATCHER, _EXTRACTOR = "matcher.", "extractor.model.net."
 _building = Lock()
@@ -83,7 +85,11 @@ def load_lightglue(
     (``width_confidence``). Tensors for these may be missing if they are off (-1). Half precision
     excludes positions and assignment.
     """
-    tensors = {_BLOCK.sub(r"transformers.\2.\1.", key): value for key, value in tensors.items()}
+    tensors = {
+        _BLOCK.sub(r"transformers.\2.\1.", key): value
+        for key, value in tensors.items()
+        if not _UNUSED.search(key)
+    }
     layers = {int(key.split(".")[1]) for key in tensors if key.startswith("transformers.")}
     if not layers:
         raise DataError("this file does not fit LightGlue: it has no layers", path=where)

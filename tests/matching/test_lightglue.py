@@ -212,6 +212,16 @@ def test_matches_are_kornias(checkpoint: Path, size: int) -> None:
     np.testing.assert_allclose(scores, found["scores"][0].numpy(), atol=1e-4)
 
 
+def test_unused_tensors_of_disks_file_are_ignored(tmp_path: Path) -> None:
+    tensors = official(random_network(128))
+    image = random_image(60, 128, seed=1)
+    found = []
+    for name, more in (("plain", {}), ("disk", {"log_assignment.0.r": torch.zeros(1)})):
+        torch.save(tensors | more, tmp_path / f"{name}.pth")
+        found.append(matcher(tmp_path / f"{name}.pth").match(image, image)[0])
+    np.testing.assert_array_equal(*found)
+
+
 def test_a_file_may_lack_what_is_not_used(checkpoint: Path, size: int, tmp_path: Path) -> None:
     kept = {
         key: value
