@@ -119,7 +119,7 @@ def network_input(
 
 
 class LightGlueOptions(NetworkOptions):
-    """Options of LightGlue."""
+    """Options of LightGlue, with the authors' defaults."""
 
     weights: str = Field(
         default="superpoint_lightglue",
@@ -127,10 +127,10 @@ class LightGlueOptions(NetworkOptions):
     )
     threshold: float = Field(default=0.1, ge=0, lt=1, description="probability of a match")
     depth_confidence: float = Field(
-        default=-1.0, ge=-1, le=1, description="stop early at this confidence; -1: all layers"
+        default=0.95, ge=-1, le=1, description="stop early at this confidence; -1: all layers"
     )
     width_confidence: float = Field(
-        default=-1.0, ge=-1, le=1, description="drop keypoints at this confidence; -1: none"
+        default=0.99, ge=-1, le=1, description="drop keypoints at this confidence; -1: none"
     )
 
 
@@ -187,9 +187,15 @@ def _kornia_input(image: ImageFeatures, device: torch.device) -> dict[str, torch
 
 
 class LighterGlueOptions(LightGlueOptions):
-    """Options of LighterGlue."""
+    """Options of LighterGlue, with the authors' defaults."""
 
     weights: str = Field(default="xfeat-lighterglue", description="name in the registry, or a file")
+    depth_confidence: float = Field(
+        default=-1.0, ge=-1, le=1, description="stop early at this confidence; -1: all layers"
+    )
+    width_confidence: float = Field(
+        default=0.95, ge=-1, le=1, description="drop keypoints at this confidence; -1: none"
+    )
 
 
 class LighterGlue(LightGlue):

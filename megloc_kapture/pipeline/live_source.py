@@ -329,7 +329,7 @@ def _unit(rows: NDArray[np.float32]) -> NDArray[np.float32]:
 class LiveSource:
     """Matches of one camera, computed with as many candidates as are asked for.
 
-    Reranking and guided pyramids need the matches with all candidates first.
+    Reranking, a second matcher and guided pyramids need the matches with all candidates first.
     """
 
     def __init__(

@@ -30,6 +30,7 @@ from megloc_kapture.stages.matches import (
     FeatureCache,
     Features,
     VerifiedMatches,
+    best_pairs,
     match_all,
     verification_of,
     verified,
@@ -79,6 +80,10 @@ class LocalType:
         return found
 
     @cached_property
+    def second_matcher(self) -> Matcher | None:
+        return self._options.make_second_matcher()
+
+    @cached_property
     def extractor(self) -> LocalFeatureExtractor:
         found = self.brought()
         if found is None:
@@ -113,13 +118,16 @@ class LocalType:
         """Return descriptors (N, D) of a map image."""
         return self.first.descriptors(image) if self._again is None else self._again[image]
 
-    def match(self, query: Features, images: Sequence[str]) -> list[VerifiedMatches]:
+    def match(
+        self, query: Features, images: Sequence[str], matcher: Matcher | None = None
+    ) -> list[VerifiedMatches]:
         found = dict.fromkeys(images, _NO_MATCHES)
         verify = verification_of(self._options.verify_queries())
         # limits the features in memory
         for names in batched((image for image in images if image in self.first), BATCH):
             others = [self._map_features(self.first, name) for name in names]
-            pairs = match_all(self.matcher, query, others, [f"pair with {name}" for name in names])
+            labels = [f"pair with {name}" for name in names]
+            pairs = match_all(matcher or self.matcher, query, others, labels)
             for name, other, pair in zip(names, others, pairs, strict=True):
                 found[name] = verified(query, other, pair, verify)
         return [found[image] for image in images]
@@ -127,12 +135,19 @@ class LocalType:
     def match_again(
         self, query: Features, pairs: Mapping[str, VerifiedMatches], image: QueryImage
     ) -> tuple[NDArray[np.float32], list[ImageMatches], str]:
-        """Match map images with few matches again by guided pyramid matching, if enabled.
+        """Match the best map images with the second matcher, and those with few matches by guided
+        pyramid matching, as far as these are enabled.
 
         Returns query keypoints with added ones last, matches in the order of ``pairs``, and the
-        reason if the enabled step was skipped, else "".
+        reason if the pyramid was skipped, else "".
         """
         options = self._options
+        if self.second_matcher is not None:
+            verified = {("", name): len(pair.matches) for name, pair in pairs.items()}
+            best = best_pairs(verified, options.second_matching.pairs, of_both=False)
+            names = [name for _, name in best]
+            again = self.match(query, names, self.second_matcher)
+            pairs = {**pairs, **dict(zip(names, again, strict=True))}
         is_hard = options.guided_pyramid.is_hard
         matches = [(name, pair.matches, pair.scores) for name, pair in pairs.items()]
         if not any(is_hard(pair.num_found, len(pair.matches)) for pair in pairs.values()):
@@ -194,7 +209,7 @@ def local_types_of(
     for base in sorted(by_base, key=lambda name: (_rank(name, choices), name)):
         points = by_base[base]
         first, rank = points, _rank(base, choices)
-        if options.matches_again() and base in kapture_map.stored_types():
+        if options.uses_pyramid() and base in kapture_map.stored_types():
             first = kapture_map.keypoints_of(base)
         choice = choices[rank] if rank < len(choices) else None
         found.append(LocalType(kapture_map, points, first, choice, options, cache))

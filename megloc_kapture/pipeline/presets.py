@@ -299,6 +299,8 @@ def _makers(options: PipelineOptions) -> Iterator[Callable[[], object]]:
         features.append((options.given_features, options.matching))
     chosen += [(LOCAL_FEATURES, extractor) for extractor, _ in features]
     chosen += [(MATCHERS, matcher) for _, matcher in features]
+    if (second := options.second_matching.matcher) is not None:
+        chosen.append((MATCHERS, second))
     chosen.append((POSE_RANKERS, options.localization.rank))
     chosen += [(POSE_REFINERS, one) for one in options.pose_refinement.by]
     for group, one in chosen:

@@ -16,6 +16,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.geometry.cameras import bearing_rays
@@ -32,7 +33,7 @@ from megloc_kapture.matching.verification import (
     verify_with_poses,
 )
 from megloc_kapture.plugin_loading import checked_array
-from megloc_kapture.plugins import Matcher
+from megloc_kapture.plugins import Matcher, PluginChoice
 from megloc_kapture.stages.given_map import matched_images
 from megloc_kapture.stages.local_features import check_lengths
 from megloc_kapture.stages.stage import (
@@ -64,6 +65,20 @@ class NoVerification(Options):
 
 
 Verification = KnownPoseOptions | TwoViewOptions | NoVerification
+
+
+class SecondMatchingOptions(Options):
+    """Options of a second pass of matching: the best pairs again, with another matcher."""
+
+    matcher: PluginChoice | None = Field(
+        default=None,
+        description="matcher whose matches replace those of the best pairs; none: no second pass",
+    )
+    pairs: int = Field(
+        default=5,
+        gt=0,
+        description="pairs of each query and each map image, those with most verified matches",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +164,23 @@ def match_pairs(
         "pairs_with_matches": sum(count.verified > 0 for count in counts),
         "matches": sum(count.verified for count in counts),
     }
+
+
+def best_pairs(
+    verified: Mapping[tuple[str, str], int], number: int, *, of_both: bool
+) -> list[tuple[str, str]]:
+    """Return the ``number`` pairs with most verified matches of each first image, sorted.
+
+    With ``of_both`` also those of each second image. Ties are in order of the names.
+    """
+    chosen: set[tuple[str, str]] = set()
+    taken: Counter[str] = Counter()
+    for pair in sorted(verified, key=lambda pair: (-verified[pair], pair)):
+        for image in pair if of_both else pair[:1]:
+            taken[image] += 1
+            if taken[image] <= number:
+                chosen.add(pair)
+    return sorted(chosen)
 
 
 def check_given_poses(

@@ -26,7 +26,7 @@ from megloc_kapture.stages.densifying import DensifyOptions
 from megloc_kapture.stages.global_features import GlobalFeaturesChoice
 from megloc_kapture.stages.image_pairs import MappingPairsOptions, RerankingOptions
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
-from megloc_kapture.stages.matches import NoVerification, Verification
+from megloc_kapture.stages.matches import NoVerification, SecondMatchingOptions, Verification
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.query_poses import LocalizationOptions
@@ -84,6 +84,7 @@ class PipelineOptions(Options):
     )
     mapping_verification: KnownPoseOptions = KnownPoseOptions()
     query_verification: TwoViewOptions = TwoViewOptions()
+    second_matching: SecondMatchingOptions = SecondMatchingOptions()
     guided_pyramid: GuidedPyramidOptions = GuidedPyramidOptions()
     map: Literal["triangulate", "lift", "given"] = Field(
         default="triangulate",
@@ -133,9 +134,13 @@ class PipelineOptions(Options):
         """Return whether the map has points of features extracted in this run."""
         return self.map != "given"
 
-    def matches_again(self) -> bool:
+    def uses_pyramid(self) -> bool:
         """Return whether guided pyramid matching is enabled."""
         return self.guided_pyramid.mode != "off"
+
+    def matches_again(self) -> bool:
+        """Return whether some pairs are matched again, by a second matcher or guided pyramids."""
+        return self.uses_pyramid() or self.second_matching.matcher is not None
 
     def triangulates(self) -> bool:
         return self.map == "triangulate"
@@ -146,14 +151,14 @@ class PipelineOptions(Options):
     def point_types(self) -> list[str]:
         """Return keypoints types with points made in this run, possibly pyramid types."""
         types = self.own_types()
-        if self.matches_again() and self.triangulates():
+        if self.uses_pyramid() and self.triangulates():
             return [pyramid_type(local_type) for local_type in types]
         return types
 
     def query_types(self) -> list[str]:
         """Return keypoints types of the query matches, in the order of :meth:`local_types`."""
         types = self.local_types()
-        return [pyramid_type(name) for name in types] if self.matches_again() else types
+        return [pyramid_type(name) for name in types] if self.uses_pyramid() else types
 
     def own_extractors(self) -> list[LocalFeatureExtractor]:
         """Create the extractors of types that get points in this run; none for a prebuilt map."""
@@ -200,6 +205,11 @@ class PipelineOptions(Options):
     def make_matcher(self, local_type: str) -> Matcher:
         matcher: Matcher = load_chosen(MATCHERS, self.matching_of(local_type), self.placement)
         return matcher
+
+    def make_second_matcher(self) -> Matcher | None:
+        """Create the matcher of the second pass, or None."""
+        chosen = self.second_matching.matcher
+        return None if chosen is None else load_chosen(MATCHERS, chosen, self.placement)
 
     def verify_mapping(self) -> Verification:
         return NoVerification() if self.verification == "none" else self.mapping_verification

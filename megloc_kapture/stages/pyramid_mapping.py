@@ -1,19 +1,21 @@
-"""Stages: guided pyramid matching of map images and of queries.
+"""Stages that match pairs of map images, or of queries, again by stronger means.
 
-All variants are matched before pairs are combined, so that the order of the added keypoints does
-not depend on the workers.
+A second matcher matches the best pairs of each image, and guided pyramids then match poor pairs at
+other scales and rotations. All variants are matched before pairs are combined, so that the order of
+the added keypoints does not depend on the workers.
 """
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +28,7 @@ from megloc_kapture.io.kapture import (
     MatchesWriter,
     read_pairs,
 )
-from megloc_kapture.io.tables import read_match_counts
+from megloc_kapture.io.tables import PairCount, read_match_counts
 from megloc_kapture.mapping.pairs import views_can_overlap
 from megloc_kapture.matching.guided_pyramid import PairVerifier, VariantMatches, pyramid_type
 from megloc_kapture.matching.pyramid_combination import Combined, KeypointUnion, combine
@@ -50,8 +52,10 @@ from megloc_kapture.stages.matches import (
     Features,
     NoVerification,
     Verification,
+    best_pairs,
     cached_features,
     mapping_pairs,
+    match_pairs,
 )
 from megloc_kapture.stages.stage import (
     FEATURES,
@@ -299,90 +303,163 @@ def _retry(
     )
 
 
-def _num_found(work: StageWork, matches: str, local_type: str) -> dict[_Pair, int]:
-    rows = read_match_counts(work.path(matches), local_type)
-    return {(row.image, row.other): row.matches for row in rows}
+class _AgainStage(PipelineStage):
+    """Match the best pairs again with a second matcher, and poor pairs in guided pyramids."""
 
-
-class _PyramidStage(PipelineStage):
-    def _extractors(self) -> list[LocalFeatureExtractor]:
-        return self.options.query_extractors()
-
-    def plugins(self) -> Sequence[object]:
-        extractors = self._extractors()
-        return [*extractors, *(self.options.make_matcher(one.name) for one in extractors)]
-
-    def _methods(self, verification: Verification) -> Iterator[tuple[str, PyramidMethod]]:
-        options = self.options
-        for extractor in self._extractors():
-            matcher = options.make_matcher(extractor.name)
-            yield (
-                extractor.name,
-                PyramidMethod(
-                    extractor, matcher, verification, options.guided_pyramid, options.mask_margin_px
-                ),
-            )
-
-
-class PyramidMapping(_PyramidStage):
-    """Match map images with few matches again, at other scales and turns."""
-
-    name = "mapping_pyramid"
-    version = 2
-    uses = (*MATCHING_OPTIONS, "mapping_verification", "guided_pyramid", "mask_margin_px")
+    version = 3
+    matches: ClassVar[str]
     explained_by = (
         "guided_pyramid.mode",
         "guided_pyramid.min_matches",
         "guided_pyramid.count",
+        "second_matching.matcher",
+        "second_matching.pairs",
+    )
+
+    def is_wanted(self) -> bool:
+        return self.options.matches_again()
+
+    def plugins(self) -> Sequence[object]:
+        extractors, second = self._extractors(), self.options.make_second_matcher()
+        matchers = [self.options.make_matcher(one.name) for one in extractors]
+        return [*extractors, *matchers, *(() if second is None else (second,))]
+
+    def _extractors(self) -> list[LocalFeatureExtractor]:
+        return self.options.query_extractors()
+
+    @abstractmethod
+    def _verification(self) -> Verification: ...
+
+    @abstractmethod
+    def _inputs(
+        self, work: StageWork, local_type: str
+    ) -> tuple[KaptureFolder, KaptureFolder, list[ImagePair]]:
+        """Return the folders of the first and second images, and the pairs."""
+
+    @abstractmethod
+    def _pyramid(
+        self,
+        folders: tuple[KaptureFolder, KaptureFolder],
+        pairs: Sequence[ImagePair],
+        method: PyramidMethod,
+        **how: Any,
+    ) -> dict[str, float]: ...
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        options, out = self.options, work.out / self.writes[0]
+        verification, second_matcher = self._verification(), options.make_second_matcher()
+        counts: dict[str, float] = {}
+        for extractor in self._extractors():
+            name = extractor.name
+            first, second, pairs = self._inputs(work, name)
+            rows = _match_counts(work.path(self.matches), name)
+            if second_matcher is not None:
+                best = best_pairs(
+                    {pair: rows[pair].verified for pair in _named(pairs) & rows.keys()},
+                    options.second_matching.pairs,
+                    of_both=first.root == second.root,
+                )
+                again = [ImagePair(*pair, 1.0) for pair in best]
+                matched = match_pairs(
+                    first, second, again, name, second_matcher, verification, out, work=work
+                )
+                rows |= _match_counts(out, name)
+                counts |= {f"{name} second {key}": count for key, count in matched.items()}
+            if options.uses_pyramid():
+                matcher, margin_px = options.make_matcher(name), options.mask_margin_px
+                method = PyramidMethod(
+                    extractor, matcher, verification, options.guided_pyramid, margin_px
+                )
+                first = first.with_features([out, *first.features_dirs])
+                num_found = {pair: row.matches for pair, row in rows.items()}
+                found = self._pyramid(
+                    (first, second), pairs, method, output=out, num_found=num_found, work=work
+                )
+                counts |= {f"{name} {key}": count for key, count in found.items()}
+        return counts
+
+
+def _match_counts(features_dir: Path, local_type: str) -> dict[_Pair, PairCount]:
+    return {(row.image, row.other): row for row in read_match_counts(features_dir, local_type)}
+
+
+def _named(pairs: Sequence[ImagePair]) -> set[_Pair]:
+    """Return the names of the pairs in both orders, as map pairs are stored in one."""
+    return {names for one in pairs for names in ((one.query, one.map), (one.map, one.query))}
+
+
+class PyramidMapping(_AgainStage):
+    """Match pairs of map images again: with a second matcher, at other scales and rotations."""
+
+    name = "mapping_pyramid"
+    matches = MAPPING_MATCHES
+    uses = (
+        *MATCHING_OPTIONS,
+        "mapping_verification",
+        "second_matching",
+        "guided_pyramid",
+        "mask_margin_px",
     )
     inputs = (Layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS, MAPPING_MATCHES)
     outputs = (MAPPING_PYRAMID,)
 
     def is_wanted(self) -> bool:
-        return self.options.matches_again() and self.options.triangulates()
+        return super().is_wanted() and self.options.triangulates()
 
     def _extractors(self) -> list[LocalFeatureExtractor]:
         return self.options.make_extractors()
 
-    def run(self, work: StageWork) -> Mapping[str, float]:
-        counts: dict[str, float] = {}
+    def _verification(self) -> Verification:
+        return self.options.verify_mapping()
+
+    def _inputs(
+        self, work: StageWork, local_type: str
+    ) -> tuple[KaptureFolder, KaptureFolder, list[ImagePair]]:
         mapping = work.folder(self.layout.mapping(), FEATURES, MAPPING_MATCHES)
-        pairs, out = mapping_pairs(work, mapping), work.out / MAPPING_PYRAMID
-        for name, method in self._methods(self.options.verify_mapping()):
-            before = _num_found(work, MAPPING_MATCHES, name)
-            found = pyramid_mapping(mapping, pairs, name, method, out, num_found=before, work=work)
-            counts |= {f"{name} {key}": count for key, count in found.items()}
-        return counts
+        return mapping, mapping, mapping_pairs(work, mapping)
+
+    def _pyramid(
+        self,
+        folders: tuple[KaptureFolder, KaptureFolder],
+        pairs: Sequence[ImagePair],
+        method: PyramidMethod,
+        **how: Any,
+    ) -> dict[str, float]:
+        return pyramid_mapping(folders[0], pairs, method.extractor.name, method, **how)
 
 
-class PyramidQueries(_PyramidStage):
-    """Match queries with few matches again; see :class:`PyramidMapping`."""
+class PyramidQueries(_AgainStage):
+    """Match queries with candidates again; see :class:`PyramidMapping`."""
 
     name = "query_pyramid"
-    version = 2
-    uses = (*MATCHING_OPTIONS, "query_verification", "guided_pyramid", "mask_margin_px")
-    explained_by = (
-        "guided_pyramid.mode",
-        "guided_pyramid.min_matches",
-        "guided_pyramid.count",
+    matches = QUERY_MATCHES
+    uses = (
+        *MATCHING_OPTIONS,
+        "query_verification",
+        "second_matching",
+        "guided_pyramid",
+        "mask_margin_px",
     )
     inputs = (Layout.mapping, Layout.query, LOCAL_FEATURES, MAP, QUERY_PAIRS, QUERY_MATCHES)
     outputs = (QUERY_PYRAMID,)
 
-    def is_wanted(self) -> bool:
-        return self.options.matches_again()
+    def _verification(self) -> Verification:
+        return self.options.verify_queries()
 
-    def run(self, work: StageWork) -> Mapping[str, float]:
-        counts: dict[str, float] = {}
+    def _inputs(
+        self, work: StageWork, local_type: str
+    ) -> tuple[KaptureFolder, KaptureFolder, list[ImagePair]]:
         query = work.folder(self.layout.query(), FEATURES, QUERY_MATCHES)
-        pairs, out = read_pairs(work.path(QUERY_PAIRS)), work.out / QUERY_PYRAMID
-        for name, method in self._methods(self.options.verify_queries()):
-            before = _num_found(work, QUERY_MATCHES, name)
-            mapping = matched_images(work, self, name)
-            described = mapping.descriptors(name)
-            some = [pair for pair in pairs if pair.map in described]
-            found = pyramid_queries(
-                query, mapping, some, name, method, out, num_found=before, work=work
-            )
-            counts |= {f"{name} {key}": count for key, count in found.items()}
-        return counts
+        mapping = matched_images(work, self, local_type)
+        described = mapping.descriptors(local_type)
+        pairs = read_pairs(work.path(QUERY_PAIRS))
+        return query, mapping, [pair for pair in pairs if pair.map in described]
+
+    def _pyramid(
+        self,
+        folders: tuple[KaptureFolder, KaptureFolder],
+        pairs: Sequence[ImagePair],
+        method: PyramidMethod,
+        **how: Any,
+    ) -> dict[str, float]:
+        return pyramid_queries(*folders, pairs, method.extractor.name, method, **how)

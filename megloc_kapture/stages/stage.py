@@ -110,12 +110,13 @@ class Layout:
     def mapping_matches(self) -> tuple[str, ...]:
         if not self.options.triangulates():
             return ()
+        # the first folder that has a pair counts
         again = self.options.matches_again()
-        return (MAPPING_MATCHES, MAPPING_PYRAMID) if again else (MAPPING_MATCHES,)
+        return (MAPPING_PYRAMID, MAPPING_MATCHES) if again else (MAPPING_MATCHES,)
 
     def query_matches(self) -> tuple[str, ...]:
         again = self.options.matches_again()
-        return (QUERY_MATCHES, QUERY_PYRAMID) if again else (QUERY_MATCHES,)
+        return (QUERY_PYRAMID, QUERY_MATCHES) if again else (QUERY_MATCHES,)
 
     def sparse_map(self) -> str:
         return MAP if self.options.mvs.mode == "off" else SPARSE
@@ -286,7 +287,7 @@ def _option_text(options: Any, key: str) -> str:
     value = options
     for name in key.split("."):
         value = getattr(value, name)
-    several = value if isinstance(value, tuple) else (value,)
+    several = value if isinstance(value, tuple) else () if value is None else (value,)
     return " + ".join(str(getattr(one, "name", one)) for one in several) or "none"
 
 

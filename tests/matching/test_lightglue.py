@@ -1,4 +1,6 @@
-"""LightGlue with official checkpoints' keys and random values: transformers', and kornia's own."""
+"""LightGlue with official checkpoints' keys and random values: the published code's matches,
+transformers', and kornia's own.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ from transformers import LightGlueConfig, LightGlueForKeypointMatching, SuperPoi
 from megloc_kapture.errors import DataError
 from megloc_kapture.matching.networks import LightGlue, LightGlueOptions
 from megloc_kapture.values import ImageFeatures
+from tests.matching import published_lightglue as published
 
+FULL = {"depth_confidence": -1.0, "width_confidence": -1.0}
 SIZES = [256, 128]  # SuperPoint's descriptors, ALIKED's
 LAYERS = 2  # of nine: each costs the same
 
@@ -22,8 +26,9 @@ LAYERS = 2  # of nine: each costs the same
 def random_network(size: int) -> KorniaLightGlue:
     """kornia's network with weights that match like with like, so that there are matches."""
     torch.manual_seed(0)
-    conf = {"filter_threshold": 0.1, "depth_confidence": -1, "width_confidence": -1}
-    network = KorniaLightGlue(None, input_dim=size, n_layers=LAYERS, flash=False, **conf).eval()
+    network = KorniaLightGlue(
+        None, input_dim=size, n_layers=LAYERS, flash=False, filter_threshold=0.1, **FULL
+    ).eval()
     with torch.no_grad():
         last = network.log_assignment[-1]
         last.final_proj.weight.mul_(8)
@@ -126,8 +131,9 @@ def official_of(network: LightGlueForKeypointMatching) -> dict[str, torch.Tensor
     return tensors
 
 
-def matcher(path: Path) -> LightGlue:
-    return LightGlue(LightGlueOptions(weights=str(path), device="cpu"))
+def matcher(path: Path, **options: float) -> LightGlue:
+    """All layers and keypoints, unless the options say otherwise."""
+    return LightGlue(LightGlueOptions(weights=str(path), device="cpu", **FULL | options))  # type: ignore[arg-type]
 
 
 def assert_refused(tensors: dict[str, torch.Tensor], folder: Path, message: str) -> None:
@@ -135,6 +141,31 @@ def assert_refused(tensors: dict[str, torch.Tensor], folder: Path, message: str)
     image = random_image(3, 128, seed=0)
     with pytest.raises(DataError, match=message):
         matcher(folder / "it.pth").match(image, image)
+
+
+@pytest.mark.parametrize("setting", range(len(published.CONFIDENCES)))
+def test_matches_are_those_of_the_published_code(setting: int, tmp_path: Path) -> None:
+    """Also where it stops early and drops keypoints."""
+    torch.save(published.tensors(), tmp_path / "random.pth")
+    depth, width = published.CONFIDENCES[setting]
+    one = matcher(tmp_path / "random.pth", depth_confidence=depth, width_confidence=width)
+    with np.load(published.DATA) as data:
+        for pair in range(len(published.PAIRS)):
+            images = [
+                ImageFeatures(xy + np.float32(0.5), descriptors, *published.IMAGE_SIZE)
+                for xy, descriptors in published.features(pair)
+            ]
+            matches, scores = one.match(*images)
+            layers, dropped = data[f"stop_{setting}_{pair}"]
+            assert (layers < published.LAYERS) == (depth > 0) and (dropped > 0) == (width > 0)
+            np.testing.assert_array_equal(matches, data[f"matches_{setting}_{pair}"])
+            np.testing.assert_allclose(scores, data[f"scores_{setting}_{pair}"], atol=1e-4)
+
+
+def test_the_authors_thresholds_are_the_default() -> None:
+    options = LightGlueOptions()
+    thresholds = options.depth_confidence, options.width_confidence, options.threshold
+    assert thresholds == (0.95, 0.99, 0.1)
 
 
 def test_matches_are_those_of_transformers(tmp_path: Path) -> None:
@@ -179,6 +210,16 @@ def test_matches_are_kornias(checkpoint: Path, size: int) -> None:
     assert len(matches) > 50
     np.testing.assert_array_equal(matches, found["matches"][0].numpy())
     np.testing.assert_allclose(scores, found["scores"][0].numpy(), atol=1e-4)
+
+
+def test_unused_tensors_of_disks_file_are_ignored(tmp_path: Path) -> None:
+    tensors = official(random_network(128))
+    image = random_image(60, 128, seed=1)
+    found = []
+    for name, more in (("plain", {}), ("disk", {"log_assignment.0.r": torch.zeros(1)})):
+        torch.save(tensors | more, tmp_path / f"{name}.pth")
+        found.append(matcher(tmp_path / f"{name}.pth").match(image, image)[0])
+    np.testing.assert_array_equal(*found)
 
 
 def test_a_file_may_lack_what_is_not_used(checkpoint: Path, size: int, tmp_path: Path) -> None:
