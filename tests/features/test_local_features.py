@@ -40,7 +40,7 @@ KINDS: dict[str, Any] = {
 PUBLISHED = {
     "aliked": ("aliked/aliked-n16.pth", (400, 300, 320, 240)),
     "xfeat": ("xfeat/xfeat.pt", (0, 0, 320, 256)),
-    "r2d2": ("r2d2/r2d2_WASF_N16.pt", (600, 300, 240, 160)),
+    "r2d2": ("r2d2/r2d2_WASF_N16.pt", (600, 300, 160, 110)),
 }
 NETWORKS = [name for name in KINDS if "sift" not in name]
 DESCRIPTORS = {"superpoint": 256, "xfeat": 64}  # the others have 128
@@ -88,7 +88,7 @@ def make(name: str, weights: Path | None) -> Make:
         if weights is not None:
             options = {"weights": str(weights), "device": "cpu", **options}
         if name == "r2d2":
-            options = {"min_size": 200, "max_size": 240, **options}
+            options = {"min_size": 130, "max_size": 160, **options}
         return KINDS[name](KINDS[name].Options.model_validate(options))
 
     return made

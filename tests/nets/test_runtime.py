@@ -62,23 +62,23 @@ def test_sizes(height: int, width: int, most: int, size: tuple[int, int]) -> Non
     assert sized_tensor(image, most, CPU).shape == (1, 3, *size)
 
 
-@pytest.mark.parametrize("newer", [False, True])
-def test_tf32_is_off_only_during_inference(newer: bool) -> None:
-    """torch refuses to read its older settings once the newer ones were written."""
-    if newer and not hasattr(torch.backends.cuda.matmul, "fp32_precision"):
-        pytest.skip("this torch has the older settings only")
-    code = (
-        "import torch\n"
-        "from megloc_kapture.nets.runtime import _without_tf32\n"
-        "products = torch.backends.cuda.matmul\n"
-    )
-    code += (
-        "torch.backends.fp32_precision = 'tf32'\nread = lambda: products.fp32_precision == 'tf32'\n"
-        if newer
-        else "products.allow_tf32 = True\nread = lambda: products.allow_tf32\n"
-    )
-    code += (
-        "with _without_tf32():\n    assert getattr(products, 'fp32_precision', 'ieee') == 'ieee'\n"
-        "assert read()\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
+TF32 = """
+import os, torch
+from megloc_kapture.nets.runtime import _without_tf32
+products = torch.backends.cuda.matmul
+newer = hasattr(products, "fp32_precision")
+child = os.fork() if newer else 0
+if child:
+    torch.backends.fp32_precision = "tf32"
+else:
+    products.allow_tf32 = True
+with _without_tf32():
+    assert not newer or products.fp32_precision == "ieee"
+assert products.fp32_precision == "tf32" if child else products.allow_tf32
+assert not child or os.waitpid(child, 0)[1] == 0
+"""
+
+
+def test_tf32_is_off_only_during_inference() -> None:
+    """torch refuses to read its older settings once the newer ones were written: two processes."""
+    subprocess.run([sys.executable, "-c", TF32], check=True)

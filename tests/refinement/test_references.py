@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import cv2
@@ -66,6 +67,7 @@ def test_an_image_must_fit_its_camera() -> None:
         pyramid_of(replace(one, image=one.image[:50]), RenderingOptions())
 
 
+@cache
 def texture(width: int, height: int, seed: int) -> NDArray[np.uint8]:
     rng = np.random.default_rng(seed)
     image = np.zeros((height, width, 3))

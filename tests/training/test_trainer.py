@@ -192,7 +192,7 @@ def test_a_split_superpoint_is_trained_and_read(
     chosen = options(
         files,
         DescriptorOptions,
-        **{"features": {"name": "superpoint", "options": frozen}, "steps": 2, "layers": 2},
+        **{"features": {"name": "superpoint", "options": frozen}, "steps": 1, "layers": 2},
         **{"pairs_per_step": 1, "learning_rate": 1e-3, "max_keypoints": 60},
     )
     output = tmp_path / "night.safetensors"
@@ -218,7 +218,7 @@ def test_what_cannot_be_trained_is_refused(
 ) -> None:
     data = TrainingData([KaptureFolder(walk)])
     output = tmp_path / "x.safetensors"
-    chosen = options(files, steps=2)
+    chosen = options(files, steps=1, layers=2)
     for wrong, message in (
         (TrainingData(), "nothing to train on"),
         (TrainingData([KaptureFolder(walk)], held_out=[KaptureFolder(walk)]), "and held out"),
