@@ -89,11 +89,10 @@ def test_the_traceback_is_shown_with_debug_only(megloc: Any, tmp_path: Path) -> 
 
 def test_who_stops_reading_gets_no_complaint() -> None:
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "bufsize": 0}
-    for arguments in (["weights", "list"], ["eval", "--help"]):
-        command: Any = subprocess.Popen([PROGRAM, *arguments], **pipes)  # type: ignore[call-overload]
-        command.stdout.close()
-        assert command.stderr.read() == b""
-        assert command.wait() == 0
+    command: Any = subprocess.Popen([PROGRAM, "weights", "list"], **pipes)  # type: ignore[call-overload]
+    command.stdout.close()
+    assert command.stderr.read() == b""
+    assert command.wait() == 0
 
 
 def test_progress_says_how_many_how_fast_and_how_long(

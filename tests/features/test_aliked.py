@@ -57,7 +57,7 @@ def test_keypoints_are_kornias(cropped: Image, shared_data: Path, variant: str) 
     own = extractor(weights=variant, max_keypoints=20_000)
     ours = own.extract(image)
     assert own.name == variant and own.descriptor_size == ours.descriptors.shape[1]
-    assert theirs.n > 80
+    assert theirs.n > 50
     expected = theirs.keypoints.numpy() + 0.5  # kornia's pixel centres are integers
     distance = np.linalg.norm(expected[:, None] - ours.keypoints_px[None, :, :2], axis=2)
     row = distance.argmin(axis=1)

@@ -187,23 +187,16 @@ def test_an_exact_map_is_consistent(exact: Consistency) -> None:
     assert exact.median.moved_m < 0.005 and exact.median.turned_deg < 0.08
 
 
-@pytest.mark.parametrize(
-    ("m", "deg"),
-    [(0.02, 0.5), pytest.param(0.02, 0.0, marks=SLOW), pytest.param(0.0, 0.5, marks=SLOW)],
-)
-def test_poses_that_are_off_contradict_each_other(
-    corner: Map, verdict: Verdict, m: float, deg: float
-) -> None:
-    found = verdict(posed(corner, lambda k, each: displaced(each, k, m, deg)))
+def test_poses_that_are_off_contradict_each_other(corner: Map, verdict: Verdict) -> None:
+    found = verdict(posed(corner, lambda k, each: displaced(each, k, 0.02, 0.5)))
     assert "contradicts itself" in found.reason
-    assert found.median.moved_m > 0.5 * m and found.median.turned_deg > 0.5 * deg
+    assert found.median.moved_m > 0.01 and found.median.turned_deg > 0.25
 
 
-@pytest.mark.parametrize("shift_px", [7, pytest.param(-7, marks=SLOW)])
 def test_depth_that_is_shifted_against_colour_shows_between_views(
-    corner: Map, verdict: Verdict, shift_px: int
+    corner: Map, verdict: Verdict
 ) -> None:
-    shifted = with_depth(corner, lambda view: {"depth_m": np.roll(view.depth_m, shift_px, axis=1)})
+    shifted = with_depth(corner, lambda view: {"depth_m": np.roll(view.depth_m, 7, axis=1)})
     assert "contradicts itself" in verdict(shifted).reason
 
 
@@ -218,7 +211,7 @@ def test_a_depth_camera_that_stands_elsewhere_than_said_shows_between_views(
 
 
 @SLOW
-@pytest.mark.parametrize(("scale", "off_deg"), [(0.1, 0.0), (0.1, 0.5), (12.0, 0.0), (12.0, 0.5)])
+@pytest.mark.parametrize(("scale", "off_deg"), [(0.1, 0.0), (12.0, 0.5)])
 def test_neither_unit_nor_frame_matters(
     corner: Map, verdict: Verdict, scale: float, off_deg: float
 ) -> None:
