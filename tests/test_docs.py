@@ -243,6 +243,7 @@ def test_the_plugins_of_the_tutorial(
         sys.modules.pop("my_plugins", None)
 
 
+@pytest.mark.slow
 def test_the_api_reference_has_the_public_names_and_no_module_below(tmp_path: Path) -> None:
     script = REPOSITORY / "scripts" / "api_reference.py"
     done = subprocess.run(

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from kornia.feature import LightGlue as KorniaLightGlue
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError
 from megloc_kapture.features.kornia_features import XFeat, XFeatOptions
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.images import read_image_rgb
@@ -129,24 +127,3 @@ def test_what_does_not_fit_is_named(weights: str, shared_data: Path) -> None:
     wide = replace(image, descriptors=np.zeros((3, 128), np.float32))
     with pytest.raises(DataError, match="descriptors of 64 values, the features' have 128"):
         matcher(weights).match(image, wide)
-
-
-def test_without_kornia_it_says_what_to_install(
-    weights: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "kornia", None)
-    with pytest.raises(OptionError, match=r"pip install 'megloc-kapture\[kornia\]'"):
-        matcher(weights)
-
-
-def test_what_is_global_is_left_alone(weights: str) -> None:
-    conf = dict(KorniaLightGlue.default_conf)
-    before = torch.backends.cuda.flash_sdp_enabled()
-    try:
-        for flash in (True, False):
-            torch.backends.cuda.enable_flash_sdp(flash)
-            load_lighterglue(read_weights(find_weights(weights)), weights)
-            assert torch.backends.cuda.flash_sdp_enabled() == flash
-    finally:
-        torch.backends.cuda.enable_flash_sdp(before)
-    assert KorniaLightGlue.default_conf == conf
