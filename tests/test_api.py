@@ -13,7 +13,6 @@ import pytest
 from PIL import Image, ImageOps
 
 import megloc_kapture as megloc
-from megloc_kapture.cli.main import main
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 
@@ -87,19 +86,6 @@ def test_results_are_evaluated_as_they_are(
     columns = ["position_error_m", "angle_error_deg"]
     difference = found.to_pandas()[columns] - again.to_pandas()[columns]
     assert np.abs(difference.to_numpy()).max() < 1e-9
-
-
-def test_the_command_writes_the_same_bytes(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
-    changes = [part for key, value in SMALL.items() for part in ("--set", f"{key}={value}")]
-    place = built.kapture_map.folder.root
-    query = scene / "query"
-    command = ["localize", "-i", str(place), "--query", str(query), "-o", str(tmp_path / "there")]
-    with pytest.raises(SystemExit) as end:
-        main([*command, "-q", *changes])
-    assert end.value.code == 0
-    built.localize(query, workers=2).save(tmp_path / "here")
-    for name in ("status.csv", "clusters.csv", "sensors/trajectories.txt"):
-        assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes()
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ import torch
 from images import Image
 from published import Tensors, random_tensors
 
-from megloc_kapture.errors import DataError
 from megloc_kapture.features import aliked
 from megloc_kapture.features.aliked import (
     _VALUES_AT_ONCE,
@@ -193,23 +192,3 @@ def test_descriptors_are_kornias_everywhere(shared_data: Path) -> None:
         found = net.desc_head(net(image)[0], xy)
     assert (found - expected).abs().max() < 2e-5
     assert (found.norm(dim=1) - 1).abs().max() < 1e-5
-
-
-def test_half_precision_stays_near() -> None:
-    tensors = calm_tensors("aliked-t16")
-    net = aliked_from(tensors, "t16")
-    image = texture(64, 96)
-    with torch.inference_mode():
-        full = net(image)[0].scores
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            half = net(image)[0].scores
-    assert half.dtype == torch.float32
-    assert 0 < (full - half).abs().max() < 0.1
-
-
-@pytest.mark.parametrize("key", ["block1.conv1.weight", "conv4.weight", "desc_head.agg_weights"])
-def test_a_file_of_something_else_is_refused(key: str) -> None:
-    tensors = random_tensors("aliked-t16")
-    del tensors[key]
-    with pytest.raises(DataError, match=rf"x\.pth: .*no ALIKED checkpoint.*{key}"):
-        aliked_from(tensors, "x.pth")

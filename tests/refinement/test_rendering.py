@@ -33,8 +33,6 @@ from megloc_kapture.values import Camera, RigidTransform
 
 OPTIONS = SyntheticWorldOptions(num_places=1, day_queries=2, night_queries=1)
 HERE = RigidTransform.identity()
-CAMERA = Camera("OPENCV", 640, 480, (500.0, 505.0, 322.0, 239.0, -0.05, 0.01, 1e-3, 0.0))
-TURNED = RigidTransform((0.8, 0.6, 0.0, 0.0), (1.0, -2.0, 0.5))
 
 
 @dataclass(frozen=True, eq=False)
