@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import copy
+import fcntl
 import hashlib
 import os
+import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -87,13 +89,34 @@ def _remembered(extract: Any) -> Any:
 
 
 @pytest.fixture(scope="session")
-def colmap_room(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def written_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Function: the folder of a name, which one worker writes for all; not to be written into."""
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def folder(name: str, write: Callable[[Path], Any]) -> Path:
+        done = base / f"{name}.done"
+        with (base / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not done.exists():
+                write(base / name)
+                done.touch()
+        return base / name
+
+    return folder
+
+
+@pytest.fixture(scope="session")
+def colmap_room(scene: Path, written_once: Callable[..., Path]) -> Path:
     """The scene's map as a COLMAP workspace, made by COLMAP; not to be written into."""
     from colmap_workspace import write_workspace
 
-    root = tmp_path_factory.mktemp("colmap") / "room"
-    write_workspace(root, scene)
-    return root
+    def write(root: Path) -> None:
+        # its images are links
+        shutil.copytree(scene, root / "scene")
+        write_workspace(root / "room", root / "scene")
+
+    return written_once("colmap", write) / "room"
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,8 +13,7 @@ import pytest
 from PIL import Image, ImageOps
 
 import megloc_kapture as megloc
-from megloc_kapture.cli.main import main
-from megloc_kapture.io.images import read_image_rgb, write_image
+from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureFolder
 
 SMALL = {
@@ -88,19 +86,6 @@ def test_results_are_evaluated_as_they_are(
     columns = ["position_error_m", "angle_error_deg"]
     difference = found.to_pandas()[columns] - again.to_pandas()[columns]
     assert np.abs(difference.to_numpy()).max() < 1e-9
-
-
-def test_the_command_writes_the_same_bytes(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
-    changes = [part for key, value in SMALL.items() for part in ("--set", f"{key}={value}")]
-    place = built.kapture_map.folder.root
-    query = scene / "query"
-    command = ["localize", "-i", str(place), "--query", str(query), "-o", str(tmp_path / "there")]
-    with pytest.raises(SystemExit) as end:
-        main([*command, "-q", *changes])
-    assert end.value.code == 0
-    built.localize(query, workers=2).save(tmp_path / "here")
-    for name in ("status.csv", "clusters.csv", "sensors/trajectories.txt"):
-        assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes()
 
 
 @pytest.fixture
@@ -211,23 +196,6 @@ def test_features_matches_and_a_pose_by_arrays(built: megloc.Map, scene: Path) -
     assert found and np.allclose(found.cam_from_world.translation, 0, atol=1e-6)
     failed = megloc.solve_pose(rng.uniform(0, 480, (60, 2)), points, camera)
     assert not failed and failed.reason
-
-
-def test_a_mask_that_changed_makes_the_map_anew(scene: Path, tmp_path: Path) -> None:
-    mapping = tmp_path / "mapping"
-    shutil.copytree(scene / "mapping", mapping)
-    first = megloc.build_map(mapping, set=SMALL, workspace=tmp_path / "workspace")
-    folder = KaptureFolder(mapping)
-    for name in folder.read().image_names():
-        assert first.kapture_map.folder.keypoints("rootsift").read(name)[:, 0].min() < 100
-        camera = folder.read().camera_of(name)
-        mask = np.full((camera.height, camera.width), 255, np.uint8)
-        mask[:, : camera.width // 2] = 0
-        write_image(mapping / "sensors" / "masks" / f"{name}.png", mask)
-    again = megloc.build_map(mapping, set=SMALL, workspace=tmp_path / "workspace")
-    for name in folder.read().image_names():
-        middle = folder.read().camera_of(name).width / 2
-        assert again.kapture_map.folder.keypoints("rootsift").read(name)[:, 0].min() >= middle
 
 
 def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:

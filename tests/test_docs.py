@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import inspect
-import os
 import re
 import shlex
 import shutil
@@ -72,22 +71,6 @@ def test_python_examples_name_what_there_is_with_its_arguments() -> None:
             if str(getattr(called, "__module__", "")).startswith("megloc_kapture"):
                 words = {word.arg: None for word in node.keywords if word.arg}
                 inspect.signature(called).bind_partial(*node.args, **words)
-
-
-@pytest.mark.slow
-def test_python_examples_pass_a_strict_type_checker(tmp_path: Path) -> None:
-    for number, example in enumerate(EXAMPLES):
-        (tmp_path / f"example_{number}.py").write_text(example)
-    # errors of the package itself are what `make lint` is for
-    options = ["--strict", "--config-file=", "--follow-imports=silent", "--cache-dir=cache"]
-    done = subprocess.run(
-        [sys.executable, "-m", "mypy", *options, *sorted(tmp_path.glob("example_*.py"))],
-        cwd=tmp_path,
-        env={**os.environ, "MYPYPATH": str(REPOSITORY)},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
@@ -243,6 +226,7 @@ def test_the_plugins_of_the_tutorial(
         sys.modules.pop("my_plugins", None)
 
 
+@pytest.mark.slow
 def test_the_api_reference_has_the_public_names_and_no_module_below(tmp_path: Path) -> None:
     script = REPOSITORY / "scripts" / "api_reference.py"
     done = subprocess.run(

@@ -7,9 +7,6 @@ importing pycolmap through it, must always be safe, whichever version is install
 
 from __future__ import annotations
 
-import os
-import re
-import signal
 import subprocess
 import sys
 
@@ -40,7 +37,6 @@ def run_python(code: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize(
     "imports",
     [
-        "import megloc_kapture, pycolmap",
         "import megloc_kapture.io.colmap, pycolmap",
         "import megloc_kapture, pycolmap, kapture.io.csv, torch",
         "import kapture.io.csv, megloc_kapture, pycolmap",
@@ -71,19 +67,3 @@ def test_package_imports_zlib_before_anything_else(module: str) -> None:
     done = run_python(FIRST_IMPORTS.format(module=module))
     assert done.returncode == 0, done.stderr
     assert done.stdout.split()[:2] == ["megloc_kapture", "zlib"]
-
-
-if "MEGLOC_TEST_CRASHES" in os.environ:
-
-    def test_crash() -> None:
-        import pycolmap  # noqa: F401
-
-        os.kill(os.getpid(), signal.SIGSEGV)
-
-
-def test_a_test_that_crashes_says_where() -> None:
-    """pycolmap's import takes over the signals that pytest would tell of."""
-    command = [sys.executable, "-m", "pytest", "-q", f"{__file__}::test_crash"]
-    environment = {**os.environ, "MEGLOC_TEST_CRASHES": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert re.search(r"Segmentation fault(.|\n)*test_import_order.* in test_crash", done.stderr)

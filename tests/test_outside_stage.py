@@ -60,14 +60,6 @@ def expected_counts(workspace: Workspace) -> list[str]:
     return [f"{name},{keypoints.length(name)}" for name in folder.read().image_names()]
 
 
-def test_a_stage_is_written_in_25_lines() -> None:
-    lines = (SOURCE / "keypoint_counts" / "__init__.py").read_text().splitlines()
-    body = lines[
-        next(n for n, line in enumerate(lines) if line.startswith("class CountKeypoints")) :
-    ]
-    assert len([line for line in body if line.strip()]) <= 25
-
-
 def test_it_is_part_of_the_plan_with_manifest_and_progress(scene: Path, tmp_path: Path) -> None:
     workspace = Workspace(tmp_path / "workspace")
     told: list[tuple[int, str]] = []

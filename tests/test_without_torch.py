@@ -23,56 +23,64 @@ def environment(tmp_path: Path) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": str(absent.parent)}
 
 
-def megloc(environment: dict[str, str], *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    code = "from megloc_kapture.cli.main import main; main()"
-    command = [sys.executable, "-c", code, *map(str, arguments)]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+def megloc(
+    environment: dict[str, str], *commands: tuple[str | Path, ...], code: str = ""
+) -> subprocess.CompletedProcess[str]:
+    """Run commands in one process, which prints their statuses last; then Python code."""
+    script = (
+        "from megloc_kapture.cli.main import main\nstatuses = []\n"
+        f"for command in {[list(map(str, command)) for command in commands]!r}:\n"
+        "    try:\n        main(command)\n"
+        "    except SystemExit as end:\n        statuses.append(end.code)\n"
+        f"{code}\nprint(statuses)"
+    )
+    return subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False
+    )
 
 
 def test_a_network_says_what_to_install(environment: dict[str, str], scene: Path) -> None:
-    for arguments in (
+    done = megloc(
+        environment,
         ("options", "superpoint"),
         ("eval", "kapture", "--root", scene, "--preset", "modern", "--dry-run"),
-    ):
-        done = megloc(environment, *arguments)
-        assert done.returncode == 2
-        assert done.stderr.startswith("megloc: ") and done.stderr.endswith(f"{HINT}\n")
-        assert done.stderr.count("\n") == 1
-    assert HINT in megloc(environment, "doctor").stdout
+        ("doctor",),
+    )
+    assert done.stdout.endswith("[2, 2, 0]\n"), done
+    lines = done.stderr.splitlines()
+    assert len(lines) == 2
+    assert all(line.startswith("megloc: ") and line.endswith(HINT) for line in lines), lines
+    assert HINT in done.stdout
 
 
 def test_a_map_of_networks_serves_queries_that_bring_their_features(
     environment: dict[str, str], shared_data: Path, tmp_path: Path
 ) -> None:
-    gallery = shared_data / "foreign_maps" / "virtual_gallery"
+    gallery, result = shared_data / "foreign_maps" / "virtual_gallery", tmp_path / "localized"
     queries = ("-i", gallery / "map", "--query", gallery / "query")
-    done = megloc(environment, "localize", *queries, "-o", tmp_path / "localized", "--quiet")
-    assert done.returncode == 0, done.stderr
-    result = ("-i", tmp_path / "localized", "--gt", gallery / "query_gt", "--thresholds", "0.05,5")
-    done = megloc(environment, "evaluate", *result)
-    assert "100.0" in done.stdout, done.stdout + done.stderr
-    opens = (
-        "import megloc_kapture as megloc\n"
-        f"m = megloc.open_map({str(gallery / 'map')!r})\n"
-        f"found = m.localize({str(gallery / 'query')!r})\n"
-        "assert len(found) == 4 and all(found.values()), dict(found)\n"
-        "from megloc_kapture.service.app import make_app\n"
+    done = megloc(
+        environment,
+        ("localize", *queries, "-o", result, "--quiet"),
+        ("evaluate", "-i", result, "--gt", gallery / "query_gt", "--thresholds", "0.05,5"),
+        code=(
+            "import megloc_kapture as megloc\n"
+            f"image_map = megloc.open_map({str(gallery / 'map')!r})\n"
+            f"results = image_map.localize({str(gallery / 'query')!r})\n"
+            "assert len(results) == 4 and all(results.values()), dict(results)\n"
+            "from megloc_kapture.service.app import make_app\n"
+        ),
     )
-    done = subprocess.run(
-        [sys.executable, "-c", opens], env=environment, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith("[0, 0]\n") and "100.0" in done.stdout, done
 
 
 @pytest.mark.slow
 def test_classic_runs(environment: dict[str, str], scene: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    done = megloc(environment, "eval", "kapture", "--root", scene, "--workspace", run, "--quiet")
-    assert done.returncode == 0, done.stderr
-    assert "100.0 / 100.0 / 100.0 / 100.0" in done.stdout
-    asked = megloc(
+    done = megloc(
         environment,
-        *("localize", "-i", run / "map", "--query", scene / "query"),
-        *("-o", tmp_path / "localized"),
+        ("eval", "kapture", "--root", scene, "--workspace", run, "--quiet"),
+        ("localize", "-i", run / "map", "--query", scene / "query", "-o", tmp_path / "localized"),
     )
-    assert asked.stdout.startswith("4 of 4 queries localized"), asked.stderr
+    assert done.stdout.endswith("[0, 0]\n"), done
+    assert "100.0 / 100.0 / 100.0 / 100.0" in done.stdout
+    assert "4 of 4 queries localized" in done.stdout

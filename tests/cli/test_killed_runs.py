@@ -115,17 +115,17 @@ def test_ctrl_c_says_how_to_go_on(scene: Path, tmp_path: Path) -> None:
     assert left_behind(tmp_path / "run") == []
 
 
-@pytest.mark.parametrize("group", [True, False])
-def test_sigterm_says_how_to_go_on(scene: Path, tmp_path: Path, group: bool) -> None:
+def test_sigterm_says_how_to_go_on(scene: Path, tmp_path: Path) -> None:
     run = start(scene, tmp_path / "run")
     wait_for(run, "local_features, stage")
-    (os.killpg if group else os.kill)(run.pid, signal.SIGTERM)
+    os.kill(run.pid, signal.SIGTERM)
     assert run.stderr is not None
     assert f"megloc: terminated; {ON}" in run.stderr.read().splitlines()
     assert run.wait() == 143
     assert left_behind(tmp_path / "run") == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
 def test_a_killed_run_keeps_its_finished_items(
     scene: Path, finished: Path, tmp_path: Path, contents: Contents

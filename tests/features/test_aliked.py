@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +12,6 @@ import torch
 from images import Image
 from published import Tensors, random_tensors
 
-from megloc_kapture.errors import DataError
 from megloc_kapture.features import aliked
 from megloc_kapture.features.aliked import (
     _VALUES_AT_ONCE,
@@ -51,14 +49,14 @@ def test_keypoints_are_kornias(cropped: Image, shared_data: Path, variant: str) 
     net = feature.ALIKED(variant, max_num_keypoints=20_000)
     file = shared_data / "weights" / "aliked" / f"{variant}.pth"
     net.load_state_dict(torch.load(file, weights_only=True, map_location="cpu"), strict=False)
-    image = cropped[:195, :262]  # no multiples of 32
+    image = cropped[:163, :198]  # no multiples of 32
     planes = torch.from_numpy(image.transpose(2, 0, 1).astype(np.float32) / 255)
     with torch.inference_mode():
         theirs = net.eval()(planes[None])[0]
     own = extractor(weights=variant, max_keypoints=20_000)
     ours = own.extract(image)
     assert own.name == variant and own.descriptor_size == ours.descriptors.shape[1]
-    assert theirs.n > 80
+    assert theirs.n > 50
     expected = theirs.keypoints.numpy() + 0.5  # kornia's pixel centres are integers
     distance = np.linalg.norm(expected[:, None] - ours.keypoints_px[None, :, :2], axis=2)
     row = distance.argmin(axis=1)
@@ -95,37 +93,30 @@ def test_a_peak_of_the_score_map_lies_at_its_pixels_centre(monkeypatch: pytest.M
 
 
 @pytest.mark.usefixtures("weights")
-@pytest.mark.parametrize(
-    ("scene", "step", "keypoints", "least"),
-    [("fountain_p11", 1, 1500, 0.6), ("redkitchen_rgbd", 5, 500, 0.6)],
-)
-def test_matches_of_real_images_lie_on_epipolar_lines(
-    shared_data: Path, scene: str, step: int, keypoints: int, least: float
-) -> None:
-    folder = KaptureFolder(shared_data / "scenes" / scene / "mapping")
+def test_matches_of_real_images_lie_on_epipolar_lines(shared_data: Path) -> None:
+    folder = KaptureFolder(shared_data / "scenes" / "redkitchen_rgbd" / "mapping")
     data = folder.read()
-    names = sorted(data.poses())[: step + 1 : step]
-    features = [extractor().extract(read_image_rgb(folder.image_path(name))) for name in names]
-    # the large one has as many as the default keeps
-    assert all(keypoints <= len(found.scores) <= 1500 for found in features)
-    for (a, of_a), (b, of_b) in pairwise(zip(names, features, strict=True)):
-        matches, _ = match_nearest(of_a.descriptors, of_b.descriptors)
-        sides = []
-        for name, of, rows in ((a, of_a, matches[:, 0]), (b, of_b, matches[:, 1])):
-            px, camera = of.keypoints_px[rows, :2], data.camera_of(name)
-            rays = bearing_rays(camera, px)
-            sides += [rays, ray_slopes(camera, px, rays)]
-        pose_a, pose_b = data.cam_from_world(a), data.cam_from_world(b)
-        assert pose_a is not None and pose_b is not None
-        error = sampson_error_px(*sides, pose_b @ pose_a.inverse())
-        assert len(matches) > 200
-        assert (error < 2).mean() > least
+    poses = data.poses()
+    names = sorted(poses)[:6:5]
+    features = [
+        extractor().extract(read_image_rgb(folder.image_path(name))[:300, :400]) for name in names
+    ]
+    matches, _ = match_nearest(*(each.descriptors for each in features))
+    sides = []
+    for name, found, rows in zip(names, features, matches.T, strict=True):
+        px, camera = found.keypoints_px[rows, :2], data.camera_of(name)
+        rays = bearing_rays(camera, px)
+        sides += [rays, ray_slopes(camera, px, rays)]
+    error = sampson_error_px(*sides, poses[names[1]] @ poses[names[0]].inverse())
+    assert len(matches) > 80
+    assert (error < 2).mean() > 0.6
 
 
 @pytest.mark.usefixtures("weights")
 def test_many_keypoints_are_described_in_parts(
     cropped: Image, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    cropped = cropped[:120, :160]
     whole = extractor().extract(cropped)
     monkeypatch.setitem(_VALUES_AT_ONCE, "cpu", 4 * 16 * 128 * 7)
     parts = extractor().extract(cropped)
@@ -145,10 +136,6 @@ def calm_tensors(variant: str) -> Tensors:
         if "offset_conv" in key:
             values *= 3  # readings some pixels away
     return tensors
-
-
-def published_tensors(shared_data: Path, variant: str) -> Tensors:
-    return read_weights(find_weights(str(shared_data / "weights" / "aliked" / f"{variant}.pth")))
 
 
 def kornias(variant: str, tensors: Tensors, **options: Any) -> torch.nn.Module:
@@ -176,11 +163,10 @@ def dense_features(net: AlikedNet, image: torch.Tensor) -> tuple[torch.Tensor, t
     return maps.scores, features.T.reshape(-1, height, width)
 
 
-@pytest.mark.parametrize("size", [(64, 96), (75, 101), (33, 40)])
 @pytest.mark.parametrize("variant", ["aliked-t16", "aliked-n32"])
-def test_random_weights_give_kornias_maps(variant: str, size: tuple[int, int]) -> None:
+def test_random_weights_give_kornias_maps(variant: str) -> None:
     tensors = calm_tensors(variant)
-    image = texture(*size)
+    image = texture(59, 75)  # no multiples of 32
     with torch.inference_mode():
         features, scores = kornias(variant, tensors).extract_dense_map(image)
         our_scores, our_features = dense_features(aliked_from(tensors, variant), image)
@@ -190,9 +176,9 @@ def test_random_weights_give_kornias_maps(variant: str, size: tuple[int, int]) -
     assert (our_features - features[0]).abs().max() < 1e-4
 
 
-@pytest.mark.parametrize("variant", ["aliked-t16", "aliked-n16"])
-def test_descriptors_are_kornias_everywhere(shared_data: Path, variant: str) -> None:
-    tensors = published_tensors(shared_data, variant)
+def test_descriptors_are_kornias_everywhere(shared_data: Path) -> None:
+    variant = "aliked-t16"
+    tensors = read_weights(find_weights(str(shared_data / "weights" / "aliked" / f"{variant}.pth")))
     image = texture(96, 128)
     generator = torch.Generator().manual_seed(1)
     # all over the map, its border included
@@ -206,23 +192,3 @@ def test_descriptors_are_kornias_everywhere(shared_data: Path, variant: str) -> 
         found = net.desc_head(net(image)[0], xy)
     assert (found - expected).abs().max() < 2e-5
     assert (found.norm(dim=1) - 1).abs().max() < 1e-5
-
-
-def test_half_precision_stays_near() -> None:
-    tensors = calm_tensors("aliked-t16")
-    net = aliked_from(tensors, "t16")
-    image = texture(64, 96)
-    with torch.inference_mode():
-        full = net(image)[0].scores
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            half = net(image)[0].scores
-    assert half.dtype == torch.float32
-    assert 0 < (full - half).abs().max() < 0.1
-
-
-@pytest.mark.parametrize("key", ["block1.conv1.weight", "conv4.weight", "desc_head.agg_weights"])
-def test_a_file_of_something_else_is_refused(key: str) -> None:
-    tensors = random_tensors("aliked-t16")
-    del tensors[key]
-    with pytest.raises(DataError, match=rf"x\.pth: .*no ALIKED checkpoint.*{key}"):
-        aliked_from(tensors, "x.pth")

@@ -208,6 +208,7 @@ def test_images_of_any_size_have_vectors(make: Make, name: str, size: tuple[int,
     assert np.linalg.norm(make(name).describe(random_image(*size))) == pytest.approx(1, abs=1e-6)
 
 
+@pytest.mark.parametrize("name", ["openibl", "megaloc"])
 def test_half_precision_describes_nearly_the_same(name: str, make: Make) -> None:
     image = texture(64, 80, sigma_px=6.0)
     full, half = make(name).describe(image), make(name, half_precision=True).describe(image)

@@ -46,9 +46,9 @@ def test_sizes_up_to_the_bound_are_left_alone() -> None:
 
 
 def test_keypoints_of_a_reduced_image_are_where_they_were() -> None:
-    image, centres = discs(1601, 1203)
+    image, centres = discs(801, 603)
     whole = RootSift().extract(image)
-    half, same = (RootSift(RootSiftOptions(max_megapixels=most)) for most in (0.5, 2.0))
+    half, same = (RootSift(RootSiftOptions(max_megapixels=most)) for most in (0.1208, 0.5))
     found = extract_bounded(half, [(image, None)])[0]
     assert len(found.keypoints_px) > len(centres)
     for features in (whole, found):
@@ -59,10 +59,10 @@ def test_keypoints_of_a_reduced_image_are_where_they_were() -> None:
     np.testing.assert_array_equal(unchanged.descriptors, whole.descriptors)
     # the mask is reduced with the image
     mask = np.ones(image.shape[:2], bool)
-    mask[:, :801] = False
+    mask[:, :401] = False
     found = extract_bounded(half, [(image, mask)])[0]
     assert len(found.keypoints_px) > 10 and found.num_masked > 10
-    assert found.keypoints_px[:, 0].min() >= 801
+    assert found.keypoints_px[:, 0].min() >= 401
 
 
 def test_a_plugin_without_the_option_is_bounded_all_the_same() -> None:
@@ -84,7 +84,7 @@ def test_all_our_extractors_have_the_option() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("megapixels", [12, 24, 48, 108])
+@pytest.mark.parametrize("megapixels", [12, 48])
 def test_memory_does_not_grow_with_the_image(megapixels: int) -> None:
     """RootSIFT took 2.9 GB at 12 megapixels, 5.6 GB at 24 and was killed at 48 and 108."""
     script = f"""if True:

@@ -314,16 +314,6 @@ def test_there_and_back_is_where_it_was(
     np.testing.assert_allclose(px_in_variant(variant, back, *size), px, atol=1e-9)
 
 
-@given(size=SIZES, variant=VARIANTS)
-def test_corners_stay_corners(size: tuple[int, int], variant: ImageVariant) -> None:
-    width, height = size
-    corners = np.array([(0, 0), (width, 0), (width, height), (0, height)], dtype=np.float64)
-    w, h = variant.size(width, height)
-    # counter-clockwise: the corner that was at the right of the top is now at its left
-    turned = np.roll([(0, 0), (w, 0), (w, h), (0, h)], variant.rotation_deg // 90, axis=0)
-    np.testing.assert_allclose(px_in_variant(variant, corners, width, height), turned, atol=1e-9)
-
-
 @pytest.mark.parametrize("rotation", (0, 90, 180, 270))
 @pytest.mark.parametrize("scale", SCALES)
 def test_a_scaled_ramp_shows_the_places_its_pixels_come_from(scale: float, rotation: int) -> None:

@@ -92,23 +92,6 @@ def test_equal_to_loops_over_all_pairs(
         np.testing.assert_allclose(score, 1 - apart[0] / apart[1] if apart[1] else 0.0, atol=1e-5)
 
 
-@given(descriptors())
-@settings(deadline=None)
-def test_a_mutual_match_uses_every_row_once_and_is_nearest_both_ways(
-    problem: tuple[NDArray[Any], NDArray[Any], int],
-) -> None:
-    a, b, _ = problem
-    matches, scores = match_nearest(a, b)
-    assert len(matches) >= 1  # the best pair of all is always mutual
-    assert len(set(matches[:, 0].tolist())) == len(set(matches[:, 1].tolist())) == len(matches)
-    assert (np.diff(matches[:, 0]) > 0).all()
-    products = a.astype(np.float64) @ b.astype(np.float64).T
-    own = products[matches[:, 0], matches[:, 1]]
-    np.testing.assert_allclose(own, products[matches[:, 0]].max(axis=1), atol=1e-5)
-    np.testing.assert_allclose(own, products[:, matches[:, 1]].max(axis=0), atol=1e-5)
-    assert len(scores) == len(matches)
-
-
 @pytest.mark.parametrize("max_ratio", [0.6, 0.7, 0.8, 0.9, 0.95, 1.0])
 @pytest.mark.parametrize("mutual", [True, False])
 def test_the_ratio_is_of_distances(max_ratio: float, mutual: bool) -> None:
@@ -126,15 +109,6 @@ def test_the_ratio_is_of_distances(max_ratio: float, mutual: bool) -> None:
         assert [tuple(match) for match in matches] == by_loops(a, b, options)
         if max_ratio < 0.8:
             assert 0 < len(matches) < 45  # the test tells ratios apart
-
-
-def test_more_rows_than_one_block() -> None:
-    rng = np.random.default_rng(4)
-    b = rng.integers(-3, 4, (40, 5)).astype(np.float32)
-    a = rng.integers(-3, 4, (1300, 5)).astype(np.float32)
-    matches, _ = match_nearest(a, b)
-    assert [tuple(m) for m in matches.tolist()] == by_loops(a, b, NearestNeighbourOptions())
-    assert matches[:, 0].max() > 512  # some come from later blocks
 
 
 def test_ties_go_to_the_smaller_index_and_few_candidates_are_no_fault() -> None:

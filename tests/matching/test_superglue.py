@@ -115,17 +115,6 @@ def test_many_are_each_alone(weights: Path) -> None:
         assert scores.shape == (0,) and scores.dtype == np.float32
 
 
-def test_half_precision_keeps_the_matches(weights: Path) -> None:
-    a = image(80, 0)
-    b = seen_again(a, 60, 1)
-    (whole, _), (half, scores) = (
-        matcher(weights, half_precision=half).match(a, b) for half in (False, True)
-    )
-    assert scores.dtype == np.float32
-    found, exact = ({*map(tuple, matches.tolist())} for matches in (half, whole))
-    assert len(found & exact) / len(found | exact) > 0.9
-
-
 def test_what_it_cannot_use_is_named(weights: Path) -> None:
     good = image(9, 0)
     plugin = matcher(weights)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -54,7 +51,7 @@ def net(trunk: Trunk) -> Lpips:
     return random_lpips(trunk)
 
 
-def pictures(seed: int, height: int = 65, width: int = 79) -> tuple[torch.Tensor, torch.Tensor]:
+def pictures(seed: int, height: int = 47, width: int = 61) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     return tuple(torch.rand(1, 3, height, width, generator=generator) for _ in range(2))
 
@@ -148,7 +145,8 @@ def test_keys_and_shapes_are_the_published_ones(net: Lpips, trunk: Trunk) -> Non
     assert all(key.startswith(("lin", "features.")) for key in state)
 
 
-def test_it_is_a_distance_of_the_valid_pixels(net: Lpips) -> None:
+def test_it_is_a_distance_of_the_valid_pixels() -> None:
+    net = random_lpips("alex")
     a, b = pictures(3, 48, 64)
     assert distance(net, a, a) == 0.0 < distance(net, a, b)
     assert distance(net, a, b) == pytest.approx(distance(net, b, a), rel=1e-5)
@@ -162,7 +160,8 @@ def test_it_is_a_distance_of_the_valid_pixels(net: Lpips) -> None:
     assert distance(net, a, same, valid) == 0.0 < distance(net, a, same)
 
 
-def test_smallest_images_work_and_pairs_are_independent(net: Lpips) -> None:
+def test_smallest_images_work_and_pairs_are_independent() -> None:
+    net = random_lpips("squeeze")
     a, b = pictures(4, SMALLEST_PX, SMALLEST_PX)
     valid = torch.ones(2, 1, SMALLEST_PX, SMALLEST_PX)
     with torch.inference_mode():
@@ -184,28 +183,3 @@ def test_checkpoints_load_strictly(net: Lpips, trunk: Trunk) -> None:
         lpips_from(trunk, of_trunk, heads, "file")
     with pytest.raises(DataError, match=r"lin0\.model\.1\.weight"):
         lpips_from(trunk, state, {**heads, "lin0.model.1.weight": torch.zeros(1, 9, 1, 1)}, "file")
-
-
-def test_published_heads_grow_with_blur_and_noise(
-    net: Lpips, trunk: Trunk, shared_data: Path
-) -> None:
-    file = shared_data / "weights" / "lpips_lin" / "v0.1" / f"{trunk}.pth"
-    heads = torch.load(file, map_location="cpu", weights_only=True)
-    assert all((value >= 0).all() for value in heads.values())
-    state = {k: v for k, v in net.state_dict().items() if k.startswith("features.")}
-    net = lpips_from(trunk, state, heads, "files")
-    rng = np.random.default_rng(0)
-    image = cv2.resize(rng.uniform(0, 1, (16, 20, 3)), (80, 64), interpolation=cv2.INTER_CUBIC)
-    image = np.clip(image + 0.2 * (rng.uniform(0, 1, (64, 80, 3)) - 0.5), 0, 1)
-    noise = rng.standard_normal(image.shape)
-
-    def tensor(pixels: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.clip(pixels, 0, 1).transpose(2, 0, 1)[None]).float()
-
-    sharp = tensor(image)
-    blurred = [tensor(cv2.GaussianBlur(image, (0, 0), s)) for s in (0.6, 1.5, 4.0)]
-    noisy = [tensor(image + s * noise) for s in (0.02, 0.06, 0.2)]
-    for series in (blurred, noisy):
-        found = [distance(net, sharp, sharp), *(distance(net, sharp, each) for each in series)]
-        assert found[0] == 0.0
-        assert (np.diff(found) > 0).all(), found

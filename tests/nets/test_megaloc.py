@@ -8,8 +8,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
 from published import published_shapes
@@ -310,13 +308,6 @@ def test_positions_are_read_bicubically_with_dinov2s_offset(rows: int, columns: 
     found = net.positions(rows, columns).detach().numpy()[0]
     np.testing.assert_allclose(found[0], learnt[0], atol=1e-7)
     np.testing.assert_allclose(found[1:].reshape(rows, columns, DINO_CHANNELS), expected, atol=1e-5)
-
-
-@given(st.integers(1, 90), st.integers(1, 90))
-@settings(max_examples=60)
-def test_every_size_has_as_many_positions_as_patches(rows: int, columns: int) -> None:
-    net = DinoV2(channels=1, depth=0, heads=1)
-    assert net.positions(rows, columns).shape == (1, 1 + rows * columns, 1)
 
 
 def test_what_fills_no_patch_is_left_out() -> None:

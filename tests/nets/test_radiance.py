@@ -151,15 +151,15 @@ def test_a_field_renders_rays(kind: type[NerfW] | type[TriPlane]) -> None:
     torch.manual_seed(0)
     field = kind(3)
     generator = torch.Generator().manual_seed(0)
-    rays = rays_of(9)
+    rays = rays_of(4)
     assert field.appearance is not None and field.transient is not None
-    images = torch.arange(9) % 3
+    images = torch.arange(4) % 3
     full = replace(rays, appearance=field.appearance(images), transient=field.transient(images))
     seen = field.render(full, generator)
-    for value, shape in ((seen.rgb, (9, 3)), (seen.depth, (9,)), (seen.beta, (9,))):
+    for value, shape in ((seen.rgb, (4, 3)), (seen.depth, (4,)), (seen.beta, (4,))):
         assert value.shape == shape and torch.isfinite(value).all()
     assert ((seen.opacity >= 0) & (seen.opacity <= 1 + 1e-6)).all() and (seen.beta > 0.03).all()
-    nerf_w_loss(seen, torch.rand(9, 3)).backward()
+    nerf_w_loss(seen, torch.rand(4, 3)).backward()
     assert all(value.grad is not None for value in field.parameters())
     plain = field.render(rays)
     assert (plain.beta == 0.03).all() and plain.transient_density == 0

@@ -73,16 +73,6 @@ def test_suppression_is_its_definition(radius: int, rounds: int) -> None:
     np.testing.assert_array_equal(found[0].numpy(), by_definition(scores, radius, rounds))
 
 
-@given(seed=st.integers(0, 99), radius=st.integers(1, 5))
-def test_what_stays_is_far_apart_and_stays_again(seed: int, radius: int) -> None:
-    scores = torch.from_numpy(random_scores(seed, (40, 40)))
-    once = suppress_non_maxima(scores, radius)
-    torch.testing.assert_close(suppress_non_maxima(once, radius), once, rtol=0, atol=0)
-    yx = torch.nonzero(once)
-    distance = (yx[:, None] - yx).abs().amax(dim=2) + 1000 * torch.eye(len(yx))
-    assert distance.min() > radius
-
-
 def test_the_best_come_first_and_ties_by_y_then_x() -> None:
     scores = torch.zeros(6, 7)
     scores[4, 1] = scores[2, 5] = scores[2, 3] = 0.5

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from published import published_shapes
 from torch.nn import functional
 from transformers import SuperGlueConfig, SuperGlueForKeypointMatching
 from transformers.models.superglue.modeling_superglue import log_optimal_transport as in_logarithm
@@ -24,13 +23,16 @@ from megloc_kapture.nets.superglue import (
 
 WIDTH, HEIGHT = 640, 480
 THRESHOLD = 0.2
+# a quarter of the published width, and 6 of 18 layers: the same code in a tenth of the time
+SIZE, ENCODER, LAYERS = 64, (8, 16, 32, 64, 64), 6
 
 
-def peaky_weights(seed: int = 0) -> dict[str, torch.Tensor]:
-    """Under the official keys and shapes."""
-    generator = torch.Generator().manual_seed(seed)
+def peaky_weights() -> dict[str, torch.Tensor]:
+    """Random weights under the official keys."""
+    generator = torch.Generator().manual_seed(0)
     found = {}
-    for key, sizes in published_shapes("superglue").items():
+    for key, shape in SuperGlueNet(ENCODER, LAYERS).state_dict().items():
+        sizes = tuple(shape.shape)
         value = torch.randn(sizes, generator=generator)
         if len(sizes) == 3:
             value *= sizes[1] ** -0.5
@@ -44,11 +46,11 @@ def peaky_weights(seed: int = 0) -> dict[str, torch.Tensor]:
             value *= 0.2
         found[key] = value
     found["bin_score"] = torch.tensor(2.0)
-    found["final_proj.weight"] = found["final_proj.weight"] + 7.0 * torch.eye(256)[:, :, None]
+    found["final_proj.weight"] = found["final_proj.weight"] + 7.0 * torch.eye(SIZE)[:, :, None]
     return found
 
 
-def random_image(num: int, seed: int, size: int = 256) -> ImageKeypoints:
+def random_image(num: int, seed: int, size: int = SIZE) -> ImageKeypoints:
     generator = torch.Generator().manual_seed(seed)
     descriptors = functional.normalize(torch.randn((num, size), generator=generator), dim=1)
     pixels = torch.rand((num, 2), generator=generator) * torch.tensor([WIDTH - 1.0, HEIGHT - 1.0])
@@ -60,7 +62,7 @@ def seen_again(image: ImageKeypoints, num: int, num_new: int, seed: int) -> Imag
     """Another view of the first keypoints, moved and noisy, with others among them."""
     generator = torch.Generator().manual_seed(seed)
     new = random_image(num_new, seed + 1000)
-    noise = torch.randn((num, 256), generator=generator) / 16
+    noise = torch.randn((num, SIZE), generator=generator) / SIZE**0.5
     order = torch.randperm(num + num_new, generator=generator)
     moved = image.xy[:num] + 0.02 * torch.randn((num, 2), generator=generator)
     noisy = functional.normalize(image.descriptors[:num] + 0.7 * noise, dim=1)
@@ -75,8 +77,9 @@ def transformers_model(
     weights: dict[str, torch.Tensor], *, by_head: bool = True
 ) -> SuperGlueForKeypointMatching:
     """With the weights under its own names, and its heads one after the other."""
-    # row h * 64 + d of its projections is row d * 4 + h of the official ones
-    order = torch.arange(256).view(64, 4).T.flatten() if by_head else torch.arange(256)
+    # row h * (SIZE / 4) + d of its projections is row d * 4 + h of the official ones
+    order = torch.arange(SIZE)
+    order = order.view(SIZE // 4, 4).T.flatten() if by_head else order
     renamed = {}
     for key, value in weights.items():
         name, value = key, value.squeeze(-1) if value.ndim == 3 else value
@@ -102,7 +105,13 @@ def transformers_model(
         if key.startswith("final_proj."):
             name = f"final_projection.{key}"
         renamed[name] = value
-    config = SuperGlueConfig(matching_threshold=THRESHOLD, attn_implementation="eager")
+    config = SuperGlueConfig(
+        matching_threshold=THRESHOLD,
+        hidden_size=SIZE,
+        keypoint_encoder_sizes=list(ENCODER[:-1]),
+        gnn_layers_types=["self", "cross"] * (LAYERS // 2),
+        attn_implementation="eager",
+    )
     model = SuperGlueForKeypointMatching(config).eval()
     own = {k for k in model.state_dict() if not k.startswith("keypoint_detector.")}
     assert own == set(renamed)
@@ -134,17 +143,16 @@ def partners(assignment: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return partner, values
 
 
-def network(seed: int = 0) -> SuperGlueNet:
-    return superglue(peaky_weights(seed), "w.pth").eval()
+def network() -> SuperGlueNet:
+    return superglue(peaky_weights(), "w.pth").eval()
 
 
 @torch.inference_mode()
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_matches_are_transformers(seed: int) -> None:
-    a = random_image(150, seed)
-    b = seen_again(a, 110, 40, seed)
-    weights = peaky_weights(seed)
-    partner, scores = partners(network(seed)([(a, b)], 100)[0])
+def test_matches_are_transformers() -> None:
+    a = random_image(150, 0)
+    b = seen_again(a, 110, 40, 0)
+    weights = peaky_weights()
+    partner, scores = partners(network()([(a, b)], 100)[0])
     expected, expected_scores = transformers_matches(transformers_model(weights), a, b)
     found = partner >= 0
     assert 40 < found.sum() < 150  # some match and some do not
@@ -156,7 +164,6 @@ def test_matches_are_transformers(seed: int) -> None:
     assert (other_scores - scores).abs().max() > 0.05
 
 
-@pytest.mark.slow
 @torch.inference_mode()
 def test_pairs_of_any_sizes_together_are_each_alone() -> None:
     net = network()
@@ -230,8 +237,8 @@ def random_scores(rows: int, columns: int, scale: float, seed: int = 0) -> torch
 
 
 # up to 300: scores beyond a thousand, where an exponential alone over- and underflows
-@pytest.mark.parametrize("iterations", [1, 2, 7, 100])
-@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0, 50.0, 300.0])
+@pytest.mark.parametrize("iterations", [1, 2, 100])
+@pytest.mark.parametrize("scale", [0.1, 10.0, 300.0])
 @pytest.mark.parametrize("bin_score", [-300.0, 2.3, 300.0])
 def test_it_is_the_log_domain_definition(scale: float, iterations: int, bin_score: float) -> None:
     scores, dustbin = random_scores(60, 45, scale), torch.tensor(bin_score)

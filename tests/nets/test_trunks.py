@@ -16,7 +16,6 @@ from transformers import (
 )
 
 from megloc_kapture.nets.trunks import (
-    Depth,
     ResNet,
     Vgg16Features,
     generalized_mean,
@@ -27,7 +26,6 @@ CONFIGURATION: tuple[int | str, ...] = (
     *(64, 64, "P", 128, 128, "P"),
     *(256, 256, 256, "P", 512, 512, 512, "P", 512, 512, 512, "P"),
 )
-BLOCKS: dict[Depth, list[int]] = {50: [3, 4, 6, 3], 101: [3, 4, 23, 3]}
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +54,7 @@ def restated(state: dict[str, torch.Tensor], image: torch.Tensor) -> list[torch.
     return activations
 
 
-@pytest.mark.parametrize("last", [0, 3, 8, 15, 22, 28, 29, 30])
+@pytest.mark.parametrize("last", [3, 28, 30])
 def test_an_activation_is_the_restated_one(image: torch.Tensor, last: int) -> None:
     torch.manual_seed(0)
     state = Vgg16Features(last=30).state_dict()
@@ -72,7 +70,7 @@ def test_an_activation_is_the_restated_one(image: torch.Tensor, last: int) -> No
     assert expected.std() > 0.05
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-5 * float(expected.std()))
     assert torch.equal(given, before)
-    assert (found < 0).any() == (last in (0, 28))
+    assert (found < 0).any() == (last == 28)
 
 
 def resnet_names(key: str) -> str:
@@ -90,13 +88,12 @@ def resnet_names(key: str) -> str:
     return f"{place}.layer.{int(parts[2][-1]) - 1}.{kind[parts[2][0]]}.{parts[3]}"
 
 
-@pytest.mark.parametrize(("depth", "size"), [(50, (97, 130)), (101, (64, 80))])
-def test_the_stages_are_transformers_stages(depth: Depth, size: tuple[int, int]) -> None:
-    ours = randomised(ResNet(depth))
-    theirs = ResNetModel(ResNetConfig(depths=BLOCKS[depth], layer_type="bottleneck")).eval()
+def test_the_stages_are_transformers_stages() -> None:
+    ours = randomised(ResNet(50))
+    theirs = ResNetModel(ResNetConfig(depths=[3, 4, 6, 3], layer_type="bottleneck")).eval()
     renamed = {resnet_names(key): value for key, value in ours.state_dict().items()}
     theirs.load_state_dict(renamed, strict=True)
-    image = torch.randn(2, 3, *size)
+    image = torch.randn(2, 3, 65, 98)
     with torch.inference_mode():
         found = ours(image)
         expected = theirs(image, output_hidden_states=True).hidden_states[1:]

@@ -265,6 +265,7 @@ def test_gps_tells_scale_and_axes(room: Path, tmp_path: Path) -> None:
     assert np.linalg.norm(apart, axis=1).max() < 2.0  # East, North, Up
 
 
+@pytest.mark.slow
 def test_photographs_of_one_size_may_have_other_cameras(
     room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -366,8 +367,9 @@ SCENES = {"fountain_p11": (11, 0.002), "herzjesu_p25": (25, 0.003)}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mapper", ["incremental", "global"])
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize(
+    ("scene", "mapper"), [("fountain_p11", "global"), ("herzjesu_p25", "incremental")]
+)
 def test_surveyed_facades(shared_data: Path, tmp_path: Path, scene: str, mapper: Any) -> None:
     root = shared_data / "scenes" / scene
     number, worst = SCENES[scene]
@@ -381,7 +383,7 @@ def test_surveyed_facades(shared_data: Path, tmp_path: Path, scene: str, mapper:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("focal_35mm", [None, 25, 32, 42])
+@pytest.mark.parametrize("focal_35mm", [None, 25])
 def test_twenty_photographs_in_three_commands(
     shared_data: Path, tmp_path: Path, focal_35mm: int | None
 ) -> None:

@@ -164,7 +164,7 @@ def assert_found(
     assert off_m < distance_m and off_deg < angle_deg
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_noise_and_holes_leave_5_mm_and_a_fifth_of_a_degree(furnished: Any, seed: int) -> None:
     start = disturbed(seed, 0.05, 3.0)
     assert errors(start) == pytest.approx((0.05, 3.0))
@@ -177,18 +177,15 @@ def test_noise_and_holes_leave_5_mm_and_a_fifth_of_a_degree(furnished: Any, seed
     assert measures["moved_deg"] == pytest.approx(3.0, abs=0.2)
     assert measures["condition"] < 30  # furniture determines the pose
     assert found.covariance is not None and found.covariance.shape == (6, 6)
-    if seed == 3:  # twice the same
+    if seed == 1:  # twice the same
         again = refine(furnished, start)
         assert (again.cam_from_world, again.measures) == (found.cam_from_world, measures)
         np.testing.assert_array_equal(again.covariance, found.covariance)
 
 
-@pytest.mark.parametrize(("distance_m", "angle_deg"), [(1.0, 5.0), (0.1, 60.0), (2.0, 120.0)])
-@pytest.mark.parametrize("seed", range(2))
-def test_a_hopeless_start_stays(
-    furnished: Any, seed: int, distance_m: float, angle_deg: float
-) -> None:
-    start = disturbed(seed, distance_m, angle_deg)
+@pytest.mark.parametrize(("distance_m", "angle_deg"), [(1.0, 5.0), (0.1, 60.0)])
+def test_a_hopeless_start_stays(furnished: Any, distance_m: float, angle_deg: float) -> None:
+    start = disturbed(0, distance_m, angle_deg)
     found = refine(furnished, start)
     assert not found.accepted and found.reason
     assert found.cam_from_world == start and found.covariance is None
@@ -208,8 +205,7 @@ def test_the_offset_between_depth_and_colour_counts(
     assert errors(refine(scene, start).cam_from_world)[0] > 0.02
 
 
-@pytest.mark.parametrize("name", ["wall", "corridor"])
-@pytest.mark.parametrize("seed", [None, 0], ids=["exact", "noisy"])
+@pytest.mark.parametrize(("name", "seed"), [("wall", None), ("corridor", 0)])
 def test_surfaces_that_slide_are_recognised(
     scene_of: Callable[..., Any], name: str, seed: int | None
 ) -> None:

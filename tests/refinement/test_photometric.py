@@ -263,7 +263,7 @@ def test_correlation_is_that_of_numpy_about_each_references_mean(problem: Proble
 
 def test_covariance_is_that_of_the_errors(problem: Problems) -> None:
     errors, claimed = [], []
-    for seed in range(60):
+    for seed in range(40):
         aligned, truth = problem(count=3000, noise=0.3, seed=seed)
         found = minimise(aligned, aligned.nuisance_at(truth), last_step_px=1e-3)
         claim = covariance(aligned, found)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import cv2
@@ -66,6 +67,7 @@ def test_an_image_must_fit_its_camera() -> None:
         pyramid_of(replace(one, image=one.image[:50]), RenderingOptions())
 
 
+@cache
 def texture(width: int, height: int, seed: int) -> NDArray[np.uint8]:
     rng = np.random.default_rng(seed)
     image = np.zeros((height, width, 3))
@@ -185,38 +187,21 @@ def test_an_exact_map_is_consistent(exact: Consistency) -> None:
     assert exact.median.moved_m < 0.005 and exact.median.turned_deg < 0.08
 
 
-@pytest.mark.parametrize(
-    ("m", "deg"),
-    [(0.02, 0.5), pytest.param(0.02, 0.0, marks=SLOW), pytest.param(0.0, 0.5, marks=SLOW)],
-)
-def test_poses_that_are_off_contradict_each_other(
-    corner: Map, verdict: Verdict, m: float, deg: float
-) -> None:
-    found = verdict(posed(corner, lambda k, each: displaced(each, k, m, deg)))
+def test_poses_that_are_off_contradict_each_other(corner: Map, verdict: Verdict) -> None:
+    found = verdict(posed(corner, lambda k, each: displaced(each, k, 0.02, 0.5)))
     assert "contradicts itself" in found.reason
-    assert found.median.moved_m > 0.5 * m and found.median.turned_deg > 0.5 * deg
+    assert found.median.moved_m > 0.01 and found.median.turned_deg > 0.25
 
 
-@pytest.mark.parametrize("shift_px", [7, pytest.param(-7, marks=SLOW)])
 def test_depth_that_is_shifted_against_colour_shows_between_views(
-    corner: Map, verdict: Verdict, shift_px: int
+    corner: Map, verdict: Verdict
 ) -> None:
-    shifted = with_depth(corner, lambda view: {"depth_m": np.roll(view.depth_m, shift_px, axis=1)})
+    shifted = with_depth(corner, lambda view: {"depth_m": np.roll(view.depth_m, 7, axis=1)})
     assert "contradicts itself" in verdict(shifted).reason
 
 
 @SLOW
-def test_a_depth_camera_that_stands_elsewhere_than_said_shows_between_views(
-    corner: Map, exact: Consistency, verdict: Verdict
-) -> None:
-    beside = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.025, 0.0, 0.0))
-    # that all images are off by as much and look nearly the same way hides most of it
-    found = verdict(with_depth(corner, lambda view: {"image_from_depth": beside}))
-    assert found.median.squared_distance > 2.0 * exact.median.squared_distance
-
-
-@SLOW
-@pytest.mark.parametrize(("scale", "off_deg"), [(0.1, 0.0), (0.1, 0.5), (12.0, 0.0), (12.0, 0.5)])
+@pytest.mark.parametrize(("scale", "off_deg"), [(0.1, 0.0), (12.0, 0.5)])
 def test_neither_unit_nor_frame_matters(
     corner: Map, verdict: Verdict, scale: float, off_deg: float
 ) -> None:
@@ -231,14 +216,6 @@ def test_neither_unit_nor_frame_matters(
     moved = posed(corner, change)
     other = with_depth(moved, lambda view: {"depth_m": np.float32(scale) * view.depth_m})
     assert verdict(other).consistent == (off_deg == 0.0)
-
-
-@SLOW
-def test_the_size_of_images_does_not_matter(verdict: Verdict) -> None:
-    large = drawn(Camera("PINHOLE", 720, 540, tuple(3.0 * x for x in CAMERA.params)))
-    assert verdict(large).consistent
-    noisy = posed(large, lambda k, each: displaced(each, k, 0.02, 0.5))
-    assert "contradicts itself" in verdict(noisy).reason
 
 
 @SLOW

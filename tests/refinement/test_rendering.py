@@ -33,8 +33,6 @@ from megloc_kapture.values import Camera, RigidTransform
 
 OPTIONS = SyntheticWorldOptions(num_places=1, day_queries=2, night_queries=1)
 HERE = RigidTransform.identity()
-CAMERA = Camera("OPENCV", 640, 480, (500.0, 505.0, 322.0, 239.0, -0.05, 0.01, 1e-3, 0.0))
-TURNED = RigidTransform((0.8, 0.6, 0.0, 0.0), (1.0, -2.0, 0.5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +136,7 @@ def occluded(image: NDArray[np.uint8], seed: int) -> tuple[NDArray[np.uint8], ND
     return np.where(free[..., None], image, cloth), free
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_gain_colour_and_noise_of_the_night_do_not_matter(case: Case, seed: int) -> None:
     start = start_from(case.truth, seed)
     refined = run(case, start)
@@ -177,25 +175,23 @@ def test_the_truth_stays(case: Case) -> None:
         assert refined.measures["cost_after"] < refined.measures["cost_before"]
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_good_start_becomes_better(case: Case, seed: int) -> None:
-    refined = run(case, start_from(case.truth, seed, m=0.01, deg=0.1))
+def test_a_good_start_becomes_better(case: Case) -> None:
+    refined = run(case, start_from(case.truth, 0, m=0.01, deg=0.1))
     assert_found(refined, case.truth, 0.008, 0.08)
     assert refined.measures["significance"] >= RenderingOptions().min_significance
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_good_start_behind_a_moving_object_never_becomes_worse(case: Case, seed: int) -> None:
-    start = start_from(case.truth, seed, m=0.01, deg=0.1)
-    image, _ = occluded(case.query.image, seed)
+def test_a_good_start_behind_a_moving_object_never_becomes_worse(case: Case) -> None:
+    start = start_from(case.truth, 0, m=0.01, deg=0.1)
+    image, _ = occluded(case.query.image, 0)
     hidden = showing(case, image)
     refined = run(hidden, start)
     # it may stay; with no rule to keep it, it is better
     free = run(hidden, start, min_significance=0.0)
     assert refined.cam_from_world in (start, free.cam_from_world)
     assert_found(free, case.truth, 0.008, 0.08)
-    if seed == 0:  # and from farther away
-        assert_found(run(hidden, start_from(case.truth, 1)), case.truth, 0.02, 0.15)
+    # and from farther away
+    assert_found(run(hidden, start_from(case.truth, 1)), case.truth, 0.02, 0.15)
 
 
 def test_a_search_that_leads_astray_does_not_spoil_a_good_start(
@@ -236,15 +232,15 @@ def test_what_a_references_mask_hides_changes_nothing(case: Case) -> None:
     assert found[0].cam_from_world == found[1].cam_from_world
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_hopeless_start_keeps_its_pose(case: Case, seed: int) -> None:
-    start = start_from(case.truth, seed, m=1.5, deg=25.0)
+def test_a_hopeless_start_keeps_its_pose(case: Case) -> None:
+    start = start_from(case.truth, 0, m=1.5, deg=25.0)
     refined = run(case, start, min_overlap=0.0)
     assert not refined.accepted and refined.reason
     assert refined.cam_from_world is start and refined.covariance is None
 
 
 def test_each_bound_keeps_the_old_pose(case: Case) -> None:
+    case = replace(case, references=case.references[:2])
     start = start_from(case.truth, 0)
     for options, reason in (
         ({"max_translation_m": 0.05}, "would move"),

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import fourier_gaussian, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from megloc_kapture.values import Camera, RigidTransform
@@ -43,7 +43,8 @@ def _texture(seed: int) -> NDArray[np.float64]:
     image = np.zeros((_TEXTURE_PX, _TEXTURE_PX, 3))
     for sigma, strength in ((3.0, 1.0), (8.0, 1.2), (24.0, 1.5)):
         noise = rng.normal(size=(_TEXTURE_PX, _TEXTURE_PX, 3))
-        layer = gaussian_filter(noise, (sigma, sigma, 0), mode="wrap")
+        spectrum = fourier_gaussian(np.fft.fft2(noise, axes=(0, 1)), (sigma, sigma, 0))
+        layer = np.fft.ifft2(spectrum, axes=(0, 1)).real
         image += strength * layer / layer.std()
     return np.clip(0.5 + 0.1 * image, 0.02, 0.98)
 

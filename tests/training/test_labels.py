@@ -40,8 +40,8 @@ def corner_view(pose: RigidTransform) -> PosedView:
 def twin() -> tuple[PosedView, PosedView]:
     """Two images of a rendered square, with cars and people that moved; the second is distorted."""
     options = SyntheticWorldOptions(
-        seed=11, num_places=1, stations_per_place=3, day_queries=4, night_queries=0, width=320,
-        height=240, supersampling=1,
+        seed=11, num_places=1, stations_per_place=3, day_queries=2, night_queries=0, width=240,
+        height=180, supersampling=1,
     )  # fmt: skip
     world = build_world(options)
     renderer = PlaceRenderer(world.places[0], seed=11, supersampling=1)

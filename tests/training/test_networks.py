@@ -91,7 +91,7 @@ def test_a_new_superglue_matches_as_its_descriptors_do() -> None:
 def test_what_is_trained_is_read_as_descriptor_weights(
     files: dict[str, str], tmp_path: Path
 ) -> None:
-    image = texture(96, 128)
+    image = texture(64, 96)
     for extractor in extractors(files):
         before = extractor.extract(image)
         describer = describer_of(extractor)
@@ -165,16 +165,16 @@ def test_products_match_as_nearest_neighbours() -> None:
 
 
 def test_deep_supervision_is_the_mean_over_cross_attention(files: dict[str, str]) -> None:
-    extractor = extractors(files)[0]
+    extractor = extractors(files)[1]
     images = texture(96, 128), texture(96, 128, 1)
     labels = Labels(np.arange(10), np.arange(10))
     pair = FrozenFeatures(extractor, 10).prepare(TrainingPair(images, None, lambda a, b: labels))
     torch.manual_seed(0)
-    head = SuperGlueNet(encoder_sizes(256), num_layers=6).eval()
+    head = SuperGlueNet(encoder_sizes(64), num_layers=6).eval()
     deep = PairModel(head, None, iterations=10, deep_supervision=True).eval()
     losses = []
     for layers in (2, 4, 6):
-        shallow = SuperGlueNet(encoder_sizes(256), num_layers=layers).eval()
+        shallow = SuperGlueNet(encoder_sizes(64), num_layers=layers).eval()
         kept = {k: v for k, v in head.state_dict().items() if k in shallow.state_dict()}
         shallow.load_state_dict(kept)
         losses.append(PairModel(shallow, None, iterations=10).eval()([pair]))
@@ -246,7 +246,8 @@ def test_gradients_through_superglue_reach_its_inputs() -> None:
         return sum(transport_loss(depth[0], LABELS) for depth in depths)  # type: ignore[return-value]
 
     inputs = (a.descriptors.requires_grad_(), b.descriptors.requires_grad_(), net.bin_score.data)
-    assert torch.autograd.gradcheck(loss, inputs, eps=1e-6, atol=1e-5)
+    # along a random direction of each
+    assert torch.autograd.gradcheck(loss, inputs, eps=1e-6, atol=1e-5, fast_mode=True)
 
 
 def test_matches_are_judged_by_labels_of_both_images() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -61,16 +61,9 @@ def small() -> dict[str, SyntheticDataset[Any]]:
 
 
 @pytest.fixture(scope="session")
-def rendered(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+def rendered(written_once: Callable[..., Path]) -> Callable[[str], Path]:
     """Folder of the small dataset in a layout; not to be written into."""
-
-    @cache
-    def written(name: str) -> Path:
-        root = tmp_path_factory.mktemp(name) / "root"
-        SMALL[name].write(root)
-        return root
-
-    return written
+    return lambda name: written_once(f"rendered_{name}", SMALL[name].write)
 
 
 @pytest.fixture(scope="module")

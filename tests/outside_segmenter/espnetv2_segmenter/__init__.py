@@ -1,1 +1,0 @@
-"""ESPNetv2, trained on Cityscapes, for who segments without a large network."""
