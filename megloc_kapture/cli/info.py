@@ -56,14 +56,14 @@ _QUANTILES = (0.1, 0.5, 0.9)
 
 @dataclass(frozen=True, kw_only=True)
 class Info(Reading, Common):
-    """Say what is in a kapture folder, and what a map allows."""
+    """Describe a kapture folder, and how it can be used as a map."""
 
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="KAPTURE")]
     """Kapture folder, or a COLMAP model."""
     keypoints_type: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Keypoints type to look at; may be repeated; all that have points unless given."""
+    """Keypoints type; may be repeated; default: all types with points."""
     pixel_origin: PixelOriginChoice = "auto"
-    """Where the map's intrinsics put the pixel origin; auto finds it out."""
+    """Pixel origin of the map's intrinsics; auto detects it."""
     deep: bool = False
     """Read every file, images included."""
 
@@ -209,11 +209,11 @@ class OptionsCommand(Common):
     """List the options that --set takes, with value, type and meaning."""
 
     key: tyro.conf.Positional[str] = ""
-    """Those of a step (localization.pose), one of them, or those of a plugin (aliked)."""
+    """Options of a step (localization.pose), a single option, or options of a plugin (aliked)."""
     preset: str = DEFAULT_PRESET
     """Show the values of this preset."""
     basic: bool = False
-    """Only the ten options that people change."""
+    """Only the ten options that are changed most often."""
 
     def run(self, console: Console) -> None:
         every = list(options_of(options_of_preset(self.preset)))

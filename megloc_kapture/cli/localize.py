@@ -60,29 +60,28 @@ class Localize(Reading, Deciding, Common):
     input: Input
     """Kapture map: keypoints, points3d and observations; or a COLMAP model. Read only."""
     query: Path | None = None
-    """Kapture folder with the queries, and their features where the map's cannot be extracted."""
+    """Kapture folder with the queries, and with their features if the map's type cannot be
+    extracted."""
     images: tuple[Path, ...] = ()
-    """Instead of --query: photographs and videos, or folders of them. Their focal lengths are taken
-    from EXIF or guessed, and estimated with the poses."""
+    """Instead of --query: photographs, videos, or folders of them. Focal lengths come from EXIF or
+    a guess and are estimated with the poses."""
     camera: str | None = None
-    """Camera of all --images, whose pixels are then taken as they are stored:
-    MODEL,WIDTH,HEIGHT,PARAMETERS as COLMAP has them; or a file with a camera for each image, rows
-    of NAME MODEL WIDTH HEIGHT PARAMETERS."""
+    """Camera of all --images, which are then not rotated by EXIF: MODEL,WIDTH,HEIGHT,PARAMETERS as
+    in COLMAP; or a file with a row NAME MODEL WIDTH HEIGHT PARAMETERS per image."""
     every: int | None = None
-    """Of videos among --images every so many frames one is taken; 30 unless given."""
+    """Use every N-th frame of the videos among --images; default: 30."""
     output: Output = Path("localized")
     """Kapture folder with the queries' poses, and status.csv."""
     pairs: Path | None = None
-    """Candidates of each query, instead of retrieval."""
+    """Pairs file with the candidates of each query, instead of retrieval."""
     keypoints_type: Texts = ()
-    """Keypoints type to localize with; may be repeated; all that have points unless given."""
+    """Keypoints type to localize with; may be repeated; default: all types with points."""
     pixel_origin: PixelOriginChoice = "auto"
-    """Where the map's intrinsics put the pixel origin; auto finds it out."""
+    """Pixel origin of the map's intrinsics; auto detects it."""
     workers: int | None = None
-    """Number of threads; all cores unless given."""
+    """Number of threads; default: all cores."""
     force: Overwrite = False
-    """Write into a folder that has other things in it, and localize in a map that contradicts
-    itself."""
+    """Write into a non-empty folder, and localize in an inconsistent map."""
 
     def run(self, console: Console) -> None:
         self._check_queries()
@@ -145,30 +144,30 @@ class Localize(Reading, Deciding, Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Serve(Reading, Deciding, Common):
-    """Localize images that come by HTTP in a kapture map; with a page for photographs."""
+    """Localize images sent over HTTP in a kapture map; has a page for photographs."""
 
     map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
     """Kapture map: keypoints, points3d and observations; or a COLMAP model. Read only."""
     host: str = "127.0.0.1"
-    """Address to listen at; any other than this machine's own needs --token-file."""
+    """Address to listen on; any other than loopback needs --token-file."""
     port: int = 8000
-    """Port to listen at; 0: a free one."""
+    """Port to listen on; 0: any free port."""
     token_file: Path | None = None
-    """File with a token that clients have to send, 16 characters or more."""
+    """File with the token that clients must send, at least 16 characters."""
     threads: int | None = None
-    """Images that are localized at once; all cores unless given."""
+    """Number of images localized in parallel; default: all cores."""
     max_waiting: int = _LIMITS.max_waiting
-    """Images that may wait for a thread; more are refused (503)."""
+    """Number of images that may wait; more are refused (503)."""
     max_mb: float = _LIMITS.max_mb
-    """Size of a request."""
+    """Largest request, megabytes."""
     max_megapixels: float = _LIMITS.max_megapixels
-    """Size of an image."""
+    """Largest image, megapixels."""
     keypoints_type: Texts = ()
-    """Keypoints type to localize with; may be repeated; all that have points unless given."""
+    """Keypoints type to localize with; may be repeated; default: all types with points."""
     pixel_origin: PixelOriginChoice = "auto"
-    """Where the map's intrinsics put the pixel origin; auto finds it out."""
+    """Pixel origin of the map's intrinsics; auto detects it."""
     force: Overwrite = False
-    """Localize in a map that contradicts itself."""
+    """Localize in an inconsistent map."""
 
     def run(self, console: Console) -> None:
         from megloc_kapture.service.server import bind, prepared_localizer, serve

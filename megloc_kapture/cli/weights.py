@@ -50,7 +50,7 @@ class LicenceError(MeglocError):
 
 @dataclass(frozen=True, kw_only=True)
 class List(Common):
-    """List all networks: file, size, licence, whether it is there and its sha256 known."""
+    """List all networks with file, size, licence and state."""
 
     def run(self, console: Console) -> None:
         rows: list[tuple[str, ...]] = [
@@ -69,16 +69,16 @@ class List(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Fetch(Common):
-    """Download weights from where they are published, check them, and keep them."""
+    """Download published weights, check them, and keep them."""
 
     names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME...]")] = ()
-    """Networks, by their names in the list."""
+    """Names of networks, as listed."""
     preset: str | None = None
-    """All that a preset needs and has not."""
+    """All missing weights of this preset."""
     accept_licence: bool = False
     """Agree to a licence that does not plainly allow commercial use."""
     force: Overwrite = False
-    """Replace a different file that stands in its place."""
+    """Replace an existing, different file."""
 
     def run(self, console: Console) -> None:
         names = self.names
@@ -131,16 +131,16 @@ class Fetch(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Add(Common):
-    """Copy a file that was downloaded by hand into the folder of weights, once it is proven."""
+    """Check a downloaded file and copy it into the folder of weights."""
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """Downloaded file, or X.safetensors that scripts/convert_weights.py has written."""
     name: str | None = None
-    """Network that it is for; told by its sha256 or its name unless given."""
+    """Network of the file; default: recognised by sha256 or file name."""
     unverified: bool = False
-    """Take a file that is not the published one, such as one you trained."""
+    """Accept a file that is not the published one, such as one that you trained."""
     force: Overwrite = False
-    """Replace a different file that stands in its place."""
+    """Replace an existing, different file."""
 
     def run(self, console: Console) -> None:
         added = add_weights(self.file, name=self.name, force=self.force, unverified=self.unverified)
@@ -149,14 +149,14 @@ class Add(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Convert(Common):
-    """Write the tensors of a checkpoint of torch as safetensors."""
+    """Convert a torch checkpoint to safetensors."""
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
-    """Checkpoint of torch; scripts/convert_weights.py converts other files."""
+    """torch checkpoint; scripts/convert_weights.py converts other files."""
     output: Output
     """File to write; must end in .safetensors."""
     force: Overwrite = False
-    """Replace a file that stands there."""
+    """Overwrite an existing file."""
 
     def run(self, console: Console) -> None:
         count = convert_weights(self.file, self.output, force=self.force)
@@ -165,10 +165,10 @@ class Convert(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Check(Common):
-    """Check the files that are there: sha256 where it is known, and that they load safely."""
+    """Check the existing files: sha256 if known, and safe loading."""
 
     names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME...]")] = ()
-    """Networks, by their names in the list; all whose files are there unless given."""
+    """Names of networks, as listed; default: all with a file."""
 
     def run(self, console: Console) -> int:
         """Return 2 if a file is wrong."""
