@@ -118,7 +118,7 @@ def refuse_given(of: str, **flags: object) -> None:
     """Raise OptionError if a flag of another mode is given."""
     for name, value in flags.items():
         if value is not None:
-            raise OptionError(f"--{name.replace('_', '-')} changes nothing: it is of {of}")
+            raise OptionError(f"--{name.replace('_', '-')} has no effect here: it belongs to {of}")
 
 
 def opened_map(path: Path, console: Console, *, force: bool = False) -> Path:

@@ -117,7 +117,7 @@ class Import(Common):
             console.say(f"{what}: {found or 'none'}")
         console.counts(counts)
         if self.unit == NO_METRES:
-            console.say("unit: units of the map, whose scale is not known; --unit m if in metres")
+            console.say("unit: units of the map, of unknown scale; --unit m if in metres")
 
     def _import_megadepth(self, console: Console) -> None:
         options = options_with(MegaDepthOptions, self.set)

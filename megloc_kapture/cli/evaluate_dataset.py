@@ -120,9 +120,9 @@ class Eval(Deciding, Working):
             doubtful = done["submission"].counts.get("doubtful", 0)
             if doubtful and run.source.adapter is not None:  # only challenges have a server
                 console.say(
-                    f"{doubtful:,} queries that the pose file lacks had a pose of too little "
-                    "confidence; a server counts a missing pose as a wrong one: --set "
-                    "localization.min_confidence=0 hands in every pose"
+                    f"{doubtful:,} poses had too little confidence for the pose file; a server "
+                    "counts a missing pose as wrong: --set localization.min_confidence=0 keeps "
+                    "every pose"
                 )
         report = workspace.path(EVALUATION) / REPORT_HTML
         if "evaluation" in done and report.is_file():
@@ -144,7 +144,7 @@ class Eval(Deciding, Working):
             kept = keep_submission(pose_file, submissions)
             if kept.name != pose_file.name:
                 console.say(
-                    f"{shown(submissions / pose_file.name)} is of another result and stays as it is"
+                    f"{shown(submissions / pose_file.name)} belongs to another result and is kept"
                 )
             pose_file = kept
         console.result(f"pose file  {shown(pose_file)}")

@@ -88,7 +88,7 @@ class Info(Reading, Common):
         except MeglocError as error:
             line(console, "localizing", f"not possible: {error}")
             return
-        unknown = "units of the map: its scale is not known"
+        unknown = "units of the map, of unknown scale"
         line(console, "unit", "metres" if opened.unit == METRES else unknown)
         if fault := opened.fault():
             line(console, "FAULT", fault)
@@ -118,7 +118,7 @@ def describe_content(console: Console, folder: KaptureFolder) -> None:
         joined = len(depth_records(data))
         told = f"{len(data.records_depth)}, of {joined} images"
         # depth sensors in the camera's rig
-        told += "" if joined else ": no rig joins their sensor to a camera, and they are not used"
+        told += "" if joined else ": ignored, as no rig links their sensor to a camera"
         line(console, "depth maps", told)
     for kind in ("keypoints", "descriptors", "global_features"):
         for name in folder.types(kind):
@@ -179,9 +179,9 @@ def describe_descriptors(
     if keypoints.has_descriptors(opened.images):
         return "there"
     if extractor is None:
-        return "missing, and no extractor for the type is installed: localizing is not possible"
+        return "missing, and no extractor for the type is installed: localization is not possible"
     if not opened.has_images():
-        return "missing, and no images to extract them from: localizing is not possible"
+        return "missing, and no images to extract them from: localization is not possible"
     return f"missing; will be extracted again by plugin {extractor.name}"
 
 

@@ -116,9 +116,9 @@ class Localize(Reading, Deciding, Common):
         remarks = Counter(remark for _, result in named for remark in result.remarks)
         focal = {remark for remark in remarks if "focal length" in remark}
         for remark in sorted(remarks.keys() - focal):
-            console.say(f"left out of {remarks[remark]} queries: {remark}")
+            console.say(f"skipped for {remarks[remark]} queries: {remark}")
         if kapture_map.unit != METRES:
-            console.say("positions are in units of the map, whose scale is not known")
+            console.say("positions are in units of the map, of unknown scale")
         if misfits := misfits_text(("; ".join(r.remarks) for _, r in named), STATUS_FILE):
             console.say(misfits)
         console.result(
@@ -134,12 +134,12 @@ class Localize(Reading, Deciding, Common):
             raise OptionError("give the queries: either --query, a kapture folder, or --images")
         if self.query is not None and self.query.is_file():
             raise OptionError(
-                f"--query {self.query}: takes a kapture folder; a list of cameras goes to "
+                f"--query {self.query}: not a kapture folder; a list of cameras goes to "
                 "--camera, the images to --images"
             )
         for path in self.images:
             if is_kapture(path):
-                raise OptionError(f"--images {path}: a kapture folder; give it by --query")
+                raise OptionError(f"--images {path}: a kapture folder; use --query")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,7 +175,9 @@ class Serve(Reading, Deciding, Common):
         limits = self._limits()
         token = None if self.token_file is None else _read_token(self.token_file)
         if token is None and self.host not in _LOOPBACK:
-            raise OptionError(f"--host {self.host}: other machines can ask; give --token-file")
+            raise OptionError(
+                f"--host {self.host}: reachable from other machines; give --token-file"
+            )
         options = _options_of(self)
         with bind(self.host, self.port) as bound:
             path = opened_map(self.map, console, force=self.force)
@@ -217,9 +219,7 @@ def _options_of(command: Deciding) -> PipelineOptions:
 def _check_consistent(kapture_map: KaptureMap, path: Path, *, force: bool) -> None:
     """Raise DataError for an inconsistent map, unless forced."""
     if not force and (fault := kapture_map.fault()):
-        raise DataError(
-            f"{fault}; the poses would be wrong (--force localizes all the same)", path=path
-        )
+        raise DataError(f"{fault}; the poses would be wrong (--force localizes anyway)", path=path)
 
 
 def _names(types: Sequence[LocalType]) -> str:

@@ -56,7 +56,7 @@ from megloc_kapture.stages.preprocessing import (
 PREPROCESSED, FEATURES, MAP = "preprocessed", "features", "map"
 _SOURCES = {
     "own": "masks of the kapture",
-    "user": "masks brought along",
+    "user": "user masks",
     "fixed": "fixed masks",
     "unchanging": "unchanging regions",
     "classes": "dynamic classes",
@@ -132,7 +132,8 @@ class ExtractLocal(Linked, StageCommand):
                     )
                 if "images_reduced" in counts:
                     told.append(
-                        f"{counts['images_reduced']} images were reduced meanwhile (max_megapixels)"
+                        f"{counts['images_reduced']} images were reduced for extraction "
+                        "(max_megapixels)"
                     )
                 console.say(f"{extractor.name}: {'; '.join(told)}")
 
@@ -237,7 +238,7 @@ class OutsideStage(Working):
     def run(self, console: Console) -> None:
         stage = load_plugin(STAGES, self.stage, assigned(self.set))
         if not (self.workspace / "stages").is_dir():
-            raise OptionError(f"{self.workspace} is no workspace of megloc eval")
+            raise OptionError(f"{self.workspace} is not a workspace of megloc eval")
         workspace = Workspace(self.workspace)
         with self.working_in(workspace) as work:
             run_plan([stage], workspace, work, say=console.say)

@@ -191,7 +191,7 @@ class Render(Linked, Working):
         from megloc_kapture.stages.neural_field import render_along, views_between
 
         if sum(each is not None for each in (self.pose, self.along, self.between)) != 1:
-            raise OptionError("say what to render: --pose and --camera, --along or --between")
+            raise OptionError("nothing to render: give --pose and --camera, --along or --between")
         many = self.along or self.between
         if many is None:
             others = {"workers": self.workers, "scheduler": self.scheduler}
@@ -226,7 +226,7 @@ class Render(Linked, Working):
         from megloc_kapture.stages.neural_field import open_field
 
         if self.pose is None or self.camera is None:
-            raise OptionError("--pose needs the --camera that looks")
+            raise OptionError("--pose needs the --camera")
         pose, camera = _pose_of_text(self.pose), camera_of_text(self.camera)
         endings: list[tuple[Path, tuple[str, ...]]] = [(self.output, WRITABLE_SUFFIXES)]
         if self.depth is not None:
@@ -235,7 +235,7 @@ class Render(Linked, Working):
             if path.suffix.lower() not in known:
                 raise OptionError(f"{path}: the file must end in {' or '.join(known)}")
             if path.exists() and not self.force:
-                raise OutputError(f"{path}: stands there; -f replaces it")
+                raise OutputError(f"{path}: exists; -f overwrites it")
         with single_threaded():
             field = open_field(self.field)
             light = None if self.appearance is None else field.appearance_of(self.appearance)

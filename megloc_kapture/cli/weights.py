@@ -54,7 +54,7 @@ class List(Common):
 
     def run(self, console: Console) -> None:
         rows: list[tuple[str, ...]] = [
-            ("name", "what for", "file", "size", "licence", "state", "sha256")
+            ("name", "use", "file", "size", "licence", "state", "sha256")
         ]
         rows += [_row(weights) for weights in registry().values()]
         for line in _aligned(rows):
@@ -105,10 +105,10 @@ class Fetch(Common):
         place = weights_folder() / file.name
         if place.is_file() and not self.force:
             if file.sha256 in (None, sha256_of(describe(weights.name, place))):
-                console.result(f"{weights.name}: already there, {place}")
+                console.result(f"{weights.name}: already present, {place}")
                 _say_to_convert(console, weights, file, place)
                 return
-            raise OutputError(f"{place}: stands there, but is not the published file; -f fetches")
+            raise OutputError(f"{place}: exists, but is not the published file; -f replaces it")
 
         console.say(f"{weights.name}: {url}")
         console.say(f"  licence: {weights.licence}: {weights.terms}")
@@ -256,13 +256,13 @@ def _fetchable(weights: Weights, accepted: bool) -> tuple[Weights, PublishedFile
     file = weights.to_fetch
     if file is None or file.url is None:
         raise MissingWeightsError(
-            f"{weights.name} cannot be fetched by a program: download it from {weights.page} and "
-            "run: megloc weights add FILE"
+            f"{weights.name} cannot be downloaded automatically: download it from {weights.page} "
+            "and run: megloc weights add FILE"
         )
     if not (weights.commercial or accepted):
         raise LicenceError(
-            f"{weights.name} has a licence to agree to: {weights.licence}: {weights.terms} "
-            f"(whole text at {weights.page}); if you do, add --accept-licence"
+            f"{weights.name} needs your consent to its licence: {weights.licence}: {weights.terms} "
+            f"(whole text at {weights.page}); to agree, add --accept-licence"
         )
     return weights, file, file.url
 
@@ -361,12 +361,12 @@ def find_problems() -> list[str]:
     torch, vision = installed_version("torch"), installed_version("torchvision")
     if vision and torch and "+cpu" in torch:
         problems.append(
-            f"torchvision {vision} beside torch {torch}: its CPU builds fail to import and break "
+            f"torchvision {vision} with torch {torch}: its CPU builds fail to import and break "
             "transformers too; pip uninstall torchvision"
         )
     if installed_version("opencv-python") and installed_version("opencv-python-headless"):
         problems.append(
-            "opencv-python beside opencv-python-headless: both write the folder cv2; uninstall "
+            "opencv-python and opencv-python-headless both write the folder cv2; uninstall "
             "both and install opencv-python-headless"
         )
     if importlib.util.find_spec("cv2") is None:

@@ -41,7 +41,7 @@ _IDENTITY = RigidTransform.identity()
 class MegaDepthOptions(Options):
     """Options of importing MegaDepth."""
 
-    scenes: tuple[str, ...] = Field(default=(), description="by their numbers; none: all there are")
+    scenes: tuple[str, ...] = Field(default=(), description="scene numbers; none: all")
 
 
 @dataclass(frozen=True)

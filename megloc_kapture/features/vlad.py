@@ -37,31 +37,39 @@ _LEAST = 1e-9
 class VladOptions(Options):
     num_clusters: int = Field(default=128, gt=0, description="of each vocabulary")
     vocabularies: int = Field(
-        default=1, gt=0, description="trained with different seeds, their vectors side by side"
+        default=1,
+        gt=0,
+        description="number of vocabularies with different seeds, whose vectors are concatenated",
     )
     dimensions: int | None = Field(
         default=None,
         gt=0,
-        description="PCA whitening learnt on the map, to at most this many and fewer than it has "
-        "images; none without",
+        description="dimensions after PCA whitening learnt on the map, fewer than its images; "
+        "none: no whitening",
     )
     whitening_power: float = Field(
         default=0.5,
         ge=0,
         le=1,
-        description="of the deviations that whitening divides by; 1 as in Jegou and Chum, 0.5 as "
-        "in AP-GeM",
+        description="power of the deviations that whitening divides by; 1 as in Jegou and Chum, "
+        "0.5 as in AP-GeM",
     )
     assignment: Literal["hard", "soft"] = "hard"
     alpha: float = Field(
         default=30.0, gt=0, description="sharpness of soft assignment, for unit descriptors"
     )
-    intra_normalization: bool = Field(default=True, description="unit length per cluster")
-    power: float = Field(default=1.0, gt=0, le=1, description="signed power law, 0.5 is usual")
-    training_descriptors: int = Field(
-        default=200_000, gt=0, description="sampled evenly over the map's images"
+    intra_normalization: bool = Field(default=True, description="normalise each cluster's vector")
+    power: float = Field(
+        default=1.0, gt=0, le=1, description="exponent of the signed power law; 0.5 is usual"
     )
-    iterations: int = Field(default=20, gt=0, description="of Lloyd's algorithm, at most")
+    training_descriptors: int = Field(
+        default=200_000,
+        gt=0,
+        description="number of descriptors, sampled evenly over the map's images",
+    )
+    iterations: int = Field(
+        default=20, gt=0, description="largest number of iterations of Lloyd's algorithm"
+    )
     seed: int = Field(default=0, ge=0)
 
 

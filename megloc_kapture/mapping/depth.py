@@ -155,12 +155,12 @@ class DepthVerificationOptions(Options):
     max_sigmas: float | None = Field(
         default=3.0,
         gt=0,
-        description="distance from the sensor's depth, in standard deviations, beyond which an "
-        "observation is dropped; none: depth maps are not looked at",
+        description="largest difference from the sensor's depth, in standard deviations; "
+        "observations beyond it are dropped; none: ignore depth maps",
     )
     noise: tuple[float, float, float] = Field(
         default=STRUCTURED_LIGHT,
-        description="a, b, c of the noise a + b z + c z^2 at depth z, in the map's unit",
+        description="a, b, c of the depth noise a + b z + c z^2 at depth z, in map units",
     )
 
     @field_validator("noise")

@@ -39,8 +39,8 @@ class FusionOptions(Options):
 
     method: FusionMethod = Field(
         default="ghm",
-        description="ghm: generalized harmonic mean; early: of concatenated vectors; "
-        "reciprocal_rank: of ranks",
+        description="fusion of similarities (mean; ghm: generalized harmonic mean), of "
+        "concatenated vectors (early), or of ranks (reciprocal_rank)",
     )
 
     def fuses_ranks(self) -> bool:

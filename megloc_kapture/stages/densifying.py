@@ -80,8 +80,8 @@ class DensifyOptions(Options):
 
     mode: Literal["off", "depth", "points"] = Field(
         default="off",
-        description="depth: depth maps beside map images that have none; points: keypoints without "
-        "a point get one of it as well",
+        description="depth: estimate depth of map images without it; points: also lift keypoints "
+        "without a point",
     )
     estimator: PluginChoice = Field(
         default=PluginChoice(name="sweep"), description="sweep, colmap or a plugin"
@@ -363,7 +363,7 @@ def _scratch(job: _Job, image: str, kind: str) -> Path:
 
 
 class Densify(PipelineStage):
-    """Estimate depth of the map's images that have none."""
+    """Estimate depth of map images without depth."""
 
     name = "densify"
     version = 4

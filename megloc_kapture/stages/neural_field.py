@@ -261,24 +261,24 @@ def render_along(
 
 
 class FieldRefinerOptions(Options):
-    field: str = Field(default="", description="folder that megloc train-field wrote")
-    device: Device = Field(default="auto", description="of the field: auto, cpu, cuda or cuda:N")
+    field: str = Field(default="", description="folder written by megloc train-field")
+    device: Device = Field(
+        default="auto", description="device of the field: auto, cpu, cuda or cuda:N"
+    )
     features: PluginChoice = Field(
-        default=PluginChoice(name="rootsift"), description="local features that are matched"
+        default=PluginChoice(name="rootsift"), description="local features to match"
     )
     matcher: PluginChoice = Field(
         default=PluginChoice(name="nn", options={"max_ratio": 0.9}),
-        description="of query and rendering",
+        description="matcher of query and rendering",
     )
     max_side_px: int = Field(
         default=320, ge=64, description="longer side of the rendering; larger queries are reduced"
     )
     max_translation_m: float = Field(
-        default=0.5, gt=0, description="a pose whose centre moves further is not accepted"
+        default=0.5, gt=0, description="largest accepted movement of the centre"
     )
-    max_rotation_deg: float = Field(
-        default=5.0, gt=0, description="a pose that turns further is not accepted"
-    )
+    max_rotation_deg: float = Field(default=5.0, gt=0, description="largest accepted rotation")
 
 
 class FieldRefiner:

@@ -216,7 +216,7 @@ def test_what_submit_refuses(megloc: Any, imported: Path, tmp_path: Path) -> Non
         "unknown dataset 'cambridge'; known: kapture"
     )
     megloc("submit", "aachen", "-i", result, "-o", place, "--from-rig").refused("rigs.txt")
-    megloc("submit", "aachen", "-i", result, "-o", tmp_path).refused("is not what is to be written")
+    megloc("submit", "aachen", "-i", result, "-o", tmp_path).refused("exists and is not a file")
     assert not place.exists()
     (tmp_path / "poses.txt.json").write_text("mine")
     megloc("submit", "aachen", "-i", result, "-o", place).refused("poses.txt.json exists; -f")

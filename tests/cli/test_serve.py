@@ -28,7 +28,7 @@ def nothing_is_served(monkeypatch: pytest.MonkeyPatch) -> None:
         (("--features-dir", "nowhere"), "nowhere: no such folder"),
         (("--max-mb", "0"), "--max-mb: it should be greater than 0"),
         (("--threads", "0"), "--threads: it should be greater than or equal to 1"),
-        (("--host", "0.0.0.0"), "--host 0.0.0.0: other machines can ask; give --token-file"),
+        (("--host", "0.0.0.0"), "--host 0.0.0.0: reachable from other machines; give --token-file"),
     ],
 )
 def test_what_cannot_be_served_is_refused(
