@@ -191,7 +191,7 @@ class Map:
         many: KaptureFolder | Photographs
         if isinstance(query, KaptureFolder):
             if camera is not None:
-                raise OptionError(f"{query.root}: a kapture folder has cameras of its own")
+                raise OptionError(f"{query.root}: a kapture folder has its own cameras")
             many = query
         elif isinstance(query, list | tuple):
             many = Photographs([Path(path) for path in query], camera)
@@ -202,7 +202,9 @@ class Map:
                 raise OptionError("workers: one image is localized by one thread")
             return localizer.localize_query(_query_of(query, camera, prior))
         if prior is not None:
-            raise OptionError("prior is of one image; a kapture dataset's stand in its tables")
+            raise OptionError(
+                "prior is for one image; a kapture dataset has its priors in its tables"
+            )
         return Results(localizer, many, workers=workers)
 
 

@@ -234,11 +234,11 @@ def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
     image = next((scene / "query").rglob("*.jpg"))
     with pytest.raises(megloc.OptionError, match="by one thread"):
         built.localize(image, workers=2)
-    with pytest.raises(megloc.OptionError, match="prior is of one image"):
+    with pytest.raises(megloc.OptionError, match="prior is for one image"):
         built.localize(scene / "query", prior=["0000.jpg"])
     with pytest.raises(megloc.DataError, match="no such image"):
         built.localize(tmp_path / "nowhere.jpg")
-    with pytest.raises(megloc.OptionError, match="has cameras of its own"):
+    with pytest.raises(megloc.OptionError, match="has its own cameras"):
         camera: Any = megloc.Camera.pinhole(64, 48, 50)
         built.localize(KaptureFolder(scene / "query"), camera)
     with pytest.raises(megloc.DataError, match="nowhere"):

@@ -129,7 +129,7 @@ def read_reference(folder: Path) -> Reference:
     )
     if mapping is None and query is None and not tables.is_dir():
         raise DataError(
-            "no imported dataset: it has none of mapping/, query/ and megloc/", path=folder
+            "no imported dataset: mapping/, query/ and megloc/ are missing", path=folder
         )
     rules = benchmark_of(tables)
     queries = frozenset() if query is None else frozenset(query.read().image_names())
@@ -250,7 +250,7 @@ def _read_rows(path: Path, kind: PoseFileFormat) -> _Rows:
             findings.append(Finding("error", kind, message, line=line))
 
         if fields[0].startswith("#"):
-            problem("comment", "a comment; the format has none, and no header")
+            problem("comment", "a comment; the format allows neither comments nor a header")
             continue
         if len(fields) != num_keys + 7:
             message = f"{_plural(len(fields), 'column')} instead of {num_keys + 7} ({columns})"

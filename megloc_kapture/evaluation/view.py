@@ -1,7 +1,7 @@
 """The 3D view of a map and of queries in it: one self-contained HTML page, drawn by WebGL2.
 
 Coordinates are float32 relative to an origin in full precision. A page that would be large shows a
-part of the data and says so.
+part of the data, with a note.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Scene:
     radius : of the visible content around the origin.
     frames : names of coordinate frames, shown one at a time; ``point_frames``, ``camera_frames``
         and ``query_frames`` are indices into them.
-    notes : sentences on what is left out.
+    notes : sentences about omissions.
     """
 
     title: str
@@ -118,7 +118,7 @@ def write_view(
 
     Another view at ``path`` is overwritten, other files only with ``force``. ``result`` and
     ``truth`` are as in :func:`megloc_kapture.evaluation.evaluate.evaluate`: queries are coloured by
-    their error, or by their confidence without truth. Returns sentences on what is left out.
+    their error, or by their confidence without truth. Returns sentences about omissions.
     """
     path = Path(path)
     _check_output(path, force=force)
@@ -194,7 +194,7 @@ def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = 
     quats, translations = stack_poses(spanning)
     centers = camera_centers(quats, translations)
     view = top_view(quats, centers)
-    # separately, so that ten cameras count beside a thousand points
+    # separately, so that ten cameras count next to a thousand points
     ends = [np.quantile(a, _SEEN_AT_FIRST, axis=0) for a in (centers, points[:, :3]) if len(a)]
     low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
     # few digits, so that JSON has exactly what was subtracted

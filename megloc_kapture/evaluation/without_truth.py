@@ -60,7 +60,7 @@ class WithoutTruth(Reported):
     """Results without true poses.
 
     ``statement`` names the owner of the true poses; ``thresholds`` and ``agreement`` are for each
-    pair of results, as is ``apart``: the differences of their poses, infinite where one has none.
+    pair of results, as is ``apart``: the differences of their poses, infinite if one is missing.
     """
 
     statement: str

@@ -22,7 +22,7 @@ from megloc_kapture.geometry.cameras import (
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
-# a point's pixel in a depth sensor beside the camera depends on its depth, so it is iterated;
+# a point's pixel in a depth sensor next to the camera depends on its depth, so it is iterated;
 # points that do not converge are behind an edge
 _ROUNDS = 6
 _SETTLED = 0.01

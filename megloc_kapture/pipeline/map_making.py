@@ -273,7 +273,7 @@ def describe_map(workspace: Path, photographs: Photographs) -> list[str]:
     if world.unit == NO_METRES:
         hint = "--scale gps would tell it" if len(photographs.gps()) >= MIN_IMAGES else ""
         hint = hint or "--scale IMAGE IMAGE METRES tells it"
-        lines.append(f"the map has no metres, but units of its own; {hint}")
+        lines.append(f"the map is in arbitrary units, not metres; {hint}")
     if world.geo_origin is not None:
         at = ", ".join(f"{value:.7g}" for value in world.geo_origin)
         lines.append(f"its axes are East, North and Up at {at}")

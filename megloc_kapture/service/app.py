@@ -287,7 +287,7 @@ def make_app(service: Service, overview: bytes) -> FastAPI:
     async def get_map() -> Response:
         return Response(overview, media_type="application/json")
 
-    @app.get("/health", summary="Whether the service runs")
+    @app.get("/health", summary="Report that the service is running")
     async def health() -> dict[str, str]:
         return {"status": "ok"}
 

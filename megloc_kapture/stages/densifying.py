@@ -97,7 +97,7 @@ class DensifyOptions(Options):
 
 @dataclass(frozen=True)
 class StereoFit:
-    """What stereo of a map can confirm, given the accuracy of its poses.
+    """Resolution and tolerance of stereo, given the accuracy of the poses.
 
     Attributes
     ----------
@@ -177,7 +177,7 @@ def densify_map(
 def _check(source: KaptureFolder, data: KaptureData) -> None:
     if not source.has_points():
         raise DataError(
-            "no map to densify: depth is looked for around its points (reconstruction/points3d.txt "
+            "no map to densify: the depth range comes from its points (reconstruction/points3d.txt "
             "and observations.txt); triangulate first",
             path=source.root,
         )
@@ -249,10 +249,10 @@ def _plan(
     for row, image in enumerate(images):
         blank = DepthRow(image, (), 0.0, 0.0, 0.0, "")
         if image in has_depth:
-            rows.append(replace(blank, reason="has depth of its own"))
+            rows.append(replace(blank, reason="already has depth"))
             continue
         if not source.image_path(image).is_file():
-            rows.append(replace(blank, reason="there is no image file"))
+            rows.append(replace(blank, reason="no image file"))
             continue
         found = depth_range(poses[image].apply(xyz[points_of[row]])[:, 2])
         chosen = choose_sources(

@@ -449,7 +449,7 @@ def _reject_uncertain(selection: MapSelection, max_robust_sigmas: float) -> None
 
 
 class RefineMap(PipelineStage):
-    """Take out of the map what its images or their depth contradict, and what is uncertain."""
+    """Remove map points that images or depth contradict, and uncertain ones."""
 
     name = "map"
     version = 3

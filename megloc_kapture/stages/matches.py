@@ -91,7 +91,7 @@ class Features(ImageFeatures):
 
 
 Verify = Callable[[Features, Features, NDArray[np.int64]], NDArray[np.bool_]]
-"""Which of the matches (K, 2) of two images, best first, are right, bool (K,)."""
+"""Select the right ones, bool (K,), of the matches (K, 2) of two images, best first."""
 
 
 _PairMatches = tuple[NDArray[np.int64], NDArray[np.float32]]

@@ -282,7 +282,7 @@ class FieldRefinerOptions(Options):
 
 
 class FieldRefiner:
-    """Plugin ``field``: the query is matched with what a neural field shows at its pose.
+    """Plugin ``field``: match the query with the field's rendering at its pose.
 
     Features of query and rendering are matched and lifted by rendered depth, and the pose is solved
     (as in GS-CPR, Liu et al., ICLR 2025). New renderings are aligned with the query, and the pose

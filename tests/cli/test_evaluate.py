@@ -200,7 +200,7 @@ def test_side_tables_of_elsewhere(megloc: Any, imported: Path, tmp_path: Path) -
     result = tmp_path / "elsewhere" / "result"
     shutil.copytree(imported / "localized", result, symlinks=True)
     command = ["submit", "aachen", "-i", result, "-o", tmp_path / "poses.txt"]
-    megloc(*command).refused("rules of aachen stand in the megloc/ folder", "--side-tables")
+    megloc(*command).refused("rules of aachen are in the megloc/ folder", "--side-tables")
     done = megloc(*command, "--side-tables", imported / "megloc")
     assert done.out.startswith("3 poses of 4 queries")
     megloc(*command, "--side-tables", tmp_path / "nowhere").refused("nowhere: no such folder")

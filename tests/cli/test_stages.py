@@ -217,7 +217,7 @@ def test_what_cannot_be_extracted_is_refused(megloc: Any, scene: Path, tmp_path:
     )
     command = ["extract-local", "-i", scene / "query", "-i", scene / "query"]
     done = megloc(*command, "-o", tmp_path / "features", "-q")
-    done.refused(r"image 0001\.jpg stands in two kapture folders at once")
+    done.refused(r"image 0001\.jpg is in two kapture folders")
     assert list(tmp_path.iterdir()) == []
 
 

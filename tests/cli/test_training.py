@@ -250,7 +250,7 @@ def test_what_is_refused(megloc: Any, mapping: Path, field: Path, tmp_path: Path
         ((pose, *camera, "--max-side", "9"), "--max-side has no effect"),
         ((pose, *camera, "--workers", "2"), "--workers has no effect"),
         ((pose, *camera, "--appearance", "me.jpg"), "not trained on an image 'me.jpg'"),
-        (("--along", mapping, *camera), "--camera changes"),
+        (("--along", mapping, *camera), "--camera has no effect"),
         (("--between", out / "none"), "none"),
         *(
             ((f"--pose={wrong}", *camera), "qw,qx,qy,qz,tx")

@@ -185,7 +185,7 @@ def test_images_that_have_depth_keep_it(densified: KaptureFolder, tmp_path: Path
     counts = densify_map(KaptureFolder(kept), tmp_path / "out", OPTIONS)
     assert counts["images_with_depth"] == 4
     rows = {row.image: row for row in read_depth_rows(tmp_path / "out" / DEPTH_FILE)}
-    assert rows[first].reason == "has depth of its own"
+    assert rows[first].reason == "already has depth"
     out = KaptureFolder(tmp_path / "out")
     found = depth_records(out.read())[first]
     assert found.path == "own.depth" and read_depth(out, found).any()
@@ -215,7 +215,7 @@ def test_an_image_without_a_file_has_a_reason(world: Any, tmp_path: Path) -> Non
     counts = densify_map(folder, tmp_path / "out", OPTIONS.model_copy(update={"mode": "depth"}))
     rows = {row.image: row for row in read_depth_rows(tmp_path / "out" / DEPTH_FILE)}
     assert counts["images_with_depth"] == 4 and counts["points_lifted"] == 0
-    assert rows["left/0.png"].reason == "there is no image file"
+    assert rows["left/0.png"].reason == "no image file"
     assert all("left/0.png" not in row.sources for row in rows.values())
 
 

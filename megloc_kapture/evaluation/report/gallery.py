@@ -1,4 +1,4 @@
-"""Pictures of a report: the worst queries beside map images, masks, and depth."""
+"""Pictures of a report: the worst queries next to map images, masks, and depth."""
 
 from __future__ import annotations
 
@@ -52,9 +52,10 @@ class Picture:
 def worst_pictures(
     queries: Sequence[ShownQuery], context: ResultContext, map_poses: Poses
 ) -> list[Picture]:
-    """Draw queries beside the candidate with most matches, else the map image nearest to the pose.
+    """Draw queries next to the candidate with most matches, else the nearest map image.
 
-    Images that are missing or broken are left out: a report without a picture is better than none.
+    Images that are missing or broken are left out: a report without a picture is better than no
+    report.
     """
     pictures = []
     readers = _open_matches(context)
@@ -172,7 +173,7 @@ def mask_pictures(folders: Sequence[KaptureFolder]) -> list[Picture]:
 
 
 def depth_pictures(mapping: KaptureFolder | None) -> list[Picture]:
-    """Draw a few map images beside their depth by stereo."""
+    """Draw a few map images next to their stereo depth."""
     import cv2
 
     from megloc_kapture.stages.scene import depth_records, read_depth

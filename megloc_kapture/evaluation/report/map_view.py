@@ -45,7 +45,7 @@ def top_view(quats_wxyz: NDArray[np.float64], centers: NDArray[np.float64]) -> T
             first, second = second, first
         return TopView(np.eye(3)[first], np.eye(3)[second], ("xyz"[first], "xyz"[second]))
     right = axes[0] - (axes[0] @ upward) * upward
-    if np.linalg.norm(right) < 1e-6:  # the cameras stand on one vertical line
+    if np.linalg.norm(right) < 1e-6:  # the cameras are on one vertical line
         right = np.eye(3)[int(np.argmin(np.abs(upward)))]
         right = right - (right @ upward) * upward
     right = _signed(right / np.linalg.norm(right))
