@@ -250,7 +250,7 @@ def _read_rows(path: Path, kind: PoseFileFormat) -> _Rows:
             findings.append(Finding("error", kind, message, line=line))
 
         if fields[0].startswith("#"):
-            problem("comment", "a comment; the format allows neither comments nor a header")
+            problem("comment", "a comment; the format has no comments and no header")
             continue
         if len(fields) != num_keys + 7:
             message = f"{_plural(len(fields), 'column')} instead of {num_keys + 7} ({columns})"
