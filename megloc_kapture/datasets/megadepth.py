@@ -65,7 +65,7 @@ def import_megadepth(
         images = list(_images(root, scene))
         written = _write_scene(output / scene, work.track(images, len(images), scene))
         if not written:
-            raise DataError(f"scene {scene} has no image that is there with its depth", path=root)
+            raise DataError(f"scene {scene} has no image with depth", path=root)
         counts["scenes"] += 1
         counts["images"] += written
         counts["without_depth"] += len(images) - written
@@ -104,7 +104,7 @@ def _images(root: Path, scene: str) -> Iterator[_Image]:
     elif table.is_file():
         yield from _of_table(root, scene, table)
     else:
-        raise DataError(f"neither {folder} nor {table} is there", path=root)
+        raise DataError(f"neither {folder} nor {table} exists", path=root)
 
 
 def _of_model(root: Path, scene: str, model: Path, folder: Path) -> Iterator[_Image]:

@@ -191,7 +191,7 @@ def localize_in_clusters(
     attempts = [attempt(clusters[at], frames[at] if frames else "") for at in tried]
     attempts = _join_agreeing(attempts, attempt, rank_of.__getitem__)
     if not attempts:
-        return Failure("no match is with a point of the map", seconds=clock.seconds), None
+        return Failure("no match has a map point", seconds=clock.seconds), None
     hypotheses = [each.hypothesis for each in attempts if each.hypothesis is not None]
     scores = iter(rank(hypotheses).tolist() if hypotheses else ())
     ranked = tuple(

@@ -78,7 +78,7 @@ class FixedMask(Options):
         if self.polygon is not None:
             return outside_polygon(np.array(self.polygon), width, height)
         if self.bottom_share is None:
-            raise ValueError("the mask is a file, it is not drawn")
+            raise ValueError("the mask is a file, not a shape")
         rows = (np.arange(height) + 0.5) / height < 1 - self.bottom_share
         return np.repeat(rows[:, None], width, axis=1)
 
@@ -183,9 +183,11 @@ def find_unchanging_region(sequence: Iterable[Float32]) -> UnchangingRegion:
     tops = _without_slivers(tops, height)
     nothing = (1.0,) * width
     if (tops == height).all():
-        return UnchangingRegion(nothing, "nothing stays the same at the bottom of its images")
+        return UnchangingRegion(nothing, "its images have no static region at the bottom")
     if 1 - tops.mean() / height > _MAX_AREA:
-        return UnchangingRegion(nothing, "nearly all of its images stays the same: it hardly moves")
+        return UnchangingRegion(
+            nothing, "nearly its whole image is static: the camera hardly moves"
+        )
     tops = np.where(tops < height, np.maximum(tops - _MARGIN_PX, 0), tops)
     return UnchangingRegion(tuple(float(top) for top in tops / height))
 

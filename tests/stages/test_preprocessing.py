@@ -328,7 +328,7 @@ def test_a_bonnet_is_found_with_the_maps_images(tmp_path: Path) -> None:
     new, report = run(drive("without", 11, 0, bonnet_px=0), tmp_path / "none", {"unchanging": True})
     assert report.images_masked == 0
     assert not (new.root / "sensors" / "masks").exists()
-    assert len(report.remarks) == 1 and "nothing stays the same" in report.remarks[0]
+    assert len(report.remarks) == 1 and "no static region" in report.remarks[0]
 
 
 def test_broken_inputs_are_named(street: KaptureFolder, tmp_path: Path) -> None:

@@ -95,7 +95,7 @@ class InLoc:
     def check(self, root: Path) -> None:
         layout = Layout.find(root)
         if not any((layout.cutouts / floor).is_dir() for floor in self.floors):
-            raise DataError(f"none of {', '.join(self.floors)} is there", path=layout.cutouts)
+            raise DataError(f"none of {', '.join(self.floors)} exists", path=layout.cutouts)
 
     def input_files(self, root: Path) -> Iterator[Path]:
         layout = Layout.find(root)
