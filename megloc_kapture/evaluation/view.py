@@ -132,7 +132,7 @@ def write_view(
         context = replace(context, cameras={**(cameras or {}), **context.cameras})
         title = evaluation.label or title
     elif truth is not None:
-        raise OptionError("a truth needs a result to be compared with")
+        raise OptionError("true poses need a result to compare with")
     scene = scene_of(title, StoredInliers(context), queries)
     if scene is None:
         raise DataError("no image has a pose, so there is nothing to see", path=folder.root)
@@ -159,7 +159,7 @@ def _check_output(path: Path, *, force: bool) -> None:
     with open(path, "rb") as file:
         is_view = _OURS in file.read(_HEAD_BYTES)
     if not is_view:
-        raise OutputError(f"{path}: exists and is no view; -f overwrites it")
+        raise OutputError(f"{path}: exists and is not a view; -f overwrites it")
 
 
 def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = ()) -> Scene | None:
@@ -203,14 +203,14 @@ def scene_of(title: str, stored: StoredInliers, queries: Sequence[ShownQuery] = 
     with_inliers = min(max(len(queries), 1), _MAX_QUERIES_WITH_INLIERS)
     most = min(_MAX_INLIERS // with_inliers, _MAX_INLIERS_OF_ONE)
     if stored.known and len(queries) > _MAX_QUERIES_WITH_INLIERS:
-        notes.append(f"Inliers are drawn of the worst {_MAX_QUERIES_WITH_INLIERS} queries.")
+        notes.append(f"Inliers are drawn for the worst {_MAX_QUERIES_WITH_INLIERS} queries.")
     inliers = [
         stored.of(query)[1] if query.num_inliers else np.zeros((0, 3))
         for query in queries[:_MAX_QUERIES_WITH_INLIERS]
     ]
     inliers += [np.zeros((0, 3))] * (len(queries) - len(inliers))
     if any(len(xyz) > most for xyz in inliers):
-        notes.append(f"Of a query's inliers at most {most} are drawn.")
+        notes.append(f"At most {most} inliers per query are drawn.")
     inliers = [xyz[spread(len(xyz), most)] for xyz in inliers]
     up = np.cross(view.right, view.up)
     colors = _colors(points, up, mapping, kept)
@@ -356,7 +356,7 @@ def _dense_points(
     images = stereo_images(mapping)
     names = list(images)
     if len(names) > _MAX_DENSE_IMAGES:
-        notes.append(f"Depth is shown of {_MAX_DENSE_IMAGES} of {len(names)} images.")
+        notes.append(f"Depth is shown for {_MAX_DENSE_IMAGES} of {len(names)} images.")
         names = [names[at] for at in spread(len(names), _MAX_DENSE_IMAGES)]
     # a view without depth is better than none
     with contextlib.suppress(DataError):

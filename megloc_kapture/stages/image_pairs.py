@@ -214,7 +214,7 @@ RETRIEVAL_OPTIONS = ("global_features", "fusion", *LOCAL_TYPES)
 
 
 class PairMapping(PipelineStage):
-    """Choose which map images are matched with each other."""
+    """Choose pairs of map images to match."""
 
     name = "mapping_pairs"
     version = 4
@@ -240,7 +240,7 @@ class PairMapping(PipelineStage):
 
 
 class PairQueries(PipelineStage):
-    """Choose the map images that each query is matched with."""
+    """Choose map images to match with each query."""
 
     version = 3
     uses = ("query_pairs", *RETRIEVAL_OPTIONS)
@@ -374,7 +374,7 @@ def _stored(
 
 
 class RerankQueries(PipelineStage):
-    """Keep of each query's candidates those that its local features say are right."""
+    """Keep each query's best candidates by local matches."""
 
     name = "query_pairs"
     version = 4

@@ -165,7 +165,9 @@ def views_between(data: KaptureData) -> KaptureData:
     near = PairsByPosesOptions(num_neighbours=_NEIGHBOURS, max_angle_deg=_MAX_ANGLE_DEG)
     pairs = pairs_by_poses([poses[name] for name in names], near).tolist()
     if not pairs:
-        raise DataError("no two cameras here look the same way: nothing is between them")
+        raise DataError(
+            "no two cameras have a similar viewing direction: there are no views between them"
+        )
     found = KaptureData()
     for number, (a, b) in enumerate(pairs):
         first, second = poses[names[a]], poses[names[b]]

@@ -84,8 +84,8 @@ class LocalizationOptions(Options):
         default=None,
         gt=0,
         le=1,
-        description="candidates are taken in turn, best first, and no more once the pose has "
-        f"{_SURE_INLIERS} inliers and is as likely to be right as this; none: all are taken",
+        description="match candidates in turn, best first, until the pose has "
+        f"{_SURE_INLIERS} inliers and this confidence; none: match all candidates",
     )
     rigs: bool = Field(default=False, description="localize all cameras of a rig jointly")
     fallback: Fallback = Field(

@@ -137,5 +137,5 @@ def test_what_cannot_be_done_is_said_in_a_line(
     megloc(*command, "--unchanging").refused("it has 4 images, and at least 10")
     assert not out.exists()
     inside = scene / "query" / "new"
-    megloc(*command[:4], inside).refused("lies in the kapture that is read")
+    megloc(*command[:4], inside).refused("is inside the input kapture folder")
     assert not inside.exists()

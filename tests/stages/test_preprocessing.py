@@ -143,7 +143,7 @@ def test_by_default_everything_is_linked_and_the_original_is_never_touched(
     new, _ = run(street, tmp_path / "new", max_size_px=160)
     assert image_size(new.image_path("front/0.png")) == (160, 96)
     for place in (street.root, street.root / "sensors"):
-        with pytest.raises(OutputError, match="lies in the kapture that is read"):
+        with pytest.raises(OutputError, match="is inside the input kapture folder"):
             run(street, place)
     assert contents(street.root) == before
 
