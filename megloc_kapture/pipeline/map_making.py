@@ -222,8 +222,8 @@ def structure_options(
         gps = photographs.gps()
         if len(gps) < MIN_IMAGES:
             raise DataError(
-                f"--scale gps: {len(gps)} photographs have a GPS position, at least {MIN_IMAGES} are "
-                "needed"
+                f"--scale gps: {len(gps)} photographs have a GPS position, at least {MIN_IMAGES} "
+                "are needed"
             )
     elif len(scale) == 3:
         try:
