@@ -87,7 +87,7 @@ def test_a_model_of_unknown_scale(megloc: Any, colmap_room: Path, tmp_path: Path
     ("arguments", "told"),
     [
         (("--scale", "0000.jpg", "0002.jpg"), "takes gps, or two photographs and the metres"),
-        (("--scale", "0000.jpg", "0002.jpg", "far"), "'far' is no distance in metres"),
+        (("--scale", "0000.jpg", "0002.jpg", "far"), "'far' is not a distance in metres"),
         (("--camera", "PINHOLE,1"), "not such a list"),
         (("--preset", "modrn"), "unknown preset"),
     ],

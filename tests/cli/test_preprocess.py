@@ -131,7 +131,7 @@ def test_what_cannot_be_done_is_said_in_a_line(
         ("--mask-file", f"{camera}={tmp_path}/x.png", r"x\.png: no such mask"),
         ("--user-masks", none, "none: no such folder of masks"),
         ("--sequence", none, "none: no such folder"),
-        ("--dynamic", "car", "no segmenter"),
+        ("--dynamic", "car", "need a segmenter"),
     ):
         megloc(*command, flag, value).refused(words)
     megloc(*command, "--unchanging").refused("it has 4 images, and at least 10")

@@ -86,7 +86,7 @@ def test_refused(megloc: Any, finished: Path, tmp_path: Path, data_of: Any) -> N
     other, page = tmp_path / "notes.html", tmp_path / "v.html"
     other.write_text("mine")
     a_map, gt = finished / "map", finished / "query_gt"
-    megloc("view", a_map, "-o", other).refused("notes.html", "is no view; -f overwrites")
+    megloc("view", a_map, "-o", other).refused("notes.html", "is not a view; -f overwrites")
     assert other.read_text() == "mine"
     megloc("view", a_map, "-o", tmp_path).refused("is a folder")
     for arguments, words in (

@@ -172,4 +172,4 @@ def test_too_few_queries_say_nothing_of_a_median(number: int) -> None:
     assert np.isnan(median.low_m) == (number == 5) and median.is_real == (number == 6)
     verdict = ("-0.4000 m; too few queries to tell it from chance.", "the difference is real")
     assert verdict[number - 5] in text
-    assert f"too few queries ({number}) to compare recall by" in text
+    assert f"too few queries ({number}) to compare recall:" in text

@@ -396,7 +396,7 @@ def test_what_a_segmenter_must_not_return(
 def test_classes_that_nobody_knows(street: KaptureFolder, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="no class 'bicycle'; it has: road, sky, car"):
         run(street, tmp_path / "new", {"dynamic": ("car", "bicycle")}, segmenter=Halves())
-    with pytest.raises(OptionError, match="no segmenter"):
+    with pytest.raises(OptionError, match="need a segmenter"):
         run(street, tmp_path / "new", {"dynamic": ("car",)})
     with pytest.raises(PluginError, match="no plugin 'nobody'"):
         run(street, tmp_path / "new", {"segmenter": {"name": "nobody"}})
