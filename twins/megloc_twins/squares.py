@@ -36,7 +36,7 @@ _MAX_FURNITURE = 8
 _PLACE_DISTANCE_M = 90.0  # between the middles of neighbours, before each is moved a little
 _WALL_TEXELS_PER_M = 100
 _MATERIALS = ("brick", "stone", "plaster")
-_TEXTURES = {  # width, height in texels; how many all places share, how many a place has of its own
+_TEXTURES = {  # width, height in texels; numbers that all places share and that a place adds
     "window": (156, 192, 3, 3),
     "door": (132, 270, 2, 3),
     "shutter": (240, 300, 1, 2),
