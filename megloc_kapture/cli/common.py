@@ -189,9 +189,9 @@ class Working(Common):
     executor: ExecutorKind = "processes"
     """Run in this process, in local processes, or on a dask cluster."""
     workers: int | None = None
-    """Number of processes; default: all cores."""
+    """Number of processes; if omitted, all cores."""
     scheduler: str | None = None
-    """Address of a running dask scheduler (tcp://HOST:8786); default: a local cluster."""
+    """Address of a running dask scheduler (tcp://HOST:8786); if omitted, a local cluster."""
 
     def open_executor(self, output: Path) -> AbstractContextManager[Executor | None]:
         return open_executor(self.executor, self.workers, self.scheduler, output)
@@ -274,7 +274,7 @@ class Computing:
     device: str | None = None
     """Device of the networks: auto (a GPU if available), cpu, cuda, or cuda:N."""
     precision: Literal["full", "half"] | None = None
-    """Precision of the networks; half: float16 on a GPU, bfloat16 on a CPU. Default: full."""
+    """Precision of the networks; half: float16 on a GPU, bfloat16 on a CPU. If omitted, full."""
 
     def placement(self) -> list[str]:
         """Return device and precision in ``--set`` syntax."""
@@ -301,7 +301,7 @@ class Deciding(Choosing):
 
     min_confidence: float | None = None
     """Reject poses with a lower confidence (0 to 1); 0 keeps every pose, for challenges, where a
-    wrong pose costs nothing. Default: 0.6."""
+    wrong pose costs nothing. If omitted, 0.6."""
 
     def assignments(self) -> tuple[str, ...]:
         if self.min_confidence is None:

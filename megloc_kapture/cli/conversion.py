@@ -60,13 +60,13 @@ class Import(Common):
     output: Output
     """Output folder."""
     images: Path | None = None
-    """For colmap: folder of the images; default: images/ next to the model or in a parent
+    """For colmap: folder of the images; if omitted, images/ next to the model or in a parent
     folder."""
     database: Path | None = None
-    """For colmap: database of the features; default: database.db next to the model or in a parent
-    folder."""
+    """For colmap: database of the features; if omitted, database.db next to the model or in a
+    parent folder."""
     unit: Literal["m", "units"] = "units"
-    """For colmap: m if the model is in metres; default: unknown scale."""
+    """For colmap: m if the model is in metres; if omitted, unknown scale."""
     allow_missing: bool = False
     """Accept a partial download."""
     set: Texts = ()

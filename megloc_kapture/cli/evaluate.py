@@ -39,7 +39,7 @@ class Evaluate(Common):
     no true poses."""
     dataset: str | None = None
     """Dataset whose thresholds, conditions and pools apply: aachen, robotcar, 4seasons, inloc, ...;
-    default: the workspace's protocol."""
+    if omitted, the workspace's protocol."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Folder for tables (text, JSON, CSV) and report.html."""
     thresholds: tuple[str, ...] = ()
@@ -48,10 +48,10 @@ class Evaluate(Common):
     """Align the poses with the truth first, as evo does: sim3 with scale, for maps in an arbitrary
     frame and scale; se3 without scale. The alignment ignores outliers."""
     side_tables: Path | None = None
-    """The workspace's megloc/ folder (conditions, protocol); default: the one next to the truth or
-    the results."""
+    """The workspace's megloc/ folder (conditions, protocol); if omitted, the one next to the truth
+    or the results."""
     map: Path | None = None
-    """Kapture folder of the map, for the report; default: the workspace's."""
+    """Kapture folder of the map, for the report; if omitted, the workspace's."""
     force: Force = False
 
     def run(self, console: Console) -> None:
@@ -115,7 +115,7 @@ class Submit(Common):
     output: Output
     """Pose file; for 4seasons a folder, with one file per relocalization file."""
     side_tables: Path | None = None
-    """The megloc/ folder of the imported dataset; default: the one next to the result."""
+    """The megloc/ folder of the imported dataset; if omitted, the one next to the result."""
     from_rig: bool = False
     """Give a query without a pose the pose of another camera of its rig at the same moment."""
     force: Overwrite = False
@@ -186,7 +186,8 @@ class Check(Common):
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """Pose file; for 4seasons also the folder of all pose files."""
     data: Path | None = None
-    """Imported dataset or workspace to compare with; default: runs/DATASET-* if only one exists."""
+    """Imported dataset or workspace to compare with; if omitted, runs/DATASET-* if only one
+    exists."""
     json: bool = False
     """Print the result as JSON."""
 

@@ -40,15 +40,15 @@ class Eval(Deciding, Working):
     """aachen, robotcar, 4seasons, inloc; synthetic-X: a rendered twin of one of them; kapture: any
     pair of kapture folders; synthetic: the rendered world as plain kapture."""
     root: Path | None = None
-    """Folder of the dataset in its published layout; default: searched below MEGLOC_DATA."""
+    """Folder of the dataset in its published layout; if omitted, searched below MEGLOC_DATA."""
     allow_missing: bool = False
     """Accept a partial download."""
     workspace: Annotated[Path | None, tyro.conf.arg(aliases=["-w"])] = None
-    """Workspace folder; default: runs/DATASET-PRESET, for kapture folders
+    """Workspace folder; if omitted, runs/DATASET-PRESET, for kapture folders
     runs/kapture-ROOT-PRESET."""
     submissions: Path | None = None
     """Folder for a copy of the pose file and its provenance, without overwriting those of another
-    result. Default: submissions/, or none with --workspace."""
+    result. If omitted, submissions/, or none with --workspace."""
     import_option: Texts = ()
     """An option of the dataset, as megloc import --set takes it: key=value (version=1.0,
     location_prior=false); may be repeated."""

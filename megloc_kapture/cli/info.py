@@ -61,7 +61,7 @@ class Info(Reading, Common):
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="KAPTURE")]
     """Kapture folder, or a COLMAP model."""
     keypoints_type: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Keypoints type; may be repeated; default: all types with points."""
+    """Keypoints type; may be repeated; if omitted, all types with points."""
     pixel_origin: PixelOriginChoice = "auto"
     """Pixel origin of the map's intrinsics; auto detects it."""
     deep: bool = False

@@ -69,17 +69,17 @@ class Localize(Reading, Deciding, Common):
     """Camera of all --images, which are then not rotated by EXIF: MODEL,WIDTH,HEIGHT,PARAMETERS as
     in COLMAP; or a file with a row NAME MODEL WIDTH HEIGHT PARAMETERS per image."""
     every: int | None = None
-    """Use every N-th frame of the videos among --images; default: 30."""
+    """Use every N-th frame of the videos among --images; if omitted, 30."""
     output: Output = Path("localized")
     """Kapture folder with the queries' poses, and status.csv."""
     pairs: Path | None = None
     """Pairs file with the candidates of each query, instead of retrieval."""
     keypoints_type: Texts = ()
-    """Keypoints type to localize with; may be repeated; default: all types with points."""
+    """Keypoints type to localize with; may be repeated; if omitted, all types with points."""
     pixel_origin: PixelOriginChoice = "auto"
     """Pixel origin of the map's intrinsics; auto detects it."""
     workers: int | None = None
-    """Number of threads; default: all cores."""
+    """Number of threads; if omitted, all cores."""
     force: Overwrite = False
     """Write into a non-empty folder, and localize in an inconsistent map."""
 
@@ -155,7 +155,7 @@ class Serve(Reading, Deciding, Common):
     token_file: Path | None = None
     """File with the token that clients must send, at least 16 characters."""
     threads: int | None = None
-    """Number of images localized in parallel; default: all cores."""
+    """Number of images localized in parallel; if omitted, all cores."""
     max_waiting: int = _LIMITS.max_waiting
     """Number of images that may wait; more are refused (503)."""
     max_mb: float = _LIMITS.max_mb
@@ -163,7 +163,7 @@ class Serve(Reading, Deciding, Common):
     max_megapixels: float = _LIMITS.max_megapixels
     """Largest image, megapixels."""
     keypoints_type: Texts = ()
-    """Keypoints type to localize with; may be repeated; default: all types with points."""
+    """Keypoints type to localize with; may be repeated; if omitted, all types with points."""
     pixel_origin: PixelOriginChoice = "auto"
     """Pixel origin of the map's intrinsics; auto detects it."""
     force: Overwrite = False

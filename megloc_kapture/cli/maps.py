@@ -57,12 +57,12 @@ class MapPhotographs(Choosing, Working):
     """COLMAP's mapper."""
     scale: tuple[str, ...] = ()
     """Scale: gps, from the positions in EXIF; or IMAGE IMAGE METRES, two photographs and the
-    distance between their cameras. Default: arbitrary units."""
+    distance between their cameras. If omitted, arbitrary units."""
     camera: str | None = None
     """Fixed camera of all images, which are then not rotated by EXIF: MODEL,WIDTH,HEIGHT,PARAMETERS
     as in COLMAP; or a file with a row NAME MODEL WIDTH HEIGHT PARAMETERS per image."""
     every: int | None = None
-    """Use every N-th frame of videos; default: 30."""
+    """Use every N-th frame of videos; if omitted, 30."""
     force: Force = False
 
     def run(self, console: Console) -> None:
@@ -84,8 +84,8 @@ class MapPhotographs(Choosing, Working):
 class RefineMap(Reading, StageCommand):
     """Remove points and observations that a map's images or depth maps contradict.
 
-    --set refinement.uncertainty.max_robust_sigmas=2.5 also rejects uncertain points; default: the
-    preset's choice.
+    --set refinement.uncertainty.max_robust_sigmas=2.5 also rejects uncertain points; if omitted,
+    the preset's choice.
     """
 
     input: Input
@@ -136,7 +136,7 @@ class Densify(Reading, StageCommand):
     output: Output
     """Kapture folder of the map with depth."""
     by: str | None = None
-    """Estimator: sweep, colmap or a plugin; default: sweep."""
+    """Estimator: sweep, colmap or a plugin; if omitted, sweep."""
     points: bool = False
     """Lift keypoints without a point through the depth, with their uncertainty."""
     fuse: Path | None = None
@@ -178,8 +178,8 @@ class RefinePoses(Linked, StageCommand):
     output: Output
     """Kapture folder of the refined result, with status.csv and the tables of refinement."""
     by: Texts = ()
-    """Pose refiner: icp, rendering or field; repeat to run several one after another; default: the
-    preset's."""
+    """Pose refiner: icp, rendering or field; repeat to run several one after another; if omitted,
+    the preset's."""
     force: Force = False
 
     def run(self, console: Console) -> None:

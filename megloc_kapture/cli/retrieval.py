@@ -36,7 +36,7 @@ class ExtractGlobal(Reading, StageCommand):
     output: Output
     """Features folder: global_features/T/global_features."""
     features: tuple[str, ...] = ()
-    """Global features: vlad, or plugins; default: the preset's."""
+    """Global features: vlad, or plugins; if omitted, the preset's."""
     local_type: str | None = None
     """Local features that VLAD aggregates; required if several types exist."""
     force: Force = False
@@ -75,11 +75,11 @@ class PairsMapping(Reading, StageCommand):
     topk: int | None = None
     """Number of most similar images per image (retrieval)."""
     covisibility_map: Path | None = None
-    """Kapture map of the same images, for the points that they share; default: the input."""
+    """Kapture map of the same images, for the points that they share; if omitted, the input."""
     features: tuple[str, ...] = ()
     """Types of global features, several are fused; required if several exist."""
     fusion: FusionMethod | None = None
-    """Fusion of several types; default: the preset's."""
+    """Fusion of several types; if omitted, the preset's."""
     force: Overwrite = False
     """Overwrite the pairs file."""
 
@@ -122,7 +122,7 @@ class PairsQuery(Reading, StageCommand):
     features: tuple[str, ...] = ()
     """Types of global features, several are fused; required if several exist."""
     fusion: FusionMethod | None = None
-    """Fusion of several types; default: the preset's."""
+    """Fusion of several types; if omitted, the preset's."""
     exhaustive: bool = False
     """Pair each query with all map images; for small maps."""
     rerank: int | None = None
@@ -131,7 +131,7 @@ class PairsQuery(Reading, StageCommand):
     """Score of a candidate: its matches, the verified ones (two-view geometry), or coverage (of
     these, at keypoints that better candidates do not match)."""
     local_features: tuple[str, ...] = ()
-    """Types of local features to rerank by; default: all types of map and queries."""
+    """Types of local features to rerank by; if omitted, all types of map and queries."""
     matches_dir: Path | None = None
     """Folder for the matches of reranking, which later steps use."""
     force: Overwrite = False

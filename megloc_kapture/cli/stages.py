@@ -110,7 +110,7 @@ class ExtractLocal(Linked, StageCommand):
     output: Output
     """Features folder: local_features/T/{keypoints,descriptors}."""
     features: tuple[str, ...] = ()
-    """Extractor plugins; default: the preset's."""
+    """Extractor plugins; if omitted, the preset's."""
     force: Force = False
 
     def run(self, console: Console) -> None:
@@ -153,7 +153,7 @@ class Match(Reading, StageCommand):
     features: str | None = None
     """Type of local features; required if several exist."""
     matcher: str | None = None
-    """Matcher plugin; default: the preset's."""
+    """Matcher plugin; if omitted, the preset's."""
     force: Overwrite = False
     """Write into a non-empty folder, and accept poses that contradict the matches."""
 
@@ -267,7 +267,7 @@ class Preprocess(Linked, Computing, Working):
     segmenter: str | None = None
     """Segmenter plugin whose dynamic classes (people, vehicles) are masked."""
     dynamic: tuple[str, ...] = ()
-    """Classes to mask; default: the segmenter's dynamic classes."""
+    """Classes to mask; if omitted, the segmenter's dynamic classes."""
     bottom_share: Texts = ()
     """Mask the bottom of a camera's images: CAMERA=0.2, a sensor id or a pattern of image names."""
     polygon: Texts = ()

@@ -50,7 +50,7 @@ class Train(Linked, Common):
     output: Output
     """File to write: X.safetensors; also writes X.json, X.csv and X.state.pt."""
     features: str | None = None
-    """Extractor whose features are matched, or whose detector is frozen; default: superpoint."""
+    """Extractor whose features are matched, or whose detector is frozen; if omitted, superpoint."""
     set: Texts = ()
     """Change an option: key.key=value (steps=20000, pairs.max_size_px=800); may be repeated."""
     threads: int = 1
@@ -183,7 +183,7 @@ class Render(Linked, Working):
     max_side: int | None = None
     """For --along and --between: longer side of the renderings, px; larger cameras are reduced."""
     appearance: str | None = None
-    """Training image whose light is used; default: the mean of all."""
+    """Training image whose light is used; if omitted, the mean of all."""
     force: Overwrite = False
     """Overwrite a file, or write into a non-empty folder."""
 

@@ -136,7 +136,7 @@ class Add(Common):
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """Downloaded file, or X.safetensors that scripts/convert_weights.py has written."""
     name: str | None = None
-    """Network of the file; default: recognised by sha256 or file name."""
+    """Network of the file; if omitted, recognised by sha256 or file name."""
     unverified: bool = False
     """Accept a file that is not the published one, such as one that you trained."""
     force: Overwrite = False
@@ -168,7 +168,7 @@ class Check(Common):
     """Check the existing files: sha256 if known, and safe loading."""
 
     names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME...]")] = ()
-    """Names of networks, as listed; default: all with a file."""
+    """Names of networks, as listed; if omitted, all with a file."""
 
     def run(self, console: Console) -> int:
         """Return 2 if a file is wrong."""

@@ -11,7 +11,7 @@ class Limits(Options):
     threads: int | None = Field(
         default=None,
         ge=1,
-        description="Number of images localized in parallel; default: all cores.",
+        description="Number of images localized in parallel; if omitted, all cores.",
     )
     max_waiting: int = Field(
         default=32, ge=1, description="Number of images that may wait; more are refused (503)."
