@@ -195,7 +195,7 @@ class Map:
         many: KaptureFolder | Photographs
         if isinstance(query, KaptureFolder):
             if camera is not None:
-                raise OptionError(f"{query.root}: a kapture folder already has cameras")
+                raise OptionError(f"{query.root}: a kapture folder has its own cameras")
             many = query
         elif isinstance(query, list | tuple):
             many = Photographs([Path(path) for path in query], camera)
@@ -204,7 +204,9 @@ class Map:
         else:
             return localizer.localize_query(_query_of(query, camera, prior))
         if prior is not None:
-            raise OptionError("prior is for one image; a dataset has priors in its tables")
+            raise OptionError(
+                "prior is for one image; a kapture dataset has its priors in its tables"
+            )
         return Results(localizer, many, workers=workers)
 
 

@@ -82,7 +82,7 @@ class GlobalFeatureExtractor(Protocol):
     """
 
     name: str
-    """The kapture type name its vectors are stored under; it tells the model as well."""
+    """The kapture type name its vectors are stored under, which identifies the model."""
 
     def describe(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Describe an RGB image, uint8 (H, W, 3): float32 (D,), unit length."""
@@ -116,7 +116,7 @@ class Segmenter(Protocol):
     classes: tuple[str, ...]
     """Name of each label."""
     dynamic: frozenset[str]
-    """Classes whose pixels are masked unless the options say otherwise."""
+    """Classes that are masked by default."""
 
     def segment(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return labels uint8 (H, W) of an RGB image, uint8 (H, W, 3)."""
@@ -332,7 +332,7 @@ class DatasetAdapter(Protocol):
     name: str
     """The dataset, as on the command line."""
     card: Any
-    """Where it is published and how it lies on disk."""
+    """Its source and its layout on disk."""
 
     def check(self, root: Path) -> None:
         """Check quickly whether ``root`` can be this dataset; DataError if not."""
@@ -352,7 +352,7 @@ class RenderedDataset(Protocol):
     """
 
     version: int
-    """Of the files; raised when the same options draw others than before."""
+    """Version of the files; increase it when equal options give other files."""
 
     @property
     def options(self) -> Options:
@@ -375,9 +375,9 @@ class StageOfAPlan(Protocol):
     """
 
     name: str
-    """Of its manifest, its command and its options, ``stages.NAME``."""
+    """Name in its manifest, its command and its options, ``stages.NAME``."""
     reads: Sequence[str]
-    """Paths in the workspace; it runs behind the stages that write them."""
+    """Paths in the workspace; it runs after the stages that write them."""
     writes: Sequence[str]
     """Paths in the workspace."""
 

@@ -39,7 +39,7 @@ ONE_FOCAL_MODELS = frozenset(
 MIN_CONFIDENCE = 0.6
 
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
-"""Where a network computes: auto (a GPU if available), cpu, cuda, or cuda:N."""
+"""Device of a network: auto (a GPU if available), cpu, cuda, or cuda:N."""
 Precision = Literal["full", "half"]
 
 

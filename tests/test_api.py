@@ -206,7 +206,7 @@ def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
         built.localize(scene / "query", prior=["0000.jpg"])
     with pytest.raises(megloc.DataError, match="no such image"):
         built.localize(tmp_path / "nowhere.jpg")
-    with pytest.raises(megloc.OptionError, match="already has cameras"):
+    with pytest.raises(megloc.OptionError, match="has its own cameras"):
         camera: Any = megloc.Camera.pinhole(64, 48, 50)
         built.localize(KaptureFolder(scene / "query"), camera)
     with pytest.raises(megloc.DataError, match="nowhere"):

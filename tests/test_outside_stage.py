@@ -105,7 +105,7 @@ def test_it_has_a_command_of_its_own(
     text = megloc("count-keypoints", "--help")[1]
     assert "Count the keypoints of every map image." in text
     command = ("count-keypoints", "-w", str(workspace.root), "--executor", "inline")
-    assert megloc(*command) == (2, f"megloc: {workspace.root} is no workspace of megloc eval\n")
+    assert megloc(*command) == (2, f"megloc: {workspace.root} is not a workspace of megloc eval\n")
     run_plan(planned(scene, {}), workspace, last="import")
     status, text = megloc(*command)
     assert status == 2 and "count_keypoints reads local_features, which no stage" in text

@@ -40,7 +40,8 @@ Input = Annotated[Path, tyro.conf.arg(aliases=["-i"])]
 Inputs = Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["-i"]), tyro.conf.UseAppendAction]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 Force = Annotated[
-    bool, tyro.conf.arg(aliases=["-f"], help="Write into a folder that has other things in it.")
+    bool,
+    tyro.conf.arg(aliases=["-f"], help="Write into a non-empty folder."),
 ]
 Overwrite = Annotated[bool, tyro.conf.arg(aliases=["-f"])]
 Folders = Annotated[tuple[Path, ...], tyro.conf.UseAppendAction]
@@ -173,11 +174,11 @@ class Working(Common):
     """Flags of commands with per-image or per-pair work."""
 
     executor: ExecutorKind = "processes"
-    """Where the work runs: in this process, in local processes, or on a dask cluster."""
+    """Run in this process, in local processes, or on a dask cluster."""
     workers: int | None = None
-    """Number of processes; all cores unless given."""
+    """Number of processes; if omitted, all cores."""
     scheduler: str | None = None
-    """Address of a running dask scheduler (tcp://HOST:8786); a local cluster unless given."""
+    """Address of a running dask scheduler (tcp://HOST:8786); if omitted, a local cluster."""
 
     def placement(self) -> Placement:
         return AUTO
@@ -219,8 +220,8 @@ class Linked:
     """Flags of commands that read kapture folders, which may consist of links."""
 
     allow_links_below: Folders = ()
-    """Folder that links in the kapture folders may lead to, as those of kapture-localization's
-    proxy folders do; may be repeated."""
+    """Folder to which links in the kapture folders may lead, as in kapture-localization's proxy
+    folders; may be repeated."""
 
     def kapture(self, root: Path) -> KaptureFolder:
         return KaptureFolder(root, allow_links_below=existing(self.allow_links_below))
@@ -238,7 +239,7 @@ class Reading(Linked):
     """Flags of commands that read features of kapture folders."""
 
     features_dir: Folders = ()
-    """Features folder beside the kapture folders; may be repeated."""
+    """Folder of features outside the kapture folders; may be repeated."""
 
     def kapture(self, root: Path) -> KaptureFolder:
         return KaptureFolder(
@@ -263,12 +264,12 @@ class Reading(Linked):
 
 @dataclass(frozen=True, kw_only=True)
 class Computing:
-    """Flags that say where and how networks compute."""
+    """Flags for the device and the precision of networks."""
 
     device: str | None = None
-    """Where networks compute: auto (a GPU where there is one), cpu, cuda, or cuda:N."""
+    """Device of the networks: auto (a GPU if available), cpu, cuda, or cuda:N."""
     precision: Literal["full", "half"] | None = None
-    """Of networks; half: float16 on a GPU, bfloat16 on a processor. Full unless given."""
+    """Precision of the networks; half: float16 on a GPU, bfloat16 on a CPU. If omitted, full."""
 
     def placed(self) -> list[str]:
         """Return device and precision in ``--set`` syntax."""
@@ -284,7 +285,7 @@ class Choosing(Computing):
     """Flags that choose options."""
 
     preset: str | None = None
-    """A set of options by name: classic, modern, modern-large, megloc."""
+    """Preset: classic, modern, modern-large, megloc."""
     set: Texts = ()
     """Change an option: key.key=value; may be repeated."""
 
@@ -303,8 +304,8 @@ class Deciding(Choosing):
     """Flags of commands that localize."""
 
     min_confidence: float | None = None
-    """A pose that is less likely to be right (0 to 1) is a failure; 0: every pose is kept, for
-    challenges, where a wrong answer costs nothing. 0.6 unless given."""
+    """Reject poses with a lower confidence (0 to 1); 0 keeps every pose, for challenges, where a
+    wrong pose costs nothing. If omitted, 0.6."""
 
     def assignments(self) -> tuple[str, ...]:
         if self.min_confidence is None:

@@ -45,33 +45,36 @@ DATASET, COLMAP, MEGADEPTH = "dataset", "colmap", "megadepth"
 
 @dataclass(frozen=True, kw_only=True)
 class Import(Common):
-    """Bring a dataset into DIR/{mapping,query,query_gt,megloc}, or a COLMAP model into a map.
+    """Import a dataset into DIR/{mapping,query,query_gt,megloc}, or a COLMAP model as a map.
 
-    Images are linked, not copied."""
+    Images are linked, not copied.
+    """
 
     dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
-    """aachen, robotcar, 4seasons, inloc, kapture: any pair of kapture folders; colmap: a model;
-    megadepth: to train on, DIR/SCENE each."""
+    """aachen, robotcar, 4seasons, inloc; kapture: any pair of kapture folders; colmap: a model;
+    megadepth: training data, a folder DIR/SCENE per scene."""
     root: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ROOT")]
-    """Folder of the dataset, laid out as it is published; of colmap the model (sparse/0), or the
-    workspace around it."""
+    """Folder of the dataset in its published layout; for colmap the model (sparse/0), or the
+    workspace that contains it."""
     output: Output
-    """Where to."""
+    """Output folder."""
     images: Path | None = None
-    """Of colmap: folder of the images; images/ beside the model or around it unless given."""
+    """For colmap: folder of the images; if omitted, images/ next to the model or in a parent
+    folder."""
     database: Path | None = None
-    """Of colmap: the features; database.db beside the model or around it unless given."""
+    """For colmap: database of the features; if omitted, database.db next to the model or in a
+    parent folder."""
     unit: Literal["m", "units"] = "units"
-    """Of colmap: m says that the model is in metres; its scale is unknown unless given."""
+    """For colmap: m if the model is in metres; if omitted, unknown scale."""
     allow_missing: bool = False
-    """Import what is there of a partial download."""
+    """Accept a partial download."""
     set: Texts = ()
     """An option of the dataset: key=value (version=1.0, reference_model=true); may be repeated."""
     query_prefix: str = ""
-    """Put the queries into a folder of this name, where they share names with the map."""
+    """Put the queries into a folder of this name, if they share names with map images."""
     force: Overwrite = False
-    """Write into a folder that has other things in it; of colmap: map poses that contradict the
-    matches of their images."""
+    """Write into a non-empty folder; for colmap: accept poses that contradict the matches of their
+    images."""
 
     def run(self, console: Console) -> None:
         name = self.dataset.removeprefix(TWIN_PREFIX)
@@ -113,7 +116,7 @@ class Import(Common):
             console.say(f"{what}: {found or 'none'}")
         console.counts(counts)
         if self.unit == NO_METRES:
-            console.say("unit: units of the map, whose scale is not known; --unit m if in metres")
+            console.say("unit: units of the map, of unknown scale; --unit m if in metres")
 
     def _import_megadepth(self, console: Console) -> None:
         options = options_with(MegaDepthOptions, self.set)
@@ -125,14 +128,15 @@ class Import(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Synth(Working):
-    """Render a dataset: the synthetic world as kapture, or a small twin in an official layout."""
+    """Render a dataset: a synthetic world as kapture, or a small twin in an official layout."""
 
     dataset: tyro.conf.Positional[str] = SYNTHETIC
-    """synthetic: the world as plain kapture; aachen, robotcar, 4seasons, inloc: its twin."""
+    """synthetic: a world as plain kapture; aachen, robotcar, 4seasons, inloc: a twin of the
+    dataset."""
     output: Output
-    """Where to."""
+    """Output folder."""
     seed: int = 0
-    """Another seed is another world."""
+    """Seed of the world."""
     set: Texts = ()
     """An option of the world: key=value; may be repeated."""
     force: Force = False
@@ -159,16 +163,16 @@ class Export(Common):
     input: Annotated[Path | None, tyro.conf.arg(aliases=["-i"])] = None
     """Kapture map, or a kapture folder of images with poses."""
     query: Path | None = None
-    """Kapture folder of localized queries; trajectories are of these alone where given."""
+    """Kapture folder of localized queries; a tum trajectory then contains only these."""
     output: Output
     """Folder for colmap and nerfstudio, else a file."""
     sensor: str | None = None
-    """Images of this camera only; several cameras of one moment are no trajectory."""
+    """Export images of this camera only; tum needs it if several cameras share timestamps."""
     undistort: bool = False
-    """Of colmap: also write images/, undistorted, and the model of these in sparse/0, with PINHOLE
-    cameras, as programs for Gaussian splatting read them."""
+    """For colmap: write undistorted images/ and their model with PINHOLE cameras to sparse/0, the
+    layout that programs for Gaussian splatting read."""
     force: Overwrite = False
-    """Overwrite, or write into a folder that has other things in it."""
+    """Overwrite, or write into a non-empty folder."""
 
     def run(self, console: Console) -> None:
         number = export(
@@ -185,21 +189,21 @@ class Export(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class View(Linked, Common):
-    """Write a page that shows a map in 3D, and the queries of a result in it; it needs no
-    network."""
+    """Write a page that shows a map and localized queries in 3D; it works offline."""
 
     map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
     """Kapture folder: a map with points, or images with poses; or a COLMAP model."""
     result: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="RESULT")] = None
     """Localized kapture folder, pose file or COLMAP model."""
     gt: Path | None = None
-    """The true poses, likewise: queries are coloured by their error, and joined to it."""
+    """True poses, in the same formats: queries are coloured by their error and joined to their true
+    pose."""
     output: Output = Path("view.html")
     """File to write."""
     open: bool = False
-    """Show it in the browser."""
+    """Open the page in a browser."""
     force: Overwrite = False
-    """Overwrite a file that is no view."""
+    """Overwrite a file that is not a view."""
 
     def run(self, console: Console) -> None:
         # slow import

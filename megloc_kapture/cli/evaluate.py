@@ -35,23 +35,23 @@ class Evaluate(Common):
     input: Inputs = ()
     """Localized kapture folder, pose file or COLMAP model; may be repeated to compare results."""
     gt: Path | None = None
-    """The true poses: kapture folder, pose file or COLMAP model; without it, says what can be known
-    without truth."""
+    """True poses: kapture folder, pose file or COLMAP model; without it, only statistics that need
+    no true poses."""
     dataset: str | None = None
-    """Dataset whose thresholds, conditions and pools hold: aachen, robotcar, 4seasons, inloc, ...;
-    the workspace's protocol unless given."""
+    """Dataset whose thresholds, conditions and pools apply: aachen, robotcar, 4seasons, inloc, ...;
+    if omitted, the workspace's protocol."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Folder for tables (text, JSON, CSV) and report.html."""
     thresholds: tuple[str, ...] = ()
-    """Recall thresholds, metres and degrees: 0.25,2 0.5,5."""
+    """Recall thresholds in metres and degrees, for example 0.25,2 0.5,5."""
     align: Literal["none", "se3", "sim3"] = "none"
-    """Align the poses with the truth first, as evo does: sim3 with scale, for maps in a frame and
-    scale of their own; se3 without. Robust: the poses that agree determine it."""
+    """Align the poses with the truth first, as evo does: sim3 with scale, for maps in an arbitrary
+    frame and scale; se3 without scale. The alignment ignores outliers."""
     side_tables: Path | None = None
-    """The workspace's megloc/ folder (conditions, protocol); found beside truth or results by
-    itself."""
+    """The workspace's megloc/ folder (conditions, protocol); if omitted, the one next to the truth
+    or the results."""
     map: Path | None = None
-    """Kapture folder of the map, for the report; found in the workspace by itself."""
+    """Kapture folder of the map, for the report; if omitted, the workspace's."""
     force: Force = False
 
     def run(self, console: Console) -> None:
@@ -102,20 +102,21 @@ class Evaluate(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Submit(Common):
-    """Write the pose file of a localized kapture folder, and its provenance beside it."""
+    """Write the pose file of a localized kapture folder, and a JSON file with its provenance."""
 
     dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
-    """Dataset whose rules hold: aachen, robotcar, 4seasons, inloc, kapture, synthetic or a twin."""
+    """Dataset whose rules apply: aachen, robotcar, 4seasons, inloc, kapture, synthetic or a
+    twin."""
     input: Input
     """Localized kapture folder."""
     output: Output
-    """Pose file; for 4seasons the folder that gets one per relocalization file."""
+    """Pose file; for 4seasons a folder, with one file per relocalization file."""
     side_tables: Path | None = None
-    """The megloc/ folder of the imported dataset; found beside the result by itself."""
+    """The megloc/ folder of the imported dataset; if omitted, the one next to the result."""
     from_rig: bool = False
-    """Queries without a pose get one through the rig, from another camera of their moment."""
+    """Give a query without a pose the pose of another camera of its rig at the same moment."""
     force: Overwrite = False
-    """Overwrite the pose file, and the JSON beside it."""
+    """Overwrite the pose file and its JSON file."""
 
     def run(self, console: Console) -> None:
         from megloc_kapture.io.dataset_tables import Protocol, read_protocol
@@ -146,7 +147,7 @@ class Submit(Common):
         place = self.output
         if place.is_dir() != folder and place.exists():
             kind = "folder, one file per relocalization file" if folder else "file"
-            raise OptionError(f"{place} exists and is not what is to be written, a {kind}")
+            raise OptionError(f"{place} exists and is not a {kind}")
         empty = folder and place.exists() and not any(place.iterdir())
         paths = [provenance_path(place)] if empty else [place, provenance_path(place)]
         there = [path for path in paths if path.exists()]
@@ -174,16 +175,18 @@ _RUNS = Path("runs")
 
 @dataclass(frozen=True, kw_only=True)
 class Check(Common):
-    """Check a pose file, ours or foreign, against the rules of its challenge and the map."""
+    """Check a pose file of any tool against the rules of its challenge and the map."""
 
     dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")]
-    """Dataset whose rules hold: aachen, robotcar, 4seasons, inloc, kapture, synthetic or a twin."""
+    """Dataset whose rules apply: aachen, robotcar, 4seasons, inloc, kapture, synthetic or a
+    twin."""
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
-    """Pose file; for 4seasons also the folder of all of them."""
+    """Pose file; for 4seasons also the folder of all pose files."""
     data: Path | None = None
-    """Imported dataset or workspace to compare with; runs/DATASET-* where there is just one."""
+    """Imported dataset or workspace to compare with; if omitted, runs/DATASET-* if only one
+    exists."""
     json: bool = False
-    """Print everything that was found as JSON."""
+    """Print the result as JSON."""
 
     def run(self, console: Console) -> int:
         """Return 2 if there are problems."""

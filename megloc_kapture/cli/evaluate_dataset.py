@@ -33,43 +33,43 @@ BELOW_RECALL = 3
 
 @dataclass(frozen=True, kw_only=True)
 class Eval(Deciding, Working):
-    """Run all stages on a dataset; what is done and still true is kept."""
+    """Run all stages on a dataset; stages that are up to date are kept."""
 
     dataset: tyro.conf.Positional[str] = "synthetic-aachen"
     """aachen, robotcar, 4seasons, inloc; synthetic-X: a rendered twin of one of them; kapture: any
     pair of kapture folders; synthetic: the rendered world as plain kapture."""
     root: Path | None = None
-    """Folder of the dataset as it is published; looked for below MEGLOC_DATA unless given."""
+    """Folder of the dataset in its published layout; if omitted, searched below MEGLOC_DATA."""
     allow_missing: bool = False
-    """Go on with what is there of a partial download."""
+    """Accept a partial download."""
     workspace: Annotated[Path | None, tyro.conf.arg(aliases=["-w"])] = None
-    """Where everything is kept; runs/DATASET-PRESET unless given, of kapture folders
+    """Workspace folder; if omitted, runs/DATASET-PRESET, for kapture folders
     runs/kapture-ROOT-PRESET."""
     submissions: Path | None = None
-    """Folder that gets a copy of the pose file and its provenance, and overwrites none of another
-    result; submissions/ unless --workspace is given."""
+    """Folder for a copy of the pose file and its provenance, without overwriting those of another
+    result. If omitted, submissions/, or none with --workspace."""
     import_option: Texts = ()
     """An option of the dataset, as megloc import --set takes it: key=value (version=1.0,
     location_prior=false); may be repeated."""
     config: Path | None = None
-    """A benchmark file (TOML) with this dataset's options, instead of the one that we bring."""
+    """Benchmark file (TOML) with this dataset's options, instead of the built-in one."""
     thresholds: tuple[str, ...] = ()
-    """Recall thresholds, metres and degrees: 0.25,2 0.5,5."""
+    """Recall thresholds in metres and degrees, for example 0.25,2 0.5,5."""
     query_prefix: str = ""
-    """Put the queries into a folder of this name, where they share names with the map."""
+    """Put the queries into a folder of this name, if they share names with map images."""
     from_stage: Annotated[str | None, tyro.conf.arg(name="from")] = None
-    """Run this stage again, and what follows; take those before it as they are."""
+    """Run this stage and its successors again; use earlier stages as they are."""
     until: str | None = None
-    """Stop behind this stage."""
+    """Stop after this stage."""
     dry_run: bool = False
-    """Say which stages would run, and why."""
+    """List the stages that would run, and why."""
     explain: bool = False
-    """List the stages, which of them this run has and which options decide that; run nothing."""
+    """List all stages, on or off, with the options that decide it; run nothing."""
     fail_below: float | None = None
-    """Exit with 3 when the share of queries at the last threshold is lower (0 to 1)."""
+    """Exit with 3 if recall at the last threshold (0 to 1) is lower."""
     force: Overwrite = False
-    """Use a workspace folder that has other things in it, or was made of another root; and map
-    poses that contradict the matches of their images."""
+    """Use a non-empty workspace, or that of another root; accept map poses that contradict the
+    matches of their images."""
 
     def run(self, console: Console) -> int:
         run = choose_run(
@@ -119,9 +119,9 @@ class Eval(Deciding, Working):
             doubtful = done["submission"].counts.get("doubtful", 0)
             if doubtful and run.source.adapter is not None:  # only challenges have a server
                 console.say(
-                    f"{doubtful:,} queries that the pose file lacks had a pose of too little "
-                    "confidence; a server counts a missing pose as a wrong one: --set "
-                    "localization.min_confidence=0 hands in every pose"
+                    f"{doubtful:,} poses had too little confidence for the pose file; a server "
+                    "counts a missing pose as wrong: --set localization.min_confidence=0 keeps "
+                    "every pose"
                 )
         report = workspace.path(EVALUATION) / REPORT_HTML
         if "evaluation" in done and report.is_file():
@@ -144,7 +144,7 @@ class Eval(Deciding, Working):
             kept = keep_submission(pose_file, submissions)
             if kept.name != pose_file.name:
                 console.say(
-                    f"{shown(submissions / pose_file.name)} is of another result and stays as it is"
+                    f"{shown(submissions / pose_file.name)} belongs to another result and is kept"
                 )
             pose_file = kept
         console.result(f"pose file  {shown(pose_file)}")

@@ -56,14 +56,14 @@ _QUANTILES = (0.1, 0.5, 0.9)
 
 @dataclass(frozen=True, kw_only=True)
 class Info(Reading, Common):
-    """Say what is in a kapture folder, and what a map allows."""
+    """Describe a kapture folder, and how it can be used as a map."""
 
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="KAPTURE")]
     """Kapture folder, or a COLMAP model."""
     keypoints_type: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Keypoints type to look at; may be repeated; all that have points unless given."""
+    """Keypoints type; may be repeated; if omitted, all types with points."""
     pixel_origin: PixelOriginChoice = "auto"
-    """Where the map's intrinsics put the pixel origin; auto finds it out."""
+    """Pixel origin of the map's intrinsics; auto detects it."""
     deep: bool = False
     """Read every file, images included."""
 
@@ -88,7 +88,7 @@ class Info(Reading, Common):
         except MeglocError as error:
             line(console, "localizing", f"not possible: {error}")
             return
-        unknown = "units of the map: its scale is not known"
+        unknown = "units of the map, of unknown scale"
         line(console, "unit", "metres" if opened.unit == METRES else unknown)
         if fault := opened.fault():
             line(console, "FAULT", fault)
@@ -118,7 +118,7 @@ def describe_content(console: Console, folder: KaptureFolder) -> None:
         joined = len(depth_records(data))
         told = f"{len(data.records_depth)}, of {joined} images"
         # depth sensors in the camera's rig
-        told += "" if joined else ": no rig joins their sensor to a camera, and they are not used"
+        told += "" if joined else ": ignored, as no rig links their sensor to a camera"
         line(console, "depth maps", told)
     for kind in ("keypoints", "descriptors", "global_features"):
         for name in folder.types(kind):
@@ -179,9 +179,9 @@ def describe_descriptors(
     if keypoints.has_descriptors(opened.images):
         return "there"
     if extractor is None:
-        return "missing, and no extractor for the type is installed: localizing is not possible"
+        return "missing, and no extractor for the type is installed: localization is not possible"
     if not opened.has_images():
-        return "missing, and no images to extract them from: localizing is not possible"
+        return "missing, and no images to extract them from: localization is not possible"
     return f"missing; will be extracted again by plugin {extractor.name}"
 
 
@@ -209,11 +209,11 @@ class OptionsCommand(Common):
     """List the options that --set takes, with value, type and meaning."""
 
     key: tyro.conf.Positional[str] = ""
-    """Those of a step (localization.pose), one of them, or those of a plugin (aliked)."""
+    """Options of a step (localization.pose), a single option, or options of a plugin (aliked)."""
     preset: str = DEFAULT_PRESET
     """Show the values of this preset."""
     basic: bool = False
-    """Only the ten options that people change."""
+    """Only the ten options that are changed most often."""
 
     def run(self, console: Console) -> None:
         every = list(options_of(options_of_preset(self.preset)))

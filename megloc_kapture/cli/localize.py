@@ -60,29 +60,28 @@ class Localize(Reading, Deciding, Common):
     input: Input
     """Kapture map: keypoints, points3d and observations; or a COLMAP model. Read only."""
     query: Path | None = None
-    """Kapture folder with the queries, and their features where the map's cannot be extracted."""
+    """Kapture folder with the queries, and with their features if the map's type cannot be
+    extracted."""
     images: tuple[Path, ...] = ()
-    """Instead of --query: photographs and videos, or folders of them. Their focal lengths are taken
-    from EXIF or guessed, and estimated with the poses."""
+    """Instead of --query: photographs, videos, or folders of them. Focal lengths come from EXIF or
+    a guess and are estimated with the poses."""
     camera: str | None = None
-    """Camera of all --images, whose pixels are then taken as they are stored:
-    MODEL,WIDTH,HEIGHT,PARAMETERS as COLMAP has them; or a file with a camera for each image, rows
-    of NAME MODEL WIDTH HEIGHT PARAMETERS."""
+    """Camera of all --images, which are then not rotated by EXIF: MODEL,WIDTH,HEIGHT,PARAMETERS as
+    in COLMAP; or a file with a row NAME MODEL WIDTH HEIGHT PARAMETERS per image."""
     every: int | None = None
-    """Of videos among --images every so many frames one is taken; 30 unless given."""
+    """Use every N-th frame of the videos among --images; if omitted, 30."""
     output: Output = Path("localized")
     """Kapture folder with the queries' poses, and status.csv."""
     pairs: Path | None = None
-    """Candidates of each query, instead of retrieval."""
+    """Pairs file with the candidates of each query, instead of retrieval."""
     keypoints_type: Texts = ()
-    """Keypoints type to localize with; may be repeated; all that have points unless given."""
+    """Keypoints type to localize with; may be repeated; if omitted, all types with points."""
     pixel_origin: PixelOriginChoice = "auto"
-    """Where the map's intrinsics put the pixel origin; auto finds it out."""
+    """Pixel origin of the map's intrinsics; auto detects it."""
     workers: int | None = None
-    """Number of threads; all cores unless given."""
+    """Number of threads; if omitted, all cores."""
     force: Overwrite = False
-    """Write into a folder that has other things in it, and localize in a map that contradicts
-    itself."""
+    """Write into a non-empty folder, and localize in an inconsistent map."""
 
     def run(self, console: Console) -> None:
         self._check_queries()
@@ -117,9 +116,9 @@ class Localize(Reading, Deciding, Common):
         remarks = Counter(remark for _, result in named for remark in result.remarks)
         focal = {remark for remark in remarks if "focal length" in remark}
         for remark in sorted(remarks.keys() - focal):
-            console.say(f"left out of {remarks[remark]} queries: {remark}")
+            console.say(f"skipped for {remarks[remark]} queries: {remark}")
         if kapture_map.unit != METRES:
-            console.say("positions are in units of the map, whose scale is not known")
+            console.say("positions are in units of the map, of unknown scale")
         if misfits := misfits_text(results.values(), STATUS_FILE):
             console.say(misfits)
         console.result(
@@ -135,41 +134,39 @@ class Localize(Reading, Deciding, Common):
             raise OptionError("give the queries: either --query, a kapture folder, or --images")
         check_option(
             self.query is None or not self.query.is_file(),
-            f"--query {self.query}: takes a kapture folder; a list of cameras goes to "
+            f"--query {self.query}: not a kapture folder; a list of cameras goes to "
             "--camera, the images to --images",
         )
         for path in self.images:
-            check_option(
-                not is_kapture(path), f"--images {path}: a kapture folder; give it by --query"
-            )
+            check_option(not is_kapture(path), f"--images {path}: a kapture folder; use --query")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Serve(Reading, Deciding, Common):
-    """Localize images that come by HTTP in a kapture map; with a page for photographs."""
+    """Localize images sent over HTTP in a kapture map; has a page for photographs."""
 
     map: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
     """Kapture map: keypoints, points3d and observations; or a COLMAP model. Read only."""
     host: str = "127.0.0.1"
-    """Address to listen at; any other than this machine's own needs --token-file."""
+    """Address to listen on; any other than loopback needs --token-file."""
     port: int = 8000
-    """Port to listen at; 0: a free one."""
+    """Port to listen on; 0: any free port."""
     token_file: Path | None = None
-    """File with a token that clients have to send, 16 characters or more."""
+    """File with the token that clients must send, at least 16 characters."""
     threads: int | None = None
-    """Images that are localized at once; all cores unless given."""
+    """Number of images localized in parallel; if omitted, all cores."""
     max_waiting: int = _LIMITS.max_waiting
-    """Images that may wait for a thread; more are refused (503)."""
+    """Number of images that may wait; more are refused (503)."""
     max_mb: float = _LIMITS.max_mb
-    """Size of a request."""
+    """Largest request, megabytes."""
     max_megapixels: float = _LIMITS.max_megapixels
-    """Size of an image."""
+    """Largest image, megapixels."""
     keypoints_type: Texts = ()
-    """Keypoints type to localize with; may be repeated; all that have points unless given."""
+    """Keypoints type to localize with; may be repeated; if omitted, all types with points."""
     pixel_origin: PixelOriginChoice = "auto"
-    """Where the map's intrinsics put the pixel origin; auto finds it out."""
+    """Pixel origin of the map's intrinsics; auto detects it."""
     force: Overwrite = False
-    """Localize in a map that contradicts itself."""
+    """Localize in an inconsistent map."""
 
     def run(self, console: Console) -> None:
         from megloc_kapture.service.server import bind, prepared_localizer, serve
@@ -177,7 +174,9 @@ class Serve(Reading, Deciding, Common):
         limits = self._limits()
         token = None if self.token_file is None else _read_token(self.token_file)
         if token is None and self.host not in _LOOPBACK:
-            raise OptionError(f"--host {self.host}: other machines can ask; give --token-file")
+            raise OptionError(
+                f"--host {self.host}: reachable from other machines; give --token-file"
+            )
         options = _options_of(self)
         with bind(self.host, self.port) as bound:
             path = opened_map(self.map, console, force=self.force)
@@ -220,9 +219,7 @@ def _options_of(command: Deciding) -> PipelineOptions:
 def _check_consistent(kapture_map: KaptureMap, path: Path, *, force: bool) -> None:
     """Raise DataError for an inconsistent map, unless forced."""
     if not force and (fault := kapture_map.fault()):
-        raise DataError(
-            f"{fault}; the poses would be wrong (--force localizes all the same)", path=path
-        )
+        raise DataError(f"{fault}; the poses would be wrong (--force localizes anyway)", path=path)
 
 
 def _names(types: Sequence[LocalType]) -> str:

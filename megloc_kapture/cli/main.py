@@ -26,51 +26,50 @@ class Terminated(BaseException):
 
 # name, module:class and first help line, so that only the requested command is imported
 _TABLE = """
-eval evaluate_dataset:Eval Run all stages on a dataset; what is done and still true is kept.
-import conversion:Import Bring a dataset into DIR/{mapping,query,query_gt,megloc}, or a COLMAP \
-model into a map.
-synth conversion:Synth Render a dataset: the synthetic world as kapture, or a small twin in an \
+eval evaluate_dataset:Eval Run all stages on a dataset; stages that are up to date are kept.
+import conversion:Import Import a dataset into DIR/{mapping,query,query_gt,megloc}, or a COLMAP \
+model as a map.
+synth conversion:Synth Render a dataset: a synthetic world as kapture, or a small twin in an \
 official layout.
-preprocess stages:Preprocess Resize, undistort and mask the images of a kapture; poses stay, \
-cameras follow.
+preprocess stages:Preprocess Resize, undistort and mask the images of a kapture folder; cameras \
+are adapted.
 extract-local stages:ExtractLocal Extract local features of all images of kapture folders.
-extract-global retrieval:ExtractGlobal Describe every image by one vector: VLAD trained on the \
-map, or image networks.
-pairs-mapping retrieval:PairsMapping Choose which images of a map are matched with each other.
-pairs-query retrieval:PairsQuery Choose the map images each query is matched with.
+extract-global retrieval:ExtractGlobal Compute global features of all images: VLAD trained on \
+the map, or networks.
+pairs-mapping retrieval:PairsMapping Choose pairs of map images to match.
+pairs-query retrieval:PairsQuery Choose the map images to match with each query.
 match stages:Match Match and verify image pairs; with known poses within a map, else by a two-view \
 model.
 triangulate stages:Triangulate Triangulate verified matches of images with known poses into a \
 kapture map.
-refine-map maps:RefineMap Take points and observations out of a map that its images, or depth \
-maps, contradict.
-densify maps:Densify Estimate depth of a map's images that have none, by multi-view stereo.
-refine-poses maps:RefinePoses Refine the poses of localized queries; a pose that gets no better \
-stays, and says why.
-map maps:MapPhotographs Make a map of photographs without poses; what is done and still true is \
+refine-map maps:RefineMap Remove points and observations that a map's images or depth maps \
+contradict.
+densify maps:Densify Estimate depth of map images without depth, by multi-view stereo.
+refine-poses maps:RefinePoses Refine the poses of localized queries; a pose that does not \
+improve is kept, with the reason.
+map maps:MapPhotographs Make a map of photographs without poses; stages that are up to date are \
 kept.
 localize localize:Localize Localize photographs, or the images of a kapture folder, in a kapture \
 map.
-serve localize:Serve Localize images that come by HTTP in a kapture map; with a page for \
+serve localize:Serve Localize images sent over HTTP in a kapture map; has a page for \
 photographs.
-submit evaluate:Submit Write the pose file of a localized kapture folder, and its provenance \
-beside it.
-check evaluate:Check Check a pose file, ours or foreign, against the rules of its challenge and \
-the map.
+submit evaluate:Submit Write the pose file of a localized kapture folder, and a JSON file with \
+its provenance.
+check evaluate:Check Check a pose file of any tool against the rules of its challenge and the \
+map.
 evaluate evaluate:Evaluate Compare localized queries (kapture folders, pose files, COLMAP models) \
 with their true poses, and two or more results with each other.
 export conversion:Export Write a map, localized queries or both for COLMAP, nerfstudio, evo and \
 viewers.
-view conversion:View Write a page that shows a map in 3D, and the queries of a result in it; it \
-needs no network.
+view conversion:View Write a page that shows a map and localized queries in 3D; it works offline.
 train training:Train Train SuperGlue, or a detector's descriptors, on kapture folders with depth \
 and on photographs.
 train-field training:TrainField Train a neural field (NeRF-W) on the images of a map, to render \
 views and refine poses.
-render training:Render Render a view of a neural field, views of a result, or views that no camera \
-took.
+render training:Render Render views of a neural field: at a pose, along a result, or between map \
+cameras.
 weights weights:WeightsCommand List, fetch, add, convert and check the weights of networks.
-info info:Info Say what is in a kapture folder, and what a map allows.
+info info:Info Describe a kapture folder, and how it can be used as a map.
 options info:OptionsCommand List the options that --set takes, with value, type and meaning.
 doctor weights:Doctor Check the environment: versions, known-bad combinations, GPU, weights.
 """

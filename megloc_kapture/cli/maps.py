@@ -46,23 +46,22 @@ from megloc_kapture.stages.stereo_depth import fuse_depth
 
 @dataclass(frozen=True, kw_only=True)
 class MapPhotographs(Choosing, Working):
-    """Make a map of photographs without poses; what is done and still true is kept."""
+    """Make a map of photographs without poses; stages that are up to date are kept."""
 
     images: tyro.conf.Positional[tuple[Path, ...]]
-    """Photographs and videos, or folders of them; or a kapture folder of images without poses."""
+    """Photographs, videos, or folders of them; or a kapture folder of images without poses."""
     output: Output
-    """Workspace, a map for all commands: the kapture map is its folder map/."""
+    """Workspace, which all commands accept as a map; its folder map/ is the kapture map."""
     mapper: Mapper = "incremental"
     """COLMAP's mapper."""
     scale: tuple[str, ...] = ()
-    """What tells metres: gps, the positions in EXIF; or IMAGE IMAGE METRES, two photographs and
-    the distance of their cameras. Without it the map has units of its own."""
+    """Scale: gps, from the positions in EXIF; or IMAGE IMAGE METRES, two photographs and the
+    distance between their cameras. If omitted, arbitrary units."""
     camera: str | None = None
-    """Camera of all images, whose pixels are then taken as they are stored:
-    MODEL,WIDTH,HEIGHT,PARAMETERS as COLMAP has them. It stays as it is. Or a file with a camera
-    for each image, rows of NAME MODEL WIDTH HEIGHT PARAMETERS."""
+    """Fixed camera of all images, which are then not rotated by EXIF: MODEL,WIDTH,HEIGHT,PARAMETERS
+    as in COLMAP; or a file with a row NAME MODEL WIDTH HEIGHT PARAMETERS per image."""
     every: int | None = None
-    """Of videos every so many frames one is taken; 30 unless given."""
+    """Use every N-th frame of videos; if omitted, 30."""
     force: Force = False
 
     def run(self, console: Console) -> None:
@@ -82,14 +81,14 @@ class MapPhotographs(Choosing, Working):
 
 @dataclass(frozen=True, kw_only=True)
 class RefineMap(Reading, StageCommand):
-    """Take points and observations out of a map that its images, or depth maps, contradict.
+    """Remove points and observations that a map's images or depth maps contradict.
 
-    --set refinement.uncertainty.max_robust_sigmas=2.5 rejects uncertain points; the preset decides
-    otherwise.
+    --set refinement.uncertainty.max_robust_sigmas=2.5 also rejects uncertain points; if omitted,
+    the preset's choice.
     """
 
     input: Input
-    """Kapture folder of the map; it stays as it is."""
+    """Kapture folder of the map; not modified."""
     output: Output
     """Kapture folder of the refined map."""
     force: Force = False
@@ -125,22 +124,22 @@ def report_lines(root: Path) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class Densify(Reading, StageCommand):
-    """Estimate depth of a map's images that have none, by multi-view stereo.
+    """Estimate depth of map images without depth, by multi-view stereo.
 
-    The depth maps are kapture depth records; what a map with depth allows (verification, ranking
-    by looks, refinement by rendering) works as with a depth sensor's.
+    The depth maps are kapture depth records; verification, perceptual ranking and refinement by
+    rendering use them like those of a depth sensor.
     """
 
     input: Input
-    """Kapture folder of the map, with points; it stays as it is."""
+    """Kapture folder of the map, with points; not modified."""
     output: Output
     """Kapture folder of the map with depth."""
     by: str | None = None
-    """Estimator: sweep, colmap or a plugin; sweep unless given."""
+    """Estimator: sweep, colmap or a plugin; if omitted, sweep."""
     points: bool = False
-    """Lift keypoints that have no point through the depth, with their uncertainty."""
+    """Lift keypoints without a point through the depth, with their uncertainty."""
     fuse: Path | None = None
-    """Write all depth as one cloud to this PLY file."""
+    """Write the fused point cloud to this PLY file."""
     force: Force = False
 
     def run(self, console: Console) -> None:
@@ -166,7 +165,8 @@ class Densify(Reading, StageCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class RefinePoses(Linked, StageCommand):
-    """Refine the poses of localized queries; a pose that gets no better stays, and says why."""
+    """Refine the poses of localized queries; a pose that does not improve is kept, with the
+    reason."""
 
     input: Input
     """Kapture map, with images and depth maps. Read only."""
@@ -177,8 +177,8 @@ class RefinePoses(Linked, StageCommand):
     output: Output
     """Kapture folder of the refined result, with status.csv and the tables of refinement."""
     by: Texts = ()
-    """Pose refiner: icp, rendering or field; repeated, one after another; the preset's unless
-    given."""
+    """Pose refiner: icp, rendering or field; repeat to run several one after another; if omitted,
+    the preset's."""
     force: Force = False
 
     def run(self, console: Console) -> None:

@@ -27,7 +27,7 @@ from megloc_kapture.stages.options import PipelineOptions
 
 @dataclass(frozen=True, kw_only=True)
 class ExtractGlobal(Reading, StageCommand):
-    """Describe every image by one vector: VLAD trained on the map, or image networks."""
+    """Compute global features of all images: VLAD trained on the map, or networks."""
 
     input: Input
     """Kapture folder of the map; VLAD is trained on its descriptors."""
@@ -36,9 +36,9 @@ class ExtractGlobal(Reading, StageCommand):
     output: Output
     """Features folder: global_features/T/global_features."""
     features: tuple[str, ...] = ()
-    """Global features: vlad, or plugins; those of the preset unless given."""
+    """Global features: vlad, or plugins; if omitted, the preset's."""
     local_type: str | None = None
-    """Local features that VLAD aggregates; needed where there are several types."""
+    """Local features that VLAD aggregates; required if several types exist."""
     force: Force = False
 
     def run(self, console: Console) -> None:
@@ -64,22 +64,22 @@ class ExtractGlobal(Reading, StageCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class PairsMapping(Reading, StageCommand):
-    """Choose which images of a map are matched with each other."""
+    """Choose pairs of map images to match."""
 
     input: Input
     """Kapture folder with poses."""
     output: Output
     """Pairs file."""
     by: tuple[PairingMethod, ...] = ("retrieval",)
-    """How; several methods are united."""
+    """Method; several are united."""
     topk: int | None = None
-    """Most similar images per image (retrieval)."""
+    """Number of most similar images per image (retrieval)."""
     covisibility_map: Path | None = None
-    """Kapture map of the same images, for the points they share; the input's own without it."""
+    """Kapture map of the same images, for the points that they share; if omitted, the input."""
     features: tuple[str, ...] = ()
-    """Types of global features; several are fused; needed where there are several."""
+    """Types of global features, several are fused; required if several exist."""
     fusion: FusionMethod | None = None
-    """How several are fused; as the preset has it unless given."""
+    """Fusion of several types; if omitted, the preset's."""
     force: Overwrite = False
     """Overwrite the pairs file."""
 
@@ -109,7 +109,7 @@ class PairsMapping(Reading, StageCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class PairsQuery(Reading, StageCommand):
-    """Choose the map images each query is matched with."""
+    """Choose the map images to match with each query."""
 
     input: Input
     """Kapture folder of the map."""
@@ -118,24 +118,24 @@ class PairsQuery(Reading, StageCommand):
     output: Output
     """Pairs file."""
     topk: int | None = None
-    """Most similar map images per query."""
+    """Number of most similar map images per query."""
     features: tuple[str, ...] = ()
-    """Types of global features; several are fused; needed where there are several."""
+    """Types of global features, several are fused; required if several exist."""
     fusion: FusionMethod | None = None
-    """How several are fused; as the preset has it unless given."""
+    """Fusion of several types; if omitted, the preset's."""
     exhaustive: bool = False
-    """All map images for each query; for small maps."""
+    """Pair each query with all map images; for small maps."""
     rerank: int | None = None
-    """Match local features with all candidates, and keep this many with the most matches."""
+    """Rerank the candidates by local matches and keep this many."""
     rerank_by: Literal["coverage", "verified", "matches"] = "coverage"
-    """What counts: matches, those that two-view geometry leaves, or of these the keypoints that
-    the images before do not match."""
+    """Score of a candidate: its matches, the verified ones (two-view geometry), or coverage (of
+    these, at keypoints that better candidates do not match)."""
     local_features: tuple[str, ...] = ()
-    """Types of local features to rerank by; all that map and queries have unless given."""
+    """Types of local features to rerank by; if omitted, all types of map and queries."""
     matches_dir: Path | None = None
-    """Features folder that gets the matches of reranking, for the steps after it."""
+    """Folder for the matches of reranking, which later steps use."""
     force: Overwrite = False
-    """Overwrite the pairs file, and what is in the folder of matches."""
+    """Overwrite the pairs file and the folder of matches."""
 
     def run(self, console: Console) -> None:
         if (self.rerank is None) != (self.matches_dir is None):

@@ -57,7 +57,7 @@ from megloc_kapture.stages.preprocessing import (
 PREPROCESSED, FEATURES, MAP = "preprocessed", "features", "map"
 _SOURCES = {
     "own": "masks of the kapture",
-    "user": "masks brought along",
+    "user": "user masks",
     "fixed": "fixed masks",
     "unchanging": "unchanging regions",
     "classes": "dynamic classes",
@@ -111,7 +111,7 @@ class ExtractLocal(Linked, StageCommand):
     output: Output
     """Features folder: local_features/T/{keypoints,descriptors}."""
     features: tuple[str, ...] = ()
-    """Extractor plugins; those of the preset unless given."""
+    """Extractor plugins; if omitted, the preset's."""
     force: Force = False
 
     def run(self, console: Console) -> None:
@@ -132,7 +132,8 @@ class ExtractLocal(Linked, StageCommand):
                     )
                 if "images_reduced" in counts:
                     told.append(
-                        f"{counts['images_reduced']} images were reduced meanwhile (max_megapixels)"
+                        f"{counts['images_reduced']} images were reduced for extraction "
+                        "(max_megapixels)"
                     )
                 console.say(f"{extractor.name}: {'; '.join(told)}")
 
@@ -150,12 +151,11 @@ class Match(Reading, StageCommand):
     output: Output
     """Features folder: local_features/T/matches."""
     features: str | None = None
-    """Type of local features; needed where there are several."""
+    """Type of local features; required if several exist."""
     matcher: str | None = None
-    """Matcher plugin; the preset's unless given."""
+    """Matcher plugin; if omitted, the preset's."""
     force: Overwrite = False
-    """Write into a folder that has other things in it, and match with poses that contradict the
-    matches."""
+    """Write into a non-empty folder, and accept poses that contradict the matches."""
 
     def run(self, console: Console) -> None:
         mapping = self.kapture_map(self.input)
@@ -190,7 +190,7 @@ class Triangulate(Reading, StageCommand):
     pairs: Path | None = None
     """Use the matches of these pairs only."""
     features: tuple[str, ...] = ()
-    """Types of local features, each with its own points; needed where there are several."""
+    """Types of local features, each with separate points; required if several exist."""
     force: Force = False
 
     def run(self, console: Console) -> None:
@@ -229,14 +229,15 @@ class OutsideStage(Working):
     stage: ClassVar[str]
 
     workspace: Annotated[Path, tyro.conf.arg(aliases=["-w"])]
-    """Workspace of megloc eval that has what the stage reads."""
+    """Workspace of megloc eval with the stage's inputs."""
     set: Texts = ()
     """Change an option of the stage: key=value; may be repeated."""
 
     def run(self, console: Console) -> None:
         stage = load_plugin(STAGES, self.stage, assigned(self.set))
         check_option(
-            (self.workspace / "stages").is_dir(), f"{self.workspace} is no workspace of megloc eval"
+            (self.workspace / "stages").is_dir(),
+            f"{self.workspace} is not a workspace of megloc eval",
         )
         workspace = Workspace(self.workspace)
         with self.working_in(workspace) as work:
@@ -253,32 +254,32 @@ def stage_command(name: str) -> type[Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class Preprocess(Linked, Computing, Working):
-    """Resize, undistort and mask the images of a kapture; poses stay, cameras follow."""
+    """Resize, undistort and mask the images of a kapture folder; cameras are adapted."""
 
     input: Input
-    """Kapture folder; it stays as it is."""
+    """Kapture folder; not modified."""
     output: Output
     """Kapture folder of the new images."""
     resize: int | None = None
-    """The larger side of larger images, px; both sides are then cropped to multiples of 8."""
+    """Reduce images to this larger side, px; both sides are then cropped to multiples of 8."""
     undistort: bool = False
-    """Make images that a pinhole camera would have taken."""
+    """Remove lens distortion."""
     segmenter: str | None = None
     """Segmenter plugin whose dynamic classes (people, vehicles) are masked."""
     dynamic: tuple[str, ...] = ()
-    """Classes to mask; the segmenter's own choice unless given."""
+    """Classes to mask; if omitted, the segmenter's dynamic classes."""
     bottom_share: Texts = ()
     """Mask the bottom of a camera's images: CAMERA=0.2, a sensor id or a pattern of image names."""
     polygon: Texts = ()
     """Mask a polygon: CAMERA="x,y x,y x,y", corners in shares of width and height."""
     mask_file: Texts = ()
-    """Mask what is 0 in an image of the camera's size: CAMERA=FILE."""
+    """Mask the pixels that are 0 in an image of the camera's size: CAMERA=FILE."""
     unchanging: bool = False
-    """Mask the region at the bottom that never changes (the car's bonnet), found per camera."""
+    """Detect and mask the static ego-vehicle region of each camera."""
     sequence: Folders = ()
-    """Kapture folder whose images of the same cameras help to find it; may be repeated."""
+    """Further kapture folder with images of the same cameras for --unchanging; may be repeated."""
     user_masks: Path | None = None
-    """Folder of masks IMAGE.png, 0 where the image is ignored."""
+    """Folder of masks IMAGE.png, 0 for ignored pixels."""
     set: Texts = ()
     """Change another option: key=value (upscale); may be repeated."""
     force: Force = False

@@ -33,29 +33,29 @@ from megloc_kapture.values import RigidTransform
 @dataclass(frozen=True, kw_only=True)
 class Train(Linked, Common):
     """Train SuperGlue, or a detector's descriptors, on kapture folders with depth and on
-    photographs. It goes on where it was interrupted."""
+    photographs. Repeat the command to resume."""
 
     task: Annotated[
         tyro.conf.Positional[Literal["matcher", "descriptor"]], tyro.conf.arg(metavar="TASK")
     ]
-    """matcher: SuperGlue on frozen features; descriptor: of a frozen detector's keypoints."""
+    """matcher: SuperGlue for frozen features; descriptor: descriptors of a frozen detector's
+    keypoints."""
     input: Inputs = ()
     """Kapture folder with poses and depth; may be repeated."""
     photographs: Folders = ()
-    """Folder of images, trained on under random homographies; may be repeated."""
+    """Folder of images to train on under random homographies; may be repeated."""
     held_out: Folders = ()
     """Kapture folder with poses and depth to evaluate on; may be repeated."""
     output: Output
-    """File to write: X.safetensors; beside it X.json, X.csv and X.state.pt."""
+    """File to write: X.safetensors; also writes X.json, X.csv and X.state.pt."""
     features: str | None = None
-    """Extractor whose features are matched, or whose detector is frozen; superpoint unless
-    given."""
+    """Extractor whose features are matched, or whose detector is frozen; if omitted, superpoint."""
     set: Texts = ()
     """Change an option: key.key=value (steps=20000, pairs.max_size_px=800); may be repeated."""
     threads: int = 1
     """Threads that prepare pairs."""
     force: Overwrite = False
-    """Begin again where files of another training stand."""
+    """Overwrite the files of another training."""
 
     def run(self, console: Console) -> None:
         # torch imports slowly
@@ -92,34 +92,34 @@ _MIN_SHOWN = 0.5
 @dataclass(frozen=True, kw_only=True)
 class TrainField(Linked, Common):
     """Train a neural field (NeRF-W) on the images of a map, to render views and refine poses.
-    It goes on where it was interrupted."""
+    Repeat the command to resume."""
 
     input: Input
-    """Kapture map: images with poses; masks and depth maps are used where there are any."""
+    """Kapture map: images with poses, optionally masks and depth maps."""
     output: Output
     """Folder of the field: field.json and field.safetensors."""
     kind: Literal["triplane", "nerfw"] = "triplane"
-    """triplane: minutes on a processor; nerfw: the published network, which needs a GPU."""
+    """triplane: minutes on a CPU; nerfw: the published network, which needs a GPU."""
     steps: int = 4000
-    """Of the training."""
+    """Number of training steps."""
     minutes: float | None = None
-    """End after so many at the latest; only without are the bytes the same twice."""
+    """Stop after this many minutes; results are reproducible only without it."""
     max_side: int = 320
-    """Longer side of the images that are trained on, px; larger ones are reduced."""
+    """Longer side of the training images, px; larger images are reduced."""
     held_out_every: int = 8
-    """Of so many images one is held out, to measure PSNR; 0: all are trained on."""
+    """Hold out every N-th image to measure PSNR; 0: none."""
     lights: Literal["image", "folder"] = "image"
-    """An appearance for each image, or one for each folder of images, where that is a session."""
+    """Learn one appearance per image, or per folder of images (a session)."""
     seed: int = 0
-    """Of everything that is drawn."""
+    """Seed of all random numbers."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """auto: a GPU where there is one."""
+    """auto: a GPU if available."""
     half_precision: bool = False
-    """Networks compute in bfloat16, which pays on a GPU."""
+    """Compute in bfloat16; faster on a GPU."""
     compiled: bool = False
-    """By torch.compile, which pays on a GPU: minutes at first, and it needs a C compiler."""
+    """Use torch.compile: faster on a GPU after minutes of compilation; needs a C compiler."""
     force: Overwrite = False
-    """Write into a folder that has other things in it; begin again."""
+    """Write into a non-empty folder; start again."""
 
     def run(self, console: Console) -> None:
         from pydantic import ValidationError
@@ -161,35 +161,36 @@ class TrainField(Linked, Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Render(Linked, Working):
-    """Render a view of a neural field, views of a result, or views that no camera took."""
+    """Render views of a neural field: at a pose, along a result, or between map cameras."""
 
     field: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FIELD")]
     """Folder that megloc train-field wrote."""
     output: Output
     """Image file for --pose, kapture folder for --along and --between."""
     pose: str | None = None
-    """cam_from_world as qw,qx,qy,qz,tx,ty,tz; write --pose=... where the first is negative."""
+    """cam_from_world as qw,qx,qy,qz,tx,ty,tz; write --pose=... if the first number is negative."""
     camera: str | None = None
-    """Of --pose: MODEL,WIDTH,HEIGHT,PARAMETERS, as COLMAP defines them."""
+    """For --pose: MODEL,WIDTH,HEIGHT,PARAMETERS as in COLMAP."""
     depth: Path | None = None
-    """Of --pose: file for the depth, 16-bit PNG in thousandths of the map's unit, 0 where empty."""
+    """For --pose: depth file, 16-bit PNG in thousandths of the map's unit, 0 where empty."""
     along: Path | None = None
-    """Kapture folder, e.g. a result: all its images that have poses are rendered, with depth."""
+    """Kapture folder, such as a result: render all its images with poses, with depth."""
     between: Path | None = None
-    """The map: views halfway between its neighbouring cameras are rendered, with depth, as map
-    images more (kapture_merge joins them); those that show the scene in less than half are not."""
+    """Map: render views halfway between neighbouring cameras, with depth, as additional map images
+    (merge them with kapture_merge); views with less than half of their pixels on the scene are
+    omitted."""
     max_side: int | None = None
-    """Of --along and --between: longer side of the renderings, px; larger cameras are reduced."""
+    """For --along and --between: longer side of the renderings, px; larger cameras are reduced."""
     appearance: str | None = None
-    """An image that was trained on, in whose light to render; the mean of all unless given."""
+    """Training image whose light is used; if omitted, the mean of all."""
     force: Overwrite = False
-    """Overwrite a file, or write into a folder that has other things in it."""
+    """Overwrite a file, or write into a non-empty folder."""
 
     def run(self, console: Console) -> None:
         from megloc_kapture.stages.neural_field import render_along, views_between
 
         if sum(each is not None for each in (self.pose, self.along, self.between)) != 1:
-            raise OptionError("say what to render: --pose and --camera, --along or --between")
+            raise OptionError("nothing to render: give --pose and --camera, --along or --between")
         many = self.along or self.between
         if many is None:
             self._render_one()
@@ -220,7 +221,7 @@ class Render(Linked, Working):
         from megloc_kapture.stages.neural_field import open_field
 
         if self.pose is None or self.camera is None:
-            raise OptionError("--pose needs the --camera that looks")
+            raise OptionError("--pose needs the --camera")
         pose, camera = _pose_of_text(self.pose), camera_of_text(self.camera)
         endings: list[tuple[Path, tuple[str, ...]]] = [(self.output, WRITABLE_SUFFIXES)]
         if self.depth is not None:
@@ -230,7 +231,7 @@ class Render(Linked, Working):
                 path.suffix.lower() in known, f"{path}: the file must end in {' or '.join(known)}"
             )
             if path.exists() and not self.force:
-                raise OutputError(f"{path}: stands there; -f replaces it")
+                raise OutputError(f"{path}: exists; -f overwrites it")
         with single_threaded():
             field = open_field(self.field)
             light = None if self.appearance is None else field.appearance_of(self.appearance)

@@ -46,7 +46,7 @@ WRONG_FILES = 2
 
 @dataclass(frozen=True, kw_only=True)
 class List(Common):
-    """List all networks: file, size, licence, whether it is there and its sha256 known."""
+    """List all networks with file, size, licence and state."""
 
     def run(self, console: Console) -> None:
         import pandas as pd  # slow import
@@ -62,16 +62,16 @@ class List(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Fetch(Common):
-    """Download weights from where they are published, check them, and keep them."""
+    """Download published weights, check them, and keep them."""
 
     names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME...]")] = ()
-    """Networks, by their names in the list."""
+    """Names of networks, as listed."""
     preset: str | None = None
-    """All that a preset needs and has not."""
+    """All missing weights of this preset."""
     accept_licence: bool = False
     """Agree to a licence that does not plainly allow commercial use."""
     force: Overwrite = False
-    """Replace a different file that stands in its place."""
+    """Replace an existing, different file."""
 
     def run(self, console: Console) -> None:
         names = self.names
@@ -98,10 +98,10 @@ class Fetch(Common):
         place = weights_folder() / file.name
         if place.is_file() and not self.force:
             if file.sha256 in (None, sha256_of(describe(weights.name, place))):
-                console.result(f"{weights.name}: already there, {place}")
+                console.result(f"{weights.name}: already present, {place}")
                 _say_to_convert(console, weights, file, place)
                 return
-            raise OutputError(f"{place}: stands there, but is not the published file; -f fetches")
+            raise OutputError(f"{place}: exists, but is not the published file; -f replaces it")
 
         console.say(f"{weights.name}: {url}")
         console.say(f"  licence: {weights.licence}: {weights.terms}")
@@ -122,16 +122,16 @@ class Fetch(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Add(Common):
-    """Copy a file that was downloaded by hand into the folder of weights, once it is proven."""
+    """Check a downloaded file and copy it into the folder of weights."""
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """Downloaded file, or X.safetensors that scripts/convert_weights.py has written."""
     name: str | None = None
-    """Network that it is for; told by its sha256 or its name unless given."""
+    """Network of the file; if omitted, recognised by sha256 or file name."""
     unverified: bool = False
-    """Take a file that is not the published one, such as one you trained."""
+    """Accept a file that is not the published one, such as one that you trained."""
     force: Overwrite = False
-    """Replace a different file that stands in its place."""
+    """Replace an existing, different file."""
 
     def run(self, console: Console) -> None:
         added = add_weights(self.file, name=self.name, force=self.force, unverified=self.unverified)
@@ -140,14 +140,14 @@ class Add(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Convert(Common):
-    """Write the tensors of a checkpoint of torch as safetensors."""
+    """Convert a torch checkpoint to safetensors."""
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
-    """Checkpoint of torch; scripts/convert_weights.py converts other files."""
+    """torch checkpoint; scripts/convert_weights.py converts other files."""
     output: Output
     """File to write; must end in .safetensors."""
     force: Overwrite = False
-    """Replace a file that stands there."""
+    """Overwrite an existing file."""
 
     def run(self, console: Console) -> None:
         count = convert_weights(self.file, self.output, force=self.force)
@@ -156,10 +156,10 @@ class Convert(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Check(Common):
-    """Check the files that are there: sha256 where it is known, and that they load safely."""
+    """Check the existing files: sha256 if known, and safe loading."""
 
     names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME...]")] = ()
-    """Networks, by their names in the list; all whose files are there unless given."""
+    """Names of networks, as listed; if omitted, all with a file."""
 
     def run(self, console: Console) -> int:
         """Return 2 if a file is wrong."""
@@ -216,13 +216,13 @@ def _fetchable(weights: Weights, accepted: bool) -> tuple[Weights, PublishedFile
     file = weights.to_fetch
     if file is None or file.url is None:
         raise MissingWeightsError(
-            f"{weights.name} cannot be fetched by a program: download it from {weights.page} and "
-            "run: megloc weights add FILE"
+            f"{weights.name} cannot be downloaded automatically: download it from {weights.page} "
+            "and run: megloc weights add FILE"
         )
     check_option(
         weights.commercial or accepted,
-        f"{weights.name} has a licence to agree to: {weights.licence}: {weights.terms} "
-        f"(whole text at {weights.page}); if you do, add --accept-licence",
+        f"{weights.name} needs your consent to its licence: {weights.licence}: {weights.terms} "
+        f"(whole text at {weights.page}); to agree, add --accept-licence",
     )
     return weights, file, file.url
 
@@ -304,12 +304,12 @@ def find_problems() -> list[str]:
     torch, vision = installed_version("torch"), installed_version("torchvision")
     if vision and torch and "+cpu" in torch:
         problems.append(
-            f"torchvision {vision} beside torch {torch}: its CPU builds fail to import and break "
+            f"torchvision {vision} with torch {torch}: its CPU builds fail to import and break "
             "transformers too; pip uninstall torchvision"
         )
     if installed_version("opencv-python") and installed_version("opencv-python-headless"):
         problems.append(
-            "opencv-python beside opencv-python-headless: both write the folder cv2; uninstall "
+            "opencv-python and opencv-python-headless both write the folder cv2; uninstall "
             "both and install opencv-python-headless"
         )
     if importlib.util.find_spec("cv2") is None:

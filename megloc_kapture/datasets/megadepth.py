@@ -41,7 +41,7 @@ _IDENTITY = RigidTransform.identity()
 class MegaDepthOptions(Options):
     """Options of importing MegaDepth."""
 
-    scenes: tuple[str, ...] = Field(default=(), description="by their numbers; none: all there are")
+    scenes: tuple[str, ...] = Field(default=(), description="scene numbers; none: all")
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def import_megadepth(
     for scene in scenes:
         images = list(_images(root, scene))
         written = _write_scene(output / scene, work.track(images, len(images), scene))
-        require(written, f"scene {scene} has no image that is there with its depth", path=root)
+        require(written, f"scene {scene} has no image with depth", path=root)
         counts["scenes"] += 1
         counts["images"] += written
         counts["without_depth"] += len(images) - written
@@ -102,7 +102,7 @@ def _images(root: Path, scene: str) -> Iterator[_Image]:
     elif table.is_file():
         yield from _of_table(root, scene, table)
     else:
-        raise DataError(f"neither {folder} nor {table} is there", path=root)
+        raise DataError(f"neither {folder} nor {table} exists", path=root)
 
 
 def _of_model(root: Path, scene: str, model: Path, folder: Path) -> Iterator[_Image]:

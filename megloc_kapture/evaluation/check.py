@@ -135,7 +135,7 @@ def read_reference(folder: Path) -> Reference:
     )
     require(
         mapping is not None or query is not None or tables.is_dir(),
-        "no imported dataset: it has none of mapping/, query/ and megloc/",
+        "no imported dataset: mapping/, query/ and megloc/ are missing",
         path=folder,
     )
     rules = benchmark_of(tables)
@@ -247,7 +247,7 @@ def _read_rows(
             findings.append(Finding("error", kind, message, line=line))
 
         if fields[0].startswith("#"):
-            problem("comment", "a comment; the format has none, and no header")
+            problem("comment", "a comment; the format has no comments and no header")
             continue
         if len(fields) != num_keys + 7:
             message = f"{counted(len(fields), 'column')} instead of {num_keys + 7} ({columns})"

@@ -70,8 +70,8 @@ def evaluate(
     ----------
     estimated, truth : kapture folder, pose file, COLMAP model, or image -> ``cam_from_world`` in
         metres. A folder of results may have a ``status.csv``, a folder of true poses a
-        ``nowhere.txt``: one query a line that shows nothing of the map and is right without a pose.
-    dataset : name of the dataset whose thresholds, conditions and pools hold; by default those of
+        ``nowhere.txt``: one query per line that does not show the map and is right without a pose.
+    dataset : name of the dataset whose thresholds, conditions and pools apply; by default those of
         the side tables.
     side_tables : ``megloc/`` folder of the workspace, by default found near truth or result.
     thresholds : recall thresholds instead of the protocol's.

@@ -233,7 +233,7 @@ _TIMESTAMP = re.compile("0|[1-9][0-9]{0,29}")
 
 @dataclass(frozen=True, slots=True)
 class RelativePose:
-    """One row: the timestamps of two keyframes, and their pose unless the row has none."""
+    """One row: the timestamps of two keyframes, and their pose if the row has one."""
 
     reference: int
     query: int
@@ -369,7 +369,7 @@ class _Provenance(BaseModel):
 
 
 def read_confidences(target: Path | str) -> dict[str, float]:
-    """Read image -> confidence from the JSON beside a pose file.
+    """Read image -> confidence from the JSON file of a pose file.
 
     Empty, with a warning, if the JSON is none of ours or has the SHA-256 of another pose file.
     """

@@ -142,7 +142,7 @@ class Result:
     Attributes
     ----------
     images : queries of the result, sorted; for a pose file only those with a pose.
-    confidences : of poses without a status, from the JSON beside a pose file.
+    confidences : of poses without a status, from a pose file's JSON file.
     covariances : image -> (6, 6), as of ``Pose``.
     by_pair : poses of the queries of MLAD's pairs, if the result is such a pose file.
     """

@@ -1,7 +1,7 @@
 """The 3D view of a map and of queries in it: one self-contained HTML page, drawn by WebGL2.
 
 Coordinates are float32 relative to an origin in full precision. A page that would be large shows a
-part of the data and says so.
+part of the data, with a note.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Scene:
     radius : of the visible content around the origin.
     frames : names of coordinate frames, shown one at a time; ``point_frames``, ``camera_frames``
         and ``query_frames`` are indices into them.
-    notes : sentences on what is left out.
+    notes : sentences about omissions.
     """
 
     title: str
@@ -114,7 +114,7 @@ def write_view(
 
     Another view at ``path`` is overwritten, other files only with ``force``. ``result`` and
     ``truth`` are as in :func:`megloc_kapture.evaluation.evaluate.evaluate`: queries are coloured by
-    their error, or by their confidence without truth. Returns sentences on what is left out.
+    their error, or by their confidence without truth. Returns sentences about omissions.
     """
     path = Path(path)
     _check_output(path, force=force)
@@ -128,7 +128,7 @@ def write_view(
         context = replace(context, cameras={**(cameras or {}), **context.cameras})
         title = evaluation.label or title
     elif truth is not None:
-        raise OptionError("a truth needs a result to be compared with")
+        raise OptionError("true poses need a result to compare with")
     scene = scene_of(title, StoredInliers(context), queries)
     if scene is None:
         raise DataError("no image has a pose, so there is nothing to see", path=folder.root)
@@ -155,7 +155,7 @@ def _check_output(path: Path, *, force: bool) -> None:
     with open(path, "rb") as file:
         is_view = _OURS in file.read(_HEAD_BYTES)
     if not is_view:
-        raise OutputError(f"{path}: exists and is no view; -f overwrites it")
+        raise OutputError(f"{path}: exists and is not a view; -f overwrites it")
 
 
 def scene_of(
@@ -192,7 +192,7 @@ def scene_of(
     quats, translations = stack_poses(spanning)
     centers = camera_centers(quats, translations)
     page, _ = top_view(quats, centers)
-    # separately, so that ten cameras count beside a thousand points
+    # separately, so that ten cameras count next to a thousand points
     ends = [np.quantile(a, _SEEN_AT_FIRST, axis=0) for a in (centers, points[:, :3]) if len(a)]
     low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
     # few digits, so that JSON has exactly what was subtracted
@@ -201,14 +201,14 @@ def scene_of(
     with_inliers = min(max(len(queries), 1), _MAX_QUERIES_WITH_INLIERS)
     most = min(_MAX_INLIERS // with_inliers, _MAX_INLIERS_OF_ONE)
     if stored.known and len(queries) > _MAX_QUERIES_WITH_INLIERS:
-        notes.append(f"Inliers are drawn of the worst {_MAX_QUERIES_WITH_INLIERS} queries.")
+        notes.append(f"Inliers are drawn for the worst {_MAX_QUERIES_WITH_INLIERS} queries.")
     inliers = [
         stored.of(query)[1] if query.num_inliers else np.zeros((0, 3))
         for query in queries[:_MAX_QUERIES_WITH_INLIERS]
     ]
     inliers += [np.zeros((0, 3))] * (len(queries) - len(inliers))
     if any(len(xyz) > most for xyz in inliers):
-        notes.append(f"Of a query's inliers at most {most} are drawn.")
+        notes.append(f"At most {most} inliers per query are drawn.")
     inliers = [xyz[spread(len(xyz), most)] for xyz in inliers]
     up = np.cross(*page)
     return Scene(

@@ -45,7 +45,7 @@ class AlikedOptions(LocalNetworkOptions):
         description="aliked-t16 (64-d), aliked-n16, aliked-n16rot, aliked-n32, or a file",
     )
     nms_radius: int = Field(default=2, gt=0, description="pixels")
-    threshold: float = Field(default=0.2, ge=0, lt=1, description="scores kept are larger")
+    threshold: float = Field(default=0.2, ge=0, lt=1, description="smallest score of a keypoint")
 
 
 class Aliked(LocalNetwork[AlikedOptions]):

@@ -57,13 +57,16 @@ _BLUR_PX = 0.8  # in the smaller image, before each step
 
 class AslFeatOptions(LocalNetworkOptions):
     weights: str = Field(default="aslfeat", description="name in the registry, or a file")
-    threshold: float = Field(default=0.5, ge=0, description="scores kept are larger")
+    threshold: float = Field(default=0.5, ge=0, description="smallest score of a keypoint")
     nms_radius: int = Field(default=1, ge=0, description="pixels")
     max_edge_ratio: float = Field(
-        default=10.0, ge=1, description="of the score map's principal curvatures at a keypoint"
+        default=10.0,
+        ge=1,
+        description="largest ratio of the score map's principal curvatures at a keypoint",
     )
     multi_scale: bool = Field(
-        default=False, description="also at 1/sqrt(2) and 1/2 of the size, for changes of scale"
+        default=False,
+        description="also extract at 1/sqrt(2) and 1/2 of the size, for changes of scale",
     )
 
 

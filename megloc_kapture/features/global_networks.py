@@ -90,7 +90,9 @@ class NetVladOptions(GlobalNetworkOptions):
         default="netvlad-pitts30k", description="netvlad-pitts30k, netvlad-tokyotm, or a file"
     )
     max_size_px: int = Field(
-        default=1024, ge=STRIDE_PX, description="longer side; smaller images stay as they are"
+        default=1024,
+        ge=STRIDE_PX,
+        description="longer side of the input; smaller images are not enlarged",
     )
 
 
@@ -126,8 +128,8 @@ class OpenIblOptions(GlobalNetworkOptions):
     max_size_px: int | None = Field(
         default=None,
         ge=STRIDE_PX,
-        description="longer side, ratio kept, smaller images as they are; None: all images are "
-        "made 640 x 480 whatever their ratio, as in training",
+        description="longer side of the input, aspect ratio kept, smaller images not enlarged; "
+        "None: 640 x 480 for all images, as in training",
     )
 
 
@@ -161,17 +163,20 @@ class ApGemOptions(GlobalNetworkOptions):
     whitening: str = Field(
         default="Landmarks_clean",
         pattern=r"^[\w-]*$",
-        description="name of a PCA in the checkpoint, as the authors evaluate with it; empty: the "
-        "network's vectors as they are, which is what their tool for kapture writes by default",
+        description="name of a PCA whitening in the checkpoint, as in the authors' evaluation; "
+        "empty: no whitening, the default of their kapture tool",
     )
     whitening_power: float = Field(
-        default=0.25, ge=0, le=1, description="of the variances that components are divided by"
+        default=0.25,
+        ge=0,
+        le=1,
+        description="power of the variances that components are divided by",
     )
     max_size_px: int | None = Field(
         default=1024,
         ge=32,
-        description="longer side that the network sees, as hloc has it; none: the image's own, as "
-        "the authors evaluate",
+        description="longer side of the network's input, as in hloc; none: original size, as in "
+        "the authors' evaluation",
     )
 
 
@@ -213,12 +218,12 @@ class DelgOptions(GlobalNetworkOptions):
         description="delg-{r50,r101}-{gld,gldv2clean}, or a converted file",
     )
     max_size_px: int | None = Field(
-        default=1024, ge=32, description="longer side that scale 1 is of; none: the image's own"
+        default=1024, ge=32, description="longer side at scale 1; none: original size"
     )
     scales: tuple[float, ...] = Field(
         default=(0.70710677, 1.0, 1.4142135),
         min_length=1,
-        description="whose vectors are summed; each is a run of the network",
+        description="scales whose vectors are summed; each is a run of the network",
     )
 
 
@@ -253,7 +258,7 @@ class MegaLocOptions(GlobalNetworkOptions):
         default=_MEGALOC_SIZE_PX,
         ge=9 * PATCH_PX,  # fewer patches would leave clusters empty
         multiple_of=PATCH_PX,
-        description="both sides that the network sees; the map's must be the queries'",
+        description="width and height of the network's input; must be equal for map and queries",
     )
 
 

@@ -28,8 +28,8 @@ class BoundedOptions(Options):
         default=DEFAULT_MEGAPIXELS,
         gt=0,
         allow_inf_nan=False,
-        description="a larger image is reduced to this before its features are extracted, and its "
-        "keypoints are scaled back; memory grows with it",
+        description="larger images are reduced to this for extraction, and keypoints scaled back; "
+        "memory grows with it",
     )
 
 

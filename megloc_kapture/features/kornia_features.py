@@ -52,9 +52,11 @@ class _KorniaFeatures(LocalNetwork[LocalOptions]):
 class XFeatOptions(LocalNetworkOptions):
     weights: str = Field(default="xfeat", description="name in the registry, or a file")
     descriptor_weights: str | None = Field(
-        default=None, description="file of another XFeat network, whose descriptors are taken"
+        default=None, description="file of another XFeat network that computes the descriptors"
     )
-    threshold: float = Field(default=0.05, ge=0, lt=1, description="probability of a keypoint")
+    threshold: float = Field(
+        default=0.05, ge=0, lt=1, description="smallest probability of a keypoint"
+    )
 
 
 class XFeat(_KorniaFeatures[XFeatOptions]):
@@ -95,8 +97,10 @@ def xfeat_offset_px(shape: Sequence[int]) -> NDArray[np.float32]:
 
 class DiskOptions(LocalNetworkOptions):
     weights: str = Field(default="disk", description="name in the registry, or a file")
-    nms_window_px: int = Field(default=5, ge=1, description="odd side of the window")
-    threshold: float = Field(default=0.0, description="scores kept are larger; they are logits")
+    nms_window_px: int = Field(
+        default=5, ge=1, description="side of the non-maximum suppression window, odd"
+    )
+    threshold: float = Field(default=0.0, description="smallest score of a keypoint, a logit")
 
 
 class Disk(_KorniaFeatures[DiskOptions]):

@@ -23,7 +23,7 @@ Level = tuple[NDArray[np.float32], NDArray[np.float32], torch.Tensor]
 
 class LocalNetworkOptions(NetworkOptions, BoundedOptions):
     weights: str
-    max_keypoints: int = Field(default=1500, gt=0, description="best scores kept")
+    max_keypoints: int = Field(default=1500, gt=0, description="number of best keypoints kept")
 
 
 LocalOptions = TypeVar("LocalOptions", bound=LocalNetworkOptions)

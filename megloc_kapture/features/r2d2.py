@@ -43,7 +43,9 @@ class R2D2Options(LocalNetworkOptions):
     """Options of R2D2; the authors' except for the number of keypoints."""
 
     weights: str = Field(default=_DEFAULT_WEIGHTS, description="name in the registry, or a file")
-    max_keypoints: int = Field(default=1500, gt=0, description="best kept; the authors keep 5000")
+    max_keypoints: int = Field(
+        default=1500, gt=0, description="number of best keypoints kept; the authors use 5000"
+    )
     min_size: int = Field(default=256, gt=0, description="longer side of the smallest level, px")
     max_size: int = Field(default=1024, gt=0, description="longer side of the largest level, px")
     min_reliability: float = Field(default=0.7, ge=0, le=1)

@@ -22,9 +22,9 @@ _NO_LIMIT = 2**31 - 1
 
 
 class RootSiftOptions(BoundedOptions):
-    max_keypoints: int = Field(default=5000, gt=0, description="strongest responses kept")
+    max_keypoints: int = Field(default=5000, gt=0, description="number of strongest keypoints kept")
     contrast_threshold: float = Field(
-        default=0.01, ge=0, description="lower keeps weaker blobs (OpenCV's own default is 0.04)"
+        default=0.01, ge=0, description="smallest contrast of a keypoint (OpenCV's default is 0.04)"
     )
     edge_threshold: float = Field(default=10.0, gt=0)
     sigma_px: float = Field(default=1.6, gt=0, description="blur of the first octave")
@@ -95,10 +95,11 @@ class ColmapSiftOptions(BoundedOptions):
     max_keypoints: int = Field(
         default=8192,
         gt=0,
-        description="coarsest kept; COLMAP keeps whole scale levels, the last may exceed it",
+        description="number of coarsest keypoints kept; COLMAP keeps whole scale levels, so the "
+        "last may exceed it",
     )
     first_octave: int = Field(
-        default=-1, ge=-1, le=5, description="-1 doubles the image first, 0 is the image's own"
+        default=-1, ge=-1, le=5, description="first octave; -1 doubles the image size, 0 keeps it"
     )
     peak_threshold: float = Field(
         default=0.02 / 3, gt=0, description="smallest difference of Gaussians, of grey in 0..1"

@@ -48,14 +48,16 @@ class SuperPointOptions(LocalNetworkOptions):
     )
     descriptor_weights: str | None = Field(
         default=None,
-        description="file with another descriptor head, or with such a head and its own backbone",
+        description="file with another descriptor head, optionally with a backbone",
     )
-    threshold: float = Field(default=0.005, ge=0, lt=1, description="scores kept are larger")
-    nms_radius: int = Field(default=4, ge=0, description="pixels; SuperGlue outdoors: 3")
-    remove_borders: int = Field(default=4, ge=0, description="pixels without keypoints")
+    threshold: float = Field(default=0.005, ge=0, lt=1, description="smallest score of a keypoint")
+    nms_radius: int = Field(default=4, ge=0, description="in pixels; SuperGlue uses 3 outdoors")
+    remove_borders: int = Field(
+        default=4, ge=0, description="width of the border without keypoints, pixels"
+    )
     descriptor_sampling: Literal["official", "exact"] = Field(
         default="official",
-        description="official: as the weights' authors do, in Magic Leap's up to 3.5 px off, which "
+        description="official: as the weights' authors, up to 3.5 px off in Magic Leap's, which "
         "SuperGlue was trained with; exact: at the keypoint",
     )
 

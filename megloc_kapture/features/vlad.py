@@ -44,13 +44,15 @@ TRAINING_DESCRIPTORS, LLOYD_STEPS = 200_000, 20
 class VladOptions(Options):
     num_clusters: int = Field(default=128, gt=0, description="of each vocabulary")
     vocabularies: int = Field(
-        default=1, gt=0, description="trained with different seeds, their vectors side by side"
+        default=1,
+        gt=0,
+        description="number of vocabularies with different seeds, whose vectors are concatenated",
     )
     dimensions: int | None = Field(
         default=None,
         gt=0,
-        description="PCA whitening learnt on the map, to at most this many and fewer than it has "
-        "images; none without",
+        description="dimensions after PCA whitening learnt on the map, fewer than its images; "
+        "none: no whitening",
     )
     assignment: Literal["hard", "soft"] = "hard"
     seed: int = Field(default=0, ge=0)

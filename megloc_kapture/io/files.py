@@ -116,8 +116,7 @@ def check_no_escape(roots: Sequence[Path], path: Path) -> Path:
     if not any(real.is_relative_to(os.path.realpath(root)) for root in roots):
         raise DataError(
             f"is or lies behind a link that leaves {roots[0]}, to {real}; images may be links to "
-            "anywhere, anything else only to below a folder that --allow-links-below names, of "
-            "commands that have it",
+            "anywhere, other files only to folders given by --allow-links-below",
             path=path,
         )
     return path

@@ -53,9 +53,11 @@ Floats = NDArray[np.float64]
 class AbsolutePoseOptions(Options):
     """Options of the pose estimation."""
 
-    max_error_px: float = Field(default=12.0, gt=0, description="reprojection error of an inlier")
-    min_inliers: int = Field(default=12, ge=4, description="fewer is a failure")
-    seed: int = Field(default=0, ge=0, description="of RANSAC's samples")
+    max_error_px: float = Field(
+        default=12.0, gt=0, description="largest reprojection error of an inlier"
+    )
+    min_inliers: int = Field(default=12, ge=4, description="queries with fewer inliers fail")
+    seed: int = Field(default=0, ge=0, description="seed of RANSAC's samples")
 
     def for_poselib(self) -> dict[str, Any]:
         """Return the RANSAC options under poselib's names."""

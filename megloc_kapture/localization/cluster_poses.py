@@ -55,14 +55,14 @@ MAX_CLUSTERS = 10
 class ClusterOptions(Options):
     by: Literal["none", "poses", "covisibility"] = Field(
         default="covisibility",
-        description="none: all candidates are one cluster; poses: images whose centres are near; "
+        description="none: all candidates in one cluster; poses: images with nearby centres; "
         "covisibility: images that see the same points",
     )
     radius: float | None = Field(
         default=None,
         gt=0,
-        description="poses: centres this close, in the map's unit, belong together, and so do "
-        "all that are joined by such steps",
+        description="for poses: images with centres this close are linked; connected images form a "
+        "cluster; in map units",
     )
 
     @model_validator(mode="after")
@@ -191,7 +191,7 @@ def localize_in_clusters(
     attempts = [attempt(clusters[at], frames[at] if frames else "") for at in tried]
     attempts = _join_agreeing(attempts, attempt, rank_of.__getitem__)
     if not attempts:
-        return Failure("no match is with a point of the map", seconds=clock.seconds), None
+        return Failure("no match has a map point", seconds=clock.seconds), None
     hypotheses = [each.hypothesis for each in attempts if each.hypothesis is not None]
     scores = iter(rank(hypotheses).tolist() if hypotheses else ())
     ranked = tuple(

@@ -39,14 +39,14 @@ _USUAL_RATIO, _FEW = 2.9, 20
 _TOLERATED_SHIFT = 0.03
 
 TERMS: dict[str, str] = {
-    "surprise": "hardly more matches agree than would by chance",
+    "surprise": "hardly more matches agree than by chance",
     "agreement": "most matches contradict the pose",
-    "matched_share": "few of the points that the camera would see were matched",
+    "matched_share": "few of the visible map points were matched",
     "residual": "the inliers fit badly",
-    "misfit": "many inliers fit, and all of them worse than the map's own images do",
-    "deviation": "the inliers hold the pose loosely",
-    "viewing_angle": "the map's images saw these points from elsewhere",
-    "distance_ratio": "the map's images saw these points from another distance",
+    "misfit": "the inliers fit worse than the map's own images do",
+    "deviation": "the inliers barely constrain the pose",
+    "viewing_angle": "the map's images see these points from other directions",
+    "distance_ratio": "the map's images see these points from another distance",
     "support": "few map images agree with the pose",
 }
 """Terms of the model, with the reason that a low contribution gives."""
@@ -134,7 +134,7 @@ def with_confidence(
     weakest = min(model.weights, key=lambda name: model.weights[name] * evidence[name])
     why, remarks = TERMS[weakest], pose.remarks
     if MAP_POINTS in evidence and confidence >= min_confidence * evidence[MAP_POINTS]:
-        why = "the map has too few points where the camera looks"
+        why = "the map has too few points in the camera's view"
     if misfit is not None:
         confidence *= (_TOLERATED_SHIFT / max(misfit.shift, _TOLERATED_SHIFT)) ** 2
         why = misfit.remark

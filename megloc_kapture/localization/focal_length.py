@@ -290,7 +290,7 @@ def refine_with_intrinsics(
         fit = _fit(problem, pose.cam_from_world, pose.inliers, given)
         if fit is None:
             return problem, Failure(
-                "neither is the focal length known, nor do the matches determine it",
+                "the focal length is unknown, and the matches do not determine it",
                 num_matches=pose.num_matches,
                 num_inliers=pose.num_inliers,
             )

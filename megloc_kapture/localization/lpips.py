@@ -20,11 +20,11 @@ class LpipsOptions(NetworkOptions):
     net: Trunk = Field(default="alex", description="alex, vgg or squeeze")
     trunk: str = Field(
         default="",
-        description="a file with the network's weights under torchvision's names; empty: the "
-        "published lpips-trunk-alex, -vgg or -squeeze",
+        description="file of trunk weights with torchvision's names; empty: the published "
+        "lpips-trunk-alex, -vgg or -squeeze",
     )
     heads: str = Field(
-        default="", description="a file of linear heads; empty: lpips-alex, -vgg or -squeeze"
+        default="", description="file of linear heads; empty: lpips-alex, -vgg or -squeeze"
     )
 
 

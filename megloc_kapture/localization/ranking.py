@@ -44,9 +44,13 @@ class InlierCount:
 
 class DistinctiveInliersOptions(Options):
     radius: float = Field(
-        default=0.03, ge=0, description="of a place's inliers, share of the image's longer side"
+        default=0.03,
+        ge=0,
+        description="radius around an inlier, as a share of the image's longer side",
     )
-    power: float = Field(default=4.0, gt=0, description="1 shares an inlier evenly")
+    power: float = Field(
+        default=4.0, gt=0, description="exponent of the sharing; 1 shares an inlier evenly"
+    )
 
 
 class DistinctiveInliers:
@@ -111,14 +115,14 @@ class PerceptualOptions(Options):
         default=5,
         ge=1,
         le=1000,
-        description="map images with depth per view: those nearest that differ",
+        description="number of map images with depth per view: the nearest ones that differ",
     )
     long_side: int = Field(
-        default=320, ge=16, description="of the views compared, pixels; never enlarged"
+        default=320, ge=16, description="longer side of the compared views, pixels; never enlarged"
     )
     distance: PluginChoice = Field(
         default=PluginChoice(name="structure"),
-        description="how different two aligned images look: structure, lpips, or another's",
+        description="distance of two aligned images: structure, lpips, or a plugin",
     )
     device: Device = Field(default="auto", description="of the distance: auto, cpu, cuda or cuda:N")
     half_precision: bool = Field(default=False, description="of the distance")
@@ -126,19 +130,19 @@ class PerceptualOptions(Options):
         default=0.05,
         ge=0,
         le=1,
-        description="inliers over the most of any cluster; with less a cluster is hopeless",
+        description="smallest share of the best cluster's inliers; clusters below it are not "
+        "compared",
     )
     min_valid: float = Field(
         default=0.15,
         ge=0,
         le=1,
-        description="share of the query's pixels that must be comparable to tell anything",
+        description="share of the query's pixels that must be comparable",
     )
     finalists: int = Field(
         default=6,
         ge=1,
-        description="clusters of the least distance that are compared with each other where both "
-        "show something",
+        description="number of clusters with the least distance that are compared in pairs",
     )
 
 

@@ -22,7 +22,7 @@ from megloc_kapture.geometry.cameras import (
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
-# a point's pixel in a depth sensor beside the camera depends on its depth, so it is iterated;
+# a point's pixel in a depth sensor next to the camera depends on its depth, so it is iterated;
 # points that do not converge are behind an edge
 _ROUNDS = 6
 _SETTLED = 0.01
@@ -155,12 +155,12 @@ class DepthVerificationOptions(Options):
     max_sigmas: float | None = Field(
         default=3.0,
         gt=0,
-        description="distance from the sensor's depth, in standard deviations, beyond which an "
-        "observation is dropped; none: depth maps are not looked at",
+        description="largest difference from the sensor's depth, in standard deviations; "
+        "observations beyond it are dropped; none: ignore depth maps",
     )
     noise: tuple[float, float, float] = Field(
         default=STRUCTURED_LIGHT,
-        description="a, b, c of the noise a + b z + c z^2 at depth z, in the map's unit",
+        description="a, b, c of the depth noise a + b z + c z^2 at depth z, in map units",
     )
 
     @field_validator("noise")

@@ -47,8 +47,12 @@ def each_once(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 class PairsByPosesOptions(Options):
     """Options of pairs by poses; neighbours are counted, so no metric scale is needed."""
 
-    num_neighbours: int = Field(default=20, gt=0, description="nearest centres taken per image")
-    max_angle_deg: float = Field(default=60.0, gt=0, le=180, description="between optical axes")
+    num_neighbours: int = Field(
+        default=20, gt=0, description="number of nearest camera centres per image"
+    )
+    max_angle_deg: float = Field(
+        default=60.0, gt=0, le=180, description="largest angle between optical axes"
+    )
 
 
 def pairs_by_poses(
@@ -97,7 +101,7 @@ _MIN_SHARED_POINTS = 15
 
 
 class PairsByCovisibilityOptions(Options):
-    top_k: int = Field(default=20, gt=0, description="images taken that share most points")
+    top_k: int = Field(default=20, gt=0, description="number of images that share the most points")
 
 
 def pairs_by_covisibility(
@@ -135,7 +139,9 @@ def pairs_by_covisibility(
 
 
 class PairsBySequenceOptions(Options):
-    window: int = Field(default=5, gt=0, description="images that each is paired with after it")
+    window: int = Field(
+        default=5, gt=0, description="number of following images that each image is paired with"
+    )
     loop: bool = Field(default=False, description="the first image follows the last one")
 
 

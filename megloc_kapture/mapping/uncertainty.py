@@ -97,9 +97,8 @@ class UncertaintyOptions(Options):
     max_robust_sigmas: float | None = Field(
         default=None,
         gt=0,
-        description="how far the logarithm of a point's share of its depth may lie above the "
-        "map's median, in standard deviations estimated from the median absolute deviation; none: "
-        "no limit",
+        description="limit for a point's relative uncertainty (log of deviation over depth), in "
+        "robust standard deviations above the map's median; none: no limit",
     )
 
 

@@ -120,23 +120,25 @@ class GuidedPyramidOptions(Options):
     """Options of guided pyramid matching."""
 
     mode: Literal["off", "all", "max"] = Field(
-        default="off", description="matches of all variants together, or of the richest"
+        default="off",
+        description="all: use the matches of all variants; max: only those of the best variant",
     )
     min_matches: int = Field(
-        default=100, gt=0, description="a pair with fewer matches is tried again"
+        default=100, gt=0, description="pairs with fewer matches are matched again"
     )
     count: Literal["matches", "verified"] = Field(
         default="verified",
-        description="matches that min_matches counts: all that the matcher returns, or those that "
-        "verification leaves",
+        description="matches that min_matches counts: all of the matcher's, or the verified ones",
     )
     scales: tuple[float, ...] = Field(
         default=(1 / 3, 0.5, 1.0, 2.0, 3.0),
         min_length=1,
-        description="sizes at which the images of a pair with few matches are matched again",
+        description="scales at which pairs with few matches are matched again",
     )
     rotations_deg: tuple[int, ...] = Field(
-        default=(0, 90, 180, 270), min_length=1, description="multiples of 90"
+        default=(0, 90, 180, 270),
+        min_length=1,
+        description="rotations at which they are matched again, multiples of 90",
     )
 
     @field_validator("scales")

@@ -22,9 +22,11 @@ class NearestNeighbourOptions(Options):
         default=None,
         gt=0,
         le=1,
-        description="largest distance to the best over distance to the second best; none: no test",
+        description="largest ratio of the distances to the best and the second best; none: no test",
     )
-    min_similarity: float | None = Field(default=None, description="smallest inner product kept")
+    min_similarity: float | None = Field(
+        default=None, description="smallest inner product of a match"
+    )
 
 
 def match_nearest(

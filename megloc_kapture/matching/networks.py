@@ -61,7 +61,7 @@ class SuperGlueOptions(NetworkOptions):
         default="superglue_outdoor",
         description="name or file: superglue_outdoor, superglue_indoor or one of the same layout",
     )
-    match_threshold: float = Field(default=0.2, ge=0, lt=1, description="scores kept are larger")
+    match_threshold: float = Field(default=0.2, ge=0, lt=1, description="smallest score of a match")
     sinkhorn_iterations: int = Field(default=100, gt=0)
 
 
@@ -125,12 +125,12 @@ class LightGlueOptions(NetworkOptions):
         default="superpoint_lightglue",
         description="superpoint_lightglue, aliked_lightglue, disk_lightglue, or a file",
     )
-    threshold: float = Field(default=0.1, ge=0, lt=1, description="probability of a match")
+    threshold: float = Field(default=0.1, ge=0, lt=1, description="smallest probability of a match")
     depth_confidence: float = Field(
-        default=0.95, ge=-1, le=1, description="stop early at this confidence; -1: all layers"
+        default=0.95, ge=-1, le=1, description="stop early at this confidence; -1: run all layers"
     )
     width_confidence: float = Field(
-        default=0.99, ge=-1, le=1, description="drop keypoints at this confidence; -1: none"
+        default=0.99, ge=-1, le=1, description="drop keypoints at this confidence; -1: keep all"
     )
 
 

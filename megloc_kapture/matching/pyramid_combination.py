@@ -142,7 +142,7 @@ class KeypointUnion:
         return len(self._base) + len(self._added)
 
     def find(self, keypoints_px: Float32) -> NDArray[np.int64]:
-        """Return the rows (K,) of the identical keypoints, -1 if there are none."""
+        """Return the rows (K,) of the identical keypoints, -1 if missing."""
         found = np.full(len(keypoints_px), -1, dtype=np.int64)
         if self._tree is not None and len(keypoints_px):
             near = self._tree.query_ball_point(

@@ -44,19 +44,21 @@ _MIN_ITERATIONS, _CONFIDENCE = 20, 0.999  # RANSAC of relative poses
 class KnownPoseOptions(Options):
     """Options of verification with known poses."""
 
-    max_error_px: float = Field(default=4.0, gt=0, description="Sampson distance in the images")
+    max_error_px: float = Field(
+        default=4.0, gt=0, description="largest Sampson distance in the images"
+    )
 
 
 class TwoViewOptions(Options):
     """Options of two-view verification; cameras are calibrated, so planes are not degenerate."""
 
     max_error_px: float = Field(
-        default=4.0, gt=0, description="distance from the epipolar line of an inlier"
+        default=4.0, gt=0, description="largest distance of an inlier from its epipolar line"
     )
     max_iterations: int = Field(
-        default=100, gt=0, description="RANSAC's; more for matchers whose scores say little"
+        default=100, gt=0, description="of RANSAC; use more for matchers with uninformative scores"
     )
-    seed: int = Field(default=0, ge=0, description="of RANSAC's samples")
+    seed: int = Field(default=0, ge=0, description="seed of RANSAC's samples")
 
 
 def essential_matrix(b_from_a: RigidTransform) -> Floats:

@@ -44,13 +44,13 @@ class SweepOptions(Options):
     """Options of the plane sweep; defaults: docs/experiments/mvs.md."""
 
     max_planes: int = Field(
-        default=128, ge=_MIN_PLANES, le=512, description="depths that are tried, at half the size"
+        default=128, ge=_MIN_PLANES, le=512, description="number of depths tried, at half the size"
     )
     passes: int = Field(
         default=2,
         ge=1,
         le=8,
-        description="of PatchMatch over slanted planes; each takes 2.5 s for 768x512",
+        description="passes of PatchMatch over slanted planes; each takes 2.5 s for 768x512",
     )
 
 

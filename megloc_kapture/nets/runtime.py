@@ -32,7 +32,7 @@ _making = Lock()
 class NetworkOptions(Options):
     device: Device = Field(default="auto", description="auto, cpu, cuda or cuda:N")
     half_precision: bool = Field(
-        default=False, description="float16 on a GPU, bfloat16 on a processor; keypoints never"
+        default=False, description="float16 on a GPU, bfloat16 on a CPU; never for keypoints"
     )
 
 

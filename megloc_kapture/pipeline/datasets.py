@@ -78,7 +78,7 @@ class DatasetChoice:
         return (self.root / QUERY_GT / "sensors" / "sensors.txt").is_file()
 
     def has_query_depth(self) -> bool:
-        """Return whether a sensor in the rig gives query depth; official datasets have none."""
+        """Return whether a sensor in the rig gives query depth; False for official datasets."""
         if self.root is None or self.adapter is not None:
             return False
         return _has_depth(self.root / QUERY)
@@ -233,7 +233,9 @@ def _root_in_environment(name: str, adapter: DatasetAdapter | None) -> Path:
     for place in tried:
         if place.is_dir():
             return place
-    looked = f"; {DATA_VARIABLE} has none of {', '.join(p.name for p in tried)}" if tried else ""
+    looked = (
+        f"; {DATA_VARIABLE} contains none of {', '.join(p.name for p in tried)}" if tried else ""
+    )
     if adapter is None:
         raise OptionError(
             f"dataset {name} needs --root, a folder with mapping/, query/ and perhaps query_gt/"
@@ -252,7 +254,7 @@ def twin_of(layout: str, **options: Any) -> RenderedDataset:
     known = plugin_names(RENDERED_DATASETS)
     if not known:
         raise OptionError(
-            "rendered datasets (synthetic, synthetic-aachen ...) come with a package of their own: "
+            "rendered datasets (synthetic, synthetic-aachen ...) need a separate package: "
             "pip install megloc-twins"
         )
     if layout not in known:

@@ -204,11 +204,11 @@ def options_of_photographs(
         raise OptionError(f"mapping_pairs.by {without[0]}: photographs have no poses yet")
     if options.preprocessing.undistort:
         raise OptionError(
-            "preprocessing.undistort: of photographs the distortion is not known; it is estimated, "
-            "and the map's cameras have it"
+            "preprocessing.undistort: the distortion of photographs is unknown; it is estimated "
+            "with the map's cameras"
         )
     if options.map != "triangulate":
-        raise OptionError(f"map = {options.map}: of photographs points are triangulated")
+        raise OptionError(f"map = {options.map}: points of photographs are triangulated")
     return options
 
 
@@ -221,7 +221,8 @@ def structure_options(
         gps = photographs.gps()
         if len(gps) < MIN_IMAGES:
             raise DataError(
-                f"--scale gps: {len(gps)} photographs have a GPS position; it takes {MIN_IMAGES}"
+                f"--scale gps: {len(gps)} photographs have a GPS position, at least {MIN_IMAGES} "
+                "are needed"
             )
     elif len(scale) == 3:
         try:
@@ -229,7 +230,9 @@ def structure_options(
         except ValueError:
             distance = "", "", math.nan
         if not 0 < distance[2] < math.inf:
-            raise OptionError(f"--scale {' '.join(scale)}: {scale[2]!r} is no distance in metres")
+            raise OptionError(
+                f"--scale {' '.join(scale)}: {scale[2]!r} is not a distance in metres"
+            )
         for name in scale[:2]:
             if name not in photographs.names:
                 raise DataError(f"--scale: there is no photograph {name!r}")
@@ -270,9 +273,9 @@ def describe_map(workspace: Path, photographs: Photographs) -> list[str]:
         lines.append(f"all of them: {tables / UNREGISTERED_FILE}")
     world = read_world(tables)
     if world.unit == NO_METRES:
-        hint = "--scale gps would tell it" if len(photographs.gps()) >= MIN_IMAGES else ""
-        hint = hint or "--scale IMAGE IMAGE METRES tells it"
-        lines.append(f"the map has no metres, but units of its own; {hint}")
+        hint = "--scale gps sets the scale" if len(photographs.gps()) >= MIN_IMAGES else ""
+        hint = hint or "--scale IMAGE IMAGE METRES sets the scale"
+        lines.append(f"the map is in arbitrary units, not metres; {hint}")
     if world.geo_origin is not None:
         at = ", ".join(f"{value:.7g}" for value in world.geo_origin)
         lines.append(f"its axes are East, North and Up at {at}")
@@ -318,7 +321,7 @@ def import_colmap(
     try:
         return read.write_map(output, work=work)
     except OtherFeaturesError as error:
-        _log.warning("%s; its images are mapped anew with its poses", error)
+        _log.warning("%s; its images are mapped again with its poses", error)
     with tempfile.TemporaryDirectory(prefix=".megloc-", dir=output) as scratch:
         images = Path(scratch) / "images"
         read.write_images(images)

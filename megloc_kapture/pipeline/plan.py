@@ -241,7 +241,7 @@ def run_plan(
     start = names.index(first) if first else 0
     stop = names.index(last) + 1 if last else len(names)
     if stop <= start:
-        raise OptionError(f"--until {last} is before --from {first}")
+        raise OptionError(f"--until {last} comes before --from {first}")
     asked = _with_followers(stages, first) if first else {}
     for name in names[:start]:
         if workspace.manifest(name) is None:

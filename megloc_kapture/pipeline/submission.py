@@ -73,8 +73,8 @@ def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> N
     wanted, given = (name.removeprefix(TWIN_PREFIX) for name in (dataset, protocol.dataset))
     if tables is None and wanted not in plain:
         raise OptionError(
-            f"the rules of {dataset} stand in the megloc/ folder that its import writes, and there "
-            "is none here; submit takes it with --side-tables, check with --data"
+            f"the rules of {dataset} are in the megloc/ folder of its import, which is missing "
+            "here; give it to submit with --side-tables, to check with --data"
         )
     official = {name for name in dataset_names() if name not in plain}
     if wanted != given and (wanted not in plain or given in official):

@@ -59,7 +59,7 @@ class DeepLabOptions(NetworkOptions):
     max_size_px: int = Field(
         default=2048,
         ge=64,
-        description="longer side that the network sees (a Cityscapes image's); it bounds memory",
+        description="longer side of the network's input (2048 in Cityscapes); bounds the memory",
     )
 
 

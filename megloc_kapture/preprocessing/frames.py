@@ -148,14 +148,12 @@ class FrameOptions(Options):
     """Size and projection of the images; by default they stay as they are."""
 
     max_size_px: int | None = Field(
-        default=None, gt=0, description="the larger side of larger images; unset: as it is"
+        default=None,
+        gt=0,
+        description="larger side that images are reduced to; unset: original size",
     )
-    upscale: bool = Field(
-        default=False, description="smaller images get that larger side too, not only larger ones"
-    )
-    undistort: bool = Field(
-        default=False, description="images as a pinhole camera would have taken them"
-    )
+    upscale: bool = Field(default=False, description="also enlarge smaller images to that side")
+    undistort: bool = Field(default=False, description="remove lens distortion")
 
 
 @dataclass(frozen=True, slots=True)

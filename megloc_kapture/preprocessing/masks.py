@@ -46,19 +46,19 @@ class FixedMask(Options):
         min_length=1, description="a sensor's id, or a pattern of image names (left/*.jpg)"
     )
     file: Path | None = Field(
-        default=None, description="an image of the camera's size, 0 where it is ignored"
+        default=None, description="image of the camera's size, 0 for ignored pixels"
     )
     polygon: tuple[tuple[float, float], ...] | None = Field(
         default=None,
         min_length=3,
-        description="corners (x, y) of what is ignored, in shares of the width and the height",
+        description="corners (x, y) of an ignored polygon, as shares of width and height",
     )
     bottom_share: float | None = Field(
-        default=None, gt=0, lt=1, description="share of the height, from the bottom"
+        default=None, gt=0, lt=1, description="ignored share of the height, from the bottom"
     )
     fallback: bool = Field(
         default=False,
-        description="only for cameras whose unchanging region was not looked for or not found",
+        description="only for cameras without a detected ego-vehicle region",
     )
 
     @model_validator(mode="after")
@@ -181,9 +181,11 @@ def find_unchanging_region(sequence: Iterable[Float32]) -> UnchangingRegion:
     tops = _without_slivers(tops, height)
     nothing = (1.0,) * width
     if (tops == height).all():
-        return UnchangingRegion(nothing, "nothing stays the same at the bottom of its images")
+        return UnchangingRegion(nothing, "its images have no static region at the bottom")
     if 1 - tops.mean() / height > _MAX_AREA:
-        return UnchangingRegion(nothing, "nearly all of its images stays the same: it hardly moves")
+        return UnchangingRegion(
+            nothing, "nearly its whole image is static: the camera hardly moves"
+        )
     tops = np.where(tops < height, np.maximum(tops - _MARGIN_PX, 0), tops)
     return UnchangingRegion(tuple(float(top) for top in tops / height))
 

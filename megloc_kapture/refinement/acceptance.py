@@ -40,47 +40,46 @@ _LEAST_CURVATURE = 1e-7
 class RenderingOptions(Options):
     appearance: Appearance = Field(
         default="normalised",
-        description="what is compared: brightness of locally normalised contrast (day and night), "
-        "or the same of each colour (colours)",
+        description="compared quantity: brightness with locally normalised contrast (day and "
+        "night), or each colour likewise (colours)",
     )
     max_references: int = Field(
-        default=4, gt=0, description="reference images with depth that are used, best first"
+        default=4, gt=0, description="number of reference images with depth"
     )
     max_points: int = Field(
-        default=12000, ge=MIN_POINTS, description="points of a reference and level of its pyramid"
+        default=12000, ge=MIN_POINTS, description="number of points per reference and pyramid level"
     )
     max_side_px: int = Field(
         default=640, ge=64, description="longer side of the finest level; larger images are reduced"
     )
     levels: int = Field(
-        default=3, ge=1, description="of the pyramids, each of half the size; begin at the coarsest"
+        default=3,
+        ge=1,
+        description="number of pyramid levels, each half the size of the previous one",
     )
     max_translation_m: float = Field(
-        default=0.5, gt=0, description="a pose whose centre moves further is not accepted"
+        default=0.5, gt=0, description="largest accepted movement of the centre"
     )
-    max_rotation_deg: float = Field(
-        default=5.0, gt=0, description="a pose that turns further is not accepted"
-    )
+    max_rotation_deg: float = Field(default=5.0, gt=0, description="largest accepted rotation")
     require_consistent_map: bool = Field(
         default=True,
-        description="refine only where the map's own images, held out, would stay where they are",
+        description="refine only in maps whose held-out images keep their poses under refinement",
     )
     accept_always: bool = Field(
         default=False,
-        description="take every pose that is found, without the tests of this pose; "
-        "require_consistent_map tests the map",
+        description="accept every refined pose without tests; require_consistent_map still tests "
+        "the map",
     )
     min_significance: float = Field(
         default=2.5,
         ge=0,
-        description="by how many of its standard errors the robust cost must fall, parts of the "
-        "query being the observations",
+        description="smallest fall of the robust cost, in standard errors over parts of the query",
     )
     min_correlation: float = Field(
         default=0.12,
         ge=-1,
         le=1,
-        description="of the query with the warped references, below which a pose is not accepted",
+        description="smallest accepted correlation of the query with the warped references",
     )
     min_overlap: float = Field(
         default=0.2, ge=0, le=1, description="share of the query that references must cover"

@@ -46,30 +46,30 @@ _KEEP_EVERY = 200
 class FieldTrainingOptions(NetworkOptions):
     kind: Kind = Field(
         default="triplane",
-        description="triplane: minutes on a processor; nerfw: needs a GPU",
+        description="triplane: minutes on a CPU; nerfw: needs a GPU",
     )
-    steps: int = Field(default=4000, gt=0, description="of the training")
+    steps: int = Field(default=4000, gt=0, description="number of training steps")
     minutes: float | None = Field(
         default=None,
         gt=0,
-        description="end the training after so many at the latest; without, the same bytes twice",
+        description="time limit; results are reproducible only without it",
     )
     rays_per_step: int = Field(default=2048, gt=0, description="random pixels of all images")
     max_side_px: int = Field(
-        default=320, ge=16, description="longer side of an image; larger ones are reduced"
+        default=320,
+        ge=16,
+        description="longer side of the training images; larger ones are reduced",
     )
     depth_weight: float = Field(
-        default=5.5, ge=0, description="of the relative error of depth in NeRF-W's loss"
+        default=5.5, ge=0, description="weight of the relative depth error in NeRF-W's loss"
     )
-    held_out_every: int = Field(
-        default=8, ge=0, description="of so many images one is held out; 0: none"
-    )
+    held_out_every: int = Field(default=8, ge=0, description="hold out every N-th image; 0: none")
     lights: Lights = Field(
-        default="image", description="an appearance for each image, or for each folder of images"
+        default="image", description="one appearance per image, or per folder of images"
     )
     compiled: bool = Field(
         default=False,
-        description="by torch.compile, which takes minutes at first and needs a C compiler",
+        description="use torch.compile, which takes minutes at first and needs a C compiler",
     )
     seed: int = Field(default=0, ge=0)
 

@@ -62,54 +62,56 @@ class IcpOptions(Options):
     voxels_m: tuple[float, ...] = Field(
         default=(0.1, 0.05, 0.025),
         min_length=1,
-        description="size of the voxels both clouds are thinned to, metres, coarse to fine",
+        description="voxel sizes for thinning both clouds, metres, coarse to fine",
     )
     max_distances_m: tuple[float, ...] = Field(
         default=(0.3, 0.15, 0.075),
         min_length=1,
-        description="points of query and map correspond up to this distance, metres, as many as "
-        "voxels_m; the finest also says what overlaps",
+        description="largest distances of corresponding points, metres, one per voxel size; the "
+        "finest also defines the overlap",
     )
     depth: DepthCloudOptions = Field(
-        default_factory=DepthCloudOptions, description="which depths are trusted"
+        default_factory=DepthCloudOptions, description="limits of trusted depths"
     )
     noise: tuple[float, float, float] = Field(
         default=STRUCTURED_LIGHT,
-        description="a, b, c of the noise a + b z + c z^2 at depth z, metres; its proportions "
-        "weight the pixels of the query",
+        description="a, b, c of the depth noise a + b z + c z^2 at depth z, metres; weights the "
+        "query's pixels",
     )
     max_references: int = Field(
         default=10,
         gt=0,
-        description="depth maps of the map, those that overlap most, one of views that are alike",
+        description="number of map depth maps: those that overlap most, one of similar views",
     )
     accept_always: bool = Field(
         default=False,
-        description="take every pose that is found, without a test of overlap, residual, movement "
-        "and condition",
+        description="accept every refined pose without tests of overlap, residual, movement and "
+        "condition",
     )
     min_points: int = Field(
-        default=1000, ge=NORMAL_NEIGHBOURS, description="in either cloud, of the finest voxels"
+        default=1000,
+        ge=NORMAL_NEIGHBOURS,
+        description="smallest number of points in either cloud at the finest voxels",
     )
     min_overlap: float = Field(
         default=0.5,
         ge=0,
         le=1,
-        description="share of the query's points that the refined pose must bring onto the map, "
-        "and that must be within the coarsest distance of it to begin with",
+        description="smallest share of the query's points that lie on the map after refinement, "
+        "and within the coarsest distance before",
     )
     max_moved_m: float = Field(
-        default=0.3, gt=0, description="the camera's centre moves at most this far, metres"
+        default=0.3, gt=0, description="largest accepted movement of the centre, metres"
     )
     max_moved_deg: float = Field(
-        default=10.0, gt=0, description="the camera turns by at most this angle, degrees"
+        default=10.0, gt=0, description="largest accepted rotation, degrees"
     )
     max_condition: float = Field(
         default=100.0,
         gt=1,
-        description="greatest over least eigenvalue of the normal matrix at the coarsest level; "
-        "beyond, the surfaces do not determine the pose: a bare wall has 10000, a corridor 2000, "
-        "a furnished room 15",
+        description="largest condition number of the normal matrix at the coarsest level; above "
+        "it the surfaces do not determine the pose: a bare wall has 10000, a corridor "
+        "2000, a furnished room 15",
     )
 
     @model_validator(mode="after")

@@ -34,16 +34,16 @@ class DepthCloudOptions(Options):
     max_depth_m: float = Field(
         default=4.0,
         gt=0,
-        description="metres; farther ones are dropped. A structured-light sensor's noise grows "
-        "with the square of the distance and is 2.6 cm here, the end of its rated range; a "
-        "laser's does not, raise it",
+        description="largest depth, metres. The noise of structured light grows with the square "
+        "of the distance and is 2.6 cm here, the end of its rated range; raise it for "
+        "lasers",
     )
     max_jump: float = Field(
         default=0.05,
         gt=0,
-        description="a pixel is on an edge, and dropped, where a neighbour's depth differs by "
-        "more than this share of the smaller; on a plane at 80 degrees the steps of a sensor with "
-        "a focal length of 585 px are 0.014",
+        description="pixels whose depth differs from a neighbour's by more than this share of the "
+        "smaller are dropped as edges; on a plane at 80 degrees the steps of a "
+        "sensor with a focal length of 585 px are 0.014",
     )
 
 

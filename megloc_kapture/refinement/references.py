@@ -202,8 +202,8 @@ def judge_consistency(displacements: Iterable[Displacement | None]) -> Consisten
         )
     elif 2 * contradicting > len(known):
         reason = (
-            f"the map contradicts itself: {contradicting} of {len(known)} of its own images would "
-            f"move by more than is claimed, all by {median.moved_m:.3f} m, "
+            f"the map contradicts itself: {contradicting} of {len(known)} held-out images would "
+            f"move by more than claimed, all by {median.moved_m:.3f} m, "
             f"{median.turned_deg:.2f} deg, {median.moved_px:.1f} px (medians)"
         )
     return Consistency(len(known), contradicting, median, reason)

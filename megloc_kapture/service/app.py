@@ -64,7 +64,7 @@ class CameraModel(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
 
     model: str = Field(description=f"one of {', '.join(CAMERA_MODEL_NUM_PARAMS)}")
-    width: int = Field(ge=1, le=100_000, description="of the image as it is stored, pixels")
+    width: int = Field(ge=1, le=100_000, description="size of the image as stored, pixels")
     height: int = Field(ge=1, le=100_000)
     params: list[float] = Field(
         max_length=12, description="in COLMAP's order; focal lengths and principal point in pixels"
@@ -92,12 +92,12 @@ class Answer(BaseModel):
     confidence: float | None = Field(description="the probability that the pose is right")
     num_matches: int
     num_inliers: int
-    candidates: list[str] = Field(description="map images that took part, best first")
+    candidates: list[str] = Field(description="matched map images, best first")
     remarks: list[str]
     frame: str | None = Field(description="the pose's coordinate frame, if the map has several")
     camera: CameraModel = Field(
-        description="the camera of the pose: that of the request; without one by EXIF, its focal "
-        "length estimated with the pose, of the image the right way up"
+        description="camera of the pose: the request's; else from EXIF for the upright image, its "
+        "focal length estimated with the pose"
     )
 
     @classmethod
@@ -287,7 +287,7 @@ def make_app(service: Service, overview: bytes) -> FastAPI:
     async def get_map() -> Response:
         return Response(overview, media_type="application/json")
 
-    @app.get("/health", summary="Whether the service runs")
+    @app.get("/health", summary="Report that the service is running")
     async def health() -> dict[str, str]:
         return {"status": "ok"}
 

@@ -97,7 +97,7 @@ class QueryPairsOptions(Options):
     by: Literal["retrieval", "exhaustive"] = Field(
         default="retrieval", description="the most similar map images, or all"
     )
-    top_k: int = Field(default=50, gt=0, description="most similar map images per query")
+    top_k: int = Field(default=50, gt=0, description="number of most similar map images per query")
 
 
 @dataclass(frozen=True)

@@ -84,8 +84,8 @@ class DensifyOptions(Options):
 
     mode: Literal["off", "depth", "points"] = Field(
         default="off",
-        description="depth: depth maps beside map images that have none; points: keypoints without "
-        "a point get one of it as well",
+        description="depth: estimate depth of map images without it; points: also lift keypoints "
+        "without a point",
     )
     estimator: PluginChoice = Field(
         default=PluginChoice(name="sweep"), description="sweep, colmap or a plugin"
@@ -99,7 +99,7 @@ class DensifyOptions(Options):
 
 @dataclass(frozen=True)
 class StereoFit:
-    """Limits of stereo in a map, given the accuracy of its poses.
+    """Resolution and tolerance of stereo, given the accuracy of the poses.
 
     Attributes
     ----------
@@ -249,7 +249,7 @@ def _plan(
             rows.append(replace(blank, reason="already has depth"))
             continue
         if not source.image_path(image).is_file():
-            rows.append(replace(blank, reason="there is no image file"))
+            rows.append(replace(blank, reason="no image file"))
             continue
         found = depth_range(poses[image].apply(xyz[points_of[row]])[:, 2])
         chosen = choose_sources(
@@ -360,7 +360,7 @@ def _scratch(job: _Job, image: str, kind: str) -> Path:
 
 
 class Densify(PipelineStage):
-    """Estimate the missing depth of the map's images."""
+    """Estimate depth of map images without depth."""
 
     name = "densify"
     version = 4

@@ -180,7 +180,7 @@ class GlobalFeaturesChoice(PluginChoice):
     """Global features by name (``vlad`` or a plugin), with options and fusion weight."""
 
     name: str = VLAD
-    weight: float = Field(default=1.0, gt=0, description="among the features that are fused")
+    weight: float = Field(default=1.0, gt=0, description="weight in the fusion")
 
     @property
     def is_vlad(self) -> bool:

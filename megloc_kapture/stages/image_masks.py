@@ -47,20 +47,18 @@ class MaskOptions(Options):
     """Mask sources in addition to the kapture's masks; by default none."""
 
     segmenter: PluginChoice | None = Field(
-        default=None, description="network that names the class of each pixel"
+        default=None, description="network that predicts the class of each pixel"
     )
     dynamic: tuple[str, ...] | None = Field(
-        default=None, description="classes to ignore; unset: those the segmenter names itself"
+        default=None, description="classes to mask; unset: the segmenter's dynamic classes"
     )
-    fixed: tuple[FixedMask, ...] = Field(
-        default=(), description="what stands still in all images of a camera"
-    )
+    fixed: tuple[FixedMask, ...] = Field(default=(), description="static masks per camera")
     unchanging: bool = Field(
         default=False,
-        description="find the region at the bottom that never changes, per camera: the bonnet",
+        description="detect and mask the static ego-vehicle region of each camera",
     )
     user_masks: Path | None = Field(
-        default=None, description="folder of masks IMAGE.png, 0 where the image is ignored"
+        default=None, description="folder of masks IMAGE.png, 0 for ignored pixels"
     )
 
 

@@ -60,9 +60,11 @@ PairingMethod = Literal["poses", "covisibility", "retrieval", "sequence", "exhau
 
 class MappingPairsOptions(Options):
     by: tuple[PairingMethod, ...] = Field(
-        default=("retrieval",), min_length=1, description="methods, of whose pairs all are matched"
+        default=("retrieval",), min_length=1, description="methods, whose pairs are united"
     )
-    top_k: int = Field(default=20, gt=0, description="most similar images per image (retrieval)")
+    top_k: int = Field(
+        default=20, gt=0, description="number of most similar images per image (retrieval)"
+    )
     poses: PairsByPosesOptions = PairsByPosesOptions()
     covisibility: PairsByCovisibilityOptions = PairsByCovisibilityOptions()
     sequence: PairsBySequenceOptions = PairsBySequenceOptions()
@@ -212,7 +214,7 @@ RETRIEVAL_OPTIONS = ("global_features", "fusion", *LOCAL_TYPES)
 
 
 class PairMapping(PipelineStage):
-    """Choose which map images are matched with each other."""
+    """Choose pairs of map images to match."""
 
     name = "mapping_pairs"
     version = 4
@@ -238,7 +240,7 @@ class PairMapping(PipelineStage):
 
 
 class PairQueries(PipelineStage):
-    """Choose the map images that each query is matched with."""
+    """Choose map images to match with each query."""
 
     version = 3
     uses = ("query_pairs", *RETRIEVAL_OPTIONS)
@@ -269,15 +271,15 @@ Matched = int | NDArray[np.int64]
 class RerankingOptions(Options):
     by: Literal["none", "matches", "verified", "coverage"] = Field(
         default="none",
-        description="matches: their number; verified: of those that two-view geometry leaves; "
-        "coverage: of these, at keypoints that the images before do not match",
+        description="score of a candidate; matches: number of matches; verified: number that "
+        "two-view geometry accepts; coverage: number of these at keypoints that "
+        "better candidates do not match",
     )
     local_type: str | None = Field(
         default=None,
-        description="type of local features whose matches count, by its name or that of its "
-        "plugin; none: all types together",
+        description="type of local features to count, by name or plugin; none: all types together",
     )
-    keep: int = Field(default=20, gt=0, description="images that stay, N")
+    keep: int = Field(default=20, gt=0, description="number of candidates kept, N")
 
     def reranks(self) -> bool:
         return self.by != "none"
@@ -372,7 +374,7 @@ def _stored(
 
 
 class RerankQueries(PipelineStage):
-    """Keep of each query's candidates those that its local features say are right."""
+    """Keep each query's best candidates by local matches."""
 
     name = "query_pairs"
     version = 4

@@ -94,7 +94,7 @@ def images_of(folders: Sequence[KaptureFolder], purpose: str) -> dict[str, Kaptu
     named.sort(key=itemgetter(0))
     for (image, _), (other, _) in pairwise(named):
         if image == other:
-            raise DataError(f"image {image} is in two of the kapture folders")
+            raise DataError(f"image {image} is in two kapture folders")
     if not named:
         raise DataError(f"there are no images to {purpose}")
     return dict(named)

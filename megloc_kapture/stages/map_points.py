@@ -282,7 +282,7 @@ def _lift(
 
 
 class GivenMap(PipelineStage):
-    """Take the points of the model that the dataset comes with."""
+    """Use the points of the dataset's model."""
 
     name = "points"
     uses = ("map", "given_features")
@@ -301,7 +301,7 @@ class GivenMap(PipelineStage):
 
 
 class LiftPoints(PipelineStage):
-    """Make the map's points of keypoints, by the depth of its images."""
+    """Lift the map's points from keypoints through depth."""
 
     name = "points"
     uses = ("map", "local_features.name", "local_features.options")

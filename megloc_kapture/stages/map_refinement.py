@@ -445,7 +445,7 @@ def _reject_uncertain(selection: MapSelection, max_robust_sigmas: float) -> None
 
 
 class RefineMap(PipelineStage):
-    """Remove points that the images or their depth contradict, and uncertain points."""
+    """Remove map points that images or depth contradict, and uncertain ones."""
 
     name = "map"
     version = 3

@@ -106,7 +106,7 @@ class Features(ImageFeatures):
 
 
 Verify = Callable[[Features, Features, NDArray[np.int64]], NDArray[np.bool_]]
-"""Returns the mask (K,) of the right ones among the matches (K, 2) of two images, best first."""
+"""Select the right ones, bool (K,), of the matches (K, 2) of two images, best first."""
 
 
 _PairMatches = tuple[NDArray[np.int64], NDArray[np.float32]]
@@ -192,7 +192,7 @@ def check_given_poses(
 ) -> None:
     """Compare the given poses of map images with two-view models of a sample of their pairs.
 
-    Log a warning where some poses contradict the matches. Where most do, raise DataError unless
+    Log a warning if some poses contradict the matches. If most do, raise DataError unless
     ``work.force``.
     """
     specs = FolderSpec(mapping), FolderSpec(mapping)
@@ -207,7 +207,7 @@ def check_given_poses(
         return
     message, most = contradiction
     if most and not work.force:
-        raise DataError(f"{message} (--force goes on all the same)", path=mapping.root)
+        raise DataError(f"{message} (--force continues anyway)", path=mapping.root)
     _log.warning("%s", message)
 
 
@@ -459,7 +459,7 @@ class MatchMapping(_MatchStage):
 
 
 class MatchQueries(_MatchStage):
-    """Match and verify queries with their candidates; where those are reranked, with all."""
+    """Match and verify queries with their candidates, before reranking with all of them."""
 
     name = "query_matches"
     version = 4

@@ -165,7 +165,9 @@ def views_between(data: KaptureData) -> KaptureData:
     near = PairsByPosesOptions(num_neighbours=_NEIGHBOURS, max_angle_deg=_MAX_ANGLE_DEG)
     pairs = pairs_by_poses([poses[name] for name in names], near).tolist()
     if not pairs:
-        raise DataError("no two cameras here look the same way: nothing is between them")
+        raise DataError(
+            "no two cameras have a similar viewing direction: there are no views between them"
+        )
     found = KaptureData()
     for number, (a, b) in enumerate(pairs):
         first, second = poses[names[a]], poses[names[b]]
@@ -261,29 +263,31 @@ def render_along(
 
 
 class FieldRefinerOptions(Options):
-    field: str = Field(default="", description="folder that megloc train-field wrote")
-    device: Device = Field(default="auto", description="of all networks: auto, cpu, cuda or cuda:N")
-    half_precision: bool = Field(default=False, description="of features and matcher")
+    field: str = Field(default="", description="folder written by megloc train-field")
+    device: Device = Field(
+        default="auto", description="device of all networks: auto, cpu, cuda or cuda:N"
+    )
+    half_precision: bool = Field(
+        default=False, description="half precision of features and matcher"
+    )
     features: PluginChoice = Field(
-        default=PluginChoice(name="rootsift"), description="local features that are matched"
+        default=PluginChoice(name="rootsift"), description="local features to match"
     )
     matcher: PluginChoice = Field(
         default=PluginChoice(name="nn", options={"max_ratio": 0.9}),
-        description="of query and rendering",
+        description="matcher of query and rendering",
     )
     max_side_px: int = Field(
         default=320, ge=64, description="longer side of the rendering; larger queries are reduced"
     )
     max_translation_m: float = Field(
-        default=0.5, gt=0, description="a pose whose centre moves further is not accepted"
+        default=0.5, gt=0, description="largest accepted movement of the centre"
     )
-    max_rotation_deg: float = Field(
-        default=5.0, gt=0, description="a pose that turns further is not accepted"
-    )
+    max_rotation_deg: float = Field(default=5.0, gt=0, description="largest accepted rotation")
 
 
 class FieldRefiner:
-    """Plugin ``field``: the query is matched with a neural field's rendering at its pose.
+    """Plugin ``field``: match the query with the field's rendering at its pose.
 
     Features of query and rendering are matched and lifted by rendered depth, and the pose is solved
     (as in GS-CPR, Liu et al., ICLR 2025). New renderings are aligned with the query, and the pose

@@ -41,7 +41,7 @@ class LocalFeaturesChoice(PluginChoice):
     """A local feature extractor, its options, and the matching of its features."""
 
     matching: PluginChoice | None = Field(
-        default=None, description="matcher of this type; none: that of the run"
+        default=None, description="matcher of this type; none: the run's"
     )
 
 
@@ -50,37 +50,37 @@ class PipelineOptions(Options):
 
     device: Device = Field(
         default="auto",
-        description="of networks that name none: auto (a GPU if there is one), cpu, cuda, cuda:N",
+        description="default device of networks: auto (a GPU if available), cpu, cuda, cuda:N",
     )
     precision: Precision = Field(
         default="full",
-        description="of networks that do not say; half: float16 on a GPU, bfloat16 on a processor",
+        description="default precision of networks; half: float16 on a GPU, bfloat16 on a CPU",
     )
     preprocessing: PreprocessingOptions = PreprocessingOptions()
     local_features: tuple[LocalFeaturesChoice, ...] = Field(
         default=(LocalFeaturesChoice(name="rootsift"),),
         min_length=1,
-        description="types of local features, all in one map; VLAD uses the first",
+        description="types of local features, combined in one map; VLAD uses the first",
     )
     mask_margin_px: float = Field(
-        default=4.0, ge=0, description="features nearer than this to a masked pixel go too"
+        default=4.0, ge=0, description="features closer than this to a masked pixel are removed"
     )
     global_features: tuple[GlobalFeaturesChoice, ...] = Field(
         default=(GlobalFeaturesChoice(),),
         min_length=1,
-        description="what retrieval compares: vlad, or image networks; several are fused",
+        description="global features for retrieval: vlad, or networks; several are fused",
     )
     fusion: FusionOptions = FusionOptions()
     mapping_pairs: MappingPairsOptions = MappingPairsOptions()
     query_pairs: QueryPairsOptions = QueryPairsOptions()
     reranking: RerankingOptions = RerankingOptions()
     matching: PluginChoice = Field(
-        default=PluginChoice(name="nn"), description="of types that name no other matcher"
+        default=PluginChoice(name="nn"), description="matcher of feature types that name none"
     )
     verification: Literal["geometric", "mapping", "none"] = Field(
         default="geometric",
-        description="of matches: within the map by known poses, of queries by a two-view model; "
-        "mapping: within the map only",
+        description="verification of matches: by known poses within the map, by a two-view model "
+        "for queries; mapping: only within the map",
     )
     mapping_verification: KnownPoseOptions = KnownPoseOptions()
     query_verification: TwoViewOptions = TwoViewOptions()
@@ -88,11 +88,11 @@ class PipelineOptions(Options):
     guided_pyramid: GuidedPyramidOptions = GuidedPyramidOptions()
     map: Literal["triangulate", "lift", "given"] = Field(
         default="triangulate",
-        description="points of the map: triangulated from matches; keypoints lifted through the "
-        "map images' depth maps; or those of the model the dataset comes with",
+        description="map points: triangulated from matches, lifted from keypoints through depth "
+        "maps, or given by the dataset's model",
     )
     given_features: PluginChoice = Field(
-        default=PluginChoice(name="sift"), description="what a given model was made of"
+        default=PluginChoice(name="sift"), description="features of a given model"
     )
     triangulation: TriangulationOptions = TriangulationOptions()
     refinement: MapRefinementOptions = MapRefinementOptions()
@@ -101,7 +101,7 @@ class PipelineOptions(Options):
     pose_refinement: PoseRefinementOptions = PoseRefinementOptions()
     stages: dict[str, dict[str, Any]] = Field(
         default_factory=dict,
-        description="stages of other packages that run as well, by name, with their options",
+        description="additional stages of other packages, by name, with their options",
     )
 
     @property

@@ -68,12 +68,12 @@ _MAX_REFERENCES = 30
 
 class PoseRefinementOptions(Options):
     by: tuple[PluginChoice, ...] = Field(
-        default=(), description="pose refiners, one after another; none: poses stay"
+        default=(), description="pose refiners, applied in order; empty: no refinement"
     )
     references: Literal["cluster", "frame"] = Field(
         default="cluster",
-        description="map images a refiner may choose from: those of the cluster that the pose "
-        "comes from, or others of its coordinate frame as well",
+        description="reference images for refiners: those of the pose's cluster, or also others "
+        "of its coordinate frame",
     )
 
     def with_refiners(self, names: Sequence[str]) -> PoseRefinementOptions:

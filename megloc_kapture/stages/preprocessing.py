@@ -107,7 +107,7 @@ def preprocess_images(
     """
     output = Path(output)
     if output.resolve().is_relative_to(folder.root.resolve()):
-        raise OutputError(f"{output}: lies in the kapture that is read, which stays as it is")
+        raise OutputError(f"{output}: is inside the input kapture folder, which is not modified")
     classes = _class_masks(options.masks, segmenter, work.placement)
     data = folder.read()
     plans = _plans(data, options)
@@ -163,7 +163,7 @@ def _class_masks(
     if segmenter is not None:
         return ClassMasks.of(segmenter, options.dynamic)
     if options.dynamic is not None:
-        raise OptionError("dynamic classes are named, but no segmenter that tells them apart")
+        raise OptionError("dynamic classes need a segmenter")
     return None
 
 

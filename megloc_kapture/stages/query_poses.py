@@ -84,27 +84,27 @@ class LocalizationOptions(Options):
     clusters: ClusterOptions = ClusterOptions()
     rank: PluginChoice = Field(
         default=PluginChoice(name="distinctive"),
-        description="which of the clusters' poses is the query's",
+        description="method that selects the query's pose among the clusters'",
     )
     pose: AbsolutePoseOptions = AbsolutePoseOptions()
     min_confidence: float = Field(
         default=MIN_CONFIDENCE,
         ge=0,
         le=1,
-        description="a pose that is less likely to be right is rejected; 0, as in benchmarks: none",
+        description="poses with a lower confidence are rejected; 0 (as in benchmarks) keeps all",
     )
     sure_confidence: float | None = Field(
         default=None,
         gt=0,
         le=1,
-        description="candidates are taken in turn, best first, and no more once the pose has "
-        f"{_SURE_INLIERS} inliers and is as likely to be right as this; none: all are taken",
+        description="match candidates in turn, best first, until the pose has "
+        f"{_SURE_INLIERS} inliers and this confidence; none: match all candidates",
     )
-    rigs: bool = Field(default=False, description="one pose for all cameras of a rig's moment")
+    rigs: bool = Field(default=False, description="localize all cameras of a rig jointly")
     fallback: Fallback = Field(
         default="none",
-        description="what a query that failed gets: nothing, the pose of its first candidate, or "
-        "its pose through the rig",
+        description="pose of a failed query: none, that of its first candidate, or that of "
+        "another camera through the rig",
     )
 
     def make_ranker(self, placement: Placement = AUTO) -> PoseRanker:

@@ -98,7 +98,7 @@ class FindPoses(PipelineStage):
         models = self._models(work, mapping, data)
         world, model, counts = _scaled(models[0], structure)
         if own := sorted(i for i, sensor in model.sensors.items() if sensor not in data.sensors):
-            said = "%d photographs have the size of others and another camera (a zoom, a crop): %s"
+            said = "%d photographs have the size of others but another camera (a zoom, a crop): %s"
             _log.warning(said, len(own), ", ".join(own))
         tables = work.out / SIDE_TABLES
         reasons = read_unreadable(work.path(SIDE_TABLES))
@@ -106,8 +106,8 @@ class FindPoses(PipelineStage):
         reasons |= dict.fromkeys(sorted(absent), "no model: too few matches agree")
         for number, other in enumerate(models[1:], start=2):
             reasons |= {
-                image: f"model {number}, of {len(other.poses)} photographs, which does not hang "
-                "together with the map"
+                image: f"model {number}, of {len(other.poses)} photographs, which is not "
+                "connected to the map"
                 for image in other.poses.keys() - model.poses.keys()
             }
         write_unreadable(tables, reasons, UNREGISTERED_FILE)

@@ -30,14 +30,18 @@ Floats = NDArray[np.float64]
 class LabelOptions(Options):
     """Options of labels, with glue-factory's distances."""
 
-    positive_px: float = Field(default=3.0, gt=0, description="partners are nearer, in both images")
+    positive_px: float = Field(
+        default=3.0, gt=0, description="largest distance of matched keypoints, in both images"
+    )
     negative_px: float = Field(
-        default=5.0, gt=0, description="an unmatched keypoint is farther from all of the other's"
+        default=5.0,
+        gt=0,
+        description="smallest distance of an unmatched keypoint from all of the other image's",
     )
     max_depth_error: float = Field(
         default=0.03,
         gt=0,
-        description="a point is hidden in an image whose depth differs by more than this share",
+        description="largest relative depth difference of a visible point",
     )
 
     @model_validator(mode="after")

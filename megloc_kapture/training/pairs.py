@@ -48,23 +48,31 @@ _HALF = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
 
 
 class HomographyOptions(Options):
-    min_scale: float = Field(default=0.5, gt=0, le=1, description="of a view, of the photograph")
-    max_angle_deg: float = Field(default=45.0, ge=0, le=180, description="of a view's rotation")
+    min_scale: float = Field(
+        default=0.5, gt=0, le=1, description="smallest size of a view, relative to the photograph"
+    )
+    max_angle_deg: float = Field(
+        default=45.0, ge=0, le=180, description="largest rotation of a view"
+    )
     perspective: float = Field(
-        default=0.2, ge=0, lt=0.5, description="how far corners move, of the view's sides"
+        default=0.2,
+        ge=0,
+        lt=0.5,
+        description="displacement of the corners, as a share of the view's sides",
     )
     light: float = Field(
-        default=1.0, ge=0, le=1, description="strength of changes of light, noise, blur and JPEG"
+        default=1.0,
+        ge=0,
+        le=1,
+        description="strength of the changes of light, noise, blur and JPEG",
     )
 
 
 class PairOptions(Options):
-    max_size_px: int = Field(
-        default=640, ge=64, description="longer side that images are reduced to"
-    )
+    max_size_px: int = Field(default=640, ge=64, description="longer side of the reduced images")
     overlap_bins: tuple[float, ...] = Field(
         default=(0.1, 0.3, 0.5, 0.7),
-        description="bounds of the bins of measured overlap; a pair is drawn from each alike",
+        description="bounds of the overlap bins, from which pairs are drawn equally",
     )
     homographies: HomographyOptions = HomographyOptions()
     labels: LabelOptions = LabelOptions()

@@ -60,30 +60,35 @@ class TrainingOptions(NetworkOptions):
     """Options of training SuperGlue on a frozen extractor's features."""
 
     half_precision: bool = Field(
-        default=False, description="bfloat16 but for keypoints, transport and loss"
+        default=False, description="bfloat16, except for keypoints, transport and loss"
     )
     features: PluginChoice = PluginChoice(name="superpoint")
-    max_keypoints: int = Field(default=512, gt=0, description="best kept of each image")
+    max_keypoints: int = Field(default=512, gt=0, description="number of best keypoints per image")
     pairs: PairOptions = PairOptions()
     steps: int = Field(default=100_000, gt=0)
-    pairs_per_step: int = Field(default=16, gt=0, description="pairs of a batch")
+    pairs_per_step: int = Field(default=16, gt=0, description="number of pairs per batch")
     learning_rate: float = Field(
-        default=1e-4, gt=0, description="Adam's, for half of the steps; then down to 1 % of it"
+        default=1e-4, gt=0, description="of Adam, for half of the steps; then decays to 1 %"
     )
     layers: int = Field(
-        default=18, gt=0, multiple_of=2, description="of attention, self and cross in turn"
+        default=18,
+        gt=0,
+        multiple_of=2,
+        description="number of attention layers, alternating self and cross",
     )
     deep_supervision: bool = Field(
-        default=False, description="the loss is the mean over all layers of cross attention"
+        default=False, description="average the loss over all cross-attention layers"
     )
     sinkhorn_iterations: int = Field(default=50, gt=0, description="in training and evaluation")
     matcher_weights: str | None = Field(
-        default=None, description="SuperGlue to begin with; none: random weights"
+        default=None, description="initial SuperGlue; none: random weights"
     )
     check_every: int = Field(
-        default=1000, gt=0, description="steps between evaluations, which are kept on disk"
+        default=1000, gt=0, description="steps between evaluations and checkpoints"
     )
-    held_out_pairs: int = Field(default=100, gt=0, description="of each held-out kapture")
+    held_out_pairs: int = Field(
+        default=100, gt=0, description="number of pairs per held-out folder"
+    )
     seed: int = Field(default=0, ge=0)
 
 

@@ -102,7 +102,7 @@ def test_the_pose_file_of_each_result_is_among_the_submissions(
     assert Path(f"{POSES}.json").read_bytes() == (run / f"{POSES}.json").read_bytes()
     until = ("--until", "submission")  # it is said without the evaluation as well
     done = megloc(*command, *other, *until)
-    assert f"{first} is of another result and stays as it is" in done.err
+    assert f"{first} belongs to another result and is kept" in done.err
     assert f"pose file  {second}\n" in done.out
     assert first.read_bytes() == poses != second.read_bytes() == (run / POSES).read_bytes()
     # back again, and into a folder of one's own

@@ -147,7 +147,7 @@ def test_the_foreign_map_needs_no_weights_of_ours(
             f"guided pyramid matching: the weights that extract {local_type} are missing "
             "(megloc weights list)"
         }
-        assert "left out of 4 queries: guided pyramid matching" in done.err
+        assert "skipped for 4 queries: guided pyramid matching" in done.err
     else:
         assert remarks == {""}
 

@@ -43,7 +43,7 @@ def test_what_is_done_is_kept(megloc: Any, unposed: Path) -> None:
     assert done.status == 0
     assert done.out.splitlines() == [
         f"map of 7 of 7 photographs: {unposed / 'map' / 'map'}",
-        "the map has no metres, but units of its own; --scale IMAGE IMAGE METRES tells it",
+        "the map is in arbitrary units, not metres; --scale IMAGE IMAGE METRES sets the scale",
     ]
     assert done.err.count("up to date") == 9
 

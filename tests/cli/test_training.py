@@ -133,7 +133,7 @@ def test_a_view_in_colour_and_depth(
     assert image.shape == (36, 48, 3) and stored.shape == (36, 48) and stored.dtype == np.uint16
     # the walls are 4 to 7 m away; six steps are not enough for more than their order
     assert 1000 < np.median(stored[stored > 0]) < 15000
-    megloc(*command).refused("stands there")
+    megloc(*command).refused("exists; -f overwrites it")
     assert megloc(*command, "-f", "--appearance", "0000.jpg").status == 0
     assert not np.array_equal(read_image_rgb(out), image)
 
@@ -213,8 +213,8 @@ def test_what_is_refused(megloc: Any, mapping: Path, field: Path, tmp_path: Path
     out = tmp_path / "view.png"
     pose, camera = pose_text(mapping), ("--camera", CAMERA_TEXT)
     for arguments, words in (
-        ((), "say what to render: --pose and --camera, --along or --between"),
-        (("--between", mapping, "--along", mapping), "say what to render"),
+        ((), "nothing to render: give --pose and --camera, --along or --between"),
+        (("--between", mapping, "--along", mapping), "nothing to render"),
         ((pose,), "--pose needs the --camera"),
         ((pose, *camera, "--appearance", "me.jpg"), "not trained on an image 'me.jpg'"),
         (("--between", out / "none"), "none"),

@@ -92,7 +92,7 @@ def test_fetch(megloc: Any, folder: Path) -> None:
     assert "licence: SHORT: for looking at only" in done.err
     assert (folder / "free.pth").read_bytes() == FREE
     again = megloc("weights", "fetch", "free", "-q")
-    assert (again.out, again.err) == (f"free: already there, {folder}/free.pth\n", "")
+    assert (again.out, again.err) == (f"free: already present, {folder}/free.pth\n", "")
 
 
 def test_fetch_for_a_preset(megloc: Any, folder: Path) -> None:
@@ -116,10 +116,10 @@ def test_each_missing_file_of_a_preset_has_a_line(
 
 def test_consent(megloc: Any, folder: Path) -> None:
     told = megloc("weights", "fetch", "free", "bound").refused(
-        r"bound has a licence to agree to: SHORT: for looking at only \(whole text at http",
+        r"bound needs your consent to its licence: SHORT: for looking at only \(whole text at http",
         "add --accept-licence",
     )
-    assert "free has" not in told
+    assert "free needs" not in told
     assert not folder.exists()  # asked before anything is fetched
     assert megloc("weights", "fetch", "bound", "--accept-licence").status == 0
     assert (folder / "bound.pth").read_bytes() == BOUND
@@ -132,12 +132,12 @@ def test_fetch_refuses(megloc: Any, served: Path, folder: Path) -> None:
         "no weights 'fre' in the registry; did you mean 'free'\\? there are"
     )
     megloc(*fetch, "by-hand").refused(
-        "by-hand cannot be fetched by a program: download it from http.*/page and run: megloc "
+        "by-hand cannot be downloaded automatically: download it from http.*/page and run: megloc "
         "weights add FILE"
     )
     folder.mkdir()
     (folder / "free.pth").write_bytes(BOUND)
-    megloc(*fetch, "free", "-q").refused("stands there, but is not the published file")
+    megloc(*fetch, "free", "-q").refused("exists, but is not the published file")
     assert megloc(*fetch, "free", "-f", "-q").status == 0
     (served / "unknown.pth").write_bytes(b"something else")
     megloc(*fetch, "unknown", "-q").refused("no file of weights that can be read")

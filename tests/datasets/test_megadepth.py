@@ -137,12 +137,12 @@ def test_a_scene_by_its_table(tmp_path: Path) -> None:
 def test_what_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="neither Undistorted_SfM/SCENE nor scene_info/SCENE.npz"):
         import_megadepth(tmp_path, tmp_path / "out")
-    with pytest.raises(DataError, match=r"neither .*0001 nor .*0001\.npz is there"):
+    with pytest.raises(DataError, match=r"neither .*0001 nor .*0001\.npz exists"):
         import_megadepth(tmp_path, tmp_path / "out", MegaDepthOptions(scenes=("0001",)))
     (tmp_path / "empty" / "scene_info").mkdir(parents=True)
     arrays = {"intrinsics": np.eye(3)[None], "poses": np.eye(4)[None]}
     np.savez(tmp_path / "empty" / "scene_info" / "7.npz", image_paths=["x.jpg"], **arrays)
-    with pytest.raises(DataError, match="scene 7 has no image that is there with its depth"):
+    with pytest.raises(DataError, match="scene 7 has no image with depth"):
         import_megadepth(tmp_path / "empty", tmp_path / "out")
     with pytest.raises(DataError, match="'..'"):
         import_megadepth(tmp_path, tmp_path / "out", MegaDepthOptions(scenes=("..",)))

@@ -166,7 +166,7 @@ def test_without_points_there_is_nothing_to_localize_in() -> None:
     bare = MapIndex.build(np.zeros((0, 3)), (), empty, empty, empty)
     typed = TypedMatches(bare, np.zeros((1, 2), np.float32), matches({"right/1": [0]}))
     result, _ = localize(QueryView("q", CAMERA, (typed,)))
-    assert result == Failure("no match is with a point of the map")
+    assert result == Failure("no match has a map point")
     # of several keypoints types all matches make one pose
     few = view({"right/1": 8}).matches
     assert isinstance(localize(QueryView("q", CAMERA, few))[0], Failure)

@@ -222,7 +222,7 @@ def test_a_map_of_few_points_is_not_trusted() -> None:
     """All 25 points that a camera sees may agree and be wrong together; with 100 they count."""
     problem, pose, sources = scene(25, 0, noise_px=0.1)
     refused = with_confidence(problem, pose, sources, ERROR_PX, 0.6)
-    assert isinstance(refused, Failure) and "too few points where the camera" in refused.reason
+    assert isinstance(refused, Failure) and "too few points in the camera" in refused.reason
     assert refused.confidence is not None and 0.3 < refused.confidence < 0.6
     more = np.concatenate([sources.seen[0]] * 4)
     trusted = with_confidence(problem, pose, replace(sources, seen=[more]), ERROR_PX, 0.6)

@@ -341,12 +341,12 @@ def test_what_makes_no_map_is_refused_with_the_reason(room: Path, tmp_path: Path
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        ({"scale": ("0000.jpg", "0001.jpg", -1.0)}, "no distance in metres"),
+        ({"scale": ("0000.jpg", "0001.jpg", -1.0)}, "not a distance in metres"),
         ({"scale": ("0000.jpg", "none.jpg", 1.0)}, "no photograph 'none.jpg'"),
         ({"scale": "gps"}, "0 photographs have a GPS position"),
         ({"set": {"mapping_pairs.by": ["poses"]}}, "have no poses yet"),
-        ({"set": {"preprocessing.undistort": True}}, "the distortion is not known"),
-        ({"set": {"map": "lift"}}, "points are triangulated"),
+        ({"set": {"preprocessing.undistort": True}}, "the distortion of photographs is unknown"),
+        ({"set": {"map": "lift"}}, "points of photographs are triangulated"),
     ],
 )
 def test_options_that_cannot_be_are_refused(

@@ -264,7 +264,7 @@ def test_first_and_last(kitchen: Kitchen) -> None:
     assert [(r.state, r.why) for r in reports] == [("skipped", ""), ("run", "asked for")]
     # what follows was asked for as well, and is still to be done
     assert [r.why for r in kitchen.cook()] == ["", "", "not done yet"]
-    with pytest.raises(OptionError, match="--until a is before --from c"):
+    with pytest.raises(OptionError, match="--until a comes before --from c"):
         kitchen.cook(first="c", last="a")
     with pytest.raises(OptionError, match="no stage 'd'; stages: a, b, c"):
         kitchen.cook(last="d")

@@ -456,7 +456,7 @@ def test_datasets_that_go_together(
 
 def test_rules_that_are_nowhere() -> None:
     check_dataset("kapture", Protocol(), tables=None)
-    with pytest.raises(OptionError, match="rules of aachen stand in the megloc/ folder"):
+    with pytest.raises(OptionError, match="rules of aachen are in the megloc/ folder"):
         check_dataset("aachen", Protocol(), tables=None)
 
 

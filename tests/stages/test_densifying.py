@@ -207,7 +207,7 @@ def test_an_image_without_a_file_has_a_reason(world: Any, tmp_path: Path) -> Non
     counts = densify_map(folder, tmp_path / "out", OPTIONS.model_copy(update={"mode": "depth"}))
     rows = {row.image: row for row in read_depth_rows(tmp_path / "out" / DEPTH_FILE)}
     assert counts["images_with_depth"] == 4 and counts["points_lifted"] == 0
-    assert rows["left/0.png"].reason == "there is no image file"
+    assert rows["left/0.png"].reason == "no image file"
     assert all("left/0.png" not in row.sources for row in rows.values())
 
 

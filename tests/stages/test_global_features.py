@@ -108,7 +108,7 @@ def test_vectors_of_different_lengths_are_refused(world: Any, tmp_path: Path) ->
 
     with pytest.raises(PluginError, match="growing.*4 values, 3 of the images before"):
         extract_global_features([world.mapping()], Growing(), tmp_path)
-    with pytest.raises(DataError, match="is in two of the kapture folders"):
+    with pytest.raises(DataError, match="is in two kapture folders"):
         extract_global_features([world.mapping(), world.mapping()], Colours(), tmp_path)
 
 

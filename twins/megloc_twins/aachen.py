@@ -1,7 +1,7 @@
-"""A rendered twin of Aachen Day-Night: photographs of many people, sequences, telephone queries.
+"""A rendered twin of Aachen Day-Night: photographs of many people, sequences, phone queries.
 
-The frames' names are those of the official layout. Their poses are in the world's coordinates
-until they are written in those that the twin publishes.
+Frames have the names of the official layout. Their poses are in the rendered world's frame and
+converted to the published one when written.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ NUM_UNLISTED = 2  # query images on disk that no list names
 _PORTRAIT_SHARE = 1 / 6
 _YAWS_DEG = (0.0, 62.0, -62.0)  # photographs taken from about the same spot
 _DEVICES = ("nexus4", "milestone", "nexus4", "milestone", "nexus5x")  # by day, by turns
-_FILES = {  # what they call an image: hour, minute, second, a number of its own
+_FILES = {  # parts of an image name: hour, minute, second, a running number
     "day/nexus4": "IMG_20140520_{:02d}{:02d}{:02d}.jpg",
     "day/milestone": "2011-12-17_{:02d}-{:02d}-{:02d}_{}.jpg",
     "day/nexus5x": "IMG_20160914_{:02d}{:02d}{:02d}.jpg",
     "night/nexus5x": "IMG_20161227_{:02d}{:02d}{:02d}.jpg",
     "night/nexus5x_additional_night": "IMG_20180115_{:02d}{:02d}{:02d}.jpg",
 }
-_WRONG_IMAGE = 1228  # db/1228.jpg has a wrong pose in the published model; ours have none
+_WRONG_IMAGE = 1228  # db/1228.jpg has a wrong pose in the published model, not here
 
 
 class AachenTwinOptions(ModelTwinOptions):
@@ -89,7 +89,7 @@ class AachenTwin(SyntheticDataset[AachenTwinOptions]):
     ``images_upright/``, ``3D-models/`` (v1.0's NVM, its list and ``database_intrinsics.txt``;
     ``aachen_v_1_1/`` with a binary COLMAP model), ``queries/`` and ``ground_truth/``. Quirks
     of the original: database images are numbered without order and the NVM has an order of its
-    own, features of the NVM are not numbered densely, v1.1's night list stands in the place of
+    own, features of the NVM are not numbered densely, v1.1's night list replaces
     v1.0's, lists end without a line end, and some images below ``query/`` are in no list. With
     ``model_features`` also ``aachen.db``, the features of v1.0's model; none of v1.1's are
     published.
@@ -137,16 +137,16 @@ class AachenFrames:
     unlisted: tuple[Frame, ...]  # below ``query/``, but in no list
 
     def mapping(self) -> tuple[Frame, ...]:
-        """All map images."""
+        """Return all map images."""
         return self.database + self.sequences
 
     def queries(self) -> tuple[Frame, ...]:
-        """All queries that are in a list."""
+        """Return all listed queries."""
         return self.day + self.night
 
 
 def build_aachen_frames(options: AachenTwinOptions) -> AachenFrames:
-    """Choose all images of the twin; the same options give the same images."""
+    """Choose all images of the twin; equal options give equal images."""
     world = options.world()
     numbers = _database_numbers(options)
     database: list[Frame] = []
@@ -178,7 +178,7 @@ def build_aachen_frames(options: AachenTwinOptions) -> AachenFrames:
 
 
 def _database_numbers(options: AachenTwinOptions) -> NDArray[np.int64]:
-    """Numbers of the database images, in no order and with gaps."""
+    """Draw numbers of the database images, unordered and with gaps."""
     count = options.num_places * options.stations_per_place * len(_YAWS_DEG)
     drawn = stream(options.seed, "aachen", "numbers").permutation(2 * count + 50) + 1
     return drawn[drawn != _WRONG_IMAGE][:count]
@@ -187,7 +187,7 @@ def _database_numbers(options: AachenTwinOptions) -> NDArray[np.int64]:
 def _photographs(
     options: AachenTwinOptions, place: Place, numbers: NDArray[np.int64]
 ) -> list[Frame]:
-    """Map images of a place, each with a camera of its own, taken on two sunny days."""
+    """Return a place's map images, each with a separate camera, taken on two sunny days."""
     rng = stream(options.seed, "aachen", "database", place.index)
     suns = [(rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(40, 60))) for _ in range(2)]
     frames: list[Frame] = []
@@ -205,7 +205,7 @@ def _photographs(
 
 
 def _sequence(options: AachenTwinOptions, place: Place) -> list[Frame]:
-    """A few steps through a place with one camera, looking to the left."""
+    """Return a sequence: a few steps through a place with one camera, looking to the left."""
     rng = stream(options.seed, "aachen", "sequence", place.index)
     sun = (float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(40, 60))))
     width, height = options.width, options.height
@@ -237,7 +237,8 @@ def _map_frame(
     sun: tuple[float, float],
     rng: np.random.Generator,
 ) -> Frame:
-    """An image, its and its sensor's name, taken by hand from ``at`` (place's frame, metres)."""
+    """Return a hand-held image from ``at`` (place's frame, metres), named after itself and its
+    sensor."""
     pitch, roll = (float(a) for a in rng.normal(0.02, 0.03, 2))
     return Frame(
         name=names[0],
@@ -257,7 +258,7 @@ def _map_frame(
 def _photo_camera(
     options: AachenTwinOptions, rng: np.random.Generator, *, portraits: bool = True
 ) -> Camera:
-    """SIMPLE_RADIAL with its principal point in the middle; some are portraits."""
+    """Draw a SIMPLE_RADIAL camera with a central principal point; some are portraits."""
     width, height = options.width, options.height
     focal, k = rng.uniform(0.7, 0.9) * width, rng.uniform(-0.1, 0.02)
     if rng.random() < _PORTRAIT_SHARE and portraits:
@@ -266,7 +267,7 @@ def _photo_camera(
 
 
 def _simple_radial(width: int, height: int, focal: float, k: float) -> Camera:
-    """With the six digits that the published lists have."""
+    """Round to the six digits of the published lists."""
     params = (float(f"{focal:.6g}"), width / 2, height / 2, float(f"{k:.6g}"))
     return Camera("SIMPLE_RADIAL", width, height, params)
 
@@ -274,7 +275,7 @@ def _simple_radial(width: int, height: int, focal: float, k: float) -> Camera:
 def _as_telephones(
     frames: Sequence[Frame], condition: Condition, options: AachenTwinOptions
 ) -> list[Frame]:
-    """Queries sorted by their number, with names of telephones and cameras as in the lists."""
+    """Return queries sorted by number, with device names as in the lists."""
     renamed = []
     for number, frame in enumerate(sorted(frames, key=lambda frame: frame.timestamp)):
         focal, _, _, k = frame.camera.params
@@ -294,7 +295,7 @@ def _as_telephones(
 def _write_nvm_model(
     folder: Path, options: AachenTwinOptions, frames: Sequence[Frame], drawn: MapFrames
 ) -> None:
-    """v1.0's model, which knows only focal lengths, and the list that has the whole cameras."""
+    """Write v1.0's model, with focal lengths only, and the list of complete cameras."""
     rng = stream(options.seed, "aachen", "points", "1.0")
     points = drawn.points(frames, rng)
     if not drawn.features:
@@ -309,7 +310,7 @@ def _write_nvm_model(
 def _write_colmap_model(
     folder: Path, options: AachenTwinOptions, frames: Sequence[Frame], drawn: MapFrames
 ) -> None:
-    """v1.1's model: image and camera ids have no order, and a sequence shares its camera."""
+    """Write v1.1's model: image and camera ids are unordered, and a sequence shares its camera."""
     rng = stream(options.seed, "aachen", "points", "1.1")
     frames = [frames[index] for index in rng.permutation(len(frames))]
     cameras = {frame.sensor_id: frame.camera for frame in frames}

@@ -40,7 +40,8 @@ _MASONRY: dict[str, tuple[int, int, float, float, float]] = {
 def smooth_noise(
     rng: np.random.Generator, height: int, width: int, *, cell: float, octaves: int = 4
 ) -> Field2D:
-    """Multi-octave noise, zero mean and unit deviation; ``cell`` is the coarsest octave, texels."""
+    """Return multi-octave noise of zero mean and unit deviation; ``cell`` is the coarsest octave,
+    texels."""
     total = np.zeros((height, width), np.float32)
     amplitude = 1.0
     for _ in range(octaves):
@@ -60,7 +61,7 @@ def smooth_noise(
 def periodic_noise(
     rng: np.random.Generator, size: int, *, cell: float, octaves: int = 4
 ) -> Field2D:
-    """Like :func:`smooth_noise`, square and seamless when tiled."""
+    """Return noise like :func:`smooth_noise`, square and seamless when tiled."""
     white = rng.standard_normal((size, size))
     rows, columns = np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None]
     freq = np.sqrt(rows * rows + columns * columns) * cell
@@ -73,23 +74,23 @@ def periodic_noise(
 def random_colour(
     rng: np.random.Generator, low: float = 30, high: float = 225, *, chroma: float = 0.75
 ) -> Colour:
-    """A random colour; ``chroma`` 0 is grey, 1 as strong as its channels' range allows."""
+    """Draw a random colour; ``chroma`` 0 is grey, 1 the strongest in range."""
     channels = rng.uniform(low, high, 3)
     return (channels.mean() + chroma * (channels - channels.mean())).astype(np.float32)
 
 
 def to_rgb(image: Picture) -> Rgb:
-    """Round to uint8, cutting off what is below 0 or above 255."""
+    """Clip to 0..255 and round to uint8."""
     return np.clip(image + 0.5, 0, 255).astype(np.uint8)
 
 
 def shade(image: Picture, factor: Field2D) -> Picture:
-    """The picture times a field (H, W)."""
+    """Multiply a picture by a field (H, W)."""
     return image * factor[..., None]
 
 
 def cv_colour(colour: Colour) -> tuple[float, float, float]:
-    """A colour as OpenCV's drawing functions take it."""
+    """Convert a colour for OpenCV's drawing functions."""
     return float(colour[0]), float(colour[1]), float(colour[2])
 
 
@@ -154,7 +155,7 @@ def draw_cracks(rng: np.random.Generator, image: Rgb, count: int) -> None:
 
 
 def _blocks(rng: np.random.Generator, base: Colour, kind: str) -> Picture:
-    """Masonry of a kind."""
+    """Draw a tile of blocks."""
     rows, cols, spread, joint, joint_grey = _MASONRY[kind]
     y, x = np.mgrid[0:TILE, 0:TILE].astype(np.float32)
     v = (y + 0.5) / TILE * rows
@@ -174,7 +175,7 @@ def _blocks(rng: np.random.Generator, base: Colour, kind: str) -> Picture:
 
 @lru_cache(maxsize=32)
 def material_tile(kind: str, seed: int) -> Picture:
-    """A seamless tile (TILE, TILE, 3) float32 of the material, RGB 0..255; not to be written to."""
+    """Return a seamless, read-only tile (TILE, TILE, 3) float32 of the material, RGB 0..255."""
     rng = stream(seed, "material", kind)
     colour, darkest = _MATERIALS[kind]
     base = np.array(colour, np.float32)
@@ -192,7 +193,8 @@ def material_tile(kind: str, seed: int) -> Picture:
 
 
 def tiled(kind: str, seed: int, height: int, width: int, shift: tuple[int, int]) -> Picture:
-    """A surface (height, width, 3) of the material, its tile moved by ``shift`` rows, columns."""
+    """Return a surface (height, width, 3) of the material, its tile moved by ``shift`` rows,
+    columns."""
     tile = np.roll(material_tile(kind, seed), shift, axis=(0, 1))
     repeats = (-(-height // TILE), -(-width // TILE), 1)
     return np.tile(tile, repeats)[:height, :width]

@@ -1,8 +1,7 @@
-"""The rendered world in 4Seasons' layout: three recordings of one route, with their truth.
+"""The rendered world in 4Seasons' layout: three recordings of one route, with true poses.
 
-The map is driven on a summer's day; queries ask for their place in winter, whose poses are
-published, and at dusk, whose poses a challenge withholds. Relocalization files name the keyframes
-that are asked for.
+The map is recorded on a summer day. Queries are from winter, with published poses, and from dusk,
+with poses that a challenge withholds. Relocalization files list the query keyframes.
 """
 
 from __future__ import annotations
@@ -74,7 +73,7 @@ class FourSeasonsTwinOptions(TwinOptions):
     height: int = Field(default=400, ge=48, description="image height in px")
 
     def drives(self) -> tuple[Drive, Drive, Drive]:
-        """The recordings, the map's first."""
+        """Return the recordings, the map's first."""
         return (
             Drive(REFERENCE, "summer", self.map_keyframes, "mapping", 0.1, 2),
             Drive(WINTER, "winter", self.winter_keyframes, "query", 0.6, 8),
@@ -145,7 +144,7 @@ def _write_grey(root: Path, frame: Frame, view: RenderedFrame) -> None:
 
 
 def _on_earth(moments: Iterable[Moment]) -> Iterator[Frame]:
-    """The moments' frames with their poses in ECEF, each camera's its own."""
+    """Yield the moments' frames with each camera's pose in ECEF."""
     world_from_earth = EARTH_FROM_WORLD.inverse()
     cams_from_cam0 = (RigidTransform.identity(), CAM1_FROM_CAM0)
     for moment in moments:
@@ -171,7 +170,7 @@ class SlamFrames:
 
     @classmethod
     def drawn(cls, seed: int, recording: str) -> SlamFrames:
-        """The frames of a recording, at random."""
+        """Draw the coordinate frames of a recording."""
         rng = stream(seed, "frames", recording)
         # each scene has its own origin, some hundred metres away
         east, north, up = rng.uniform(-300, 300, 2).tolist() + [float(rng.uniform(-5, 5))]
@@ -185,7 +184,8 @@ class SlamFrames:
         )
 
     def slam_from_cam(self, cam_from_world: RigidTransform) -> RigidTransform:
-        """A pose as ``GNSSPoses.txt`` has it, its translation in units of the SLAM world."""
+        """Return a pose in the convention of ``GNSSPoses.txt``, translation in units of the SLAM
+        world."""
         s_from_world = self.w_from_gpsw @ self.e_from_gpsw.inverse() @ EARTH_FROM_WORLD
         metric = self.s_from_as.inverse() @ s_from_world @ cam_from_world.inverse()
         x, y, z = (value / self.scale for value in metric.translation)
@@ -209,7 +209,7 @@ def _transformation_lines(slam: SlamFrames, blank_lines: bool) -> list[str]:
 
 
 def _gnss_lines(slam: SlamFrames, keyframes: Iterable[Moment]) -> list[str]:
-    """Poses, below a header that announces a column more than the rows have."""
+    """Format poses, below a header with one more column than the rows."""
     lines = [
         "# timestamp_ns, tran_x, tran_y, tran_z, quat_x, quat_y, quat_z, quat_w, scale, "
         "fusion_quality, v3"
@@ -221,7 +221,7 @@ def _gnss_lines(slam: SlamFrames, keyframes: Iterable[Moment]) -> list[str]:
 
 
 def _nmea_lines(keyframes: Sequence[Moment]) -> list[str]:
-    """A fix for each keyframe, behind the rest of a line."""
+    """Format a GNSS fix per keyframe, after a truncated line."""
     lines = [",D*1C"]
     for moment in keyframes:
         clock = datetime.fromtimestamp(moment.timestamp // 10**9, UTC)
@@ -240,7 +240,7 @@ def _nmea_lines(keyframes: Sequence[Moment]) -> list[str]:
 
 
 def _write_calibration(folder: Path, camera: Camera) -> None:
-    """The files that undistorted images need."""
+    """Write the calibration files of undistorted images."""
     params = " ".join(map(repr, camera.params))
     size = f"{camera.width} {camera.height}"
     for number in (0, 1):
@@ -251,7 +251,7 @@ def _write_calibration(folder: Path, camera: Camera) -> None:
 
 
 def _relocalization_lines(reference: Sequence[Moment], queries: Sequence[Moment]) -> list[str]:
-    """Pairs of the challenge: each query behind the keyframe of the map that is nearest to it."""
+    """Format the challenge's pairs: the nearest map keyframe, then the query."""
     centers = np.array([moment.cam0_from_world.center() for moment in reference])
     lines = []
     for moment in queries:
@@ -263,7 +263,8 @@ def _relocalization_lines(reference: Sequence[Moment], queries: Sequence[Moment]
 def _random_transform(
     rng: np.random.Generator, yaw: float, tilt: float, reach_m: float
 ) -> RigidTransform:
-    """A turn about z by up to ``yaw`` and about x and y by up to ``tilt`` radians, and a shift."""
+    """Draw a rotation about z by up to ``yaw`` and about x and y by up to ``tilt`` radians, and a
+    translation."""
     ax, ay, az = (float(a) / 2 for a in rng.uniform(-1, 1, 3) * (tilt, tilt, yaw))
     cos_x, cos_y, cos_z = settled(np.cos((ax, ay, az))).tolist()
     sin_x, sin_y, sin_z = settled(np.sin((ax, ay, az))).tolist()
@@ -277,7 +278,7 @@ def _random_transform(
 
 
 def _as_written(transform: RigidTransform) -> RigidTransform:
-    """The transform that six decimals stand for."""
+    """Round a transform to six decimals."""
     quat = np.round(transform.quat_wxyz, 6)
     w, x, y, z = (quat / np.sqrt((quat * quat).sum())).tolist()
     tx, ty, tz = np.round(transform.translation, 6).tolist()
@@ -285,7 +286,7 @@ def _as_written(transform: RigidTransform) -> RigidTransform:
 
 
 def _pose_fields(pose: RigidTransform, separator: str, decimals: int) -> str:
-    """Translation, then rotation x y z w."""
+    """Format translation, then rotation x y z w."""
     w, x, y, z = pose.quat_wxyz
     return separator.join(f"{value:.{decimals}f}" for value in (*pose.translation, x, y, z, w))
 

@@ -47,7 +47,7 @@ _DUSK_EXPOSURE = 0.65
 class Moment:
     """The car at one moment, a keyframe of the odometry or not; ``timestamp`` in nanoseconds.
 
-    ``frames`` are what its cameras took, none where the images were not kept.
+    ``frames`` are its cameras' images, empty if they were not kept.
     """
 
     timestamp: int
@@ -58,7 +58,7 @@ class Moment:
 
 @dataclass(frozen=True)
 class Drive:
-    """A recording as it is driven: where, when, and how it looks."""
+    """A recording: route, time and appearance."""
 
     name: str  # with its time
     season: Season  # light, and what lies on the ground
@@ -69,27 +69,27 @@ class Drive:
 
     @property
     def start_ns(self) -> int:
-        """Time of its first frame."""
+        """Return the time of the first frame."""
         moment = datetime.strptime(self.name, "recording_%Y-%m-%d_%H-%M-%S").replace(tzinfo=UTC)
         return int(moment.timestamp()) * 10**9
 
     def sky_seed(self, seed: int) -> int:
-        """Seed of clouds and of the dirt on the bonnet: another each season.
+        """Return the seed of the clouds and of the dirt on the bonnet, which differs by season.
 
-        With the same dirt in map and queries the bonnet would be the best match of all.
+        With the same dirt in map and queries, the bonnet would be the best match.
         """
         return seed + (get_args(Season).index(self.season) << 32)
 
 
 def stereo_camera(width: int, height: int) -> Camera:
-    """Either camera of the car, PINHOLE."""
+    """Return the intrinsics of either camera, PINHOLE."""
     sx, sy = width / _PUBLISHED_SIZE[0], height / _PUBLISHED_SIZE[1]
     params = (_FOCAL_PX * sx, _FOCAL_PX * sx, _CENTRE_PX[0] * sx, _CENTRE_PX[1] * sy)
     return Camera("PINHOLE", width, height, params)
 
 
 def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> list[Moment]:
-    """The frames of a drive through all places, in order of time."""
+    """Return the frames of a drive through all places, in order of time."""
     rng = stream(options.seed, "drive", drive.name)
     moments = []
     clock = drive.start_ns
@@ -119,7 +119,7 @@ def drive_moments(options: SyntheticWorldOptions, drive: Drive) -> list[Moment]:
 
 
 def winter_place(options: SyntheticWorldOptions, index: int) -> Place:
-    """A place whose ground has other leaves, patches and markings, on wet asphalt."""
+    """Return a place with other leaves, patches and markings, on wet asphalt."""
     place = build_place(options, index)
     seed = seed_of(options.seed, "winter", index)
     recipes = []
@@ -178,7 +178,7 @@ def _frames(
 
 
 def _free_offset(plan: FloorPlan, along: float, most: float, rng: np.random.Generator) -> float:
-    """A deviation to the left of the path, metres, that leads into nothing."""
+    """Draw a deviation to the left of the path, metres, that avoids all obstacles."""
     for _ in range(50):
         offset = float(rng.uniform(-most, most))
         steps = range(_FRAMES_PER_KEYFRAME)
@@ -189,8 +189,8 @@ def _free_offset(plan: FloorPlan, along: float, most: float, rng: np.random.Gene
 
 
 def _beside(plan: FloorPlan, along: float, offset: float) -> tuple[NDArray[np.float64], float]:
-    """Position (2,) at a distance along the path, ``offset`` to its left, metres, and direction
-    (radians) of a car, which looks ahead."""
+    """Return position (2,) and direction (radians) of a car at a distance along the path,
+    ``offset`` metres to its left."""
     (ahead, behind, spot), _ = plan.on_path([along + _LOOK_AHEAD_M, along - 0.5, along])
     heading = float(np.arctan2(*(ahead - behind)[::-1]))
     return spot + offset * np.array([-np.sin(heading), np.cos(heading)]), heading

@@ -1,4 +1,4 @@
-"""A frame: one image of the world before it is rendered, its camera, its pose and its light."""
+"""A frame: an image of the world before rendering, with camera, pose and light."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _triple(values: NDArray[np.float64]) -> Triple:
 def day_lighting(
     rng: np.random.Generator, sun: tuple[float, float], *, overcast: float
 ) -> Lighting:
-    """Daylight; exposure and white balance vary a little from image to image.
+    """Return daylight; exposure and white balance vary a little from image to image.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def day_lighting(
 
 
 def night_lighting(rng: np.random.Generator, *, exposure: float) -> Lighting:
-    """Night: warm lamps, a little blue from the sky, a slow and noisy sensor."""
+    """Return night light: warm lamps, a little blue from the sky, a slow and noisy sensor."""
     return Lighting(
         condition="night",
         lamps=_triple(np.array([1.0, 0.74, 0.42]) * rng.uniform(0.8, 1.2)),
@@ -94,7 +94,7 @@ def night_lighting(rng: np.random.Generator, *, exposure: float) -> Lighting:
 
 
 def lamp_lighting(rng: np.random.Generator, *, noise: float, spread: float = 0.0) -> Lighting:
-    """Light of ceiling lamps; ``spread`` is how much light and colour vary between images."""
+    """Return the light of ceiling lamps; ``spread`` is the variation between images."""
     light = float(exp(rng.normal(0, spread)))
     red, green, blue = np.exp(rng.normal(0, 0.35 * spread, 3)).tolist()
     return Lighting(
@@ -111,7 +111,7 @@ def lamp_lighting(rng: np.random.Generator, *, noise: float, spread: float = 0.0
 
 @dataclass(frozen=True)
 class Weather:
-    """A traversal's light and lens."""
+    """Light and lens of a traversal."""
 
     elevation_deg: float | None  # of the sun above the horizon; None at night
     overcast: float = 0.0  # 0..1, how much clouds dim the sun
@@ -173,7 +173,7 @@ def _product(a: Triple, b: Triple) -> Triple:
 def looking_at(
     position: NDArray[np.float64], yaw: float, pitch: float, roll: float
 ) -> RigidTransform:
-    """``cam_from_world`` of a camera at ``position`` (3,), metres, in a frame with z up.
+    """Return ``cam_from_world`` of a camera at ``position`` (3,), metres, in a frame with z up.
 
     It looks along ``yaw`` (radians from +x towards +y), ``pitch`` above the horizon, and is then
     turned by ``roll`` about its axis (clockwise as seen by the camera).
@@ -201,7 +201,7 @@ def cam_from_rig(right_deg: float, up_deg: float, position: Triple) -> RigidTran
 
 
 def reduced(camera: Camera, factor: int) -> Camera:
-    """The same view with ``factor`` times fewer pixels per axis (rounded up)."""
+    """Return the camera with ``factor`` times fewer pixels per axis (rounded up)."""
     width, height = -(-camera.width // factor), -(-camera.height // factor)
     num_px = 4 if camera.model == "PINHOLE" else 3
     params = [p / factor for p in camera.params[:num_px]] + list(camera.params[num_px:])
@@ -210,7 +210,7 @@ def reduced(camera: Camera, factor: int) -> Camera:
 
 @dataclass(frozen=True)
 class Frame:
-    """One image of the world, before it is drawn."""
+    """An image of the world before rendering."""
 
     name: str  # path below ``records_data``
     role: Role
@@ -227,12 +227,12 @@ class Frame:
 
 
 def noise_seed(seed: int, image: str) -> int:
-    """Seed of the sensor's noise in an image of the world of ``seed``."""
+    """Return the seed of an image's sensor noise in the world of ``seed``."""
     return seed_of(seed, "noise", image.rsplit(".", 1)[0])
 
 
 def in_frame(frames: Iterable[Frame], official_from_world: RigidTransform) -> list[Frame]:
-    """The frames with their poses in the coordinates that a dataset publishes."""
+    """Convert the frames' poses to a dataset's published frame."""
     world_from_official = official_from_world.inverse()
     return [
         replace(frame, cam_from_world=frame.cam_from_world @ world_from_official)
@@ -243,7 +243,7 @@ def in_frame(frames: Iterable[Frame], official_from_world: RigidTransform) -> li
 def kapture_records(
     frames: Iterable[Frame], *, poses: bool = True, named: bool = True
 ) -> KaptureData:
-    """Sensors, with their ids as names, and records of the frames, with their poses."""
+    """Return sensors named by id, records and poses of the frames."""
     data = KaptureData()
     for frame in frames:
         record = frame.timestamp, frame.sensor_id

@@ -1,9 +1,8 @@
-"""Floors of an office building: rooms of two kinds along a corridor; those of a kind are alike.
+"""Floors of an office building: rooms of two kinds along a corridor; rooms of a kind are alike.
 
-A room has its door in the wall y = 0 and its windows opposite. Only posters, a rug, a cupboard and
-the sign at its door are a room's own; all else, dirt included, every room of its kind has, on
-every floor. Each floor has a coordinate frame of its own, and the coordinates of one mean something
-else on the other.
+A room has its door in the wall y = 0 and windows opposite. Rooms of a kind differ only in posters,
+a rug, a cupboard and the door sign; everything else, including dirt, is equal on all floors. Each
+floor has a separate coordinate frame; coordinates of different floors cannot be compared.
 """
 
 from __future__ import annotations
@@ -55,18 +54,19 @@ _SCAN_TILT = 0.01  # radians; a tripod stands nearly upright
 
 @dataclass
 class Recipes:
-    """The textures of a floor of the world of ``seed``; surfaces count in ``items``."""
+    """Textures of a floor in the world of ``seed``; surfaces index ``items``."""
 
     seed: int
     items: list[TextureRecipe] = field(default_factory=list)
 
     def thing(self, painter: str, *label: str | int) -> int:
-        """A texture of a kind, the same for the same label."""
+        """Return a texture of a kind; equal labels give equal textures."""
         number = seed_of(self.seed, "indoor", painter, *label)
         return index_of(TextureRecipe(painter, *_SIZES[painter], number), self.items)
 
     def material(self, kind: str, size_m: tuple[float, float], *label: str | int) -> int:
-        """A wall's, floor's or ceiling's texture, the same for the same label and size."""
+        """Return a texture of a wall, floor or ceiling; equal labels and sizes give equal
+        textures."""
         number = seed_of(self.seed, "indoor", kind, *label)
         material_seed = seed_of(self.seed, "indoor", label[0])
         params = (("material", kind), ("material_seed", material_seed), ("dirt", _DIRT))
@@ -76,7 +76,7 @@ class Recipes:
 
 @dataclass
 class Parts:
-    """A room or a piece of corridor while it is built, in a frame of its own (metres, z up)."""
+    """A room or a piece of corridor under construction, in its local frame (metres, z up)."""
 
     recipes: Recipes
     low: Point  # its corners on the ground
@@ -87,7 +87,7 @@ class Parts:
     obstacles: list[Obstacle] = field(default_factory=list)
 
     def surfaces(self) -> tuple[Surfaces, NDArray[np.bool_]]:
-        """All of it, and which of the surfaces are its own."""
+        """Return all surfaces, and a mask of those that no other room has."""
         shared, own = self.shared.build(), self.own.build()
         return shared.joined(own), np.arange(len(shared) + len(own)) >= len(shared)
 
@@ -119,20 +119,21 @@ class Parts:
         size: tuple[float, float] = _POSTER_M,
         painter: str = "poster",
     ) -> None:
-        """Add something flat to a wall: ``at`` its lower left corner, along and above ground."""
+        """Add a flat thing to a wall; ``at`` is its lower left corner, along the wall and above
+        ground."""
         span, height = (at[0], at[0] + size[0]), (at[1], at[1] + size[1])
         texture = self.recipes.thing(painter, *label)
         builder = self.own if own else self.shared
         on.block(builder, span, height, 0.03, front=texture, other=on.trim)
 
     def rug(self, at: Point, size: tuple[float, float], *label: str | int) -> None:
-        """Add a thing of its own that lies on the ground, ``at`` its middle."""
+        """Add an individual thing on the ground; ``at`` is its centre."""
         corner = np.array([at[0] - 0.5 * size[0], at[1] + 0.5 * size[1], 0.01])
         along, across = np.array([size[0], 0.0, 0.0]), np.array([0.0, size[1], 0.0])
         self.own.add(corner, along, -across, self.recipes.thing("poster", *label))
 
     def box(self, at: Point, size: tuple[float, float, float], side: int, top: int) -> None:
-        """Add a piece of furniture that every room of the kind has."""
+        """Add furniture that every room of the kind has."""
         self.shared.add_box(at, size, 0.0, side, top)
         self.obstacles.append(Obstacle(*at, 0.5 * max(size[:2])))
 
@@ -153,7 +154,7 @@ class Parts:
 
 
 def _wall(start: Point, end: Point, texture: int, trim: int) -> Wall:
-    """The wall whose foot runs from ``start`` to ``end``, to the right of who looks at it."""
+    """Return the wall from ``start`` to ``end``, from left to right for a viewer in front."""
     return Wall.between(np.array(start), np.array(end), texture, trim, _HEIGHT_M)
 
 
@@ -192,7 +193,8 @@ _ORDER = (0, 3, 1, 2)  # of the walls whose posters are counted
 
 
 def build_room(recipes: Recipes, kind: str, owner: str) -> Parts:
-    """A room of a kind in its own frame: x and y from 0 to ROOM_M; ``owner`` names what is its."""
+    """Build a room of a kind in its frame, x and y from 0 to ROOM_M; ``owner`` names its individual
+    things."""
     parts, built = Parts(recipes, (0.0, 0.0), ROOM_M), _KINDS[kind]
     width, depth = ROOM_M
     parts.floor_and_ceiling(kind)
@@ -246,10 +248,9 @@ def build_room(recipes: Recipes, kind: str, owner: str) -> Parts:
 
 
 def build_module(recipes: Recipes, owner: str) -> Parts:
-    """A piece of corridor: x from 0 to MODULE_M, y from -CORRIDOR_M / 2 on.
+    """Build a piece of corridor: x from 0 to MODULE_M, y from -CORRIDOR_M / 2 on.
 
-    Both its sides are alike, one the other turned by half a turn. Each has the door of a room and
-    one that is closed.
+    Its sides are equal up to a rotation by 180 degrees. Each has a room's door and a closed one.
     """
     half = CORRIDOR_M / 2
     parts = Parts(recipes, (0.0, -half), (MODULE_M, half))
@@ -283,7 +284,7 @@ def build_module(recipes: Recipes, owner: str) -> Parts:
 
 
 def _build_end(recipes: Recipes, owner: str) -> Parts:
-    """The wall at an end of the corridor, seen by who looks along +x; at x = 0."""
+    """Return the wall at an end of the corridor, at x = 0, seen along +x."""
     half = CORRIDOR_M / 2
     parts = Parts(recipes, (0.0, -half), (0.0, half))
     texture = recipes.material("plaster", (CORRIDOR_M, _HEIGHT_M), "corridor", "end")
@@ -316,13 +317,13 @@ class Floor:
 
 
 def floor_place(modules: int, options: SyntheticWorldOptions, index: int) -> Place:
-    """A floor of a number of modules as :func:`render.render_frames` draws it."""
+    """Return a floor of a number of modules for :func:`render.render_frames`."""
     return build_floor(options.seed, index, modules).place
 
 
 @lru_cache(maxsize=4)
 def build_floor(seed: int, index: int, modules: int) -> Floor:
-    """Floor ``index`` of a building; the same object each time."""
+    """Return floor ``index`` of a building, always the same object."""
     recipes = Recipes(seed, list(moving_object_recipes(seed)))
     placed: list[tuple[Parts, RigidTransform]] = []
     rooms: list[Zone] = []
@@ -361,7 +362,7 @@ def build_floor(seed: int, index: int, modules: int) -> Floor:
 
 
 def _beside_corridor(turned: bool) -> RigidTransform:
-    """module_from_room: on the left of who walks along x, or turned and on the right."""
+    """Return module_from_room: left of the walking direction x, or rotated and on the right."""
     x, y = 0.5 * (MODULE_M - ROOM_M[0]), 0.5 * CORRIDOR_M + WALL_THICKNESS_M
     return _placed(MODULE_M - x, -y, turned=True) if turned else _placed(x, y, turned=False)
 
@@ -372,7 +373,7 @@ def _placed(x: float, y: float, *, turned: bool) -> RigidTransform:
 
 
 def _official_frame(seed: int, index: int) -> RigidTransform:
-    """world_from_place: every floor has its own, and their coordinates overlap."""
+    """Return world_from_place, which differs by floor; their coordinates overlap."""
     rng = stream(seed, "indoor", "frame", index)
     translation = np.array([*rng.uniform(-6, 6, 2), rng.uniform(-0.5, 0.5)])
     return settled_pose(about_z(rng.uniform(-np.pi, np.pi)), translation)
@@ -381,7 +382,7 @@ def _official_frame(seed: int, index: int) -> RigidTransform:
 def _zone(
     seed: int, index: int, name: str, kind: str, parts: Parts, place_from_part: RigidTransform
 ) -> Zone:
-    """The zone of a part of floor ``index``."""
+    """Return the zone of a part of floor ``index``."""
     (x0, y0), (x1, y1) = parts.low, parts.high
     corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
     outline = place_from_part.apply(np.column_stack([corners, np.zeros(4)]))[:, :2]

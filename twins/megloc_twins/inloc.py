@@ -1,4 +1,4 @@
-"""A rendered twin of InLoc: scans of two floors alike, and telephones' images."""
+"""A rendered twin of InLoc: scans of two similar floors, and phone images."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _FIRST_QUERY = 801  # of the numbers the telephone gave its images
 _REDUCTION = 20  # of a glance, px per px
 _ATTEMPTS = 400
 _WALL_DISTANCE_M = 0.7
-_NEAREST_M, _MEDIAN_M = 0.7, 1.6  # of what a query sees: 10th percentile, median
+_NEAREST_M, _MEDIAN_M = 0.7, 1.6  # depth in a query's view: 10th percentile, median
 # share of a query's view that the scans of its floor have seen from about there; how much more
 # that must be than what scans of other rooms of the kind have seen of theirs, which is alike
 _MIN_SEEN, _MIN_MARGIN = 0.6, 0.2
@@ -82,7 +82,7 @@ class InLocTwinOptions(TwinOptions):
     )
 
     def floors(self) -> list[Floor]:
-        """The building."""
+        """Return the building."""
         return [build_floor(self.seed, index, self.modules) for index in range(len(_FLOORS))]
 
 
@@ -129,7 +129,7 @@ class InLocTwin(SyntheticDataset[InLocTwinOptions]):
 
 @dataclass(frozen=True)
 class _Scan:
-    """A scan of the twin: what its files are called and where it stands."""
+    """A scan of the twin: file names and pose."""
 
     floor: int
     number: str
@@ -171,7 +171,7 @@ def _cutouts(options: InLocTwinOptions, scan: _Scan) -> list[Frame]:
 
 
 def _displaced(pose: RigidTransform, rng: np.random.Generator) -> RigidTransform:
-    """A scan's pose before its refinement: beside the true one, turned a bit."""
+    """Return a scan's pose before refinement: near the true one, slightly rotated."""
     half = 0.5 * float(rng.normal(0, 0.02))
     w, z = settled((np.cos(half), np.sin(half))).tolist()
     turn = RigidTransform((w, 0.0, 0.0, z), (0.0, 0.0, 0.0))
@@ -180,7 +180,7 @@ def _displaced(pose: RigidTransform, rng: np.random.Generator) -> RigidTransform
 
 
 def _write_files(root: Path, options: InLocTwinOptions, frame: Frame, view: RenderedFrame) -> None:
-    """A frame's image and, of a cutout, what the scanner measured in its pixels."""
+    """Write a frame's image and, for a cutout, the scanned points of its pixels."""
     write_image(root / frame.name, view.image, jpeg_quality=JPEG_QUALITY)
     if frame.role == "query":
         return
@@ -203,11 +203,12 @@ def scanned_points(
     image: NDArray[np.uint8],
     rng: np.random.Generator,
 ) -> Floats:
-    """The point in each pixel of a cutout, float64 (H, W, 3), metres in the scan's frame.
+    """Return the scanned point of each pixel of a cutout, float64 (H, W, 3), metres in the scan's
+    frame.
 
-    NaN where nothing came back: from glass and what is dark in ``image``, uint8 (H, W, 3), from far
-    away, at grazing angles and now and then. The scanner is off by a millimetre, along its beam;
-    numbers are rounded to what a float32 can hold, as in its own files.
+    NaN without a return: glass, dark pixels of ``image``, uint8 (H, W, 3), far away, at grazing
+    angles and at random. The noise is a millimetre along the beam; values are rounded to float32,
+    as in the official files.
     """
     grid = sample_grid(camera, 1)
     seen = visible_surfaces(floor.place.surfaces, cam_from_place, grid)
@@ -228,25 +229,25 @@ def scanned_points(
 
 
 def cam_from_scan(yaw_deg: float, pitch_deg: float) -> RigidTransform:
-    """A cutout's pose in its scan (z up): at yaw 0 it looks along -x, then turns to the right."""
+    """Return a cutout's pose in its scan (z up): at yaw 0 it looks along -x, then turns right."""
     return looking_at(np.zeros(3), np.pi - np.radians(yaw_deg), np.radians(pitch_deg), 0.0)
 
 
 def cutout_camera(width: int, height: int) -> Camera:
-    """A cutout's camera, 60 degrees wide."""
+    """Return a cutout's camera, 60 degrees wide."""
     return Camera.pinhole(width, height, float(width / 2 / np.tan(np.radians(30.0))))
 
 
 def phone_camera(width: int, height: int) -> Camera:
-    """A telephone's camera with a 28 mm lens (on 36 mm of film)."""
+    """Return a phone's camera with a 28 mm lens (36 mm film)."""
     return Camera.pinhole(width, height, max(width, height) * 28 / 36)
 
 
 def build_queries(options: InLocTwinOptions) -> list[Frame]:
-    """Telephones' images, the first floor's first, zone by zone; about every third held upright.
+    """Choose phone images, floor by floor and zone by zone; about every third is held upright.
 
-    Of some hundred random poses in the zone the first of which the scans of the floor have seen
-    enough, and more than those of other rooms of what looks the same; else the nearest to that.
+    Of some hundred random poses in the zone, take the first that the floor's scans cover well, and
+    better than scans of other rooms cover similar surfaces; else the closest to that.
     """
     floors = options.floors()
     scans = [[_scan_views(floor, zone) for zone in floor.zones] for floor in floors]
@@ -289,8 +290,8 @@ def _query_poses(
     scans: Sequence[Sequence[ScanViews]],
     rng: np.random.Generator,
 ) -> Iterator[tuple[float, tuple[RigidTransform, float]]]:
-    """Random poses in a zone of floor ``index`` and their yaws, each behind what it misses; of
-    those that miss more than one before, most are left out."""
+    """Yield random poses in a zone of floor ``index`` with their yaws, each after its misfit; most
+    poses with a larger misfit than an earlier one are skipped."""
     floor, plan = floors[index], zone.plan
     copies = list(_copies(floors, index, zone))
     least = np.inf
@@ -323,7 +324,8 @@ def _query_poses(
 def _copies(
     floors: Sequence[Floor], index: int, zone: Zone
 ) -> Iterator[tuple[int, RigidTransform]]:
-    """Floors and transforms that take the zone to others of its kind; a corridor's also turned."""
+    """Yield floors and transforms from the zone to others of its kind; a corridor's also
+    rotated."""
     half_turn = RigidTransform((0.0, 0.0, 0.0, 1.0), (MODULE_M, 0.0, 0.0))
     for other_index, floor in enumerate(floors):
         for other in floor.zones:
@@ -343,7 +345,7 @@ def _scan_views(floor: Floor, zone: Zone) -> ScanViews:
 
 
 def _have_seen(scans: Sequence[ScanViews], points: Floats, position: Floats) -> Bools:
-    """Points (P, 3) that a scan has seen about as one sees them from ``position`` (3,)."""
+    """Select points (P, 3) that a scan has seen similarly to a view from ``position`` (3,)."""
     found = np.zeros(len(points), bool)
     here = points - position
     distance = np.linalg.norm(here, axis=1)
@@ -362,7 +364,7 @@ def _have_seen(scans: Sequence[ScanViews], points: Floats, position: Floats) -> 
 def _people(
     zone: Zone, pose: RigidTransform, yaw: float, rng: np.random.Generator
 ) -> tuple[MovingObject, ...]:
-    """Up to two people in front of every second telephone."""
+    """Place up to two people in front of every second phone."""
     people: list[MovingObject] = []
     wanted = int(rng.integers(0, 4)) - 1
     x0, y0, _ = pose.center()

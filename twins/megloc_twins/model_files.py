@@ -1,7 +1,5 @@
-"""Writers of the files that official layouts are made of: COLMAP's and NVM's models, lists of
-images with cameras, InLoc's transformations. Numbers are the shortest texts that read back the
-same.
-"""
+"""Writers of the official layouts' files: COLMAP and NVM models, lists of images with cameras,
+InLoc's transformations. Numbers are the shortest texts that are read back exactly."""
 
 from __future__ import annotations
 
@@ -87,10 +85,9 @@ def _pose(image: ColmapImage) -> tuple[float, ...]:
 def _features(
     model: ColmapModel,
 ) -> Iterator[tuple[ColmapImage, NDArray[np.float32], NDArray[np.int64]]]:
-    """Each image with the features a file lists: where (M, 2), and the id of the point or -1.
+    """Yield each image with its features: positions (M, 2), and point ids or -1.
 
-    Features that the model does not know, because no point needs them, stand at (0, 0): their
-    rows keep the others' indices.
+    Features without a point are at (0, 0): their rows keep the indices of the others.
     """
     points = model.points
     for position, image in enumerate(model.images):
@@ -105,14 +102,14 @@ def _features(
 
 
 def _elements(model: ColmapModel) -> NDArray[np.int32]:
-    """Image id and feature of each observation, (O, 2)."""
+    """Return image id and feature of each observation, (O, 2)."""
     image_ids = np.array([image.image_id for image in model.images], "<i4")
     elements = [image_ids[model.points.image_ids], model.points.feature_ids]
     return np.stack(elements, axis=1).astype("<i4")
 
 
 def _tracks(points: SparsePoints) -> Iterator[tuple[list[float], list[int], slice]]:
-    """Of each point its position, its colour and the rows of its observations."""
+    """Yield position, colour and observation rows of each point."""
     ends = np.searchsorted(points.point_ids, np.arange(len(points) + 1)).tolist()
     tracks = map(slice, ends[:-1], ends[1:])
     return zip(points.xyz.tolist(), points.rgb.tolist(), tracks, strict=True)
@@ -163,12 +160,13 @@ def write_query_list(
 
 
 def _shortest(value: float) -> str:
-    """Shortest text that reads back as the same float64; whole numbers without a point."""
+    """Format as the shortest text that is read back as the same float64; whole numbers without a
+    point."""
     return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
 
 
 def write_transformation(path: Path, before: RigidTransform, after: RigidTransform) -> None:
-    """Write a transformation file as published: both matrices, each under its heading."""
+    """Write a transformation file in the published form: both matrices, each under its heading."""
     lines = []
     for heading, pose in (("Before general icp:", before), ("After general icp:", after)):
         rows = (" ".join(f"{value:13.9f}" for value in row) for row in pose.matrix())

@@ -1,4 +1,4 @@
-"""Floor plans, and the people and cars on them: there in one image, gone in the next."""
+"""Floor plans, and the people and cars on them, which differ from image to image."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _HEAD = 0.13  # part of a person's texture that is the head
 
 @dataclass(frozen=True)
 class Obstacle:
-    """Something that stands in a place: a circle on the ground, metres."""
+    """An obstacle in a place: a circle on the ground, metres."""
 
     x: float
     y: float
@@ -51,10 +51,10 @@ class Obstacle:
 
 @dataclass(frozen=True, eq=False)
 class FloorPlan:
-    """A place seen from above, in its own frame, metres.
+    """Plan of a place in its frame, metres.
 
-    ``outline``, float64 (N, 2), are its walls' feet, counter-clockwise; ``path``, float64 (M, 2),
-    is the closed path of the mapping rig.
+    ``outline``, float64 (N, 2), is the base line of its walls, counter-clockwise; ``path``, float64
+    (M, 2), is the closed path of the mapping rig.
     """
 
     outline: Floats
@@ -62,7 +62,7 @@ class FloorPlan:
     obstacles: tuple[Obstacle, ...] = ()
 
     def is_free(self, x: float, y: float, margin: float) -> bool:
-        """A circle of radius ``margin`` around (x, y) meets no wall and no obstacle."""
+        """Return whether a circle of radius ``margin`` around (x, y) meets no wall or obstacle."""
         return (
             self._is_inside(x, y)
             and _distance_to_ring(x, y, self.outline) >= margin
@@ -70,16 +70,17 @@ class FloorPlan:
         )
 
     def distance_to_path(self, x: float, y: float) -> float:
-        """Distance of (x, y) from the mapping rig's path."""
+        """Return the distance of (x, y) from the mapping rig's path."""
         return _distance_to_ring(x, y, self.path)
 
     @property
     def path_length_m(self) -> float:
-        """Length of the rig's path."""
+        """Return the length of the rig's path."""
         return float(np.hypot(*(np.roll(self.path, -1, axis=0) - self.path).T).sum())
 
     def on_path(self, distance_m: ArrayLike) -> tuple[Floats, Floats]:
-        """Positions (..., 2) at distances (...) along the path, and headings there (radians)."""
+        """Return positions (..., 2) at distances (...) along the path, and the headings
+        (radians)."""
         along = np.roll(self.path, -1, axis=0) - self.path
         lengths = np.hypot(*along.T)
         ends = np.cumsum(lengths)
@@ -90,7 +91,7 @@ class FloorPlan:
         return self.path[leg] + part[..., None] * along[leg], heading
 
     def stops(self, count: int) -> list[tuple[Floats, float]]:
-        """Positions (2,) at equal distances along the path, with the headings there (radians)."""
+        """Return equidistant positions (2,) along the path, with the headings (radians)."""
         spots, headings = self.on_path((np.arange(count) + 0.5) / count * self.path_length_m)
         return list(zip(spots, headings.tolist(), strict=True))
 
@@ -103,7 +104,7 @@ class FloorPlan:
 
 
 def draw_floor_plan(rng: np.random.Generator, index: int) -> FloorPlan:
-    """The empty floor plan of place ``index``: one of four shapes, a little stretched."""
+    """Return the empty floor plan of place ``index``: one of four shapes, a little stretched."""
     outline, path = (np.array(shape) for shape in _SHAPES[index % len(_SHAPES)])
     stretch = rng.uniform(0.94, 1.06, 2)
     return FloorPlan(outline * stretch, path * stretch)
@@ -129,12 +130,13 @@ class MovingObject:
 
     @property
     def radius_m(self) -> float:
-        """Of the circle on the ground that holds it."""
+        """Return the radius of its circle on the ground."""
         return 0.4 if self.kind == "person" else 2.2
 
 
 def moving_object_recipes(seed: int) -> list[TextureRecipe]:
-    """Textures of all moving objects; a place puts them first, their indices are the same."""
+    """Return the textures of all moving objects; they come first in every place, so indices
+    agree."""
     number = seed_of(seed, "movers")
     recipes = [TextureRecipe("cloth", 120, 360, number + i) for i in range(NUM_PEOPLE)]
     for i in range(NUM_CARS):
@@ -151,9 +153,9 @@ def place_moving_objects(
     position: Floats,
     yaw: float | None = None,
 ) -> tuple[MovingObject, ...]:
-    """At most ``count`` people and cars near a position (x, y first; metres, place's frame).
+    """Place up to ``count`` people and cars near a position (x, y first; metres, place's frame).
 
-    They stand in front of it where ``yaw`` (radians) is given, else all around.
+    They are in front of it if ``yaw`` (radians) is given, else all around.
     """
     moving_objects: list[MovingObject] = []
     for _ in range(60):
@@ -176,7 +178,7 @@ def place_moving_objects(
 
 
 def moving_object_surfaces(moving_objects: tuple[MovingObject, ...]) -> Surfaces:
-    """Their surfaces in the place's frame; textures as in :func:`moving_object_recipes`."""
+    """Return their surfaces in the place's frame; textures as in :func:`moving_object_recipes`."""
     builder = SurfaceBuilder()
     for item in moving_objects:
         at, yaw = item.position, item.yaw

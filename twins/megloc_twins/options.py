@@ -1,4 +1,4 @@
-"""Rendered datasets: options, random streams that hang on their seed, and the datasets' base."""
+"""Rendered datasets: options, random streams that depend on the seed, and the base class."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ JPEG_QUALITY = 92  # of all images
 
 
 class TwinOptions(Options):
-    """What can be chosen of every rendered dataset."""
+    """Options of every rendered dataset."""
 
-    seed: int = Field(default=0, ge=0, description="every random choice hangs on it")
-    supersampling: int = Field(default=2, ge=1, le=4, description="samples per px and axis")
+    seed: int = Field(default=0, ge=0, description="seed of all random choices")
+    supersampling: int = Field(default=2, ge=1, le=4, description="samples per pixel and axis")
 
     def world(self) -> SyntheticWorldOptions:
-        """The rendered world that the images are taken in."""
+        """Options of the rendered world."""
         names = SyntheticWorldOptions.model_fields.keys() & type(self).model_fields.keys()
         return SyntheticWorldOptions(**self.model_dump(include=names))
 
 
 class SyntheticWorldOptions(TwinOptions):
-    """Contents of the synthetic world, and how its images are taken.
+    """Contents and images of the synthetic world.
 
-    The defaults: hard enough that retrieval is often wrong and night is worse than day, easy
-    enough that day queries localize.
+    The defaults are hard enough that retrieval is often wrong and night is worse than day, and easy
+    enough that day queries are localized.
     """
 
     num_places: int = Field(default=4, ge=1, description="places, at least 60 m apart")
@@ -52,7 +52,7 @@ class SyntheticWorldOptions(TwinOptions):
         default=0.6,
         ge=0,
         le=1,
-        description="share of posters, doors and windows that every place has in common",
+        description="share of posters, doors and windows that all places have in common",
     )
     moving_objects: int = Field(
         default=2, ge=0, description="people and cars around each stop of the rig or query"
@@ -61,32 +61,31 @@ class SyntheticWorldOptions(TwinOptions):
         default=1.0, gt=0, description="light that reaches the sensor at night, relative"
     )
     depth: bool = Field(default=False, description="write depth maps of the mapping images")
-    masks: bool = Field(default=False, description="write masks that leave the bonnet out")
+    masks: bool = Field(default=False, description="write masks of the bonnet")
 
 
 def stream(seed: int, *labels: str | int) -> np.random.Generator:
-    """The random stream of one thing in the world, named by ``labels``.
+    """Return the random stream of a thing in the world, named by ``labels``.
 
-    Streams of different names are independent, so that adding a query or a poster does not
-    change the rest of the world.
+    Streams are independent, so adding a query or a poster does not change the rest of the world.
     """
     return np.random.default_rng([seed, crc32("/".join(map(str, labels)).encode())])
 
 
 def seed_of(seed: int, *labels: str | int) -> int:
-    """A seed of one thing in the world, see :func:`stream`."""
+    """Return a seed of a thing in the world; see :func:`stream`."""
     return int(stream(seed, *labels).integers(2**31))
 
 
 class SyntheticDataset(ABC, Generic[OptionsT]):
-    """A dataset that is rendered from its options; group ``megloc_kapture.rendered_datasets``.
+    """A dataset rendered from its options; group ``megloc_kapture.rendered_datasets``.
 
-    ``options`` are of the class's model ``Options``; its defaults unless given.
+    ``options`` are of the class's model ``Options``, by default its defaults.
     """
 
     Options: ClassVar[type[Options]]
     version: ClassVar[int]
-    """Raised when the same options give other files than before."""
+    """Increase it when equal options give other files than before."""
     options: OptionsT
 
     def __init__(self, options: OptionsT | None = None) -> None:
@@ -94,31 +93,32 @@ class SyntheticDataset(ABC, Generic[OptionsT]):
 
     @abstractmethod
     def write(self, root: Path, work: Work = HERE) -> dict[str, int]:
-        """Render it and write it below ``root``; returns what it holds.
+        """Render the dataset, write it below ``root`` and return counts.
 
-        The bytes depend on the options alone. Processes of ``work`` have to see the same files.
+        The bytes depend on the options alone. The processes of ``work`` must see the same files.
 
-        Raises OutputError where something cannot be written.
+        Raises OutputError if a file cannot be written.
         """
 
 
 class ModelTwinOptions(TwinOptions):
-    """Options of a twin that is published with a sparse model."""
+    """Options of a twin with a sparse model."""
 
     points_per_image: int = Field(
-        default=100, ge=1, description="points of the sparse models that are drawn in each image"
+        default=100, ge=1, description="points of the sparse models, drawn in each image"
     )
     night_exposure: float = Field(
         default=1.0, gt=0, description="light that reaches the sensor at night, relative"
     )
     model_features: bool = Field(
         default=False,
-        description="sparse models of SIFT of the images, not of exact points, with their database",
+        description="make sparse models of SIFT features, with their database, instead of exact "
+        "points",
     )
 
 
 def shuffled(items: Sequence[Item], seed: int, *labels: str) -> list[Item]:
-    """The items in no order, as in published files; the same for the same labels."""
+    """Shuffle the items, as in published files; equal labels give equal orders."""
     return [items[index] for index in stream(seed, *labels).permutation(len(items))]
 
 

@@ -1,9 +1,9 @@
-"""Arithmetic that gives the same bits on every processor.
+"""Arithmetic with the same bits on every processor.
 
-Sums, products, quotients and square roots are exact to the last bit (IEEE 754). Matrix products of
-BLAS, filters of OpenCV and elementary functions are not: they take what instructions the processor
-has, fused ones among them, and a grey level between two may fall to either. So products and filters
-are sums written out here; elementary functions are computed in float64 and rounded.
+Sums, products, quotients and square roots are exact to the last bit (IEEE 754). BLAS products,
+OpenCV filters and elementary functions are not: they depend on the processor's instructions, such
+as fused ones. So products and filters are explicit sums here; elementary functions are computed in
+float64 and rounded.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ Float64 = NDArray[np.float64]
 
 
 def settled(values: ArrayLike) -> Float64:
-    """Metres, radians or parts of a unit vector without their last bits, float64."""
+    """Round metres, radians or components of a unit vector to drop their last bits, float64."""
     rounded = np.round(np.asarray(values, np.float64), _DECIMALS)
     return np.asarray(rounded + 0.0, np.float64)  # of -0 and 0, 0
 
 
 def settled_pose(rotation: Float64, translation: Float64) -> RigidTransform:
-    """The transform of a rotation matrix (3, 3) and a translation (3,), without the last bits."""
+    """Return the transform of a rotation (3, 3) and a translation (3,), without the last bits."""
     quat = settled(RigidTransform.from_matrix(rotation, translation).quat_wxyz)
     # half a turn has w = 0, give or take a last bit, by which either sign may come out
     w, x, y, z = (quat * np.sign(quat[np.flatnonzero(quat)[0]]) + 0.0).tolist()
@@ -42,7 +42,7 @@ def settled_pose(rotation: Float64, translation: Float64) -> RigidTransform:
 
 
 def _rounded(function: np.ufunc) -> Callable[..., Float32]:
-    """The function computed in float64 and rounded to float32; angles are radians."""
+    """Compute the function in float64 and round to float32; angles are in radians."""
 
     def rounded(*arguments: ArrayLike) -> Float32:
         exact = function(*(np.asarray(values, np.float64) for values in arguments))
@@ -56,7 +56,7 @@ exp, sin, log2, arctan2 = (_rounded(f) for f in (np.exp, np.sin, np.log2, np.arc
 
 
 def product(left: Float64, right: Float64) -> Float64:
-    """``left @ right``, (..., K) by (K,) or (K, M), K >= 1; for a K of few."""
+    """Return ``left @ right``, (..., K) by (K,) or (K, M), for a small K >= 1."""
     terms = (left[..., k, None] * right[k] for k in range(len(right)))
     total = next(terms)
     for term in terms:
@@ -65,16 +65,16 @@ def product(left: Float64, right: Float64) -> Float64:
 
 
 def resized(image: Float32, width: int, height: int, *, cubic: bool = False) -> Float32:
-    """An image (h, w, ...) enlarged to (height, width, ...), linearly or by Keys' cubic.
+    """Enlarge an image (h, w, ...) to (height, width, ...), linearly or by Keys' cubic.
 
-    Half a pixel lies around the outermost centres, which are repeated beyond the edge.
+    Pixel centres are half a pixel inside the edge; edge pixels are repeated beyond it.
     """
     across = _interpolated(np.moveaxis(image, 1, 0), width, cubic)
     return _interpolated(np.moveaxis(across, 0, 1), height, cubic)
 
 
 def _interpolated(rows: Float32, count: int, cubic: bool) -> Float32:
-    """``count`` rows at equal distances between those of an array (N, ...)."""
+    """Resample an array (N, ...) to ``count`` equidistant rows."""
     at = (np.arange(count) + 0.5) * (len(rows) / count) - 0.5
     first = np.floor(at).astype(np.int64)
     part = at - first
@@ -89,7 +89,7 @@ def _interpolated(rows: Float32, count: int, cubic: bool) -> Float32:
 
 @compiled_loop
 def _summed(rows: Float32, taps: NDArray[np.int64], shares: Float32) -> Float32:
-    """Rows of an array (N, M) that are sums of some of its rows, by their shares, (T, K) both."""
+    """Return weighted sums of rows of an array (N, M), with indices and weights (T, K)."""
     total = np.zeros((taps.shape[1], rows.shape[1]), np.float32)
     for row in range(len(total)):
         for tap in range(len(taps)):
@@ -100,14 +100,14 @@ def _summed(rows: Float32, taps: NDArray[np.int64], shares: Float32) -> Float32:
 
 
 def _keys(distance: Float64) -> Float64:
-    """Weights of samples at distances of 0 to 2 (Keys 1981, equation 4, the slope at 1 free)."""
+    """Return weights of samples at distances of 0 to 2 (Keys 1981, equation 4, free slope at 1)."""
     d = distance
     near = ((_CUBIC + 2) * d - (_CUBIC + 3)) * d * d + 1
     return np.where(d <= 1, near, _CUBIC * (((d - 5) * d + 8) * d - 4))
 
 
 def averaged(image: Float32, factor: int) -> Float32:
-    """Means of squares of ``factor`` by ``factor`` pixels, (h // factor, w // factor, ...)."""
+    """Average blocks of ``factor`` by ``factor`` pixels: (h // factor, w // factor, ...)."""
     height, width = image.shape[0] // factor, image.shape[1] // factor
     image = image[: height * factor, : width * factor]
     down = sum(image[k::factor] for k in range(factor))
@@ -116,7 +116,7 @@ def averaged(image: Float32, factor: int) -> Float32:
 
 
 def blurred(image: Float32, deviation_px: float) -> Float32:
-    """A Gaussian blur of an image (h, w, ...), out to four deviations, mirrored at the edges."""
+    """Blur an image (h, w, ...) by a Gaussian, up to four deviations, mirrored at the edges."""
     radius = int(round(4 * deviation_px))
     weights = np.asarray(exp(-0.5 * (np.arange(radius + 1) / deviation_px) ** 2), np.float64)
     weights = (weights / (weights[0] + 2 * np.sum(weights[1:]))).astype(np.float32)

@@ -1,8 +1,8 @@
-"""Exact images of textured parallelograms: which surface each sample sees, how far, what colour.
+"""Exact rasterization of textured parallelograms: surface, depth and colour of each sample.
 
-A sample's ray is ``(x_n, y_n, 1)`` in the camera; on the plane of a surface the inverse depth and
-the two texture coordinates over depth are linear in it, so each surface costs three planes and a
-few comparisons over its bounding box. Depth is z along the optical axis, metres.
+A sample's ray is ``(x_n, y_n, 1)`` in the camera. On a surface's plane, inverse depth and the two
+texture coordinates over depth are linear in it, so each surface costs three planes and a few
+comparisons over its bounding box. Depth is z along the optical axis, metres.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ class SampleGrid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of samples."""
+        """Return the rows and columns of samples."""
         return self.camera.height * self.supersampling, self.camera.width * self.supersampling
 
     def rays(self) -> Float64:
-        """(x, y, 1) of each, float64 (rows, columns, 3)."""
+        """Return (x, y, 1) of each sample, float64 (rows, columns, 3)."""
         return np.stack(np.broadcast_arrays(self.x, self.y, 1.0), axis=-1)
 
 
@@ -56,14 +56,14 @@ class Visibility:
 
     grid: SampleGrid
     surface: NDArray[np.int16]  # (rows, columns), its index or NO_SURFACE
-    inverse_depth: Float32  # (rows, columns), 1/m, 0 where there is no surface
+    inverse_depth: Float32  # (rows, columns), 1/m, 0 without a surface
     planes: Float64
 
 
 def intrinsics(camera: Camera) -> tuple[float, float, float, float, float]:
-    """(fx, fy, cx, cy, k) of a camera; k is SIMPLE_RADIAL's distortion, else 0.
+    """Return (fx, fy, cx, cy, k) of a camera; k is SIMPLE_RADIAL's distortion, else 0.
 
-    Raises DataError where the renderer has no such camera model.
+    Raises DataError for a camera model that the renderer does not support.
     """
     if camera.model not in ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL"):
         raise DataError(f"the renderer has no camera model {camera.model}")
@@ -73,7 +73,7 @@ def intrinsics(camera: Camera) -> tuple[float, float, float, float, float]:
 
 
 def sample_grid(camera: Camera, supersampling: int) -> SampleGrid:
-    """The rays of all samples of a camera; the centre of the first pixel is (0.5, 0.5)."""
+    """Return the rays of all samples of a camera; the centre of the first pixel is (0.5, 0.5)."""
     fx, fy, cx, cy, k = intrinsics(camera)
     columns = (np.arange(camera.width * supersampling) + 0.5) / supersampling
     rows = (np.arange(camera.height * supersampling) + 0.5) / supersampling
@@ -93,7 +93,7 @@ def sample_grid(camera: Camera, supersampling: int) -> SampleGrid:
 
 
 def project(camera: Camera, points: Float64) -> Float64:
-    """Pixels (N, 2) of points (N, 3) in the camera's frame, in front of it."""
+    """Project points (N, 3) in the camera's frame, in front of it, to pixels (N, 2)."""
     fx, fy, cx, cy, k = intrinsics(camera)
     xy = points[:, :2] / points[:, 2:]
     xy = xy * (1 + k * (xy**2).sum(1, keepdims=True))
@@ -127,7 +127,7 @@ def _cover(
     nearest: Float32,
     surface: NDArray[np.int16],
 ) -> None:
-    """Write each candidate where it is nearer than what is there, within its box."""
+    """Write each candidate within its box if it is nearer than the current surface."""
     for index in candidates:
         left, right, top, bottom = boxes[index]
         depth, along_u, along_v = forms[index]
@@ -145,7 +145,8 @@ def _cover(
 
 
 def _planes(origin: Float64, edge_u: Float64, edge_v: Float64) -> tuple[Float64, NDArray[np.bool_]]:
-    """Linear forms (N, 3, 3) of 1/z, u/z, v/z in the ray, and which surfaces face the camera."""
+    """Return linear forms (N, 3, 3) of 1/z, u/z, v/z in the ray, and a mask of surfaces that face
+    the camera."""
     normal = np.cross(edge_u, edge_v)  # away from a viewer in front
     offset = np.einsum("ni,ni->n", normal, origin)
     facing = offset > 1e-9
@@ -161,7 +162,7 @@ def _planes(origin: Float64, edge_u: Float64, edge_v: Float64) -> tuple[Float64,
 
 
 def _bounding_boxes(corners: Float64, grid: SampleGrid) -> NDArray[np.int64]:
-    """Sample ranges (N, 4): left, right, top, bottom (ends exclusive) that hold each surface."""
+    """Return bounding ranges (N, 4) of samples: left, right, top, bottom (ends exclusive)."""
     following = np.roll(corners, -1, axis=1)
     z, z_next = corners[..., 2], following[..., 2]
     crosses = (z < NEAR_M) != (z_next < NEAR_M)
@@ -185,7 +186,7 @@ def _bounding_boxes(corners: Float64, grid: SampleGrid) -> NDArray[np.int64]:
 
 
 def depth_map(seen: Visibility) -> Float32:
-    """Depth along the optical axis in metres, float32 (rows, columns), 0 where nothing is seen.
+    """Return depth along the optical axis in metres, float32 (rows, columns), 0 without a surface.
 
     Computed in float64 from the surface's plane; exact at the samples' centres.
     """
@@ -196,9 +197,10 @@ def depth_map(seen: Visibility) -> Float32:
 
 
 def sample_colour(seen: Visibility, surfaces: Surfaces, atlas: Atlas) -> Float32:
-    """Colour of each sample, float32 (rows, columns, 3), RGB 0..255; 0 where nothing is seen.
+    """Return the colour of each sample, float32 (rows, columns, 3), RGB 0..255; 0 without a
+    surface.
 
-    The texture's level is chosen by the area of a sample in texels, and two levels are blended.
+    The texture level follows from the area of a sample in texels; two levels are blended.
     """
     index = np.maximum(seen.surface, 0).astype(np.int32)
     hit = seen.surface != NO_SURFACE
@@ -229,7 +231,7 @@ def sample_colour(seen: Visibility, surfaces: Surfaces, atlas: Atlas) -> Float32
 def _level(
     seen: Visibility, surfaces: Surfaces, atlas: Atlas, index: NDArray[np.int32], inverse: Float32
 ) -> Float32:
-    """Texture level (0 finest, fractional) where one sample covers about one texel in area."""
+    """Return the fractional texture level (0 finest) at which a sample covers about one texel."""
     fx, fy, _, _, _ = intrinsics(seen.grid.camera)
     size = atlas.size[surfaces.texture, 0].astype(np.float64)
     part = np.abs(surfaces.uv[:, 2:] - surfaces.uv[:, :2])
@@ -253,10 +255,10 @@ def _lookup_table(surfaces: Surfaces, atlas: Atlas) -> Float32:
 
 @compiled_loop
 def bilinear(image: NDArray[Any], x: Float32, y: Float32) -> Float32:
-    """Values of an image (H, W, C) at ``x``, ``y``, float32 (R, S) each: float32 (R, S, C).
+    """Interpolate an image (H, W, C) at ``x``, ``y``, float32 (R, S) each: float32 (R, S, C).
 
-    The first pixel's centre is (0, 0); beyond the edge is what lies on it, at NaN the first pixel.
-    OpenCV's lookups have fused multiplications on some processors; a compiled loop has none.
+    The first pixel's centre is (0, 0); edge values continue beyond the edge, NaN gives the first
+    pixel. OpenCV uses fused multiplications on some processors; this compiled loop does not.
     """
     height, width, channels = image.shape
     rows, columns = x.shape

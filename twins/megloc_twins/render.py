@@ -1,6 +1,6 @@
 """Rendering of frames to images, depth and masks, on any executor.
 
-From what samples see to pixels: sun, shadows, sky, lamps, bonnet, lens and sensor.
+The colours of surface samples become pixels: sun, shadows, sky, lamps, bonnet, lens and sensor.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _CLOUD_SIZE = 512
 
 @dataclass(frozen=True, eq=False)
 class ShadowMap:
-    """Greatest height along the sun's direction over a grid of lines parallel to it."""
+    """Largest height along the sun's direction, on a grid of lines parallel to it."""
 
     axes: NDArray[np.float64]  # (3, 3), rows: the grid's x and y directions and the sun's
     low: NDArray[np.float64]  # (2,), the grid's corner
@@ -59,7 +59,7 @@ class ShadowMap:
     height: Float32  # (_SHADOW_SIZE, _SHADOW_SIZE), metres along the sun's direction
 
     def lit(self, x: Float32, y: Float32, z: Float32) -> Float32:
-        """1 where the sun reaches a point, else 0; arrays of one shape, metres."""
+        """Return 1 for points in the sun, else 0; arrays of one shape, metres."""
         a = self.axes.astype(np.float32)
         gx, gy, up = (row[0] * x + row[1] * y + row[2] * z for row in a)
         gx = (gx - np.float32(self.low[0])) / np.float32(self.step) - np.float32(0.5)
@@ -70,7 +70,7 @@ class ShadowMap:
 
 
 def cast_shadows(surfaces: Surfaces, sun_direction: Triple) -> ShadowMap:
-    """The shadow map of the surfaces (both sides cast shadows)."""
+    """Compute the shadow map of the surfaces (both sides cast shadows)."""
     sun = np.array(sun_direction)
     side = np.cross([0.0, 0.0, 1.0] if abs(sun[2]) < 0.99 else [1.0, 0.0, 0.0], sun)
     side /= np.sqrt((side * side).sum())
@@ -85,7 +85,7 @@ def cast_shadows(surfaces: Surfaces, sun_direction: Triple) -> ShadowMap:
 
 
 def add_shadows(shadows: ShadowMap, surfaces: Surfaces) -> ShadowMap:
-    """The map with the shadows of more surfaces, where they lie on its grid."""
+    """Add the shadows of more surfaces, as far as they are on the grid."""
     axes, low, step, height = shadows.axes, shadows.low, shadows.step, shadows.height.copy()
     outline = (product(surfaces.corners(), axes.T)[..., :2] - low) / step
     first = np.clip(np.floor(outline.min(1)) - 1, 0, _SHADOW_SIZE).astype(int)
@@ -110,7 +110,7 @@ def add_shadows(shadows: ShadowMap, surfaces: Surfaces) -> ShadowMap:
 
 
 def cloud_texture(seed: int) -> Float32:
-    """Clouds, float32 (_CLOUD_SIZE, _CLOUD_SIZE) 0..1, seamless from left to right."""
+    """Paint clouds, float32 (_CLOUD_SIZE, _CLOUD_SIZE) 0..1, seamless from left to right."""
     noise = periodic_noise(stream(seed, "clouds"), _CLOUD_SIZE, cell=160, octaves=5)
     return np.clip(0.5 + 0.5 * noise, 0, 1).astype(np.float32)
 
@@ -163,7 +163,8 @@ def radiance(
 
 
 def _positions(seen: Visibility, cam_from_place: RigidTransform) -> tuple[Float32, ...]:
-    """x, y, z of what each sample sees, place's frame, metres; the camera where it sees nothing."""
+    """Return x, y, z of each sample's surface point, place's frame, metres; the camera's if
+    none."""
     rotation = cam_from_place.rotation_matrix().astype(np.float32)
     center = cam_from_place.center().astype(np.float32)
     hit = seen.inverse_depth > 0
@@ -176,7 +177,7 @@ def _positions(seen: Visibility, cam_from_place: RigidTransform) -> tuple[Float3
 
 
 def _lamp_light(position: tuple[Float32, ...], normal: Float32, lamps: Float32) -> Float32:
-    """Sum over lamps of cosine over squared distance, cut off smoothly at _LAMP_RANGE_M."""
+    """Sum cosine over squared distance over all lamps, cut off smoothly at _LAMP_RANGE_M."""
     total = np.zeros_like(position[0])
     for lamp in lamps:
         dx, dy, dz = (lamp[i] - position[i] for i in range(3))
@@ -210,9 +211,9 @@ def _sky(
 
 
 def develop(light: Float32, frame: Frame, supersampling: int, seed: int) -> NDArray[np.uint8]:
-    """Image uint8 (H, W, 3) RGB of a frame's samples' light (H * ss, W * ss, 3).
+    """Expose an image, uint8 (H, W, 3) RGB, from the light of its samples (H * ss, W * ss, 3).
 
-    ``seed`` is that of the bonnet, where the frame shows one.
+    ``seed`` is the bonnet's, if the frame shows one.
     """
     lighting, width, height = frame.lighting, frame.camera.width, frame.camera.height
     if supersampling > 1:
@@ -239,7 +240,7 @@ def develop(light: Float32, frame: Frame, supersampling: int, seed: int) -> NDAr
 
 @lru_cache(maxsize=8)
 def _corner_distance(width: int, height: int) -> Float32:
-    """Squared distance from the image's middle, 1 in the corners, float32 (height, width)."""
+    """Return squared distances from the image centre, 1 in the corners, float32 (height, width)."""
     x = (np.arange(width, dtype=np.float32) + 0.5) / width * 2 - 1
     y = (np.arange(height, dtype=np.float32) + 0.5) / height * 2 - 1
     return ((x[None] ** 2 + y[:, None] ** 2) / 2).astype(np.float32)
@@ -247,8 +248,8 @@ def _corner_distance(width: int, height: int) -> Float32:
 
 @lru_cache(maxsize=4)
 def bonnet(width: int, height: int, seed: int) -> tuple[Float32, Float32]:
-    """The bonnet as the front camera sees it: cover (H, W) 0..1 and paint (H, W, 3) linear; always
-    in the same part of the image, with its seams, dirt and emblem."""
+    """Paint the bonnet in the front camera: cover (H, W) 0..1 and paint (H, W, 3) linear, with
+    seams, dirt and emblem; it is the same in all images."""
     x = (np.arange(width, dtype=np.float32) + 0.5) / width * 2 - 1
     y = (np.arange(height, dtype=np.float32) + 0.5) / height
     edge = 0.86 + 0.11 * x**2
@@ -276,10 +277,10 @@ def bonnet(width: int, height: int, seed: int) -> tuple[Float32, Float32]:
 
 @dataclass(frozen=True, eq=False)
 class RenderedFrame:
-    """A drawn frame.
+    """A rendered frame.
 
-    Depth is along the optical axis at the pixels' centres, 0 where nothing is seen or the bonnet
-    hides it; moving objects count. None where not asked for.
+    Depth is along the optical axis at the pixels' centres, including moving objects, 0 without a
+    surface or behind the bonnet. None unless requested.
     """
 
     image: NDArray[np.uint8]  # (H, W, 3), RGB
@@ -288,12 +289,12 @@ class RenderedFrame:
 
 
 def painted(recipes: Iterable[TextureRecipe]) -> Atlas:
-    """The atlas of the textures."""
+    """Return the texture atlas."""
     return build_atlas([recipe.paint() for recipe in recipes])
 
 
 class PlaceRenderer:
-    """Draws the frames of one place; painting the place's textures takes about a second."""
+    """Renderer of the frames of one place; painting its textures takes about a second."""
 
     def __init__(self, place: Place, *, seed: int, supersampling: int) -> None:
         self._place = place
@@ -304,7 +305,7 @@ class PlaceRenderer:
         self._shadows: tuple[Triple, ShadowMap] | None = None
 
     def render(self, frame: Frame, *, depth: bool = False) -> RenderedFrame:
-        """Draw one frame, with its depth if asked."""
+        """Render one frame, with its depth if requested."""
         place, lighting = self._place, frame.lighting
         moving_objects = moving_object_surfaces(frame.moving_objects)
         surfaces = place.surfaces.joined(moving_objects)
@@ -335,7 +336,8 @@ class PlaceRenderer:
         return RenderedFrame(image, depth_m, mask)
 
     def _static_shadows(self, sun: Triple) -> ShadowMap:
-        """Shadows of what does not move; the last are kept, as frames often share their sun."""
+        """Return the shadows of static surfaces; the last are cached, as frames often share a
+        sun."""
         if self._shadows is None or self._shadows[0] != sun:
             self._shadows = (sun, cast_shadows(self._place.surfaces, sun))
         return self._shadows[1]
@@ -355,8 +357,8 @@ def render_frames(
 
     Parameters
     ----------
-    finish : called as ``finish(frame, rendered)``, in another process where there is an executor:
-        a function of a module, or a ``functools.partial`` of one. It writes the files.
+    finish : called as ``finish(frame, rendered)``, with an executor in another process: a
+        module-level function or a ``functools.partial`` of one, which writes the files.
     with_depth : names of the frames that need ``depth_m``.
     build : lays out a place of these options by its index, the same in every process.
     sky_seed : of clouds and the dirt on the bonnet; the world's unless given.
@@ -370,7 +372,7 @@ def render_frames(
 
 
 def _batches(frames: Sequence[Frame]) -> Iterator[list[Frame]]:
-    """Frames of one place each."""
+    """Group frames by place."""
     for place in sorted({frame.place for frame in frames}):
         here = [frame for frame in frames if frame.place == place]
         for start in range(0, len(here), _FRAMES_PER_BATCH):
@@ -407,12 +409,12 @@ def _bonnet_cover(frame: Frame, seed: int) -> Float32:
 
 
 def on_bonnet(frame: Frame, seed: int) -> Mask:
-    """Pixels (H, W) that the car's bonnet covers in part or whole, of the world of ``seed``."""
+    """Return the pixels (H, W) that the bonnet covers at least partly, in the world of ``seed``."""
     return _bonnet_cover(frame, seed) > _BONNET_TOUCHES
 
 
 def on_moving_objects(frame: Frame, place: Place) -> Mask:
-    """Pixels (H, W) whose centre shows a person or a car; the bonnet is not looked at."""
+    """Return the pixels (H, W) whose centre shows a person or a car, ignoring the bonnet."""
     # the moving objects' surfaces come behind the place's own
     surfaces = place.surfaces.joined(moving_object_surfaces(frame.moving_objects))
     seen = visible_surfaces(surfaces, place.cam_from_place(frame), sample_grid(frame.camera, 1))

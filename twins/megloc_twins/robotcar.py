@@ -1,7 +1,7 @@
 """A rendered twin of RobotCar Seasons: a car with three cameras, streets in all weathers.
 
-The frames' names are those of the official layout. Their poses are in the world's coordinates
-until they are written in those that the twin publishes.
+Frames have the names of the official layout. Their poses are in the rendered world's frame and
+converted to the published one when written.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ class RobotCarTwin(SyntheticDataset[RobotCarTwinOptions]):
 
 @dataclass(frozen=True, eq=False)
 class RobotCarFrames:
-    """All images of the twin, three of each moment; poses in the world's frame.
+    """All images of the twin, three per moment; poses in the world's frame.
 
     ``mapping`` are sorted by location, then time, ``queries`` by condition, then time.
     """
@@ -151,7 +151,7 @@ class RobotCarFrames:
 
 
 def build_robotcar_frames(options: RobotCarTwinOptions) -> RobotCarFrames:
-    """Choose all images of the twin; the same options give the same images."""
+    """Choose all images of the twin; equal options give equal images."""
     mapping: list[Frame] = []
     queries: list[Frame] = []
     for index in range(options.num_locations):
@@ -166,7 +166,7 @@ def build_robotcar_frames(options: RobotCarTwinOptions) -> RobotCarFrames:
 
 
 def car_cameras(size_px: int) -> dict[str, Camera]:
-    """The cameras by name, PINHOLE with the six decimals of the published files."""
+    """Return the cameras by name, PINHOLE with the six decimals of the published files."""
     focal = round(_FOCAL * size_px, 6)
     cameras = {}
     for name, centre in _CENTRES.items():
@@ -188,7 +188,7 @@ def _reference_frames(options: RobotCarTwinOptions, place: Place) -> list[Frame]
 def _query_frames(
     options: RobotCarTwinOptions, place: Place, map_views: list[CoarseView], condition: str
 ) -> list[Frame]:
-    """This location's share of a traversal's moments."""
+    """Choose this location's share of a traversal's moments."""
     azimuth = float(stream(options.seed, "robotcar", condition, place.index).uniform(-np.pi, np.pi))
     frames = []
     for number in range(place.index, options.moments_per_condition, options.num_locations):
@@ -207,7 +207,7 @@ def _moment(
     azimuth: float,
     rng: np.random.Generator,
 ) -> list[Frame]:
-    """What the three cameras take at a moment of a traversal, in the order of CAMERAS."""
+    """Return the three cameras' frames at a moment of a traversal, in the order of CAMERAS."""
     jitter = int(rng.integers(0, 1000))
     timestamp = _STARTS_US[condition] + place.index * _PLACE_US + number * _STOP_US + jitter
     car_from_world = car_from_place @ place.place_from_world
@@ -245,8 +245,8 @@ def _query_poses(
     map_views: list[CoarseView],
     rng: np.random.Generator,
 ) -> Iterator[tuple[float, RigidTransform]]:
-    """``car_from_place`` on the reference traversal's way, a little beside it, each with the
-    misfit of what the scored camera sees."""
+    """Yield ``car_from_place`` near the reference traversal, each with the misfit of the scored
+    camera's view."""
     camera, cam_on_car = car_cameras(options.size_px)[SCORED_CAMERA], CAM_FROM_CAR[SCORED_CAMERA]
     path = place.plan.stops(_STEPS)
     for _ in range(_ATTEMPTS):
@@ -263,14 +263,15 @@ def _query_poses(
 def _car_from_place(
     spot: NDArray[np.float64], yaw: float, rng: np.random.Generator
 ) -> RigidTransform:
-    """Of a car at a spot (2,), metres, that drives along ``yaw``, a little tilted."""
+    """Return the pose of a slightly tilted car at a position (2,), metres, driving along
+    ``yaw``."""
     pitch, roll = (float(a) for a in rng.normal(0, 0.012, 2))
     height = _CAMERA_HEIGHT_M + float(rng.normal(0, 0.02))
     return looking_at(np.array([*spot, height]), float(yaw), pitch, roll)
 
 
 def _registered(frames: Sequence[Frame]) -> list[Frame]:
-    """The reference images that the models have: of each location one is left out."""
+    """Return the reference images in the models: one per location is omitted."""
     last = {frame.place: frame.timestamp for frame in frames}
     return [
         frame
@@ -282,7 +283,7 @@ def _registered(frames: Sequence[Frame]) -> list[Frame]:
 def _write_models(
     layout: Layout, options: RobotCarTwinOptions, frames: Sequence[Frame], drawn: MapFrames
 ) -> None:
-    """One model per location, and all of them in one, in the same world."""
+    """Write one model per location, and a merged one, in the same world."""
     places = np.array([frame.place for frame in frames])
     parts = []
     for place in range(options.num_locations):
@@ -298,7 +299,7 @@ def _write_models(
 
 
 def _colmap_model(frames: Sequence[Frame], points: SparsePoints) -> ColmapModel:
-    """With the published models' cameras: 1 left, 2 rear, 3 right, SIMPLE_RADIAL."""
+    """Return a model with the published cameras: 1 left, 2 rear, 3 right, SIMPLE_RADIAL."""
     ids = {name: number for number, name in enumerate(CAMERAS, start=1)}
     cameras = {}
     for frame in frames:
@@ -325,7 +326,7 @@ def _write_car(layout: Layout, options: RobotCarTwinOptions) -> None:
 
 
 def _write_query_lists(layout: Layout, queries: Sequence[Frame]) -> None:
-    """All cameras' queries; the files' ends are as different as tools have left them."""
+    """Write the queries of all cameras, with the various line ends of the published files."""
     for place in sorted({frame.place for frame in queries}):
         names = [frame.name for frame in queries if frame.place == place]
         path = layout.query_list(_location(place))
@@ -340,7 +341,8 @@ def _write_query_lists(layout: Layout, queries: Sequence[Frame]) -> None:
 def _write_version_2(
     layout: Layout, options: RobotCarTwinOptions, queries: Sequence[Frame]
 ) -> None:
-    """Half of each traversal's moments with poses, half without; a few in neither list."""
+    """Write half of each traversal's moments with poses, half without; a few are in neither
+    list."""
     train: list[Frame] = []
     test: list[Frame] = []
     scored = [frame for frame in queries if frame.sensor_id == SCORED_CAMERA]
@@ -360,7 +362,7 @@ def _write_version_2(
 
 
 def _location(place: int) -> str:
-    """Number of a location as file names have it."""
+    """Format a location's number as in file names."""
     return f"{place + 1:03d}"
 
 

@@ -1,9 +1,8 @@
-"""Sparse models of a rendered world: exact tracks, or SIFT features that are triangulated.
+"""Sparse models of a rendered world: exact tracks, or triangulated SIFT features.
 
-The twins' official layouts come with a model. Exact points are lifted from the depth of the
-rendered images and projected, so that the model is as exact as float32 pixels allow. Models of SIFT
-are made as real ones are, but that poses, cameras and what matches are known: points and keypoints
-have the errors of real ones.
+The official layouts include a model. Exact points are lifted from rendered depth and projected, so
+the model is as exact as float32 pixels allow. SIFT models have known poses, cameras and matches,
+but points and keypoints with the errors of real ones.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ Depths = Mapping[str, Depth]
 def exact_tracks(
     frames: Sequence[Frame], depths_m: Depths, *, points_per_frame: int, rng: np.random.Generator
 ) -> SparsePoints:
-    """Sparse points that at least two of the frames see, with exact observations.
+    """Create sparse points seen in at least two frames, with exact observations.
 
     Pixels with depth are drawn at random in every frame, lifted to the frame of the frames' poses
     and projected into all frames of the same place whose depth agrees.
@@ -77,7 +76,7 @@ def exact_tracks(
     """
     parts = [SparsePoints.none()]
     for frame in frames:
-        # those of other places stand behind walls
+        # walls hide other places
         here = [index for index, other in enumerate(frames) if other.place == frame.place]
         points = _lifted(frame, depths_m[frame.name], points_per_frame, rng)
         seen, px = _observations([frames[index] for index in here], depths_m, points)
@@ -113,7 +112,7 @@ def _grey_points(
 
 
 def _lifted(frame: Frame, depth_m: Depth, count: int, rng: np.random.Generator) -> Floats:
-    """World points (P, 3), P <= count, of random pixels that have depth."""
+    """Lift random pixels with depth to world points (P, 3), P <= count."""
     rows, columns = np.nonzero(depth_m > 0)
     drawn = rng.permutation(len(rows))[:count]
     rows, columns = rows[drawn], columns[drawn]
@@ -125,7 +124,7 @@ def _lifted(frame: Frame, depth_m: Depth, count: int, rng: np.random.Generator) 
 def _observations(
     frames: Sequence[Frame], depths_m: Depths, points: Floats
 ) -> tuple[Bools, Floats]:
-    """Visibility bool (P, S) of points (P, 3) in frames, and their pixels, float64 (P, S, 2)."""
+    """Return visibility, bool (P, S), of points (P, 3) in frames, and pixels, float64 (P, S, 2)."""
     seen = np.zeros((len(points), len(frames)), bool)
     pixels = np.zeros((len(points), len(frames), 2))
     for column, frame in enumerate(frames):
@@ -143,9 +142,9 @@ def _observations(
 
 
 def _in_field(camera: Camera, in_camera: Floats) -> Bools:
-    """Points that lie ahead and no farther from the axis than the image's corners.
+    """Select points ahead of the camera, no farther from the axis than the image's corners.
 
-    Farther out the distortion need not be monotonous and may fold a point back into the image.
+    Beyond the corners the distortion need not be monotonic and may fold a point into the image.
     """
     z = in_camera[:, 2]
     inside = (in_camera[:, :2] ** 2).sum(1) <= _squared_reach(camera) * z**2
@@ -154,13 +153,13 @@ def _in_field(camera: Camera, in_camera: Floats) -> Bools:
 
 @cache
 def _squared_reach(camera: Camera) -> float:
-    """Greatest squared distance of a pixel's ray from the axis, at depth 1."""
+    """Return the largest squared distance of a pixel's ray from the axis at depth 1."""
     grid = sample_grid(camera, 1)
     return float((grid.x**2 + grid.y**2).max())
 
 
 def sift_points(frames: Sequence[Frame], features: Features, depths_m: Depths) -> SparsePoints:
-    """Points triangulated from features that see the same spot and look alike.
+    """Triangulate points from similar features that see the same spot.
 
     Parameters
     ----------
@@ -179,7 +178,7 @@ def sift_points(frames: Sequence[Frame], features: Features, depths_m: Depths) -
     world = [_world_points(frame, features[frame.name], depths_m[frame.name]) for frame in frames]
     matches = {}
     for i, j in combinations(range(len(frames)), 2):
-        # other places stand behind walls
+        # walls hide other places
         if frames[i].place == frames[j].place:
             mine, others = features[frames[i].name], features[frames[j].name]
             found = _matches(frames[j], mine, others, world[i])
@@ -192,7 +191,7 @@ def sift_points(frames: Sequence[Frame], features: Features, depths_m: Depths) -
 
 
 def write_sift_database(path: Path, frames: Mapping[str, Frame], features: Features) -> None:
-    """Write COLMAP's database of the frames' features, sorted by name; equal cameras are shared."""
+    """Write a COLMAP database of the frames' features, sorted by name; equal cameras are shared."""
     pycolmap = load_pycolmap()
     path.parent.mkdir(parents=True, exist_ok=True)
     camera_ids: dict[Camera, int] = {}
@@ -212,7 +211,7 @@ def write_sift_database(path: Path, frames: Mapping[str, Frame], features: Featu
 
 
 def nvm_model(names: Sequence[str], frames: Sequence[Frame], points: SparsePoints) -> NvmModel:
-    """What an NVM file says of the frames, under the names given."""
+    """Return the frames as images of an NVM file, under the given names."""
     lenses = np.array([intrinsics(frame.camera) for frame in frames])
     return NvmModel(
         names=tuple(names),
@@ -225,7 +224,7 @@ def nvm_model(names: Sequence[str], frames: Sequence[Frame], points: SparsePoint
 
 
 def _world_points(frame: Frame, features: LocalFeatures, depth_m: Depth) -> Floats:
-    """World point of each feature, float64 (N, 3); NaN where there is no depth."""
+    """Return the world point of each feature, float64 (N, 3); NaN without depth."""
     xy = features.keypoints_px
     last = np.array(depth_m.shape[::-1]) - 1
     column, row = np.clip(xy.astype(np.int64), 0, last).T
@@ -237,7 +236,7 @@ def _world_points(frame: Frame, features: LocalFeatures, depth_m: Depth) -> Floa
 def _matches(
     frame: Frame, features: LocalFeatures, others: LocalFeatures, world: Floats
 ) -> NDArray[np.int64]:
-    """Matches (K, 2) of ``features``, which show ``world``, with those of another frame."""
+    """Match ``features`` with world points ``world`` to those of another frame: (K, 2)."""
     px = px_from_cam(frame.camera, frame.cam_from_world.apply(world))
     inside = ((px > 0) & (px < (frame.camera.width, frame.camera.height))).all(axis=1)
     if inside.sum() < _MIN_SHARED:
@@ -249,7 +248,7 @@ def _matches(
 def _near(
     frame: Frame, features: LocalFeatures, world: Floats, matches: NDArray[np.int64]
 ) -> Bools:
-    """Matches whose first feature's point is projected to the second, one of the frame."""
+    """Select matches whose first feature's point projects to the second feature."""
     px = px_from_cam(frame.camera, frame.cam_from_world.apply(world[matches[:, 0]]))
     error = np.linalg.norm(px - features.keypoints_px[matches[:, 1]], axis=1)
     return np.asarray(error <= _MAX_ERROR_PX)  # NaN is not
@@ -259,7 +258,7 @@ def _near(
 class MapFrames:
     """Depth and features of the rendered map images, by image name.
 
-    ``depths_m`` are float32 (H, W) along the optical axis, 0 where nothing is seen; ``features``
+    ``depths_m`` are float32 (H, W) along the optical axis, 0 without a surface; ``features``
     COLMAP's SIFT, none where the models' points are to be exact.
     """
 
@@ -268,7 +267,7 @@ class MapFrames:
     points_per_image: int
 
     def points(self, frames: Sequence[Frame], rng: np.random.Generator) -> SparsePoints:
-        """:func:`sift_points` where there are features, else :func:`exact_tracks`."""
+        """Return :func:`sift_points` with features, else :func:`exact_tracks`."""
         if self.features:
             return sift_points(frames, self.features, self.depths_m)
         count = self.points_per_image
@@ -282,7 +281,7 @@ def render_map_and_queries(
     images: Path,
     work: Work,
 ) -> MapFrames:
-    """Draw all frames and write them below ``images`` under their names."""
+    """Render all frames and write them below ``images`` under their names."""
     names = frozenset(frame.name for frame in mapping)
     finish = partial(_write, images, names if options.model_features else frozenset())
     frames = [*mapping, *others]

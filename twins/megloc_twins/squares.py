@@ -1,8 +1,8 @@
 """Places: squares and streets a few metres across, laid out and furnished from a seed.
 
-A place is made in its own frame (metres, z up, ground at z = 0, origin near its middle) and knows
-where that frame lies in the world. Places of one world have materials, windows, doors and posters
-in common, which is what makes retrieval and matching err.
+A place has a frame (metres, z up, ground at z = 0, origin near its centre) with a pose in the
+world. Places of one world share materials, windows, doors and posters, which makes retrieval and
+matching hard.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _MAX_FURNITURE = 8
 _PLACE_DISTANCE_M = 90.0  # between the middles of neighbours, before each is moved a little
 _WALL_TEXELS_PER_M = 100
 _MATERIALS = ("brick", "stone", "plaster")
-_TEXTURES = {  # width, height in texels; how many all places share, how many a place has of its own
+_TEXTURES = {  # width, height in texels; numbers that all places share and that a place adds
     "window": (156, 192, 3, 3),
     "door": (132, 270, 2, 3),
     "shutter": (240, 300, 1, 2),
@@ -61,7 +61,7 @@ _BAYS = {
 
 @dataclass(frozen=True, eq=False)
 class Furniture:
-    """Furniture of a kind at a point (x, y metres); ``pick`` gives a texture of a kind."""
+    """Add furniture of a kind at a point (x, y metres); ``pick`` returns a texture of a kind."""
 
     builder: SurfaceBuilder
     rng: np.random.Generator
@@ -78,7 +78,7 @@ class Furniture:
             base += size
 
     def pillar(self, at: Point) -> None:
-        """An advertising pillar: two storeys of posters on eight sides."""
+        """Add an advertising pillar: two rows of posters on eight sides."""
         sides, radius = 8, 0.55
         turn = self.rng.uniform(0, np.pi)
         for level in range(2):
@@ -113,7 +113,7 @@ class Furniture:
 
 @dataclass(frozen=True, eq=False)
 class Facade:
-    """The front of a house: a wall with windows, doors, and what sticks out of it."""
+    """Facade of a house: a wall with windows, doors and attachments."""
 
     builder: SurfaceBuilder
     wall: Wall
@@ -121,7 +121,7 @@ class Facade:
     pick: TexturePicker
 
     def build(self) -> list[Vector]:
-        """Furnish the wall; returns the positions of its lamps, float64 (3,) each, metres."""
+        """Furnish the wall; return the positions of its lamps, float64 (3,) each, metres."""
         wall, rng = self.wall, self.rng
         num_bays = max(1, int(round(wall.length / rng.uniform(2.3, 3.0))))
         edges = np.linspace(0, wall.length, num_bays + 1)
@@ -210,7 +210,7 @@ class Facade:
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """One place, in its own frame."""
+    """One place, in its frame."""
 
     index: int  # in its world
     recipes: tuple[TextureRecipe, ...]  # its textures, the moving objects' first
@@ -221,15 +221,15 @@ class Place:
 
     @property
     def name(self) -> str:
-        """Name of the place in image paths and tables."""
+        """Return the place's name in image paths and tables."""
         return f"place{self.index}"
 
     def cam_from_place(self, frame: Frame) -> RigidTransform:
-        """The pose of a frame that shows the place."""
+        """Return the world pose of a frame of this place."""
         return frame.cam_from_world @ self.place_from_world.inverse()
 
     def surfaces_in_world(self) -> Surfaces:
-        """Its geometry in the world's frame."""
+        """Return its geometry in the world frame."""
         world_from_place = self.place_from_world.inverse()
         return self.surfaces.moved(
             world_from_place.rotation_matrix(), np.array(world_from_place.translation)
@@ -238,7 +238,7 @@ class Place:
 
 @dataclass
 class _TextureStore:
-    """Textures of a place by recipe, and the choice between those shared by all places and own."""
+    """Textures of a place by recipe, drawn from shared ones and from ones of this place alone."""
 
     options: SyntheticWorldOptions
     place: int
@@ -297,7 +297,7 @@ def build_place(options: SyntheticWorldOptions, index: int) -> Place:
 
 
 def _place_from_world(rng: np.random.Generator, index: int, num_places: int) -> RigidTransform:
-    """Places lie on a loose grid, each turned at random."""
+    """Return the poses of places on a loose grid, each rotated at random."""
     columns = int(np.ceil(np.sqrt(num_places)))
     middle = np.array([index % columns, index // columns, 0.0]) * _PLACE_DISTANCE_M
     middle += np.array([*rng.uniform(-8, 8, 2), rng.uniform(-1, 1)])
@@ -305,13 +305,13 @@ def _place_from_world(rng: np.random.Generator, index: int, num_places: int) -> 
 
 
 def about_z(angle: float) -> NDArray[np.float64]:
-    """The matrix (3, 3) of a turn about z, radians."""
+    """Return the rotation matrix (3, 3) about z by an angle in radians."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _furnished(plan: FloorPlan, furniture: Furniture) -> FloorPlan:
-    """The plan with furniture clear of the walls, the rig's path and each other."""
+    """Add furniture to the plan, clear of the walls, the rig's path and each other."""
     rng = furniture.rng
     placed: list[Obstacle] = []
     low, high = plan.outline.min(0), plan.outline.max(0)

@@ -1,4 +1,4 @@
-"""Textured parallelograms, seen from their front only: boxes and walls; their textures' atlas."""
+"""Textured, one-sided parallelograms: boxes and walls; the texture atlas."""
 
 from __future__ import annotations
 
@@ -34,23 +34,23 @@ class Surfaces:
     edge_v: Vector  # (N, 3)
     texture: NDArray[np.int32]  # (N,), index of the texture
     uv: Vector  # (N, 4): the part (u0, v0, u1, v1) of the texture shown, 0..1
-    glow: NDArray[np.float32]  # (N,), light of its own at night, relative to its colour
+    glow: NDArray[np.float32]  # (N,), emitted light at night, relative to its colour
 
     def __len__(self) -> int:
         return len(self.texture)
 
     def normals(self) -> Vector:
-        """Unit normals towards the viewer, float64 (N, 3)."""
+        """Return unit normals towards the viewer, float64 (N, 3)."""
         normal = np.cross(self.edge_v, self.edge_u)
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def corners(self) -> Vector:
-        """Corners in the order of the outline, float64 (N, 4, 3)."""
+        """Return the corners in order, float64 (N, 4, 3)."""
         o, u, v = self.origin, self.edge_u, self.edge_v
         return np.stack([o, o + u, o + u + v, o + v], axis=1)
 
     def moved(self, rotation: Vector, translation: Vector) -> Surfaces:
-        """The surfaces after ``x -> rotation x + translation``."""
+        """Return the surfaces after ``x -> rotation x + translation``."""
         return replace(
             self,
             origin=product(self.origin, rotation.T) + translation,
@@ -59,14 +59,14 @@ class Surfaces:
         )
 
     def joined(self, other: Surfaces) -> Surfaces:
-        """These surfaces, then the others."""
+        """Return these surfaces followed by the others."""
         names = (field.name for field in fields(self))
         return Surfaces(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
 
 
 @dataclass
 class SurfaceBuilder:
-    """Collects parallelograms and boxes."""
+    """Collector of parallelograms and boxes."""
 
     _rows: list[tuple[Vector, Vector, Vector, int, Part, float]] = field(default_factory=list)
 
@@ -80,7 +80,7 @@ class SurfaceBuilder:
         uv: Part = WHOLE,
         glow: float = 0.0,
     ) -> None:
-        """One parallelogram; see :class:`Surfaces`."""
+        """Add a parallelogram; see :class:`Surfaces`."""
         self._rows.append((origin, edge_u, edge_v, texture, uv, glow))
 
     def add_box(
@@ -96,9 +96,9 @@ class SurfaceBuilder:
         uv: Part = WHOLE,
         glow: float = 0.0,
     ) -> None:
-        """An upright box: ``size`` is (along x, along y, height) in metres before the turn by
-        ``yaw`` (radians); ``sides`` are the textures of the -y, +x, +y and -x faces, of which
-        each shows the part ``uv``."""
+        """Add an upright box: ``size`` is (along x, along y, height) in metres before the rotation
+        by ``yaw`` (radians); ``sides`` are the textures of the -y, +x, +y and -x faces, each
+        showing the part ``uv``."""
         half_x, half_y, height = size[0] / 2, size[1] / 2, size[2]
         cos, sin = np.cos(yaw), np.sin(yaw)
         along = np.array([cos, sin, 0.0])
@@ -118,7 +118,7 @@ class SurfaceBuilder:
             self.add(corner, 2 * half_x * along, 2 * half_y * across, bottom, glow=glow)
 
     def build(self) -> Surfaces:
-        """All that was added, in order."""
+        """Return all surfaces, in order."""
         count = len(self._rows)
         columns = list(zip(*self._rows, strict=True)) or [()] * 6
         origin, edge_u, edge_v = (settled(column).reshape(count, 3) for column in columns[:3])
@@ -150,7 +150,7 @@ class Opening:
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """A wall's frame: seen from inside the place it begins at ``start`` and runs to the right."""
+    """Frame of a wall, which runs from ``start`` to the right, seen from inside the place."""
 
     start: Vector  # (3,), foot of its left end, metres
     right: Vector  # (3,), a unit vector
@@ -162,14 +162,14 @@ class Wall:
 
     @classmethod
     def between(cls, start: Vector, end: Vector, texture: int, trim: int, height: float) -> Wall:
-        """The wall whose foot runs from ``start`` to ``end``, (2,) each, metres."""
+        """Return the wall from ``start`` to ``end``, (2,) each, metres."""
         length = float(np.hypot(*(end - start)))
         right = np.array([*(end - start) / length, 0.0])
         inward = np.array([right[1], -right[0], 0.0])
         return cls(np.array([*start, 0.0]), right, inward, length, texture, trim, height)
 
     def point(self, x: float, y: float, out: float = 0.0) -> Vector:
-        """World position of ``x`` along, ``y`` up, ``out`` of the wall, metres."""
+        """Return the world position of ``x`` along, ``y`` up and ``out`` of the wall, metres."""
         return self.start + x * self.right + out * self.inward + np.array([0.0, 0.0, y])
 
     def rectangle(
@@ -209,7 +209,7 @@ class Wall:
     def _frame(
         self, builder: SurfaceBuilder, x: Span, y: Span, out: float, texture: int, glow: float = 0.0
     ) -> None:
-        """The four sides between the wall and a rectangle ``out`` in front of it or behind."""
+        """Add the four sides between the wall and a rectangle ``out`` in front of or behind it."""
         width, outward = (x[1] - x[0]) * self.right, out * self.inward
         down = -(y[1] - y[0]) * np.array([0.0, 0.0, 1.0])
         builder.add(self.point(x[0], y[1]), outward, down, texture, glow=glow)
@@ -220,8 +220,8 @@ class Wall:
     def storey(self, builder: SurfaceBuilder, y: Span, openings: Iterable[Opening] = ()) -> None:
         """Add the wall between two heights, with openings that do not overlap.
 
-        An opening has the window or door at its back, and reveals. Through a passage one looks, and
-        its reveals belong to one of its sides.
+        An opening has reveals and a window or door at its back. A passage is see-through; its
+        reveals belong to one of its sides.
         """
         x = 0.0
         for hole in sorted(openings, key=lambda o: o.x0):
@@ -243,7 +243,7 @@ class Wall:
 
 @dataclass(frozen=True, eq=False)
 class Atlas:
-    """Textures packed with their levels."""
+    """Textures with their pyramid levels, packed in one image."""
 
     image: NDArray[np.uint8]  # (H, ATLAS_WIDTH, 3), RGB
     corner: NDArray[np.float32]  # (T, NUM_LEVELS, 2): x, y of a level's upper left corner in it

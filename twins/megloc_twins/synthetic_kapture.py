@@ -1,4 +1,4 @@
-"""The synthetic world as plain kapture: mapped by a rig, queried by telephones, day and night."""
+"""The synthetic world as plain kapture: mapped by a rig, queried by phones, day and night."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _LENSES = {  # focal length and principal point, shares of the width and height
 
 
 def rig_cameras(options: SyntheticWorldOptions) -> dict[str, Camera]:
-    """Cameras of the mapping rig by sensor id, PINHOLE."""
+    """Return the mapping rig's cameras by sensor id, PINHOLE."""
     width, height = options.width, options.height
     cameras = {}
     for sensor_id, (f, cx, cy) in _LENSES.items():
@@ -66,7 +66,7 @@ def rig_cameras(options: SyntheticWorldOptions) -> dict[str, Camera]:
 def _mapping_frames(
     options: SyntheticWorldOptions, place: Place, rig_from_world: dict[int, RigidTransform]
 ) -> list[Frame]:
-    """What the rig takes at its stops in a place, in order of time; adds its poses there."""
+    """Return the rig's frames at its stops in a place, in order of time; add its poses there."""
     rng = stream(options.seed, "mapping", place.index)
     sun = float(rng.uniform(-np.pi, np.pi)), float(np.radians(rng.uniform(40, 60)))
     frames = []
@@ -102,7 +102,7 @@ def _mapping_frames(
 
 @dataclass(frozen=True, eq=False)
 class SyntheticWorld:
-    """Everything there is, in one world frame (metres, z up)."""
+    """All frames and poses, in one world frame (metres, z up)."""
 
     options: SyntheticWorldOptions
     places: tuple[Place, ...]  # by index
@@ -111,13 +111,13 @@ class SyntheticWorld:
     queries: tuple[Frame, ...]  # sorted by name
 
     def frames(self) -> tuple[Frame, ...]:
-        """All images, those of the map first."""
+        """Return all images, the map's first."""
         return self.mapping + self.queries
 
     def coarse_views(self) -> dict[str, CoarseView]:
-        """Coarse view of every frame, without moving objects, by image name; world frame.
+        """Return a coarse view of every frame, without moving objects, by image name; world frame.
 
-        :func:`overlap` of two tells whether a query shares anything with a map image.
+        :func:`overlap` of two views shows if a query shares anything with a map image.
         """
         surfaces = [place.surfaces_in_world() for place in self.places]
         return {
@@ -127,7 +127,7 @@ class SyntheticWorld:
 
 
 def build_world(options: SyntheticWorldOptions | None = None) -> SyntheticWorld:
-    """Lay out the world and choose all its frames; the same options give the same world."""
+    """Lay out the world and choose all frames; equal options give equal worlds."""
     options = options or SyntheticWorldOptions()
     places = tuple(build_place(options, index) for index in range(options.num_places))
     rig_from_world: dict[int, RigidTransform] = {}
@@ -179,7 +179,7 @@ class SyntheticKapture(SyntheticDataset[SyntheticWorldOptions]):
 
 
 def mapping_data(world: SyntheticWorld) -> KaptureData:
-    """The mapping images' records; their poses are those of the rig."""
+    """Return the records of the mapping images; their poses are the rig's."""
     data = KaptureData()
     members = dict(SENSOR_FROM_RIG)
     for sensor_id, camera in rig_cameras(world.options).items():
@@ -200,7 +200,7 @@ def mapping_data(world: SyntheticWorld) -> KaptureData:
 
 
 def write_side_tables(folder: Path, world: SyntheticWorld) -> None:
-    """Conditions of the queries, thresholds and frame."""
+    """Write the queries' conditions, the thresholds and the frame."""
     groups = {
         frame.name: ImageGroup(condition=frame.condition, location=world.places[frame.place].name)
         for frame in world.queries
@@ -211,7 +211,7 @@ def write_side_tables(folder: Path, world: SyntheticWorld) -> None:
 
 
 def depth_name(image: str) -> str:
-    """Path of an image's depth map below ``records_data``."""
+    """Return the path of an image's depth map below ``records_data``."""
     return f"depth/{PurePosixPath(image).with_suffix('.depth')}"
 
 
@@ -222,7 +222,7 @@ def _depth_sensor(sensor_id: str) -> str:
 def write_files(
     root: Path, options: SyntheticWorldOptions, frame: Frame, view: RenderedFrame
 ) -> None:
-    """Write an image, its depth where it has one, and its mask where asked for."""
+    """Write an image, and its depth and mask if present."""
     sensors = root / frame.role / "sensors"
     records = sensors / "records_data"
     write_image(records / frame.name, view.image, jpeg_quality=JPEG_QUALITY)

@@ -44,7 +44,7 @@ def paint_wall(
     dirt: float = 1.0,
     graffiti: float = 0.0,
 ) -> Rgb:
-    """A wall of a material that other walls share, under dirt, cracks and graffiti of its own."""
+    """Paint a wall of a shared material, with individual dirt, cracks and graffiti."""
     shift = (0, int(rng.integers(0, TILE)))
     wall = tiled(material, int(material_seed), height, width, shift)
     coarse = smooth_noise(rng, height, width, cell=160, octaves=3)
@@ -76,7 +76,7 @@ def paint_ground(
     material: str,
     material_seed: float,
 ) -> Rgb:
-    """Paving or asphalt with patches, lines, manholes and leaves."""
+    """Paint paving or asphalt with patches, lines, manholes and leaves."""
     density = GROUND_TEXELS_PER_M
     ground = tiled(material, int(material_seed), height, width, (0, 0))
     coarse = smooth_noise(rng, height, width, cell=200, octaves=4)
@@ -114,7 +114,7 @@ def paint_ground(
 
 
 def _worn(rng: Generator, image: Rgb, strength: float, *, cell: float, octaves: int) -> Rgb:
-    """The image under noise of its own."""
+    """Add individual noise to the image."""
     noise = smooth_noise(rng, *image.shape[:2], cell=cell, octaves=octaves)
     return to_rgb(shade(image.astype(np.float32), 1 + strength * noise))
 
@@ -135,7 +135,7 @@ def _manhole(rng: Generator, size: int) -> Rgb:
 
 
 def paint_window(rng: Generator, height: int, width: int) -> Rgb:
-    """A window: frame, panes, what stands behind them."""
+    """Paint a window: frame, panes and things behind them."""
     frame = random_colour(rng, 90, 235, chroma=0.35)
     glass = np.array([58, 72, 88], np.float32) * rng.uniform(0.6, 1.3)
     ramp = np.linspace(1.35, 0.7, height, dtype=np.float32)[:, None]
@@ -166,7 +166,7 @@ def paint_window(rng: Generator, height: int, width: int) -> Rgb:
 
 
 def paint_door(rng: Generator, height: int, width: int) -> Rgb:
-    """A door of planks or panels with a handle and a number plate."""
+    """Paint a door of planks or panels with a handle and a number plate."""
     base = random_colour(rng, 40, 150, chroma=0.6)
     planks = int(rng.integers(4, 9))
     tone = _planks(rng, planks, width, seam=0.5)
@@ -188,7 +188,7 @@ def paint_door(rng: Generator, height: int, width: int) -> Rgb:
 
 
 def _planks(rng: Generator, count: int, texels: int, *, seam: float) -> NDArray[np.float64]:
-    """Tones of boards side by side (texels,), with a dark seam at the beginning of each."""
+    """Return tones of adjacent boards (texels,), with a dark seam at the beginning of each."""
     tone = rng.normal(1, 0.12, count).astype(np.float32)
     at = np.arange(texels)
     seams = np.where((at * count % texels) < count * 2, seam, 1.0)
@@ -196,7 +196,7 @@ def _planks(rng: Generator, count: int, texels: int, *, seam: float) -> NDArray[
 
 
 def paint_shutter(rng: Generator, height: int, width: int) -> Rgb:
-    """A rolling shutter: horizontal slats, with a graffito."""
+    """Paint a rolling shutter: horizontal slats, with a graffito."""
     base = random_colour(rng, 110, 200, chroma=0.3)
     slats = 1 + 0.18 * sin(np.arange(height) * (2 * np.pi / 11))
     dirt = 1 + 0.09 * smooth_noise(rng, height, width, cell=40, octaves=4)
@@ -207,7 +207,7 @@ def paint_shutter(rng: Generator, height: int, width: int) -> Rgb:
 
 
 def paint_plain(rng: Generator, height: int, width: int) -> Rgb:
-    """A painted surface with little on it: ledges, pipes, reveals."""
+    """Paint a plain surface: ledges, pipes, reveals."""
     base = np.full(3, rng.uniform(80, 190), np.float32)
     base *= rng.uniform(0.92, 1.08, 3).astype(np.float32)
     field = 1 + 0.09 * smooth_noise(rng, height, width, cell=32, octaves=5)
@@ -215,12 +215,12 @@ def paint_plain(rng: Generator, height: int, width: int) -> Rgb:
 
 
 def paint_glow(rng: Generator, height: int, width: int) -> Rgb:
-    """The shade of a lamp: nearly white."""
+    """Paint a lamp shade: nearly white."""
     return np.full((height, width, 3), (255, 244, 220), np.uint8)
 
 
 def paint_poster(rng: Generator, height: int, width: int) -> Rgb:
-    """A poster: shapes, a headline and small print on a coloured ground."""
+    """Paint a poster: shapes, a headline and small print on a coloured ground."""
     low, high = random_colour(rng, 20, 240), random_colour(rng, 20, 240)
     ramp = np.linspace(0, 1, height, dtype=np.float32)[:, None, None]
     image = to_rgb((low * (1 - ramp) + high * ramp) * np.ones((1, width, 1), np.float32))
@@ -239,7 +239,7 @@ def paint_poster(rng: Generator, height: int, width: int) -> Rgb:
 
 
 def paint_sign(rng: Generator, height: int, width: int) -> Rgb:
-    """A shop sign: one line of large letters and an emblem."""
+    """Paint a shop sign: one line of large letters and an emblem."""
     ground, ink = random_colour(rng, 20, 110), random_colour(rng, 170, 250)
     if rng.random() < 0.4:
         ground, ink = ink, ground
@@ -252,7 +252,7 @@ def paint_sign(rng: Generator, height: int, width: int) -> Rgb:
 
 
 def paint_wood(rng: Generator, height: int, width: int) -> Rgb:
-    """A crate's side: boards with grain, nails, braces and a stencil."""
+    """Paint a crate's side: boards with grain, nails, braces and a stencil."""
     base = np.array([168, 128, 84], np.float32) * rng.uniform(0.7, 1.15)
     boards = int(rng.integers(4, 7))
     tone = _planks(rng, boards, height, seam=0.4)
@@ -272,7 +272,7 @@ def paint_wood(rng: Generator, height: int, width: int) -> Rgb:
 
 
 def paint_cloth(rng: Generator, height: int, width: int) -> Rgb:
-    """A person from one side: shoes, trousers, a printed or striped coat, a head."""
+    """Paint a person from one side: shoes, trousers, a printed or striped coat, a head."""
     coat, legs = random_colour(rng, 20, 230), random_colour(rng, 20, 130)
     image = np.empty((height, width, 3), np.float32)
     image[:] = coat
@@ -291,7 +291,7 @@ def paint_cloth(rng: Generator, height: int, width: int) -> Rgb:
 
 
 def paint_car(rng: Generator, height: int, width: int, *, side: float = 1.0) -> Rgb:
-    """A car's side (``side`` 1) or end (0): paint, wheels, windows, lamps, a number plate."""
+    """Paint a car's side (``side`` 1) or end (0): paint, wheels, windows, lamps, a number plate."""
     paint = random_colour(rng, 30, 220)
     ramp = np.linspace(1.15, 0.7, height, dtype=np.float32)[:, None]
     image = to_rgb(shade(np.broadcast_to(paint, (height, width, 3)), ramp))
@@ -336,7 +336,7 @@ PAINTERS: dict[str, Callable[..., Rgb]] = {
 
 @dataclass(frozen=True)
 class TextureRecipe:
-    """How to paint one texture of ``width`` by ``height`` texels.
+    """Recipe of a texture of ``width`` by ``height`` texels.
 
     ``painter`` is a name in :data:`PAINTERS`, ``params`` are its further arguments.
     """
@@ -348,19 +348,19 @@ class TextureRecipe:
     params: tuple[tuple[str, str | float], ...] = ()
 
     def paint(self) -> Rgb:
-        """The texture, uint8 (height, width, 3), RGB."""
+        """Paint the texture, uint8 (height, width, 3), RGB."""
         rng = stream(self.seed, self.painter)
         return PAINTERS[self.painter](rng, self.height, self.width, **dict(self.params))
 
 
 def index_of(recipe: TextureRecipe, recipes: list[TextureRecipe]) -> int:
-    """The recipe's position in a list, at whose end it is put where it is new."""
+    """Return the recipe's index in a list; append it if new."""
     if recipe not in recipes:
         recipes.append(recipe)
     return recipes.index(recipe)
 
 
 def texels(size_m: tuple[float, float], per_m: float) -> tuple[int, int]:
-    """Width and height of the texture of a surface."""
+    """Return width and height of the texture of a surface."""
     width, height = (max(8, int(round(side * per_m))) for side in size_m)
     return width, height

@@ -1,4 +1,4 @@
-"""Viewpoints of queries: held elsewhere than the map was taken from, yet supported by it."""
+"""Viewpoints of queries: away from the map's cameras, but supported by its images."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class CoarseView:
-    """A view's depth at a part of its resolution, and points on a sparse grid of it.
+    """A view's depth at reduced resolution, and points on a sparse grid of it.
 
-    ``small`` is the camera of that resolution; ``depth`` is float32 (h, w), metres, 0 where nothing
-    is seen; ``points`` and ``normals``, float64 (P, 3), are of what is seen, in the surfaces'
-    frame, ``surface`` (P,) are the surfaces' indices.
+    ``small`` is the camera at that resolution; ``depth`` is float32 (h, w), metres, 0 without a
+    surface; ``points`` and ``normals``, float64 (P, 3), are visible points in the surfaces' frame,
+    ``surface`` (P,) the surfaces' indices.
     """
 
     camera: Camera
@@ -81,7 +81,7 @@ def coarse_view(
 
 
 def visible(points: Floats, view: CoarseView) -> Bools:
-    """Visibility, bool (P,), of points (P, 3) in a view."""
+    """Return the visibility, bool (P,), of points (P, 3) in a view."""
     in_camera = view.cam_from_world.apply(points)
     z = in_camera[:, 2]
     ahead = np.where((z > 0.1)[:, None], in_camera, [0.0, 0.0, 1.0])
@@ -94,15 +94,15 @@ def visible(points: Floats, view: CoarseView) -> Bools:
 
 
 def overlap(view: CoarseView, other: CoarseView) -> float:
-    """Share (0..1) of what ``view`` sees that ``other`` sees too."""
+    """Return the share (0..1) of ``view`` that ``other`` also sees."""
     return float(visible(view.points, other).mean()) if len(view.points) else 0.0
 
 
 def support(view: CoarseView, others: Sequence[CoarseView]) -> float:
-    """Share (0..1) of what ``view`` sees that a map of the ``others`` can tell it.
+    """Return the share (0..1) of ``view`` that a map of the ``others`` covers.
 
-    A point counts when another view sees it similarly enough to match, and a third view is there
-    to triangulate it with.
+    A point counts if another view sees it similarly enough to match, and a third view can
+    triangulate it.
     """
     if not len(view.points) or len(others) < 2:
         return 0.0
@@ -118,7 +118,7 @@ def support(view: CoarseView, others: Sequence[CoarseView]) -> float:
 
 
 def _aspect(points_of: CoarseView, view: CoarseView) -> tuple[Floats, Floats, Floats]:
-    """How ``view`` looks at the points of another: unit rays (P, 3), sizes and slants (P,)."""
+    """Return how ``view`` sees the points of another: unit rays (P, 3), sizes and slants (P,)."""
     difference = points_of.points - view.cam_from_world.center()
     distance = np.linalg.norm(difference, axis=1)
     rays = difference / distance[:, None]
@@ -139,7 +139,8 @@ def query_frames(
     condition: Condition,
     total: int,
 ) -> list[Frame]:
-    """This place's share of the ``total`` queries of a condition; ``mapping`` are its images."""
+    """Choose this place's share of the ``total`` queries of a condition; ``mapping`` are its map
+    images."""
     map_views = views_of(place, mapping)
     frames = []
     for number in range(place.index, total, options.num_places):
@@ -171,14 +172,14 @@ def query_frames(
 
 
 def views_of(place: Place, frames: Iterable[Frame]) -> list[CoarseView]:
-    """What images of a place see of it, in its own frame."""
+    """Return coarse views of a place's images, in the place's frame."""
     return [
         coarse_view(place.surfaces, frame.camera, place.cam_from_place(frame)) for frame in frames
     ]
 
 
 def query_camera(options: SyntheticWorldOptions, rng: np.random.Generator) -> Camera:
-    """A telephone's camera: its own focal length, principal point and distortion."""
+    """Draw a phone's camera, with focal length, principal point and distortion."""
     width, height = options.width, options.height
     focal = rng.uniform(0.7, 0.95) * width
     cx, cy = width / 2 + rng.normal(0, 2), height / 2 + rng.normal(0, 2)
@@ -197,9 +198,9 @@ def _query_lighting(
 def _query_poses(
     place: Place, camera: Camera, map_views: list[CoarseView], rng: np.random.Generator
 ) -> Iterator[tuple[float, tuple[Floats, float, RigidTransform]]]:
-    """Random viewpoints that keep their distance from things, each behind its :func:`misfit`.
+    """Yield random viewpoints away from obstacles, each after its :func:`misfit`.
 
-    A viewpoint is its position (3,), yaw and ``cam_from_place``.
+    A viewpoint has a position (3,), a yaw and ``cam_from_place``.
     """
     low, high = place.plan.outline.min(0), place.plan.outline.max(0)
     for _ in range(_ATTEMPTS):
@@ -217,9 +218,9 @@ def _query_poses(
 
 
 def misfit(view: CoarseView, map_views: Sequence[CoarseView], *, min_overlap: float = 0.0) -> float:
-    """How far a view is from being supported by the map without being a copy of its images.
+    """Measure how much a view lacks support by the map, or copies one of its images; 0 is good.
 
-    0 is well. Map images with an overlap up to ``min_overlap`` support nothing.
+    Map images with an overlap up to ``min_overlap`` give no support.
     """
     shares = [overlap(view, other) for other in map_views]
     seen = [o for o, share in zip(map_views, shares, strict=True) if share > min_overlap]
@@ -227,9 +228,10 @@ def misfit(view: CoarseView, map_views: Sequence[CoarseView], *, min_overlap: fl
 
 
 def first_fitting(candidates: Iterable[tuple[float, Item]], place: str) -> Item:
-    """The first of (misfit, candidate) whose misfit is 0; failing that, the first of the least.
+    """Return the first candidate of (misfit, candidate) with misfit 0, else the first with the
+    least.
 
-    No more are drawn than needed.
+    Only as many as needed are drawn.
     """
     best: tuple[float, Item] | None = None
     for candidate in candidates:

@@ -24,7 +24,7 @@ NUM_DATABASE, NUM_SEQUENCE = 30, 6
 def imported(
     request: pytest.FixtureRequest, root: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """What the adapter makes of it."""
+    """Import the twin by the adapter."""
     out = tmp_path_factory.mktemp("imported") / request.param
     write_official(Aachen(AachenOptions(version=request.param)).read(root), out)
     return out

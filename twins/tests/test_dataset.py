@@ -94,7 +94,7 @@ def test_the_import_is_the_truth(
 def test_published_poses_are_the_truth(
     name: str, published: str, count: int, rendered: Rendered, tmp_path: Path
 ) -> None:
-    """Without what lies beside the data."""
+    """The truth next to the data is not needed."""
     root = rendered(name)
     for entry in root.iterdir():
         if entry.name != "ground_truth":

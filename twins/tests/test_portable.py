@@ -1,4 +1,4 @@
-"""The same bytes on every processor, and what the arithmetic for it gives, against OpenCV's."""
+"""Equal bytes on every processor, and the arithmetic for them compared with OpenCV's."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ PROGRAMS = {
 
 
 def printed(program: str, folder: Path, settings: dict[str, str]) -> list[str]:
-    """The lines that a program prints in a process of its own under environment variables."""
+    """Return the lines that a program prints in a new process with environment variables."""
     folder.mkdir()
     kept = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "compiled"), **settings}
     command = [sys.executable, "-c", program, str(folder / "twin")]

@@ -110,7 +110,7 @@ def test_surfaces_are_invisible_from_behind() -> None:
 def test_visibility_equals_a_search_over_all_surfaces_and_samples(
     seed: int, camera: Camera
 ) -> None:
-    # surfaces beside, behind and around the camera: bounding boxes and clipping must not lose any
+    # surfaces next to, behind and around the camera: bounding boxes and clipping must not lose any
     rng = np.random.default_rng(seed)
     builder = SurfaceBuilder()
     for _ in range(6):

@@ -80,7 +80,7 @@ def test_rig_is_consistent_and_its_cameras_are_synchronous(root: Path, imported:
 def theirs(
     request: pytest.FixtureRequest, root: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[str, dict[str, kapture.Kapture]]:
-    """What kapture's own importer makes of the twin: one kapture per location and role."""
+    """Import the twin by kapture's importer: one kapture per location and role."""
     out = tmp_path_factory.mktemp("kapture") / "out"
     tool = str(Path(sys.executable).with_name("kapture_import_RobotCar_Seasons"))
     command = [tool, "-i", str(root), "-o", str(out), "--image_transfer", "skip"]

@@ -82,12 +82,12 @@ def test_colmap_projects_the_points_where_they_are_seen(
         assert mine.sum() > 10
         xyz = points.xyz[points.point_ids[mine]]
         np.testing.assert_allclose(points.xy_px[mine], colmap_px(frame, xyz), atol=1e-4)
-        # on what the image sees
+        # on the visible surface
         column, row = points.xy_px[mine].astype(int).T
         z = frame.cam_from_world.apply(xyz)[:, 2]
         error = np.abs(depths[frame.name][row, column] - z)
         assert (error < 0.021 + 0.011 * z).all() and np.median(error) < 0.02
-    # poses may stand in another frame
+    # poses may be in another frame
     other_from_world = RigidTransform.from_matrix(np.diag([1.0, -1.0, -1.0]), np.array([9, 8, 7]))
     back = other_from_world.inverse()
     moved = [replace(frame, cam_from_world=frame.cam_from_world @ back) for frame in frames]

@@ -1,4 +1,4 @@
-"""The synthetic world: what there is to see, and what is written."""
+"""The synthetic world: its views and its files."""
 
 from __future__ import annotations
 

@@ -239,7 +239,7 @@ class AachenOptions(Options):
     """The part of Aachen Day-Night to import."""
 
     version: Literal["auto", "1.0", "1.1"] = Field(
-        default="auto", description="auto: 1.1 where 3D-models/aachen_v_1_1 is there"
+        default="auto", description="auto: 1.1 if 3D-models/aachen_v_1_1 exists"
     )
     reference_model: bool = Field(
         default=False, description="import the SIFT model too, as a kapture map in reference/"

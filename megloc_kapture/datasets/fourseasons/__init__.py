@@ -254,7 +254,7 @@ class Recording:
                     return folder / name
         raise DataError(
             f"no folder {' or '.join(CALIBRATION_FOLDERS)} here or in {self.name}; it is a "
-            "download of its own (calibration.zip)",
+            "separate download (calibration.zip)",
             path=root,
         )
 

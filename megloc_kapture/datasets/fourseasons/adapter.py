@@ -55,20 +55,20 @@ class FourSeasonsOptions(Options):
 
     reference: tuple[str, ...] = Field(
         default=(),
-        description="recordings of the map; unless given, those that relocalization files name as "
-        "source, without such files the first by name that has poses",
+        description="recordings of the map; default: the sources of the relocalization files, "
+        "else the first by name with poses",
     )
     queries: tuple[str, ...] = Field(
         default=(),
-        description="recordings of the queries; unless given, those that relocalization files ask "
-        "for, without such files all others",
+        description="recordings of the queries; default: the targets of the relocalization files, "
+        "else all others",
     )
     frames: Literal["keyframes", "all"] = Field(
         default="keyframes",
-        description="images: those of keyframes with a pose, or all that are on disk; of a query "
-        "recording the keyframes that relocalization files ask for, or all where nothing tells",
+        description="images: keyframes with a pose (of a query recording those in the "
+        "relocalization files, if any), or all on disk",
     )
-    stereo: bool = Field(default=True, description="take the right camera too")
+    stereo: bool = Field(default=True, description="also import the right camera")
     min_fusion_quality: int = Field(
         default=1,
         ge=0,

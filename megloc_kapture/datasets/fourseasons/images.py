@@ -206,7 +206,8 @@ def _gnss_poses(recording: Recording, min_fusion_quality: int) -> KeyframePoses:
         scale = transformations.gnss_scale if row.scale is None else row.scale
         if scale is None:
             raise DataError(
-                "the pose has no scale, and Transformations.txt has none either", path=path
+                "neither the pose nor Transformations.txt has a scale",
+                path=path,
             )
         x, y, z = (scale * value for value in row.slam_from_cam.translation)
         metric = RigidTransform(row.slam_from_cam.quat_wxyz, (x, y, z))

@@ -56,14 +56,14 @@ class InLocOptions(Options):
     """The part of InLoc to import."""
 
     distractor_floors: bool = Field(
-        default=False, description="also CSE3, CSE4 and CSE5, where no query was taken"
+        default=False, description="also import CSE3, CSE4 and CSE5, without queries"
     )
     depth: bool = Field(default=True, description="the scanned points as depth maps")
     depth_step: int = Field(
         default=1,
         ge=1,
         le=64,
-        description="only every n-th row and column of the scanned points is kept",
+        description="keep every N-th row and column of the scanned points",
     )
 
 
@@ -91,7 +91,7 @@ class InLoc:
     def check(self, root: Path) -> None:
         layout = Layout.find(root)
         if not any((layout.cutouts / floor).is_dir() for floor in self.floors):
-            raise DataError(f"none of {', '.join(self.floors)} is there", path=layout.cutouts)
+            raise DataError(f"none of {', '.join(self.floors)} exists", path=layout.cutouts)
 
     def read(self, root: Path, *, allow_missing: bool = False) -> OfficialDataset:
         self.check(root)

@@ -71,24 +71,24 @@ class RobotCarOptions(Options):
     """The part of RobotCar Seasons to import, and the published model of its poses."""
 
     version: Literal["auto", 1, 2] = Field(
-        default="auto", description="of the benchmark; auto is 2 where its test list is there"
+        default="auto", description="of the benchmark; auto: 2 if its test list exists"
     )
     model: ModelChoice = Field(
-        default="auto", description="that the map's poses come from; auto prefers the merged one"
+        default="auto", description="source of the map's poses; auto prefers the merged model"
     )
     queries: Literal["all", "train", "test"] = Field(
         default="all", description="version 2: import only the moments of one of its lists"
     )
     train_as_map: bool = Field(
-        default=False, description="version 2: its training images are map images, not queries"
+        default=False, description="version 2: use its training images as map images, not queries"
     )
     reference_model: bool = Field(
         default=False, description="import the model's points as a kapture map of SIFT features"
     )
     location_prior: bool = Field(
         default=True,
-        description="a query is matched with map images of its location and camera only, which "
-        "the benchmark permits to know; false: with all",
+        description="match a query only with map images of its location and camera, as the "
+        "benchmark permits; false: with all",
     )
 
 

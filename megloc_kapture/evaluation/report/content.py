@@ -94,7 +94,7 @@ def notes(evaluation: Evaluation) -> list[str]:
     sentences = [evaluation.alignment] if evaluation.alignment else []
     if row.num_queries < FEW:
         sentences.append(
-            f"too few queries ({row.num_queries}) to compare recall by: the intervals are wide"
+            f"too few queries ({row.num_queries}) to compare recall: the intervals are wide"
         )
     kinds = {query.fallback for query in evaluation.queries} - {"none"}
     if row.num_fallback:
@@ -380,7 +380,7 @@ def refinement_table(evaluation: Evaluation) -> DataFrame | None:
             for heading, poses in (("error before", old), ("error after", new)):
                 errors = pose_errors(poses, truth, names)
                 line[heading] = _medians(zip(errors.position_m, errors.angle_deg, strict=True))
-        table.append({**line, "why other poses stay": "; ".join(listed)})
+        table.append({**line, "reasons of kept poses": "; ".join(listed)})
     return _frame(table) if table else None
 
 

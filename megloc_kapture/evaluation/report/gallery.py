@@ -1,4 +1,4 @@
-"""Pictures of the worst queries of a report beside map images."""
+"""Pictures of a report: the worst queries next to map images."""
 
 from __future__ import annotations
 
@@ -46,9 +46,10 @@ class Picture:
 def worst_pictures(
     queries: Sequence[QueryResult], context: ResultContext, map_poses: Poses
 ) -> list[Picture]:
-    """Draw queries beside the candidate with most matches, else the map image nearest to the pose.
+    """Draw queries next to the candidate with most matches, else the nearest map image.
 
-    Images that are missing or broken are left out: a report without a picture is better than none.
+    Images that are missing or broken are left out: a report without a picture is better than no
+    report.
     """
     pictures = []
     readers = _open_matches(context)

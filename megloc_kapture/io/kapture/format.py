@@ -240,7 +240,7 @@ def format_table(header: str, rows: Iterable[Sequence[str]]) -> bytes:
     for row in rows:
         for text in row:
             if "," in text or text != text.strip() or has_control_characters(text):
-                raise DataError(f"{text!r} cannot stand in a kapture text file")
+                raise DataError(f"{text!r} is not allowed in a kapture text file")
         if row[0].startswith("#"):
             raise DataError(f"{row[0]!r} would be read as a comment")
         lines.append(", ".join(row))

@@ -170,7 +170,7 @@ def test_refinement_before_and_after(displace: Any) -> None:
             "moved by (median)": "0.1500 m, 0.000 deg",
             "error before": "0.2500 m, 0.000 deg",
             "error after": "0.2000 m, 0.000 deg",
-            "why other poses stay": "1 x … m apart",
+            "reasons of kept poses": "1 x … m apart",
         },
         {
             "step": "rendering",
@@ -179,7 +179,7 @@ def test_refinement_before_and_after(displace: Any) -> None:
             "moved by (median)": "0.1900 m, 0.000 deg",
             "error before": "0.2500 m, 0.000 deg",
             "error after": "0.0600 m, 0.000 deg",
-            "why other poses stay": "1 x covers … %",
+            "reasons of kept poses": "1 x covers … %",
         },
     ]
 
