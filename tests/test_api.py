@@ -231,9 +231,6 @@ def test_a_mask_that_changed_makes_the_map_anew(scene: Path, tmp_path: Path) -> 
 
 
 def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
-    image = next((scene / "query").rglob("*.jpg"))
-    with pytest.raises(megloc.OptionError, match="by one thread"):
-        built.localize(image, workers=2)
     with pytest.raises(megloc.OptionError, match="prior is for one image"):
         built.localize(scene / "query", prior=["0000.jpg"])
     with pytest.raises(megloc.DataError, match="no such image"):
