@@ -199,9 +199,6 @@ def test_features_matches_and_a_pose_by_arrays(built: megloc.Map, scene: Path) -
 
 
 def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
-    image = next((scene / "query").rglob("*.jpg"))
-    with pytest.raises(megloc.OptionError, match="by one thread"):
-        built.localize(image, workers=2)
     with pytest.raises(megloc.OptionError, match="prior is for one image"):
         built.localize(scene / "query", prior=["0000.jpg"])
     with pytest.raises(megloc.DataError, match="no such image"):
