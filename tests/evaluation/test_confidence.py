@@ -69,7 +69,7 @@ def test_of_a_result() -> None:
     assert evaluation.row().num_queries == 4 and evaluation.without_truth == ()
     text = " ".join(report_text(evaluation).split())
     assert "2 queries show nothing of the map: 1 refused, 1 given a pose" in text
-    assert "of 4 poses with a confidence 2 are wrong" in text
+    assert "2 of 4 poses with a confidence are wrong" in text
     assert evaluation.to_pandas().loc["a", "confidence"] == 0.9
     # a result without confidences says nothing of them
     evaluation = evaluate_poses({"a": at(0.0)}, {"a": at(0.0)}, statuses={"a": status("a", None)})

@@ -129,9 +129,8 @@ def confidence_sentences(confidence: Confidence, coarsest: Threshold) -> list[st
         share = format_percent(confidence.num_wrong / confidence.num_poses)
         interval = f"{100 * confidence.wrong_low:.1f}-{100 * confidence.wrong_high:.1f}"
         sentences.append(
-            f"of {counted(confidence.num_poses, 'pose')} with a confidence "
-            f"{counted(confidence.num_wrong, 'is', 'are')} wrong (beyond {coarsest}): {share} % "
-            f"({interval})"
+            f"{confidence.num_wrong} of {counted(confidence.num_poses, 'pose')} with a confidence "
+            f"are wrong (beyond {coarsest}): {share} % ({interval})"
         )
     if confidence.num_wrong:
         by_inliers = confidence.area_by_inliers

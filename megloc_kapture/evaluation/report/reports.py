@@ -303,7 +303,7 @@ def _error_curves(evaluations: Sequence[Evaluation]) -> Section:
         "Share of all queries at or below an error, each error by itself; queries without a pose "
         "keep the curves below 100 %. Dotted: the thresholds."
     )
-    section = Section("How large the errors are", [explanation])
+    section = Section("Errors", [explanation])
     section.figure(figures.error_curves(evaluations))
     return section
 
