@@ -201,7 +201,7 @@ day        0.8-90.6       9.4-99.2       9.4-99.2      29.2-100.0
 night      0.0-84.2       0.0-84.2       1.3-98.7      1.3-98.7
 all        0.5-71.6       5.3-85.3       14.7-94.7     28.4-99.5
 
-Note: too few queries (5) to compare recall by: the intervals are wide.
+Note: too few queries (5) to compare recall: the intervals are wide.
 """
 
 
