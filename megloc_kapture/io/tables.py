@@ -55,7 +55,10 @@ CONSISTENCY_FILE = "map_consistency.csv"
 
 
 def status_row(result: LocalizationResult) -> dict[str, Any]:
-    """Return a result as a row of ``status.csv``, by column."""
+    """Return a result as a row of ``status.csv``.
+
+    The columns are the parameters of :func:`_result_of_row`: a new one goes there as well.
+    """
     return {
         "image": result.name,
         "status": result.status,

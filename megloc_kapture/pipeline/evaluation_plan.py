@@ -175,7 +175,8 @@ def _without_covisibility(options: PipelineOptions) -> PipelineOptions:
 
 WORLD = "world"
 
-# in order, between import and pose file; options select the stages
+# in order, between import and pose file; options select the stages. The stages of the map are in
+# map_making.py, as `megloc map` runs them too
 PIPELINE: tuple[type[PipelineStage], ...] = (
     *MAP_STAGES,
     PairQueries,

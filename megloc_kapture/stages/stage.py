@@ -1,6 +1,7 @@
 """Base class of stages; ``docs/plugins.md`` has an example.
 
-Inputs and outputs determine the order of the stages; they, options and version when a stage reruns.
+Inputs, outputs, options and version determine when a stage reruns. The order is ``PIPELINE`` in
+``pipeline/evaluation_plan.py``; a stage of another package follows those that write its inputs.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from megloc_kapture.pipeline.evaluation_plan import PIPELINE
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.query_poses import LocalizeQueries
-from megloc_kapture.stages.stage import PipelineStage, StageWork
+from megloc_kapture.stages.stage import PipelineStage, StageWork, wanted_stages
 
 
 class Declares(PipelineStage):
@@ -38,3 +38,13 @@ def test_the_matcher_does_not_concern_extraction_and_localization() -> None:
             same.remove(before.name)
     assert set(same) >= {"local_features", "global_features", LocalizeQueries.name, "map"}
     assert not {"mapping_matches", "query_matches"} & set(same)
+
+
+def test_no_stage_reads_a_path_that_only_a_later_stage_writes() -> None:
+    for options in (PipelineOptions(), PipelineOptions(reranking={"by": "verified"})):
+        written: list[str] = []
+        stages = wanted_stages(PIPELINE, options)
+        for at, stage in enumerate(stages):
+            written += stage.writes
+            later = {path for other in stages[at + 1 :] for path in other.writes}
+            assert not set(stage.reads) & (later - set(written)), stage.name
