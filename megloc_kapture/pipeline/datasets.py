@@ -245,7 +245,7 @@ def _root_in_environment(name: str, adapter: DatasetAdapter | None) -> Path:
     twin = f"; without the data, `megloc eval {TWIN_PREFIX}{name}` runs a rendered twin"
     raise OptionError(
         f"dataset {name} needs --root or {DATA_VARIABLE}{looked}: {card.title} is published at "
-        f"{card.published_at} ({card.size}) and has to lie as {card.layout}"
+        f"{card.published_at} ({card.size}); the root must contain {card.layout}"
         + (twin if name in plugin_names(RENDERED_DATASETS) else "")
     )
 

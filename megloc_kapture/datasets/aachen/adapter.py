@@ -261,7 +261,7 @@ class Aachen:
         title="Aachen Day-Night",
         published_at="https://data.ciirc.cvut.cz/public/projects/2020VisualLocalization/"
         "Aachen-Day-Night/",
-        size="several GB of images; aachen.db is wanted by reference_model only",
+        size="several GB of images; aachen.db is for reference_model only",
         folders=("Aachen-Day-Night", "Aachen-Day-Night-v1.1", "aachen_v1.1"),
         layout="images_upright/{db,query[,sequences]}/ (archives extracted in place), "
         "queries/{day,night}_time_queries_with_intrinsics.txt and 3D-models/ with "

@@ -206,7 +206,7 @@ def test_a_folder_that_is_another(root: Path, tmp_path: Path) -> None:
     (root / MODEL).unlink()
     refused(root, r"v1\.0 is missing: 3D-models/aachen_cvpr2018_db\.nvm")
     shutil.rmtree(root / "queries")
-    refused(root, "no folder queries; it has to lie as images_upright")
+    refused(root, "no folder queries; the root must contain images_upright")
 
 
 def test_reference_model(root: Path, tmp_path: Path) -> None:

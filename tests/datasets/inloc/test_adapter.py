@@ -233,7 +233,7 @@ def test_what_is_no_inloc_is_refused_quickly(tmp_path: Path, root: Path) -> None
     for place, gone, message in (
         (tmp_path / "absent", (), "no such folder"),
         (tmp_path / "empty", (), f"database/cutouts/ {layout}"),
-        (root, [f"database/cutouts/{floor}" for floor in SCANS], "none of DUC1, DUC2 is there"),
+        (root, [f"database/cutouts/{floor}" for floor in SCANS], "none of DUC1, DUC2 exists"),
         (root, ["query"], f"query/iphone7/ {layout}"),
         (root, ["database/alignments"], f"database/alignments/ {layout}"),
     ):
