@@ -16,7 +16,6 @@ from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, 
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.localizer import Localizer
-from megloc_kapture.service import Limits
 from megloc_kapture.service.app import Service, make_app
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import Camera
@@ -47,18 +46,11 @@ def bind(host: str, port: int) -> socket.socket:
         raise OptionError(f"cannot listen at {host}, port {port}: {error}") from error
 
 
-def serve(
-    localizer: Localizer,
-    bound: socket.socket,
-    *,
-    limits: Limits,
-    token: str | None = None,
-    log_requests: bool = False,
-) -> None:
+def serve(service: Service, bound: socket.socket, *, log_requests: bool = False) -> None:
     """Serve until SIGTERM or SIGINT, which takes effect after running requests have finished."""
     logging.getLogger("uvicorn").setLevel(logging.ERROR)
     cv2.setNumThreads(1)  # the threads are for images
-    app = make_app(Service(localizer, limits, token), map_overview(localizer.map))
+    app = make_app(service, map_overview(service.localizer.map))
     config = uvicorn.Config(
         app,
         ws="none",
