@@ -105,7 +105,7 @@ class Localize(Reading, Deciding, Common):
             counts = results.write_to(out)
         how = "as given"
         if given is None:
-            how = localizer.describe_retrieval(queries.types_of_all())
+            how = localizer.matching.describe_candidates(queries.types_of_all())
         console.say(f"localizing with {_names(localizer.types)}")
         console.say(f"candidates: {how}")
         console.say(f"pixel origin: {kapture_map.pixel_origin.intrinsics}")

@@ -19,13 +19,14 @@ from megloc_kapture.cli.common import (
     Working,
     cameras_of_text,
 )
-from megloc_kapture.cli.stages import StageCommand, restrictions_beside
+from megloc_kapture.cli.stages import StageCommand
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.report.content import consistency_sentence
 from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_consistency
+from megloc_kapture.pipeline.kapture_map import restrictions_beside
 from megloc_kapture.pipeline.map_making import (
     describe_map,
     options_of_photographs,

@@ -145,10 +145,7 @@ class KaptureMap:
                 for name, found in origins.items()
             }
         keypoints = {n: MapKeypoints(folder, n, indices[n], origins[n]) for n in indices}
-        # only a workspace has the dataset's side tables
-        tables = tables_of(folder.root)
-        restrictions = UNRESTRICTED if tables is None else Restrictions.read(tables)
-        return cls(folder, keypoints, restrictions)
+        return cls(folder, keypoints, restrictions_beside(folder.root))
 
     @property
     def pixel_origin(self) -> PixelOrigin:
@@ -240,6 +237,12 @@ class KaptureMap:
             for name, reader in readers.items()
             if all(image in reader for image in self.images)
         )
+
+
+def restrictions_beside(root: Path) -> Restrictions:
+    """Return the restrictions in the side tables of a kapture folder's workspace, if any."""
+    tables = tables_of(root)
+    return UNRESTRICTED if tables is None else Restrictions.read(tables)
 
 
 def plain_name(local_type: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import cached_property
@@ -177,12 +177,6 @@ class Localizer:
     def ranked(self, query: Query) -> list[str]:
         """Return the most similar map images of a query, best first, with reranking if enabled."""
         return self.matching.ranked(self._preprocessor.of(query))
-
-    def describe_retrieval(self, global_types: Collection[str]) -> str:
-        options = self.options.query_pairs
-        if options.by == "exhaustive" or len(self.map.images) <= options.top_k:
-            return f"all {len(self.map.images)} map images"
-        return self.matching.describe(global_types)
 
 
 def _query_of(image: Path | str | NDArray[np.uint8], camera: Camera) -> Query:

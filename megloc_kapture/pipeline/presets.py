@@ -6,8 +6,9 @@ import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import partial
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
@@ -144,7 +145,7 @@ def _validated(model: type[OptionsT], tree: Mapping[str, Any]) -> OptionsT:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise OptionError(f"unknown option {where}; {_known(where, model)}") from error
+            raise OptionError(f"unknown option {where}; {_similar(where, model)}") from error
         raise OptionError(f"option {option_fault(error, model)}") from error
 
 
@@ -176,22 +177,12 @@ def _typed(assignment: str, flag: str) -> tuple[str, Any]:
         return key, text
 
 
-def _known(path: str, root: type[Options]) -> str:
-    model: Any = root
-    *parents, name = path.split(".")
-    for part in parents:
-        if part.isdigit():
-            continue
-        annotation = model.model_fields[part].annotation if part in model.model_fields else None
-        annotation = next(iter(get_args(annotation)), annotation)
-        if not (isinstance(annotation, type) and issubclass(annotation, Options)):
-            break
-        model = annotation
-    known = sorted(model.model_fields)
-    elsewhere = [one.key for one in options_of(root()) if one.key.endswith(f".{name}")]
-    if elsewhere:
-        return f"did you mean {' or '.join(elsewhere)}? known here: {', '.join(known)}"
-    return suggestion(name, known, listed="known here: ")
+def _similar(path: str, root: type[Options]) -> str:
+    keys = [one.key for one in options_of(root())]
+    elsewhere = [key for key in keys if key.endswith(f".{path.rpartition('.')[2]}")]
+    steps = {key.rpartition(".")[0] for key in keys} - {""}
+    similar = elsewhere or get_close_matches(path, [*keys, *steps], n=1)
+    return f"did you mean {' or '.join(similar)}?" if similar else f"known: {', '.join(keys)}"
 
 
 @dataclass(frozen=True)

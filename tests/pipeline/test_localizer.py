@@ -179,8 +179,9 @@ def test_retrieval_ranks_where_there_are_more_images_than_candidates(
         # within a prior, the best of those
         kept = replace(query, prior=("0000.jpg", "0002.jpg", "0009.jpg"))
         assert set(narrow.ranked(kept)) < set(kept.prior or ())
-    assert narrow.describe_retrieval([]) == "VLAD over the map's descriptors"
-    assert narrow.describe_retrieval(["vlad_rootsift"]) == "global features vlad_rootsift"
+    assert narrow.matching.describe_candidates([]).endswith("by VLAD over the map's descriptors")
+    described = narrow.matching.describe_candidates(["vlad_rootsift"])
+    assert described.endswith("by global features vlad_rootsift")
     # given candidates are all taken, in their order
     chosen = ["0005.jpg", "0003.jpg", "0002.jpg"]
     given = {query.name: chosen for query in queries[1:]}
