@@ -88,8 +88,8 @@ def map_overview(kapture_map: KaptureMap) -> bytes:
         "right": _rounded(page[0], 9),
         "up": _rounded(page[1], 9),
         "origin": origin.tolist(),
-        "cameras": _rounded(_sample(cameras, _MAX_CAMERAS)),
-        "points": _rounded((_sample(points, _MAX_POINTS) - origin) @ page.T),
+        "cameras": _rounded(cameras[:: 1 + len(cameras) // _MAX_CAMERAS]),
+        "points": _rounded((points[:: 1 + len(points) // _MAX_POINTS] - origin) @ page.T),
     }
     return json.dumps(content, separators=(",", ":")).encode()
 
@@ -101,12 +101,6 @@ def _without_outliers(points: NDArray[np.float64]) -> NDArray[np.float64]:
     low, high = np.percentile(points, [1.0, 99.0], axis=0)
     margin = 0.5 * (high - low)
     return points[((points >= low - margin) & (points <= high + margin)).all(axis=1)]
-
-
-def _sample(rows: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    if len(rows) <= most:
-        return rows
-    return rows[np.sort(np.random.default_rng(0).choice(len(rows), most, replace=False))]
 
 
 def _rounded(values: NDArray[np.float64], digits: int = 5) -> list[float]:

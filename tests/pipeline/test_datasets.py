@@ -91,7 +91,7 @@ def test_the_root_is_found_below_the_environment(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("MEGLOC_DATA", str(tmp_path))
-    with pytest.raises(OptionError, match="MEGLOC_DATA has none of aachen, Aachen-Day-Night"):
+    with pytest.raises(OptionError, match="MEGLOC_DATA contains none of aachen, Aachen-Day-Night"):
         choose_dataset("aachen", None)
     (tmp_path / "Aachen-Day-Night").mkdir()
     assert choose_dataset("aachen", None).root == tmp_path / "Aachen-Day-Night"
