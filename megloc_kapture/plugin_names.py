@@ -16,7 +16,8 @@ def entry_points(**of: str) -> Any:
 
 
 @cache
-def _entry_points_on(_search_path: tuple[str, ...]) -> metadata.EntryPoints:
+def _entry_points_on(_search_path: tuple[str, ...]) -> Any:
+    """Any: Python 3.11 has another return type with the same selection."""
     return metadata.entry_points()
 
 
