@@ -267,33 +267,33 @@ def check_weights(options: PipelineOptions) -> None:
     raise error
 
 
+def feature_choices(options: PipelineOptions) -> list[LocalFeaturesChoice]:
+    """Return the local features of the options, those of a given map last."""
+    choices = list(options.local_features) if options.makes_points() else []
+    if options.uses_given_map():
+        given = options.given_features
+        choices.append(LocalFeaturesChoice(name=given.name, options=given.options))
+    return choices
+
+
 def _missing(options: PipelineOptions) -> MissingWeightsError | None:
+    features = feature_choices(options)
+    matchers = [choice.matching or options.matching for choice in features]
+    chosen: list[tuple[str, PluginChoice | None]] = [
+        (SEGMENTERS, options.preprocessing.masks.segmenter),
+        *((LOCAL_FEATURES, one) for one in features),
+        *((MATCHERS, one) for one in (*matchers, options.second_matching.matcher)),
+        (POSE_RANKERS, options.localization.rank),
+        *((POSE_REFINERS, one) for one in options.pose_refinement.by),
+    ]
+    makers: list[Callable[[], object]] = [
+        partial(load_plugin, group, one.name, one.options) for group, one in chosen if one
+    ]
+    makers += [one.make for one in options.global_features if not one.is_vlad]
     missing = []
-    for make in _makers(options):
+    for make in makers:
         try:
             make()
         except MissingWeightsError as error:
             missing.append(error)
     return all_missing(missing) if missing else None
-
-
-def _makers(options: PipelineOptions) -> Iterator[Callable[[], object]]:
-    chosen: list[tuple[str, PluginChoice]] = []
-    if (segmenter := options.preprocessing.masks.segmenter) is not None:
-        chosen.append((SEGMENTERS, segmenter))
-    features: list[tuple[PluginChoice, PluginChoice]] = []
-    if options.makes_points():
-        features += [
-            (local, local.matching or options.matching) for local in options.local_features
-        ]
-    if options.uses_given_map():
-        features.append((options.given_features, options.matching))
-    chosen += [(LOCAL_FEATURES, extractor) for extractor, _ in features]
-    chosen += [(MATCHERS, matcher) for _, matcher in features]
-    if (second := options.second_matching.matcher) is not None:
-        chosen.append((MATCHERS, second))
-    chosen.append((POSE_RANKERS, options.localization.rank))
-    chosen += [(POSE_REFINERS, one) for one in options.pose_refinement.by]
-    for group, one in chosen:
-        yield partial(load_plugin, group, one.name, one.options)
-    yield from (one.make for one in options.global_features if not one.is_vlad)
