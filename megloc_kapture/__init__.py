@@ -74,24 +74,14 @@ __all__ = [
 
 # lazy: an error must not import numpy, nor a value the solvers
 _LAZY = {
-    **dict.fromkeys(
-        ("Camera", "Failure", "LocalFeatures", "Pose", "RigidTransform"), "megloc_kapture.values"
-    ),
-    "KaptureMap": "megloc_kapture.pipeline.kapture_map",
-    "Localizer": "megloc_kapture.pipeline.localizer",
-    "Query": "megloc_kapture.pipeline.queries",
-    "Results": "megloc_kapture.pipeline.results",
-    "Map": "megloc_kapture.api",
-    "build_map": "megloc_kapture.api",
-    "evaluate": "megloc_kapture.evaluation.evaluate",
-    "export": "megloc_kapture.pipeline.export",
-    "extract": "megloc_kapture.api",
-    "map_photographs": "megloc_kapture.api",
-    "match": "megloc_kapture.api",
-    "open_map": "megloc_kapture.api",
-    "run": "megloc_kapture.api",
-    "solve_pose": "megloc_kapture.api",
-    "train": "megloc_kapture.api",
+    "values": ("Camera", "Failure", "LocalFeatures", "Pose", "RigidTransform"),
+    "pipeline.kapture_map": ("KaptureMap",),
+    "pipeline.localizer": ("Localizer",),
+    "pipeline.queries": ("Query",),
+    "pipeline.results": ("Results",),
+    "pipeline.export": ("export",),
+    "evaluation.evaluate": ("evaluate",),
+    "api": tuple(name for name in __all__ if name != "__version__"),  # the others
 }
 
 
@@ -100,8 +90,9 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("megloc-kapture")
-    if name in _LAZY:
-        return getattr(import_module(_LAZY[name]), name)
+    for module, names in _LAZY.items():
+        if name in names:
+            return getattr(import_module(f"megloc_kapture.{module}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

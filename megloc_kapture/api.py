@@ -85,12 +85,7 @@ class Map:
         return f"Map({str(own.folder.root)!r}: {len(own.images)} images, features {types})"
 
     def localizer(self, refine: str | Sequence[str] = ()) -> Localizer:
-        """Return the cached localizer of :meth:`localize` with these pose refiners.
-
-        Raises
-        ------
-        OptionError, PluginError, MissingWeightsError : the options cannot be used.
-        """
+        """Return the cached localizer of :meth:`localize` with these pose refiners."""
         refiners = (refine,) if isinstance(refine, str) else tuple(refine)
         if refiners not in self._localizers:
             options = self.options
@@ -119,16 +114,6 @@ class Map:
     @overload
     def localize(
         self,
-        query: Path | str,
-        camera: Camera,
-        *,
-        prior: Sequence[str] | None = None,
-        refine: str | Sequence[str] = (),
-    ) -> Pose | Failure: ...
-
-    @overload
-    def localize(
-        self,
         query: NDArray[np.uint8] | Image.Image,
         camera: Camera | None = None,
         *,
@@ -150,7 +135,7 @@ class Map:
     def localize(
         self,
         query: Path | str,
-        camera: None = None,
+        camera: Camera | None = None,
         *,
         prior: Sequence[str] | None = None,
         refine: str | Sequence[str] = (),
@@ -181,11 +166,6 @@ class Map:
         prior : names of the map images to match with one image.
         refine : names of pose refiners, applied in order: icp, rendering.
         workers : threads, for lists and folders.
-
-        Raises
-        ------
-        DataError : a file cannot be read, or features can neither be read nor extracted.
-        OptionError : an argument has no effect for such a query.
         """
         if isinstance(query, str):
             query = Path(query)
@@ -251,11 +231,6 @@ def open_map(
     preset, set : localization options; ``{"localization.rank.name": "perceptual"}``.
     features_dirs : additional folders with features.
     pixel_origin : pixel origin of the map's intrinsics; auto detects it.
-
-    Raises
-    ------
-    DataError : no map, or a broken or inconsistent one; names file and line.
-    OptionError : an unknown option.
     """
     options = options_of_preset(preset, assignments=set or {})
     opened = KaptureMap.open(
@@ -300,10 +275,6 @@ def build_map(
         reused, the map is its folder ``map``.
     workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
     scheduler : address of a dask scheduler, whose workers are used instead.
-
-    Raises
-    ------
-    MeglocError : images, poses or options cannot be used.
     """
     source = KaptureFolder(mapping)
     options = options_of_preset(preset, assignments=set or {})
@@ -339,11 +310,6 @@ def map_photographs(
         photographs.
     workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
     scheduler : address of a dask scheduler, whose workers are used instead.
-
-    Raises
-    ------
-    DataError : no map can be made of the photographs, with the reason.
-    MeglocError : the options cannot be used.
     """
     paths = [Path(one) for one in ([images] if isinstance(images, str | Path) else images)]
     options = options_of_photographs(preset, set or {})
@@ -419,10 +385,6 @@ def run(
         ``runs/kapture-ROOT-PRESET``.
     workers : processes; more than one needs ``if __name__ == "__main__":`` in a script.
     scheduler : address of a dask scheduler, whose workers are used instead.
-
-    Raises
-    ------
-    MeglocError : the dataset or the options cannot be used.
     """
     chosen = choose_run(
         dataset, None if root is None else Path(root), preset=preset, assignments=set or {}

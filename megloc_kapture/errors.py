@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 
 
@@ -33,13 +34,7 @@ class DataError(MeglocError):
 
     def __reduce__(self) -> tuple[object, ...]:
         # Exception's own pickling (process pools) loses the keyword-only fields
-        return (_rebuild_data_error, (type(self), self.message, self.path, self.line))
-
-
-def _rebuild_data_error(
-    kind: type[DataError], message: str, path: Path | str | None, line: int | None
-) -> DataError:
-    return kind(message, path=path, line=line)
+        return partial(type(self), path=self.path, line=self.line), (self.message,)
 
 
 def require(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -137,17 +136,6 @@ class Camera:
     def from_colmap(cls, camera: Any) -> Camera:
         """Convert a ``pycolmap.Camera``; DataError for an unsupported model."""
         return cls(camera.model.name, camera.width, camera.height, tuple(camera.params))
-
-    @classmethod
-    def from_exif(cls, path: Path | str) -> Camera:
-        """Create the camera of a photograph's pixels as stored, from EXIF read by COLMAP.
-
-        The focal length is uncertain (``focal_deviation``), and a guess without EXIF. DataError for
-        a missing file or no image.
-        """
-        from megloc_kapture.io.images import read_photo
-
-        return read_photo(path).camera
 
 
 @dataclass(frozen=True, slots=True)

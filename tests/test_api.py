@@ -13,7 +13,7 @@ import pytest
 from PIL import Image, ImageOps
 
 import megloc_kapture as megloc
-from megloc_kapture.io.images import read_image_rgb
+from megloc_kapture.io.images import read_image_rgb, read_photo
 from megloc_kapture.io.kapture import KaptureFolder
 
 SMALL = {
@@ -126,7 +126,7 @@ def test_photographs_need_no_camera(built: megloc.Map, scene: Path, photos: Path
     assert first and np.array_equal(first.matrix, whole[paths[0].name].matrix)
     assert one and np.allclose(first.matrix, one.matrix, atol=0.05)
     # a given camera is of the pixels as they are stored: the same place, another way up
-    lying = built.localize(paths[0], megloc.Camera.from_exif(paths[0]))
+    lying = built.localize(paths[0], read_photo(paths[0]).camera)
     assert lying and lying.camera and (lying.camera.width, lying.camera.height) == (298, 400)
     assert errors(scene, paths[0].name, lying.cam_from_world)[0] < 0.05
 

@@ -18,7 +18,6 @@ import tyro
 
 from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.io.camera_list import CameraList, read_cameras
-from megloc_kapture.io.dataset_tables import PROTOCOL_FILE, SIDE_TABLES
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.pipeline.executors import (
@@ -140,12 +139,6 @@ def cameras_of_text(text: str | None) -> Camera | CameraList | None:
     if text is None:
         return None
     return read_cameras(Path(text)) if Path(text).is_file() else camera_of_text(text)
-
-
-def side_tables_beside(result: Path) -> Path | None:
-    """Return the side tables of the workspace that contains a result, if any."""
-    folder = result.resolve().parent / SIDE_TABLES
-    return folder if (folder / PROTOCOL_FILE).is_file() else None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,6 @@ from megloc_kapture.cli.common import (
     Output,
     Overwrite,
     existing,
-    side_tables_beside,
 )
 from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.io.output_folders import staged_output
@@ -119,7 +118,7 @@ class Submit(Common):
     """Overwrite the pose file and its JSON file."""
 
     def run(self, console: Console) -> None:
-        from megloc_kapture.io.dataset_tables import Protocol, read_protocol
+        from megloc_kapture.io.dataset_tables import Protocol, read_protocol, tables_of
         from megloc_kapture.pipeline.submission import (
             check_dataset,
             workspace_provenance,
@@ -128,7 +127,7 @@ class Submit(Common):
 
         if self.side_tables is not None and not self.side_tables.is_dir():
             raise DataError("no such folder", path=self.side_tables)
-        tables = self.side_tables or side_tables_beside(self.input)
+        tables = self.side_tables or tables_of(self.input)
         rules = Protocol() if tables is None else read_protocol(tables)
         check_dataset(self.dataset, rules, tables=tables)
         self._check_output(folder=rules.pose_file == "mlad")

@@ -160,8 +160,10 @@ class Eval(Deciding, Working):
             if (evaluation / text).is_file():
                 console.result((evaluation / text).read_text(encoding="utf-8"))
                 break
-        for text in published_results(benchmark):
-            console.result(text)
+        if benchmark.published:
+            console.result("published (percent, on the official data):")
+        for text in benchmark.published:
+            console.result(f"  {text}")
         if self.fail_below is None:
             return 0
         recall = recall_rows(workspace.root)["all"]["recall"][-1]["recall"]
@@ -169,18 +171,6 @@ class Eval(Deciding, Working):
             return 0
         console.say(f"recall {recall:.3f} is below {self.fail_below:.3f}")
         return BELOW_RECALL
-
-
-def published_results(benchmark: BenchmarkFile) -> list[str]:
-    """Format published results on the dataset."""
-    if not benchmark.published:
-        return []
-    width = max(len(result.method) for result in benchmark.published)
-    lines = ["published (percent, on the official data):"]
-    for result in benchmark.published:
-        recall = "   ".join(f"{name} {figures}" for name, figures in result.recall.items())
-        lines.append(f"  {result.method:{width}s}  {recall}   [{result.source}]")
-    return [*lines, ""]
 
 
 def shown(path: Path) -> str:

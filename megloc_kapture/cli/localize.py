@@ -10,10 +10,9 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
-from pydantic import ValidationError
 
 from megloc_kapture.cli.common import (
     Common,
@@ -42,15 +41,12 @@ from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
 from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.pipeline.results import Results
-from megloc_kapture.plugin_loading import option_fault
-from megloc_kapture.service import Limits
 from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.stage import LOCALIZED
 
 _MIN_TOKEN_LENGTH = 16
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
-_LIMITS = Limits()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +105,7 @@ class Localize(Reading, Deciding, Common):
             counts = results.write_to(out)
         how = "as given"
         if given is None:
-            how = localizer.describe_retrieval(queries.types_of_all())
+            how = localizer.matching.describe_candidates(queries.types_of_all())
         console.say(f"localizing with {_names(localizer.types)}")
         console.say(f"candidates: {how}")
         console.say(f"pixel origin: {kapture_map.pixel_origin.intrinsics}")
@@ -155,11 +151,11 @@ class Serve(Reading, Deciding, Common):
     """File with the token that clients must send, at least 16 characters."""
     threads: int | None = None
     """Number of images localized in parallel; if omitted, all cores."""
-    max_waiting: int = _LIMITS.max_waiting
+    max_waiting: int = 32
     """Number of images that may wait; more are refused (503)."""
-    max_mb: float = _LIMITS.max_mb
+    max_mb: float = 20.0
     """Largest request, megabytes."""
-    max_megapixels: float = _LIMITS.max_megapixels
+    max_megapixels: float = 32.0
     """Largest image, megapixels."""
     keypoints_type: Texts = ()
     """Keypoints type to localize with; may be repeated; if omitted, all types with points."""
@@ -169,9 +165,18 @@ class Serve(Reading, Deciding, Common):
     """Localize in an inconsistent map."""
 
     def run(self, console: Console) -> None:
+        from megloc_kapture.service.app import Service
         from megloc_kapture.service.server import bind, prepared_localizer, serve
 
-        limits = self._limits()
+        limits: dict[str, Any] = {
+            "threads": self.threads,
+            "max_waiting": self.max_waiting,
+            "max_mb": self.max_mb,
+            "max_megapixels": self.max_megapixels,
+        }
+        for name, value in limits.items():
+            flag = f"--{name.replace('_', '-')}"
+            check_option(value is None or value > 0, f"{flag} {value}: give more than 0")
         token = None if self.token_file is None else _read_token(self.token_file)
         if token is None and self.host not in _LOOPBACK:
             raise OptionError(
@@ -187,18 +192,12 @@ class Serve(Reading, Deciding, Common):
             where = f"http://{host}:{bound.getsockname()[1]}/"
             console.result(f"{len(kapture_map.images)} map images, served at {where}")
             log_requests = logging.getLogger().isEnabledFor(logging.INFO)
+            service = Service(localizer, **limits, token=token)
             try:
-                serve(localizer, bound, limits=limits, token=token, log_requests=log_requests)
+                serve(service, bound, log_requests=log_requests)
             except KeyboardInterrupt:
                 console.say("stopped")
                 sys.exit(128 + signal.SIGINT)
-
-    def _limits(self) -> Limits:
-        try:
-            return Limits(**{name: getattr(self, name) for name in Limits.model_fields})
-        except ValidationError as error:
-            name, _, reason = option_fault(error, Limits).partition(": ")
-            raise OptionError(f"--{name.replace('_', '-')}: {reason}") from error
 
 
 def _read_token(path: Path) -> str:

@@ -5,6 +5,7 @@ Heavy modules are imported within :func:`main`, so that Ctrl-C is handled during
 
 from __future__ import annotations
 
+import ast
 import functools
 import operator
 import os
@@ -13,6 +14,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 from megloc_kapture.errors import MeglocError, OptionError, missing_extra, suggestion
@@ -24,64 +26,55 @@ class Terminated(BaseException):
     """SIGTERM asks the process to end."""
 
 
-# name, module:class and first help line, so that only the requested command is imported
-_TABLE = """
-eval evaluate_dataset:Eval Run all stages on a dataset; stages that are up to date are kept.
-import conversion:Import Import a dataset into DIR/{mapping,query,query_gt,megloc}, or a COLMAP \
-model as a map.
-synth conversion:Synth Render a dataset: a synthetic world as kapture, or a small twin in an \
-official layout.
-preprocess stages:Preprocess Resize, undistort and mask the images of a kapture folder; cameras \
-are adapted.
-extract-local stages:ExtractLocal Extract local features of all images of kapture folders.
-extract-global retrieval:ExtractGlobal Compute global features of all images: VLAD trained on \
-the map, or networks.
-pairs-mapping retrieval:PairsMapping Choose pairs of map images to match.
-pairs-query retrieval:PairsQuery Choose the map images to match with each query.
-match stages:Match Match and verify image pairs; with known poses within a map, else by a two-view \
-model.
-triangulate stages:Triangulate Triangulate verified matches of images with known poses into a \
-kapture map.
-refine-map maps:RefineMap Remove points and observations that a map's images or depth maps \
-contradict.
-densify maps:Densify Estimate depth of map images without depth, by multi-view stereo.
-refine-poses maps:RefinePoses Refine the poses of localized queries; a pose that does not \
-improve is kept, with the reason.
-map maps:MapPhotographs Make a map of photographs without poses; stages that are up to date are \
-kept.
-localize localize:Localize Localize photographs, or the images of a kapture folder, in a kapture \
-map.
-serve localize:Serve Localize images sent over HTTP in a kapture map; has a page for \
-photographs.
-submit evaluate:Submit Write the pose file of a localized kapture folder, and a JSON file with \
-its provenance.
-check evaluate:Check Check a pose file of any tool against the rules of its challenge and the \
-map.
-evaluate evaluate:Evaluate Compare localized queries (kapture folders, pose files, COLMAP models) \
-with their true poses, and two or more results with each other.
-export conversion:Export Write a map, localized queries or both for COLMAP, nerfstudio, evo and \
-viewers.
-view conversion:View Write a page that shows a map and localized queries in 3D; it works offline.
-train training:Train Train SuperGlue, or a detector's descriptors, on kapture folders with depth \
-and on photographs.
-train-field training:TrainField Train a neural field (NeRF-W) on the images of a map, to render \
-views and refine poses.
-render training:Render Render views of a neural field: at a pose, along a result, or between map \
-cameras.
-weights weights:WeightsCommand List, fetch, add, convert and check the weights of networks.
-info info:Info Describe a kapture folder, and how it can be used as a map.
-options info:OptionsCommand List the options that --set takes, with value, type and meaning.
-doctor weights:Doctor Check the environment: versions, known-bad combinations, GPU, weights.
-"""
-COMMANDS: dict[str, tuple[str, str]] = {
-    name: (place, text)
-    for name, place, text in (line.split(" ", 2) for line in _TABLE.strip().splitlines())
+# module:class by name, so that only the requested command is imported
+COMMANDS = {
+    "eval": "evaluate_dataset:Eval",
+    "import": "conversion:Import",
+    "synth": "conversion:Synth",
+    "preprocess": "stages:Preprocess",
+    "extract-local": "stages:ExtractLocal",
+    "extract-global": "retrieval:ExtractGlobal",
+    "pairs-mapping": "retrieval:PairsMapping",
+    "pairs-query": "retrieval:PairsQuery",
+    "match": "stages:Match",
+    "triangulate": "stages:Triangulate",
+    "refine-map": "maps:RefineMap",
+    "densify": "maps:Densify",
+    "refine-poses": "maps:RefinePoses",
+    "map": "maps:MapPhotographs",
+    "localize": "localize:Localize",
+    "serve": "localize:Serve",
+    "submit": "evaluate:Submit",
+    "check": "evaluate:Check",
+    "evaluate": "evaluate:Evaluate",
+    "export": "conversion:Export",
+    "view": "conversion:View",
+    "train": "training:Train",
+    "train-field": "training:TrainField",
+    "render": "training:Render",
+    "weights": "weights:WeightsCommand",
+    "info": "info:Info",
+    "options": "info:OptionsCommand",
+    "doctor": "weights:Doctor",
 }
+
+
+def _help_texts() -> dict[str, str]:
+    """Return the first paragraph of each command's docstring, without importing its module."""
+    folder = Path(__file__).parent
+    modules = {place.partition(":")[0] for place in COMMANDS.values()}
+    classes = {
+        f"{module}:{node.name}": (ast.get_docstring(node) or "").partition("\n\n")[0]
+        for module in modules
+        for node in ast.parse((folder / f"{module}.py").read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef)
+    }
+    return {name: " ".join(classes[place].split()) for name, place in COMMANDS.items()}
 
 
 def command_class(name: str) -> type[Any]:
     if name in COMMANDS:
-        module, _, kind = COMMANDS[name][0].partition(":")
+        module, _, kind = COMMANDS[name].partition(":")
         found: type[Any] = getattr(import_module(f"megloc_kapture.cli.{module}"), kind)
         return found
     from megloc_kapture.cli.stages import stage_command
@@ -104,7 +97,7 @@ def _parser(given: Sequence[str]) -> Any:
     annotated: Any = Annotated  # of runtime types, which mypy does not follow
     completes = given[:1] and given[0].startswith("--tyro-")  # shell completion needs all commands
     texts = {name: f"Run the stage {name}, of another package." for name in stages}
-    texts |= {name: text for name, (_, text) in COMMANDS.items()}
+    texts |= _help_texts()
     commands = []
     for name in [*COMMANDS, *(name for name in stages if name not in COMMANDS)]:
         # a stage that fails to load must not break other commands

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import starmap
 from pathlib import Path
 
 import tyro
@@ -19,13 +20,14 @@ from megloc_kapture.cli.common import (
     Working,
     cameras_of_text,
 )
-from megloc_kapture.cli.stages import StageCommand, restrictions_beside
+from megloc_kapture.cli.stages import StageCommand
 from megloc_kapture.errors import OptionError
 from megloc_kapture.evaluation.report.content import consistency_sentence
 from megloc_kapture.io.colmap_mapping import Mapper
 from megloc_kapture.io.files import read_json_model
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import CONSISTENCY_FILE, read_consistency
+from megloc_kapture.pipeline.kapture_map import restrictions_beside
 from megloc_kapture.pipeline.map_making import (
     describe_map,
     options_of_photographs,
@@ -40,7 +42,7 @@ from megloc_kapture.plugins import POSE_REFINERS
 from megloc_kapture.stages.densifying import densify_map, fitted_to_poses
 from megloc_kapture.stages.map_refinement import REPORT_FILE, RefinementReport, refine_map
 from megloc_kapture.stages.pose_refinement import refine_poses
-from megloc_kapture.stages.stage import LOCALIZED, MAP
+from megloc_kapture.stages.stage import LOCALIZED, MAP, count_text
 from megloc_kapture.stages.stereo_depth import fuse_depth
 
 
@@ -152,11 +154,7 @@ class Densify(Reading, StageCommand):
             counts = densify_map(
                 source, out, options, restrictions=restrictions_beside(source.root), work=work
             )
-            console.say(
-                f"depth of {counts['images_with_depth']} of {counts['images']} images, on "
-                f"{100 * counts['share_with_depth']:.0f} % of their pixels"
-                + (f"; {counts['points_lifted']} keypoints lifted" if self.points else "")
-            )
+            console.say(", ".join(starmap(count_text, counts.items())))
             if self.fuse is not None:
                 agreement = fitted_to_poses(source, options.max_size_px).agreement
                 fused = fuse_depth(KaptureFolder(out), self.fuse, agreement, work=work)
@@ -199,15 +197,8 @@ class RefinePoses(Linked, StageCommand):
                 restrictions=restrictions_beside(self.query),
                 work=work,
             )
-        accepted = ", ".join(
-            f"{count:,} accepted by {name.removeprefix('accepted_by_')}"
-            for name, count in counts.items()
-            if name.startswith("accepted_by_")
-        )
-        console.result(
-            f"{counts['queries']:,} poses, {accepted}; status.csv and refinement.csv in "
-            f"{self.output}"
-        )
+        text = ", ".join(starmap(count_text, counts.items()))
+        console.result(f"{text}; status.csv and refinement.csv in {self.output}")
         if (table := self.output / CONSISTENCY_FILE).is_file():
             for row in read_consistency(table):
                 console.result(consistency_sentence(row))

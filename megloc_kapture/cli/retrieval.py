@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Literal
 
 from megloc_kapture.cli.common import Console, Folders, Force, Input, Output, Overwrite, Reading
-from megloc_kapture.cli.stages import FEATURES, StageCommand, only_type, restrictions_beside
+from megloc_kapture.cli.stages import FEATURES, StageCommand, only_type
 from megloc_kapture.errors import OptionError, check_option
 from megloc_kapture.io.kapture import KaptureFolder, write_pairs
+from megloc_kapture.pipeline.kapture_map import restrictions_beside
 from megloc_kapture.retrieval.search import FusionMethod
 from megloc_kapture.stages.candidates import Retrieval
 from megloc_kapture.stages.global_features import extract_global_features, extract_vlad, vlad_type

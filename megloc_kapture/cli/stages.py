@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, make_dataclass
 from inspect import getdoc
+from itertools import starmap
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -30,7 +31,6 @@ from megloc_kapture.cli.common import (
     Working,
     assigned_pairs,
     existing,
-    side_tables_beside,
 )
 from megloc_kapture.errors import OptionError, check_option, require
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
@@ -44,26 +44,14 @@ from megloc_kapture.plugin_loading import (
     plugin_class,
 )
 from megloc_kapture.plugins import MATCHERS, STAGES, chosen_by_name
-from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.map_points import triangulate_map
 from megloc_kapture.stages.matches import check_given_poses, match_pairs
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.stages.preprocessing import (
-    PreprocessingOptions,
-    preprocess_images,
-)
+from megloc_kapture.stages.preprocessing import PreprocessingOptions, preprocess_images
+from megloc_kapture.stages.stage import count_text
 
 PREPROCESSED, FEATURES, MAP = "preprocessed", "features", "map"
-_SOURCES = {
-    "own": "masks of the kapture",
-    "user": "user masks",
-    "fixed": "fixed masks",
-    "unchanging": "unchanging regions",
-    "classes": "dynamic classes",
-    "unseen": "outside the original",
-    "all": "together",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,12 +84,6 @@ def only_type(folder: KaptureFolder, kind: str, asked: str | None) -> str:
     raise OptionError(f"{folder.root}: {reason}")
 
 
-def restrictions_beside(folder: Path) -> Restrictions:
-    """Return restrictions of the dataset that contains a kapture folder, if any."""
-    tables = side_tables_beside(folder)
-    return UNRESTRICTED if tables is None else Restrictions.read(tables)
-
-
 @dataclass(frozen=True, kw_only=True)
 class ExtractLocal(Linked, StageCommand):
     """Extract local features of all images of kapture folders."""
@@ -124,18 +106,8 @@ class ExtractLocal(Linked, StageCommand):
                 counts = extract_local_features(
                     folders, extractor, out, mask_margin_px=options.mask_margin_px, work=work
                 )
-                told = [f"{counts['keypoints']} keypoints, {counts['images']} images"]
-                if "images_with_mask" in counts:
-                    told.append(
-                        f"masks of {counts['images_with_mask']} images removed "
-                        f"{counts['keypoints_masked']}"
-                    )
-                if "images_reduced" in counts:
-                    told.append(
-                        f"{counts['images_reduced']} images were reduced for extraction "
-                        "(max_megapixels)"
-                    )
-                console.say(f"{extractor.name}: {'; '.join(told)}")
+                text = ", ".join(starmap(count_text, counts.items()))
+                console.say(f"{extractor.name}: {text}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,10 +180,7 @@ class Triangulate(Reading, StageCommand):
                 num_threads=work.num_threads,
                 work=work,
             )
-        for type_name in sorted(set(local_types)) if len(set(local_types)) > 1 else ():
-            points, seen = counts[f"points_{type_name}"], counts[f"observations_{type_name}"]
-            console.say(f"{type_name}: {points} points, {seen} observations")
-        console.say(f"{counts['points']} points, {counts['observations']} observations")
+        console.say(", ".join(starmap(count_text, counts.items())))
 
 
 def _read_pairs_of(path: Path, first: KaptureFolder, second: KaptureFolder) -> list[ImagePair]:
@@ -291,9 +260,10 @@ class Preprocess(Linked, Computing, Working):
         with self.staged(self.output, PREPROCESSED, force=self.force) as (out, work):
             counts = preprocess_images(source, out, options, sequences=sequences, work=work)
         console.say(f"{counts['images']} images, {counts['images_changed']} of them changed")
-        for source_of_masks, words in _SOURCES.items():
-            if (share := counts.get(f"masked_{source_of_masks}")) is not None:
-                console.say(f"masked by {words}: {100 * share:.2f} % of all pixels")
+        for name, share in counts.items():
+            if name.startswith("masked_"):
+                source_of_masks = name.removeprefix("masked_")
+                console.say(f"masked ({source_of_masks}): {100 * share:.2f} % of all pixels")
 
     def options(self) -> PreprocessingOptions:
         masks: dict[str, Any] = {

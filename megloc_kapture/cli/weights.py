@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -312,6 +311,4 @@ def find_problems() -> list[str]:
             "opencv-python and opencv-python-headless both write the folder cv2; uninstall "
             "both and install opencv-python-headless"
         )
-    if importlib.util.find_spec("cv2") is None:
-        problems.append("cv2 cannot be imported; pip install opencv-python-headless")
     return problems

@@ -263,14 +263,6 @@ def twin_of(layout: str, **options: Any) -> RenderedDataset:
     return twin
 
 
-class PublishedResult(Options):
-    """Published figures of another method; ``recall`` is in percent by condition."""
-
-    method: str
-    source: str
-    recall: dict[str, str]
-
-
 class PresetOptions(Options):
     """Changes of a dataset to presets, some of them only for data with depth maps."""
 
@@ -293,7 +285,7 @@ class BenchmarkFile(PresetOptions):
     """Options of one dataset, ``benchmarks/<dataset>.toml``, with changes to every preset.
 
     ``presets`` holds further changes by preset name; ``thresholds``, ``conditions`` and ``pools``
-    replace those of the dataset's Protocol.
+    replace those of the dataset's Protocol; ``published`` are lines about other methods' results.
     """
 
     dataset: str
@@ -302,7 +294,7 @@ class BenchmarkFile(PresetOptions):
     conditions: tuple[str, ...] | None = None
     pools: dict[str, tuple[str, ...]] | None = None
     presets: dict[str, PresetOptions] = Field(default_factory=dict)
-    published: tuple[PublishedResult, ...] = ()
+    published: tuple[str, ...] = ()
 
     @field_validator("presets")
     @classmethod

@@ -29,7 +29,6 @@ from megloc_kapture.stages.scene import check_points, index_map, observed_keypoi
 from megloc_kapture.values import Camera, RigidTransform
 
 PixelOriginChoice = Literal["auto", "corner", "centre"]
-AS_ASKED = "as asked for"
 
 _SAMPLED_IMAGES = 50
 _NETWORKS = ("aliked", "aslfeat", "disk", "r2d2", "superpoint", "xfeat")
@@ -142,21 +141,11 @@ class KaptureMap:
         origins = _find_origins(folder, indices)
         if pixel_origin != "auto":
             origins = {
-                name: replace(found, intrinsics=pixel_origin, reason=AS_ASKED)
+                name: replace(found, intrinsics=pixel_origin, reason="as asked for")
                 for name, found in origins.items()
             }
         keypoints = {n: MapKeypoints(folder, n, indices[n], origins[n]) for n in indices}
-        # only a workspace has the dataset's side tables
-        tables = tables_of(folder.root)
-        restrictions = UNRESTRICTED if tables is None else Restrictions.read(tables)
-        return cls(folder, keypoints, restrictions)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        asked = self.pixel_origin.intrinsics if self.pixel_origin.reason == AS_ASKED else "auto"
-        linked = tuple(path.absolute() for path in self.folder.allow_links_below)
-        features = tuple(path.absolute() for path in self.folder.features_dirs)
-        root = self.folder.root.absolute()
-        return _opened_again, (root, tuple(self.keypoints), features, asked, linked)
+        return cls(folder, keypoints, restrictions_beside(folder.root))
 
     @property
     def pixel_origin(self) -> PixelOrigin:
@@ -250,6 +239,12 @@ class KaptureMap:
         )
 
 
+def restrictions_beside(root: Path) -> Restrictions:
+    """Return the restrictions in the side tables of a kapture folder's workspace, if any."""
+    tables = tables_of(root)
+    return UNRESTRICTED if tables is None else Restrictions.read(tables)
+
+
 def plain_name(local_type: str) -> str:
     """Return a type's name in lower case without separators, which differ between tools."""
     return re.sub("[^a-z0-9]", "", local_type.lower())
@@ -266,22 +261,6 @@ def _extractor_named(name: str) -> PluginChoice | None:
         if plugin is not None and plain in weights:
             return PluginChoice(name=plugin, options={"weights": weights[plain]})
     return None
-
-
-def _opened_again(
-    root: Path,
-    keypoints_types: tuple[str, ...],
-    features_dirs: tuple[Path, ...],
-    pixel_origin: PixelOriginChoice,
-    allow_links_below: tuple[Path, ...],
-) -> KaptureMap:
-    return KaptureMap.open(
-        root,
-        keypoints_types=keypoints_types,
-        features_dirs=features_dirs,
-        pixel_origin=pixel_origin,
-        allow_links_below=allow_links_below,
-    )
 
 
 def _read_indices(folder: KaptureFolder, keypoints_types: Sequence[str]) -> dict[str, MapIndex]:

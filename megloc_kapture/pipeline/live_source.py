@@ -165,16 +165,14 @@ class MapMatching:
         """Return whether queries with these global features can be ranked immediately."""
         return all(one.is_at_hand for one in self._compared(brought))
 
-    def describe(self, brought: Collection[str]) -> str:
-        return ", ".join(
+    def describe_candidates(self, brought: Collection[str]) -> str:
+        """Describe the choice of candidates for queries with these global features."""
+        count, top_k = len(self._map.images), self.options.query_pairs.top_k
+        how = ", ".join(
             "VLAD over the map's descriptors" if one.is_vlad else f"global features {one.name}"
             for one in self._compared(brought)
         )
-
-    def describe_candidates(self, brought: Collection[str]) -> str:
-        how, count = self.describe(brought), len(self._map.images)
-        top_k = self.options.query_pairs.top_k
-        if count <= top_k:
+        if self.options.query_pairs.by == "exhaustive" or count <= top_k:
             ranked = f"ranked by {how}" if self.is_at_hand(brought) else "not ranked"
             return f"all {count} map images, {ranked}"
         return f"the {top_k} of {count} map images that are most similar by {how}"

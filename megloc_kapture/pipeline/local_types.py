@@ -14,6 +14,7 @@ from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.localization.map_index import ImageMatches
 from megloc_kapture.matching.guided_pyramid import base_type, equivalent_types
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, plain_name
+from megloc_kapture.pipeline.presets import feature_choices
 from megloc_kapture.pipeline.queries import QueryImage
 from megloc_kapture.plugin_loading import load_chosen, plugin_names
 from megloc_kapture.plugins import (
@@ -199,7 +200,7 @@ def local_types_of(
 
     Types in the options without map points only help to rank candidates.
     """
-    choices = _choices(options)
+    choices = feature_choices(options)
     by_base = {base_type(name): keypoints for name, keypoints in kapture_map.keypoints.items()}
     for stored in kapture_map.stored_types():
         named = _rank(stored, choices) < len(choices)
@@ -214,14 +215,6 @@ def local_types_of(
         choice = choices[rank] if rank < len(choices) else None
         found.append(LocalType(kapture_map, points, first, choice, options, cache))
     return found
-
-
-def _choices(options: PipelineOptions) -> list[LocalFeaturesChoice]:
-    own = list(options.local_features) if options.makes_points() else []
-    if options.uses_given_map():
-        given = options.given_features
-        own.append(LocalFeaturesChoice(name=given.name, options=given.options))
-    return own
 
 
 def _rank(local_type: str, choices: Sequence[LocalFeaturesChoice]) -> int:

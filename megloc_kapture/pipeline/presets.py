@@ -6,8 +6,9 @@ import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import partial
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
@@ -144,7 +145,7 @@ def _validated(model: type[OptionsT], tree: Mapping[str, Any]) -> OptionsT:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise OptionError(f"unknown option {where}; {_known(where, model)}") from error
+            raise OptionError(f"unknown option {where}; {_similar(where, model)}") from error
         raise OptionError(f"option {option_fault(error, model)}") from error
 
 
@@ -176,22 +177,12 @@ def _typed(assignment: str, flag: str) -> tuple[str, Any]:
         return key, text
 
 
-def _known(path: str, root: type[Options]) -> str:
-    model: Any = root
-    *parents, name = path.split(".")
-    for part in parents:
-        if part.isdigit():
-            continue
-        annotation = model.model_fields[part].annotation if part in model.model_fields else None
-        annotation = next(iter(get_args(annotation)), annotation)
-        if not (isinstance(annotation, type) and issubclass(annotation, Options)):
-            break
-        model = annotation
-    known = sorted(model.model_fields)
-    elsewhere = [one.key for one in options_of(root()) if one.key.endswith(f".{name}")]
-    if elsewhere:
-        return f"did you mean {' or '.join(elsewhere)}? known here: {', '.join(known)}"
-    return suggestion(name, known, listed="known here: ")
+def _similar(path: str, root: type[Options]) -> str:
+    keys = [one.key for one in options_of(root())]
+    elsewhere = [key for key in keys if key.endswith(f".{path.rpartition('.')[2]}")]
+    steps = {key.rpartition(".")[0] for key in keys} - {""}
+    similar = elsewhere or get_close_matches(path, [*keys, *steps], n=1)
+    return f"did you mean {' or '.join(similar)}?" if similar else f"known: {', '.join(keys)}"
 
 
 @dataclass(frozen=True)
@@ -276,33 +267,33 @@ def check_weights(options: PipelineOptions) -> None:
     raise error
 
 
+def feature_choices(options: PipelineOptions) -> list[LocalFeaturesChoice]:
+    """Return the local features of the options, those of a given map last."""
+    choices = list(options.local_features) if options.makes_points() else []
+    if options.uses_given_map():
+        given = options.given_features
+        choices.append(LocalFeaturesChoice(name=given.name, options=given.options))
+    return choices
+
+
 def _missing(options: PipelineOptions) -> MissingWeightsError | None:
+    features = feature_choices(options)
+    matchers = [choice.matching or options.matching for choice in features]
+    chosen: list[tuple[str, PluginChoice | None]] = [
+        (SEGMENTERS, options.preprocessing.masks.segmenter),
+        *((LOCAL_FEATURES, one) for one in features),
+        *((MATCHERS, one) for one in (*matchers, options.second_matching.matcher)),
+        (POSE_RANKERS, options.localization.rank),
+        *((POSE_REFINERS, one) for one in options.pose_refinement.by),
+    ]
+    makers: list[Callable[[], object]] = [
+        partial(load_plugin, group, one.name, one.options) for group, one in chosen if one
+    ]
+    makers += [one.make for one in options.global_features if not one.is_vlad]
     missing = []
-    for make in _makers(options):
+    for make in makers:
         try:
             make()
         except MissingWeightsError as error:
             missing.append(error)
     return all_missing(missing) if missing else None
-
-
-def _makers(options: PipelineOptions) -> Iterator[Callable[[], object]]:
-    chosen: list[tuple[str, PluginChoice]] = []
-    if (segmenter := options.preprocessing.masks.segmenter) is not None:
-        chosen.append((SEGMENTERS, segmenter))
-    features: list[tuple[PluginChoice, PluginChoice]] = []
-    if options.makes_points():
-        features += [
-            (local, local.matching or options.matching) for local in options.local_features
-        ]
-    if options.uses_given_map():
-        features.append((options.given_features, options.matching))
-    chosen += [(LOCAL_FEATURES, extractor) for extractor, _ in features]
-    chosen += [(MATCHERS, matcher) for _, matcher in features]
-    if (second := options.second_matching.matcher) is not None:
-        chosen.append((MATCHERS, second))
-    chosen.append((POSE_RANKERS, options.localization.rank))
-    chosen += [(POSE_REFINERS, one) for one in options.pose_refinement.by]
-    for group, one in chosen:
-        yield partial(load_plugin, group, one.name, one.options)
-    yield from (one.make for one in options.global_features if not one.is_vlad)

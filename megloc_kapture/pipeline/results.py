@@ -140,7 +140,7 @@ class Results(Mapping[str, Pose | Failure]):
                 raise DataError(f"image {lacking!r}: {error.message}", path=error.path) from error
 
     def _localized(self, workers: int, track: Track) -> Iterator[tuple[str, Pose | Failure]]:
-        executor, read_on = ThreadPoolExecutor(workers), True
+        executor = ThreadPoolExecutor(workers)
         try:
             units = map(self.queries.read, self._units)
             results = self.localizer.localize_units(units, executor, candidates=self._candidates)
@@ -153,13 +153,10 @@ class Results(Mapping[str, Pose | Failure]):
                     if isinstance(result, Failure) and name in self.queries.faults:
                         result = replace(result, reason=self.queries.faults[name])
                     yield name, result
-        except GeneratorExit:
-            # the garbage collector may close this generator in any thread, even in one that holds
-            # locks needed to stop the workers, so do not wait
-            read_on = False
-            raise
         finally:
-            executor.shutdown(wait=read_on)
+            # do not wait: the garbage collector may close this generator in any thread, even in one
+            # that holds locks needed to stop the workers
+            executor.shutdown(wait=False)
 
     def _with_shared_cameras(self, results: list[Pose | Failure]) -> list[Pose | Failure]:
         data, of_sensor = self.queries.data(), defaultdict(list)

@@ -10,7 +10,6 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY
@@ -40,7 +39,7 @@ from megloc_kapture.io.dataset_tables import (
     read_world,
 )
 from megloc_kapture.io.files import read_text, safe_join, temporary_name, write_bytes, write_json
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder
+from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import STATUS_FILE, read_status
 from megloc_kapture.pipeline.datasets import (
     KAPTURE,
@@ -55,13 +54,7 @@ from megloc_kapture.values import LocalizationResult, Pose, RigidTransform
 
 _log = logging.getLogger(__name__)
 
-# row of MLAD for a query without a pose, as kapture's exporter writes it
-_DUMMY = RigidTransform.identity()
-
-
 _Content = tuple[Mapping[str, str], Sequence[str], Sequence[tuple[str, str]]]
-
-
 _Results = Mapping[str, LocalizationResult]
 """Results by image, with the poses that are handed in, fallbacks included."""
 
@@ -148,25 +141,6 @@ def write_submission(
     return counts
 
 
-def poses_through_rig(
-    data: KaptureData,
-    poses: Mapping[str, RigidTransform],
-    statuses: Mapping[str, LocalizationResult] = MappingProxyType({}),
-) -> dict[str, RigidTransform]:
-    """Derive missing poses from the image of the same rig and timestamp with the most inliers.
-
-    Fallback poses are replaced and never propagated.
-    """
-    localized = {}
-    for image, pose in poses.items():
-        status = statuses.get(image)
-        if status is None:
-            localized[image] = Pose(pose)
-        elif status.status == "localized":
-            localized[image] = Pose(pose, num_inliers=status.num_inliers or 0)
-    return {image: pose for image, (_, pose) in scene.poses_through_rig(data, localized).items()}
-
-
 def _read_results(localized: Path, beside: Path | None, *, from_rig: bool) -> _Results:
     own = KaptureFolder(localized).read()
     data = own
@@ -193,7 +167,13 @@ def _read_results(localized: Path, beside: Path | None, *, from_rig: bool) -> _R
                 "no pose can come from the rig: neither the queries nor the result have a rigs.txt",
                 path=localized,
             )
-        for image, pose in poses_through_rig(data, poses, statuses).items():
+        # from the camera with the most inliers; fallback poses are replaced, never propagated
+        known = {
+            image: Pose(pose, num_inliers=results[image].num_inliers or 0)
+            for image, pose in poses.items()
+            if image not in statuses or statuses[image].status == "localized"
+        }
+        for image, (_, pose) in scene.poses_through_rig(data, known).items():
             results[image] = replace(results[image], cam_from_world=pose, fallback="rig")
     return results
 
@@ -250,7 +230,7 @@ def _mlad(results: _Results, tables: Path) -> _Content:
         query, reference = poses.get(pair.query), references.get(pair.reference)
         if query is None or reference is None:
             missing.append((f"{pair.file}: {pair.reference} {pair.query}", pair.query))
-            pose = _DUMMY
+            pose = RigidTransform.identity()  # as kapture's exporter writes it
         else:
             posed.append(pair.query)
             pose = relative_pose(query, reference, scale=scale)

@@ -27,7 +27,6 @@ from megloc_kapture.io.images import decode_image_rgb, photo_of, turned_upright
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.queries import Query as ImageQuery
-from megloc_kapture.service import Limits
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, Failure, Pose
 
 _PAGE = Path(__file__).with_name("localize.html")
@@ -179,13 +178,29 @@ def read_query(content: bytes, camera: str | None, *, max_megapixels: float) -> 
 
 
 class Service:
-    """A localizer with limits, shared by worker threads; clients send ``token`` if given."""
+    """A localizer with limits, shared by worker threads; clients send ``token`` if given.
 
-    def __init__(self, localizer: Localizer, limits: Limits, token: str | None = None) -> None:
-        self.localizer, self.limits, self._token = localizer, limits, token
-        self._num_threads = limits.threads or available_cores()
-        self._threads = ThreadPoolExecutor(self._num_threads, thread_name_prefix="localize")
-        self._pending = 0
+    Parameters
+    ----------
+    threads : images localized in parallel; None means all cores.
+    max_waiting : images that may wait; more are refused (503).
+    """
+
+    def __init__(
+        self,
+        localizer: Localizer,
+        *,
+        threads: int | None = None,
+        max_waiting: int = 32,
+        max_mb: float = 20.0,
+        max_megapixels: float = 32.0,
+        token: str | None = None,
+    ) -> None:
+        self.localizer, self._token = localizer, token
+        self._max_mb, self._max_megapixels = max_mb, max_megapixels
+        num_threads = threads or available_cores()
+        self._threads = ThreadPoolExecutor(num_threads, thread_name_prefix="localize")
+        self._pending, self._max_pending = 0, num_threads + max_waiting
 
     def check_token(self, request: Request) -> None:
         """Refuse requests without the token, in constant time."""
@@ -201,7 +216,7 @@ class Service:
     async def answer(self, request: Request, camera: str | None) -> Answer:
         """Localize the image in a request when a thread is free."""
         content, camera_in_form = await self._image_in(request)
-        if self._pending >= self._num_threads + self.limits.max_waiting:
+        if self._pending >= self._max_pending:
             raise HTTPException(503, "too many images are waiting", {"retry-after": "2"})
         self._pending += 1
         try:
@@ -213,7 +228,7 @@ class Service:
 
     def _localize(self, content: bytes, camera: str | None) -> Answer:
         try:
-            query = read_query(content, camera, max_megapixels=self.limits.max_megapixels)
+            query = read_query(content, camera, max_megapixels=self._max_megapixels)
             result = self.localizer.localize_query(query)
         except (DataError, OptionError) as error:
             if isinstance(error, DataError) and error.path is not None:
@@ -249,7 +264,7 @@ class Service:
         return await image.read(), camera
 
     async def _read_body(self, request: Request) -> bytes:
-        max_bytes = int(self.limits.max_mb * 1e6)
+        max_bytes = int(self._max_mb * 1e6)
         body, size = bytearray(), 0
         async for chunk in request.stream():
             size += len(chunk)
@@ -258,7 +273,7 @@ class Service:
             elif size > _READ_BEYOND_LIMIT * max_bytes:
                 break
         if size > max_bytes:
-            raise HTTPException(413, f"the request is larger than {self.limits.max_mb:g} MB")
+            raise HTTPException(413, f"the request is larger than {self._max_mb:g} MB")
         return bytes(body)
 
 

@@ -16,7 +16,6 @@ from megloc_kapture.geometry.poses import camera_centers, invert_quats, rotate, 
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.localizer import Localizer
-from megloc_kapture.service import Limits
 from megloc_kapture.service.app import Service, make_app
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import Camera
@@ -47,18 +46,11 @@ def bind(host: str, port: int) -> socket.socket:
         raise OptionError(f"cannot listen at {host}, port {port}: {error}") from error
 
 
-def serve(
-    localizer: Localizer,
-    bound: socket.socket,
-    *,
-    limits: Limits,
-    token: str | None = None,
-    log_requests: bool = False,
-) -> None:
+def serve(service: Service, bound: socket.socket, *, log_requests: bool = False) -> None:
     """Serve until SIGTERM or SIGINT, which takes effect after running requests have finished."""
     logging.getLogger("uvicorn").setLevel(logging.ERROR)
     cv2.setNumThreads(1)  # the threads are for images
-    app = make_app(Service(localizer, limits, token), map_overview(localizer.map))
+    app = make_app(service, map_overview(service.localizer.map))
     config = uvicorn.Config(
         app,
         ws="none",
@@ -96,8 +88,8 @@ def map_overview(kapture_map: KaptureMap) -> bytes:
         "right": _rounded(page[0], 9),
         "up": _rounded(page[1], 9),
         "origin": origin.tolist(),
-        "cameras": _rounded(_sample(cameras, _MAX_CAMERAS)),
-        "points": _rounded((_sample(points, _MAX_POINTS) - origin) @ page.T),
+        "cameras": _rounded(cameras[:: 1 + len(cameras) // _MAX_CAMERAS]),
+        "points": _rounded((points[:: 1 + len(points) // _MAX_POINTS] - origin) @ page.T),
     }
     return json.dumps(content, separators=(",", ":")).encode()
 
@@ -109,12 +101,6 @@ def _without_outliers(points: NDArray[np.float64]) -> NDArray[np.float64]:
     low, high = np.percentile(points, [1.0, 99.0], axis=0)
     margin = 0.5 * (high - low)
     return points[((points >= low - margin) & (points <= high + margin)).all(axis=1)]
-
-
-def _sample(rows: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    if len(rows) <= most:
-        return rows
-    return rows[np.sort(np.random.default_rng(0).choice(len(rows), most, replace=False))]
 
 
 def _rounded(values: NDArray[np.float64], digits: int = 5) -> list[float]:

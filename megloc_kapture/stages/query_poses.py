@@ -121,7 +121,6 @@ def localize_unit(
     centers: Mapping[str, NDArray[np.float64]],
     ranker: PoseRanker,
     scene: RankingScene,
-    as_rig: bool = False,
 ) -> list[Pose | Failure]:
     """Localize one query, or the cameras of a rig together; return a result per camera.
 
@@ -131,7 +130,6 @@ def localize_unit(
     ----------
     candidates : map images, best first, with a coordinate frame each in ``frames``.
     centers : camera centres (3,) of the candidates in the world.
-    as_rig : return one result with the pose ``rig_from_world``.
     """
 
     def localize(together: Sequence[QueryView]) -> tuple[Pose | Failure, PoseProblem | None]:
@@ -163,10 +161,8 @@ def localize_unit(
         )
         return replace(result, seconds={**seconds, **result.seconds}), problem
 
-    if len(views) > 1 or as_rig:
+    if len(views) > 1:
         result, problem = localize(views)
-        if as_rig:
-            return [result]
         if isinstance(result, Pose) and problem is not None:
             return poses_of_cameras(views, result, problem)
     results = [localize([QueryView(v.name, v.camera, v.matches)])[0] for v in views]
@@ -210,7 +206,6 @@ def localize_query(
     centers: Mapping[str, NDArray[np.float64]],
     ranker: PoseRanker,
     scene: RankingScene,
-    as_rig: bool = False,
 ) -> list[Pose | Failure]:
     """Localize a query, or the cameras of a rig; return a result per camera.
 
@@ -229,7 +224,6 @@ def localize_query(
             centers=centers,
             ranker=ranker,
             scene=scene,
-            as_rig=as_rig,
         )
 
     return in_turn(solve, max((len(source.candidates) for source in sources), default=0), options)

@@ -220,7 +220,8 @@ def test_retrieval_by_what_both_bring_else_by_our_own(megloc: Any, foreign: Path
     command = queries_of(foreign, foreign / "localized")
     done = megloc(*command, "--set", "query_pairs.top_k=5")
     assert done.out.startswith("4 of 4")
-    assert re.search(rf"^candidates: (global features )?{by}$", done.err, re.MULTILINE)
+    described = rf"^candidates: the 5 of 7 .* by (global features )?{by}$"
+    assert re.search(described, done.err, re.MULTILINE)
     statuses = read_status(foreign / "localized" / "status.csv")
     assert {len(s.candidates) for s in statuses.values()} == {5}
 

@@ -146,7 +146,7 @@ def test_poses_without_depth_stay_and_say_so(megloc: Any, finished: Path, tmp_pa
     out, poses = tmp_path / "refined", finished / "localized"
     done = megloc(*refine_poses(finished, poses, out), "--by", "icp", "-q")
     assert (done.status, done.err) == (0, "")
-    assert done.out.startswith("4 poses, 0 accepted by icp; status.csv and refinement.csv in")
+    assert done.out.startswith("4 queries, 0 accepted by icp; status.csv and refinement.csv in")
     before, after = (KaptureFolder(place).read().poses() for place in (poses, out))
     assert before == after
     assert {row.status for row in read_status(out / "status.csv").values()} == {"localized"}
@@ -155,7 +155,7 @@ def test_poses_without_depth_stay_and_say_so(megloc: Any, finished: Path, tmp_pa
     # the result is one to refine again, by one refiner after another
     both = ("--by", "icp", "--by", "rendering")
     done = megloc(*refine_poses(finished, out, tmp_path / "again"), *both, "-q")
-    assert done.out.startswith("4 poses, 0 accepted by icp, 0 accepted by rendering;")
+    assert done.out.startswith("4 queries, 0 accepted by icp, 0 accepted by rendering, ")
     for text in pandas.read_csv(tmp_path / "again" / "status.csv")["refinement"]:
         first, second = text.split("; ")[-2:]
         assert first.startswith("icp: ") and second.startswith("rendering: ")

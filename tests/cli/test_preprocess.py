@@ -64,7 +64,7 @@ def test_images_are_resized_and_masked(
     assert done.status == 0, done.err
     assert contents(scene / "query") == before
     assert "4 images, 4 of them changed" in done.err
-    assert "masked by fixed masks: 22.22 % of all pixels" in done.err
+    assert "masked (fixed): 22.22 % of all pixels" in done.err
     new = KaptureFolder(out)
     new.validate(deep=True)
     image = images_of(scene)[0]

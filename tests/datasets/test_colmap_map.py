@@ -27,6 +27,7 @@ from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.localizer import Localizer
+from megloc_kapture.pipeline.results import Results
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
 
@@ -153,7 +154,7 @@ def test_queries_are_localized(
     opened = KaptureMap.open(tmp_path / "map")
     assert opened.fault() is None and opened.pixel_origin.intrinsics == "corner"
     truth = KaptureFolder(scene / "query_gt").read().poses()
-    for name, pose in Localizer(opened).localize_kapture(scene / "query"):
+    for name, pose in Results(Localizer(opened), scene / "query").items():
         assert pose, (name, pose)
         off = pose.cam_from_world @ truth[name].inverse()
         assert np.linalg.norm(pose.cam_from_world.center() - truth[name].center()) < 0.01

@@ -180,7 +180,7 @@ def test_the_camera_is_that_of_colmap(
     path = tmp_path / "photo.jpg"
     noise().save(path, exif=exif_of(tags, inner))
     theirs = pycolmap.infer_camera_from_image(str(path))
-    ours = Camera.from_exif(path)
+    ours = read_photo(path).camera
     known = theirs.has_prior_focal_length
     assert ours.focal_deviation == (EXIF_DEVIATION if known else GUESS_DEVIATION)
     assert (ours.model, ours.width, ours.height) == (theirs.model.name, 64, 48)

@@ -56,7 +56,7 @@ def same_poses(workspace: Workspace, localizer: Localizer) -> list[Pose]:
     """The poses of the queries from Python, compared with those of the workspace."""
     in_run = workspace.folder("localized").read()
     status = read_status(workspace.path("localized/status.csv"))
-    found = dict(localizer.localize_kapture(workspace.path("query")))
+    found = dict(Results(localizer, workspace.path("query")))
     assert sorted(found) == in_run.image_names()
     for name, result in found.items():
         pose, row = in_run.cam_from_world(name), status[name]

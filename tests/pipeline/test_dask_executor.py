@@ -19,14 +19,10 @@ import pytest
 from distributed import Client
 from threadpoolctl import threadpool_info
 
-import megloc_kapture as megloc
 from megloc_kapture.errors import MeglocError, OptionError
-from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline import dask_executor
 from megloc_kapture.pipeline.executors import open_executor
-from megloc_kapture.pipeline.query_folders import KaptureQueries
 from megloc_kapture.stages.work import ordered_map
-from megloc_kapture.values import Pose
 
 
 @contextmanager
@@ -131,21 +127,3 @@ def test_what_cannot_be_used_is_refused(cluster: str, monkeypatch: pytest.Monkey
         pass
     with pytest.raises(OptionError, match="--scheduler"):
         open_executor("processes", 2, cluster).__enter__()
-
-
-def test_images_are_localized_on_a_cluster_as_here(
-    cluster: str, scene: Path, tmp_path: Path
-) -> None:
-    few = {"local_features.options.max_keypoints": 400}
-    built = megloc.build_map(scene / "mapping", set=few, workspace=tmp_path / "map")
-    localizer = built.localizer()
-    queries = list(KaptureQueries(KaptureFolder(scene / "query"), built.kapture_map))
-    here = list(localizer.localize_many(queries))
-    assert all(here)
-    with open_executor("dask", scheduler=cluster) as executor:
-        there = list(localizer.localize_many(queries, executor))
-    for one, other in zip(here, there, strict=True):
-        assert isinstance(one, Pose) and isinstance(other, Pose)
-        np.testing.assert_allclose(
-            one.cam_from_world.matrix(), other.cam_from_world.matrix(), atol=1e-9
-        )

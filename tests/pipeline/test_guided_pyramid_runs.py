@@ -13,6 +13,7 @@ from megloc_kapture import Camera, KaptureMap, Localizer
 from megloc_kapture.io.images import read_image_rgb, write_image
 from megloc_kapture.io.kapture import KaptureFolder, Sensor, write_sensors
 from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.results import Results
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import RigidTransform
 from tests.pipeline.runs import errors, evaluated, recall, run_in
@@ -92,5 +93,5 @@ def test_turned_queries_are_found_with_it_and_easy_pairs_are_not_tried(
     assert list(opened.keypoints) == ["xfeat-pyramid"]
     localizer = Localizer(opened, options=with_pyramid)
     truth = KaptureFolder(turned / "query_gt").read().poses()
-    for name, pose in localizer.localize_kapture(workspace.path("preprocessed/query")):
+    for name, pose in Results(localizer, workspace.path("preprocessed/query")).items():
         assert errors(pose, truth[name])[0] < 0.25

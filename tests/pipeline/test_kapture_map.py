@@ -17,6 +17,7 @@ from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.query_folders import KaptureQueries
+from megloc_kapture.pipeline.results import Results
 from megloc_kapture.plugins import PluginChoice
 from megloc_kapture.stages.matches import Features, match_all, verification_of, verified
 from megloc_kapture.values import Pose
@@ -125,8 +126,8 @@ def test_queries_are_described_as_their_map(workspace: Path, map_copy: Path, sce
     # and the poses are those of the map before
     before = Localizer(KaptureMap.open(workspace / "map"))
     original = KaptureFolder(scene / "query", features_dirs=[workspace])
-    expected = dict(before.localize_kapture(original))
-    for name, pose in Localizer(right).localize_kapture(queries):
+    expected = Results(before, original)
+    for name, pose in Results(Localizer(right), queries).items():
         reference = expected[name]
         assert isinstance(reference, Pose)
         assert errors(pose, reference.cam_from_world)[0] < 1e-3

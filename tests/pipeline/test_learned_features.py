@@ -12,6 +12,7 @@ from megloc_kapture import KaptureMap, Localizer
 from megloc_kapture.errors import OptionError
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.results import Results
 from megloc_kapture.stages.options import PipelineOptions
 from tests.pipeline.runs import errors, evaluated, recall
 
@@ -60,7 +61,7 @@ def test_modern_maps_smaller_images_and_localizes_whole_ones(
     opened = KaptureMap.open(workspace.path("map"))
     assert opened.pixel_origin.intrinsics == "corner"
     truth = KaptureFolder(fountain / "query_gt").read().poses()
-    found = Localizer(opened, options=options).localize_kapture(fountain / "query")
-    assert np.median([errors(pose, truth[name])[0] for name, pose in found]) < 0.02
+    found = Results(Localizer(opened, options=options), fountain / "query")
+    assert np.median([errors(pose, truth[name])[0] for name, pose in found.items()]) < 0.02
     with pytest.raises(OptionError, match=r"Query\(mask=...\)"):
         Localizer(opened, options=modern("preprocessing.masks.unchanging=true"))

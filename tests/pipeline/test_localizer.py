@@ -20,12 +20,11 @@ from megloc_kapture.errors import DataError
 from megloc_kapture.features.r2d2 import R2D2, R2D2Options
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder
-from megloc_kapture.localization import cluster_poses, confidence
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.query_folders import KaptureQueries
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.stages.options import PipelineOptions
-from megloc_kapture.values import LocalFeatures, RigidTransform
+from megloc_kapture.values import LocalFeatures
 from tests.pipeline.runs import errors
 
 
@@ -180,8 +179,9 @@ def test_retrieval_ranks_where_there_are_more_images_than_candidates(
         # within a prior, the best of those
         kept = replace(query, prior=("0000.jpg", "0002.jpg", "0009.jpg"))
         assert set(narrow.ranked(kept)) < set(kept.prior or ())
-    assert narrow.describe_retrieval([]) == "VLAD over the map's descriptors"
-    assert narrow.describe_retrieval(["vlad_rootsift"]) == "global features vlad_rootsift"
+    assert narrow.matching.describe_candidates([]).endswith("by VLAD over the map's descriptors")
+    described = narrow.matching.describe_candidates(["vlad_rootsift"])
+    assert described.endswith("by global features vlad_rootsift")
     # given candidates are all taken, in their order
     chosen = ["0005.jpg", "0003.jpg", "0002.jpg"]
     given = {query.name: chosen for query in queries[1:]}
@@ -210,61 +210,6 @@ def test_many_are_localized_lazily_and_in_order(
     for query, found in zip(queries, [first, *results], strict=True):
         assert errors(found, truth.cam_from_world(query.name))[0] < 0.02
     assert asked == [query.name for query in queries]
-
-
-# ------------------------------------------------------------------ a rig
-
-
-def made_up_rig(truth: KaptureData) -> tuple[RigidTransform, dict[str, RigidTransform]]:
-    """``rig_from_world`` of a rig that two queries are cameras of, and their ``cam_from_rig``."""
-    poses = {name: truth.cam_from_world(name) for name in ("0004.jpg", "0007.jpg")}
-    base = poses["0004.jpg"]
-    assert base is not None
-    turned = RigidTransform((0.8, 0.0, 0.6, 0.0), (0.3, -0.2, 1.0))
-    rig_from_world = turned @ base
-    return rig_from_world, {
-        name: pose @ rig_from_world.inverse() for name, pose in poses.items() if pose is not None
-    }
-
-
-def test_a_rig_is_localized_as_one_and_a_blind_camera_does_no_harm(
-    localizer: Localizer, queries: list[Query], truth: KaptureData
-) -> None:
-    rig_from_world, cams = made_up_rig(truth)
-    views = [(query, cams[query.name]) for query in queries if query.name in cams]
-    found = localizer.localize_rig(views)
-    metres, degrees = errors(found, rig_from_world)
-    assert metres < 0.01 and degrees < 0.05
-    alone = [localizer.localize_query(query) for query, _ in views]
-    assert found.num_matches == sum(single.num_matches for single in alone)
-    assert set(found.candidates) == set(alone[0].candidates) | set(alone[1].candidates)
-    black = Query(queries[0].camera, np.zeros((300, 400, 3), np.uint8), "blind")
-    blind = (black, RigidTransform.identity())
-    assert errors(localizer.localize_rig([blind, *views]), rig_from_world)[0] < 0.01
-    assert not localizer.localize_rig([blind])
-    assert not localizer.localize_rig([])
-
-
-def test_two_unnamed_views_of_a_rig_have_their_own_pixels(
-    localizer: Localizer, truth: KaptureData, scene: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _, cams = made_up_rig(truth)
-    images = [read_image_rgb(KaptureFolder(scene / "query").image_path(name)) for name in cams]
-    cameras = [truth.camera_of(name) for name in cams]
-    views = [
-        (Query(camera, image), at)
-        for camera, image, at in zip(cameras, images, cams.values(), strict=True)
-    ]
-    looked_at: list[np.ndarray] = []
-
-    def look(problem: Any, views: Any, found: Any, scene: Any, pose: Any) -> np.ndarray:
-        looked_at.extend(scene.query_image(view.name) for view in views)
-        return np.zeros(0)
-
-    monkeypatch.setattr(confidence, "_USUAL_RATIO", 1e-9)  # every pose is compared with pixels
-    monkeypatch.setattr(cluster_poses, "displacements_rad", look)
-    localizer.localize_rig(views)
-    assert [image.tobytes() for image in looked_at] == [image.tobytes() for image in images]
 
 
 # ------------------------------------------------------------------ maps of others

@@ -14,6 +14,7 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.io.tables import read_status
 from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
+from megloc_kapture.pipeline.results import Results
 from tests.pipeline.runs import evaluated, run_in
 
 pytestmark = pytest.mark.slow
@@ -44,7 +45,7 @@ def test_a_type_without_any_point(scene: Path, workspace: Workspace, tmp_path: P
     localizer = Localizer(opened, options=options)
     # its matches have a say in which candidates stay, as in eval
     assert [local.name for local in localizer.types] == ["rootsift", "sift"]
-    for name, found in localizer.localize_kapture(copy.path("query")):
+    for name, found in Results(localizer, copy.path("query")).items():
         assert isinstance(found, Pose)
         assert found.cam_from_world == in_run.cam_from_world(name)
         assert found.num_matches == statuses[name].num_matches

@@ -77,8 +77,8 @@ SEVERAL = 'local_features=["sift", "rootsift"]'
     [
         (["query_pairs.top_k"], "--set takes key=value, got 'query_pairs.top_k'"),
         (["=3"], "--set takes key=value"),
-        (["querypairs.top_k=3"], "option querypairs; did you mean 'query_pairs'. known here: "),
-        (["query_pairs.topk=3"], "query_pairs.topk; did you mean 'top_k'. known here: by, "),
+        (["querypairs.top_k=3"], r"option querypairs; did you mean query_pairs\?"),
+        (["query_pairs.topk=3"], r"query_pairs.topk; did you mean query_pairs.top_k\?"),
         (["query_pairs.top_k=many"], "option query_pairs.top_k: "),
         (["query_pairs.top_k=0"], "option query_pairs.top_k: "),
         (["query_pairs=3"], "option query_pairs: "),

@@ -39,7 +39,6 @@ from megloc_kapture.pipeline.evaluation_plan import Run
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.submission import (
     check_dataset,
-    poses_through_rig,
     workspace_provenance,
     write_submission,
 )
@@ -258,23 +257,6 @@ def test_poses_of_the_rig_only_when_asked(dataset: Dataset, tmp_path: Path) -> N
     dataset.localize(["dawn/rear/10.jpg"], {"dawn/rear/10.jpg": {**FAILED, "fallback": "rig"}})
     counts, _ = submit(dataset, tmp_path / "poses.txt")
     assert (counts["poses"], counts["fallbacks"], counts["from_rig"]) == (1, 0, 1)
-
-
-def test_the_sibling_with_most_inliers_counts(dataset: Dataset) -> None:
-    poses = {"dawn/left/10.jpg": random_poses(1, 3)[0], "dawn/right/10.jpg": random_poses(1, 4)[0]}
-    for best in poses:
-        statuses = {
-            image: LocalizationResult(name=image, num_inliers=50 + (image == best))
-            for image in poses
-        }
-        found = poses_through_rig(dataset.query, poses, statuses)
-        assert list(found) == ["dawn/rear/10.jpg"]
-        side = best.split("/")[1]
-        expected = matrix(dataset.rig["rear"]) @ np.linalg.inv(matrix(dataset.rig[side]))
-        np.testing.assert_allclose(
-            matrix(found["dawn/rear/10.jpg"]), expected @ matrix(poses[best]), atol=1e-9
-        )
-    assert list(poses_through_rig(dataset.query, poses)) == ["dawn/rear/10.jpg"]
 
 
 class Drives:

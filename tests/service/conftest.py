@@ -13,7 +13,6 @@ import megloc_kapture as megloc
 from megloc_kapture import KaptureMap, Localizer
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.service import Limits
 
 CHANGES = {"local_features.options.max_keypoints": 400}
 OPTIONS = options_of_preset(assignments=CHANGES)
@@ -45,5 +44,5 @@ def photos(scene: Path) -> list[Photo]:
 @pytest.fixture
 def client(localizer: Localizer) -> Iterator[TestClient]:
     """A client of a service without token."""
-    with client_of(localizer, Limits(threads=2)) as found:
+    with client_of(localizer, threads=2) as found:
         yield found

@@ -10,7 +10,6 @@ from typing import Any
 from starlette.testclient import TestClient
 
 from megloc_kapture import Camera, Localizer
-from megloc_kapture.service import Limits
 from megloc_kapture.service.app import Service, make_app
 from megloc_kapture.service.server import map_overview
 
@@ -40,7 +39,7 @@ class Photo:
         }
 
 
-def client_of(localizer: Localizer, limits: Limits, token: str | None = None) -> TestClient:
+def client_of(localizer: Localizer, **limits: Any) -> TestClient:
     """A client of a service; defects of the service are answers, as they are over a network."""
-    app = make_app(Service(localizer, limits, token), map_overview(localizer.map))
+    app = make_app(Service(localizer, **limits), map_overview(localizer.map))
     return TestClient(app, raise_server_exceptions=False)

@@ -22,7 +22,6 @@ from starlette.testclient import TestClient
 from megloc_kapture import Localizer, Pose
 from megloc_kapture.api import Map
 from megloc_kapture.errors import DataError
-from megloc_kapture.service import Limits
 
 # of the machine: no answer has one in it
 PATH = re.compile(r"/(home|root|usr|tmp|work|var|opt)/|\.py\b|Traceback")
@@ -199,7 +198,7 @@ def test_impossible_cameras_are_refused(
 def test_what_is_no_image_is_refused(
     localizer: Localizer, content: bytes, status: int, words: str
 ) -> None:
-    with client_of(localizer, Limits(threads=1, max_megapixels=1.0)) as client:
+    with client_of(localizer, threads=1, max_megapixels=1.0) as client:
         form = {"files": {"image": content}, "data": {"camera": pinhole(400, 300)}}
         refused(client.post("/localize", **form), status, words)
         raw = client.post(f"/localize?camera={quote(pinhole(400, 300))}", content=content)
@@ -213,7 +212,7 @@ def test_another_content_type_is_named(client: TestClient, photos: list[Photo]) 
 
 
 def test_a_body_that_is_too_large_is_refused(localizer: Localizer) -> None:
-    with client_of(localizer, Limits(threads=1, max_mb=0.01)) as client:
+    with client_of(localizer, threads=1, max_mb=0.01) as client:
         refused(client.post("/localize", content=bytes(10_001)), 413, "larger than 0.01 MB")
         chunks = (bytes(1000) for _ in range(11))  # of a length that is not told
         refused(client.post("/localize", content=chunks), 413, "larger than 0.01 MB")
@@ -224,7 +223,7 @@ def test_the_token_is_needed_for_all_that_tells_of_the_map(
     localizer: Localizer, photos: list[Photo]
 ) -> None:
     token = "correct horse battery"
-    with client_of(localizer, Limits(threads=1), token) as client:
+    with client_of(localizer, threads=1, token=token) as client:
         wrong = ("", "Bearer", f"Basic {token}", "Bearer correct horse batter", f"Bearer {token}s")
         for shown in (*wrong, f"bearer {token.upper()}", "Bearer \xff\xfe"):
             given = {"authorization": shown.encode("latin-1")} if shown else {}
@@ -251,7 +250,7 @@ def test_more_images_than_may_wait_are_refused(
 
     monkeypatch.setattr(localizer, "localize_query", slow)
     with (
-        client_of(localizer, Limits(threads=1, max_waiting=1)) as client,
+        client_of(localizer, threads=1, max_waiting=1) as client,
         ThreadPoolExecutor(6) as pool,
     ):
         sent = [pool.submit(client.post, "/localize", **photos[0].form()) for _ in range(6)]
@@ -274,5 +273,5 @@ def test_internal_errors_say_nothing_of_the_machine(
             raise error
 
         monkeypatch.setattr(localizer, "localize_query", fail)
-        with client_of(localizer, Limits(threads=1)) as client:
+        with client_of(localizer, threads=1) as client:
             refused(client.post("/localize", **photos[0].form()), 500, "log says more")

@@ -21,7 +21,6 @@ import uvicorn
 from serving import Photo
 
 from megloc_kapture import Localizer
-from megloc_kapture.service import Limits
 from megloc_kapture.service.app import Service, make_app
 from megloc_kapture.service.server import bind, map_overview
 
@@ -34,7 +33,7 @@ HEAD = (
 def port(localizer: Localizer) -> Iterator[int]:
     """The port of a service in a thread of this process."""
     with bind("127.0.0.1", 0) as bound:
-        app = make_app(Service(localizer, Limits(threads=1)), map_overview(localizer.map))
+        app = make_app(Service(localizer, threads=1), map_overview(localizer.map))
         server = uvicorn.Server(uvicorn.Config(app, log_config=None))
         thread = threading.Thread(target=server.run, args=([bound],))
         thread.start()

@@ -48,6 +48,8 @@ def test_a_sibling_gives_its_pose_through_the_rig(data: KaptureData) -> None:
     pose = found["rear/1.jpg"][1]
     np.testing.assert_allclose(pose.translation, expected.t_raw, atol=1e-12)
     np.testing.assert_allclose(abs(np.dot(pose.quat_wxyz, expected.r_raw)), 1, atol=1e-12)
+    both = {"left/1.jpg": Pose(left, 20, 12), "right/1.jpg": Pose(random_pose(5), 20, 13)}
+    assert poses_through_rig(data, both)["rear/1.jpg"][0] == "right/1.jpg"
     data.rigs.clear()
     assert poses_through_rig(data, {"left/1.jpg": Pose(left, 20, 12)}) == {}
 
