@@ -206,7 +206,6 @@ class Triangulate(Reading, StageCommand):
                 self.options().triangulation,
                 pairs=pairs,
                 num_threads=work.num_threads,
-                work=work,
             )
         for type_name in sorted(set(local_types)) if len(set(local_types)) > 1 else ():
             points, seen = counts[f"points_{type_name}"], counts[f"observations_{type_name}"]

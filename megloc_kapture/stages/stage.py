@@ -178,6 +178,7 @@ class Stage(ABC):
     Attributes
     ----------
     version : increase it when the output changes for the same options and inputs.
+    resumes : the unfinished output of an interrupted run is kept, and its items are skipped.
     reads, writes : paths in the workspace; a folder includes its contents.
     root : folder of user data to import, or None; the same for a whole workspace.
     placement : device and precision of its networks, in the context of ``run``.
@@ -187,6 +188,7 @@ class Stage(ABC):
     placement: Placement = AUTO
     name: str
     version: ClassVar[int] = 1
+    resumes: ClassVar[bool] = False
     reads: Sequence[str] = ()
     writes: Sequence[str] = ()
 
