@@ -329,9 +329,6 @@ class KaptureVectors:
     def dimension(self) -> int:
         return self._reader.config.dsize
 
-    def part(self, start: int, stop: int) -> KaptureVectors:
-        return KaptureVectors(self._reader, self._images[start:stop])
-
     def read(
         self, start: int, stop: int, out: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32]:
