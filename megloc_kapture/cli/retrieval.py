@@ -94,14 +94,13 @@ class PairsMapping(Reading, StageCommand):
         retrieval = None
         if "retrieval" in self.by:
             retrieval = _retrieval(mapping, self.features, self.fusion, chosen)
-        with self.working(self.output) as work:
+        with self.working(self.output):
             pairs = pair_map_images(
                 mapping,
                 options,
                 retrieval=retrieval,
                 restrictions=restrictions_beside(mapping.root),
                 covisible=None if covisible is None else self.kapture_map(covisible),
-                work=work,
             )
         _refuse_existing(self.output, force=self.force)
         write_pairs(self.output, pairs)
@@ -150,14 +149,13 @@ class PairsQuery(Reading, StageCommand):
         retrieval = None
         if not self.exhaustive:
             retrieval = _retrieval(mapping, self.features, self.fusion, options)
-        with self.working(self.output) as work:
+        with self.working(self.output):
             pairs = pair_queries(
                 mapping,
                 query,
                 options.query_pairs,
                 retrieval=retrieval,
                 restrictions=restrictions_beside(self.query),
-                work=work,
             )
         if self.rerank is not None and self.matches_dir is not None:
             local_types = self._types_of_both(mapping, query)

@@ -178,7 +178,6 @@ class Triangulate(Reading, StageCommand):
                 self.options().triangulation,
                 pairs=pairs,
                 num_threads=work.num_threads,
-                work=work,
             )
         console.say(", ".join(starmap(count_text, counts.items())))
 

@@ -27,7 +27,14 @@ from typing import (
 from pydantic import ValidationError
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.files import check_relative, first_problem, named, read_text, write_bytes
+from megloc_kapture.io.files import (
+    check_relative,
+    first_problem,
+    named,
+    read_text,
+    write_bytes,
+    writing,
+)
 from megloc_kapture.values import RigidTransform
 
 RowT = TypeVar("RowT")
@@ -208,19 +215,28 @@ class Table(Generic[RowT]):
         known: set[tuple[tuple[str, ...], ...]] = set()
         lines = []
         for row in rows:
-            values = row if type(row) is tuple else self._values_of(row)
-            cells = {
-                name: column.write(value)
-                for (name, column), value in zip(self._columns.items(), values, strict=True)
-            }
+            cells = self._cells(row)
             self._check_keys(cells, known)
             lines.append(tuple(cells.values()))
         write_csv_table(path, tuple(self._columns), lines)
 
-    def _values_of(self, row: Any) -> list[Any]:
-        if isinstance(row, Mapping):
-            return [row[name] for name in self._columns]
-        return [getattr(row, name) for name in self._columns]
+    def append(self, path: Path | str, row: Any) -> None:
+        """Append a record to a table that grows until :meth:`write` replaces it."""
+        with writing(path):
+            Path(path).parent.mkdir(parents=True, exist_ok=True)
+            with open(path, "a", encoding="utf-8", newline="") as file:
+                rows = [] if file.tell() else [tuple(self._columns)]
+                csv.writer(file, lineterminator="\n").writerows([*rows, self._cells(row).values()])
+
+    def _cells(self, row: Any) -> dict[str, str]:
+        if type(row) is tuple:
+            values = row
+        elif isinstance(row, Mapping):
+            values = tuple(row[name] for name in self._columns)
+        else:
+            values = tuple(getattr(row, name) for name in self._columns)
+        columns = zip(self._columns.items(), values, strict=True)
+        return {name: column.write(value) for (name, column), value in columns}
 
     def _check_keys(
         self, cells: Mapping[str, str], known: set[tuple[tuple[str, ...], ...]]

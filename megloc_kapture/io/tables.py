@@ -288,8 +288,15 @@ def match_counts_path(features_dir: Path, type_name: str) -> Path:
     return features_dir / "local_features" / type_name / "match_counts.csv"
 
 
-def read_match_counts(features_dir: Path, type_name: str) -> list[PairCount]:
-    return _MATCH_COUNTS.read(match_counts_path(features_dir, type_name))
+def read_match_counts(
+    features_dir: Path, type_name: str, *, missing_ok: bool = False
+) -> list[PairCount]:
+    path = match_counts_path(features_dir, type_name)
+    return _MATCH_COUNTS.read_if_there(path) if missing_ok else _MATCH_COUNTS.read(path)
+
+
+def append_match_count(features_dir: Path, type_name: str, count: PairCount) -> None:
+    _MATCH_COUNTS.append(match_counts_path(features_dir, type_name), count)
 
 
 def write_match_counts(features_dir: Path, type_name: str, counts: Iterable[PairCount]) -> None:
@@ -300,7 +307,17 @@ def mask_counts_path(features_dir: Path, type_name: str) -> Path:
     return features_dir / "local_features" / type_name / "masked.csv"
 
 
+_MASK_COUNTS: Table[Any] = Table({"image": str, "num_masked": int})
+
+
+def read_mask_counts(features_dir: Path, type_name: str) -> dict[str, int]:
+    return dict(_MASK_COUNTS.read(mask_counts_path(features_dir, type_name)))
+
+
+def append_mask_count(features_dir: Path, type_name: str, image: str, count: int) -> None:
+    _MASK_COUNTS.append(mask_counts_path(features_dir, type_name), (image, count))
+
+
 def write_mask_counts(features_dir: Path, type_name: str, counts: Mapping[str, int]) -> None:
     """Write ``masked.csv``: image with a mask -> removed keypoints."""
-    rows = [(image, str(count)) for image, count in sorted(counts.items())]
-    write_csv_table(mask_counts_path(features_dir, type_name), ("image", "num_masked"), rows)
+    _MASK_COUNTS.write(mask_counts_path(features_dir, type_name), sorted(counts.items()))

@@ -24,6 +24,7 @@ from megloc_kapture.io.files import (
     clear_temporary,
     read_json_model,
     remove,
+    write_bytes,
     write_json_model,
     writing,
 )
@@ -38,12 +39,12 @@ from megloc_kapture.stages.stage import (
     count_text,
     is_below,
 )
-from megloc_kapture.stages.work import HERE, FinishedItems, Work, is_resumable
+from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Options
 
 PARTIAL = ".partial"
 LOCK = ".lock"
-FINISHED = ".items"  # finished items in a stage's unfinished folder
+MARK = ".fingerprint"  # in the unfinished folder of a stage that resumes
 _MAP = "map"
 
 
@@ -112,7 +113,7 @@ class Workspace:
 
     def _clear_partial(self) -> None:
         for folder in (self.root / PARTIAL).glob("*"):
-            if not (folder / FINISHED).is_file():
+            if not (folder / MARK).is_file():
                 with contextlib.suppress(OSError):
                     remove(folder)
 
@@ -126,22 +127,25 @@ class Workspace:
         self._undo_claim()
 
     @contextmanager
-    def staging(self, stage: str, mark: str) -> Iterator[Path]:
+    def staging(self, stage: str, mark: str, *, resumes: bool = False) -> Iterator[Path]:
         """Yield the folder to write a stage's output into; removed on success.
 
-        Reuses the finished items of an interrupted run with the same fingerprint (``mark``).
+        A stage that ``resumes`` gets the folder of an interrupted run with the same ``mark``.
         """
         place = self.partial_path(stage)
         with writing(place):
-            if not is_resumable(place / FINISHED, mark):
+            if not (place / MARK).is_file() or (place / MARK).read_text() != mark:
                 remove(place)
             place.mkdir(parents=True, exist_ok=True)
+            if resumes:
+                write_bytes(place / MARK, mark.encode())
         done = False
         try:
             yield place
             done = True
         finally:
-            if done or not (place / FINISHED).is_file():
+            has_items = any(entry.name != MARK for entry in place.glob("*"))
+            if done or not (resumes and has_items):
                 with contextlib.suppress(OSError):
                     remove(place)
 
@@ -216,7 +220,6 @@ class StageReport:
     seconds: float
     counts: Mapping[str, float]
     why: str
-    num_kept: int = 0  # items finished by an interrupted run
 
 
 def run_plan(
@@ -274,8 +277,8 @@ def run_plan(
         else:
             reason = "starting" if why == _NOT_DONE else why
             say(f"{stage.name}, stage {number + 1} of {stop}: {reason}")
-            manifest, kept = _run(due, workspace, work)
-            report = StageReport(stage.name, "run", manifest.seconds, manifest.counts, why, kept)
+            manifest = _run(due, workspace, work)
+            report = StageReport(stage.name, "run", manifest.seconds, manifest.counts, why)
         reports.append(report)
         say(describe(report))
     return reports
@@ -389,13 +392,12 @@ def _differences(old: Any, new: Any, prefix: str = "") -> list[str]:
     return [] if old == new else [prefix]
 
 
-def _run(due: _Due, workspace: Workspace, work: Work) -> tuple[Manifest, int]:
+def _run(due: _Due, workspace: Workspace, work: Work) -> Manifest:
     stage = due.stage
     started = datetime.now(UTC).isoformat(timespec="seconds")
     clock = time.perf_counter()
-    with workspace.staging(stage.name, due.mark) as folder:
-        finished = FinishedItems(folder / FINISHED, due.mark)
-        resumed = replace(work, finished=finished, placement=stage.placement)
+    with workspace.staging(stage.name, due.mark, resumes=stage.resumes) as folder:
+        resumed = replace(work, resume=stage.resumes, placement=stage.placement)
         counts = dict(stage.run(StageWork(**vars(resumed), root=workspace.root, out=folder)))
         clear_temporary(folder)
         # without a manifest a stage killed below this line runs again
@@ -418,7 +420,7 @@ def _run(due: _Due, workspace: Workspace, work: Work) -> tuple[Manifest, int]:
         versions=package_versions(),
     )
     write_json_model(workspace.manifest_path(stage.name), manifest)
-    return manifest, finished.num_kept
+    return manifest
 
 
 def all_kept(reports: Iterable[StageReport]) -> bool:
@@ -433,6 +435,5 @@ def describe(report: StageReport) -> str:
     if report.state == "pending":
         return f"{report.name}: would run ({report.why})"
     counts = ", ".join(count_text(*count) for count in report.counts.items())
-    kept = f"{report.num_kept} items kept" if report.num_kept else ""
-    parts = filter(None, (counts, kept, f"{report.seconds:.1f} s"))
+    parts = filter(None, (counts, f"{report.seconds:.1f} s"))
     return f"{report.name}: {'; '.join(parts)}"

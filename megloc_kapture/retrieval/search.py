@@ -66,7 +66,7 @@ def common_length(sources: Sequence[VectorBlocks]) -> int:
 
 @dataclass(frozen=True)
 class FusedSearch:
-    """Search of the ``top_k`` best database rows by several features, part by part."""
+    """Search of the ``top_k`` best database rows by several features."""
 
     top_k: int
     fusion: FusionOptions
@@ -75,7 +75,7 @@ class FusedSearch:
     def lists(
         self, queries: Sequence[NDArray[np.floating[Any]]], database: Sequence[VectorSource]
     ) -> list[Found]:
-        """Rank the rows of a part: one ranking, or one per feature for fusion of ranks.
+        """Rank the rows: one ranking, or one per feature for fusion of ranks.
 
         ``queries`` and ``database`` have (Q, D_i) and (M, D_i) per feature. A ranking has indices
         int64 (Q, min(K, M)), best first, ties in the database's order, and scores float32; K is
@@ -94,9 +94,11 @@ class FusedSearch:
 
         return _search(queries, database, self.top_k, fused)
 
-    def ranking(self, parts: Sequence[Sequence[Found]]) -> Found:
-        """Merge the lists of all parts: indices and scores (Q, min(top_k, M))."""
-        lists = [_merged(found, self._list_length()) for found in zip(*parts, strict=True)]
+    def find(
+        self, queries: Sequence[NDArray[np.floating[Any]]], database: Sequence[VectorSource]
+    ) -> Found:
+        """Rank the rows: indices and scores (Q, min(top_k, M)); see :meth:`lists`."""
+        lists = self.lists(queries, database)
         if len(lists) == 1:
             indices, scores = lists[0]
             return indices[:, : self.top_k], scores[:, : self.top_k]
@@ -105,14 +107,6 @@ class FusedSearch:
 
     def _list_length(self) -> int:
         return max(self.top_k, RANKED_IMAGES if self.fusion.fuses_ranks() else 0)
-
-
-def _merged(parts: Sequence[Found], length: int) -> Found:
-    if len(parts) == 1:
-        return parts[0]
-    indices, scores = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
-    best = np.argsort(-scores, axis=1, kind="stable")[:, :length]
-    return np.take_along_axis(indices, best, axis=1), np.take_along_axis(scores, best, axis=1)
 
 
 def _search(

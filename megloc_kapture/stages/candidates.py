@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -21,11 +19,9 @@ from megloc_kapture.retrieval.search import (
     Found,
     FusedSearch,
     FusionOptions,
-    VectorBlocks,
     as_blocks,
     common_length,
 )
-from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Options
 
 
@@ -90,7 +86,6 @@ UNRESTRICTED = Restrictions()
 
 Vectors = KaptureVectors | NDArray[np.float32]  # unit rows
 _QUERY_ELEMENTS = 1 << 27  # query vector elements in memory: 512 MiB of float32
-_ROWS = 1 << 14  # maximum number of database rows per worker task
 
 
 class QueryPairsOptions(Options):
@@ -116,8 +111,6 @@ class Retrieval:
         queries: Sequence[Vectors],
         database: Sequence[Vectors],
         top_k: int,
-        *,
-        work: Work = HERE,
     ) -> Found:
         """Find the most similar database rows: indices and scores (Q, at most ``top_k``).
 
@@ -125,35 +118,14 @@ class Retrieval:
         """
         search = FusedSearch(top_k, self.fusion, self.weights or None)
         asked = [as_blocks(source) for source in queries]
-        total = common_length([as_blocks(source) for source in database])
-        bounds = np.linspace(0, total, max(1, -(-total // _ROWS)) + 1).astype(int).tolist()
-        parts = [(of[0], [_part(one, *of) for one in database]) for of in pairwise(bounds)]
-        shared = work if len(parts) > 1 else HERE
-        search_part = partial(_search_part, search, asked)
-        return search.ranking(list(shared.map(search_part, parts, "retrieval")))
-
-
-def _part(source: Vectors, start: int, stop: int) -> VectorBlocks:
-    rows = source[start:stop] if isinstance(source, np.ndarray) else source.part(start, stop)
-    return as_blocks(rows)
-
-
-_Part = tuple[int, Sequence[VectorBlocks]]  # database part: first row, and vectors by type
-
-
-def _search_part(search: FusedSearch, queries: Sequence[VectorBlocks], part: _Part) -> list[Found]:
-    first_row, database = part
-    total, width = common_length(queries), sum(one.dimension for one in queries)
-    step = max(1, _QUERY_ELEMENTS // max(width, 1))
-    found = []
-    for start in range(0, total, step) or (0,):
-        rows = [source.read(start, min(start + step, total)) for source in queries]
-        found.append(search.lists(rows, database))
-    lists = []
-    for blocks in zip(*found, strict=True):
-        indices, scores = (np.concatenate(arrays) for arrays in zip(*blocks, strict=True))
-        lists.append((np.where(indices >= 0, indices + first_row, -1), scores))
-    return lists
+        total, width = common_length(asked), sum(one.dimension for one in asked)
+        step = max(1, _QUERY_ELEMENTS // max(width, 1))
+        found = []
+        for start in range(0, total, step) or (0,):
+            rows = [source.read(start, min(start + step, total)) for source in asked]
+            found.append(search.find(rows, database))
+        indices, scores = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
+        return indices, scores
 
 
 def vectors_of(readers: Sequence[FeatureReader], images: Sequence[str]) -> list[KaptureVectors]:
@@ -183,7 +155,6 @@ class Candidates:
         queries: Sequence[Vectors],
         permitted: NDArray[np.int64],
         options: QueryPairsOptions,
-        work: Work = HERE,
     ) -> Found:
         """Return indices of the most similar images, best first, and scores: (Q, K), -1 for none.
 
@@ -193,5 +164,5 @@ class Candidates:
         permitted : sorted indices of the permitted images.
         """
         database = self._database(permitted)
-        index, scores = self._retrieval.rank(queries, database, options.top_k, work=work)
+        index, scores = self._retrieval.rank(queries, database, options.top_k)
         return np.where(index >= 0, permitted[np.maximum(index, 0)], -1), scores

@@ -22,6 +22,7 @@ from megloc_kapture.features.vlad import (
 )
 from megloc_kapture.io.files import read_json_model, write_json_model
 from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, KaptureFolder
+from megloc_kapture.io.kapture.features import has_features
 from megloc_kapture.plugin_loading import (
     AUTO,
     Placement,
@@ -49,7 +50,15 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, in_batches, ordered_map
+from megloc_kapture.stages.work import (
+    HERE,
+    Batched,
+    FolderSpec,
+    Work,
+    in_batches,
+    ordered_map,
+    resumed_label,
+)
 from megloc_kapture.values import Camera, Options
 
 
@@ -92,24 +101,22 @@ def extract_vlad(
     """Train VLAD on ``mapping`` and write vectors of all images; return counts for the log."""
     type_name = vlad_type(local_type)
     place = output / "global_features" / type_name
-    trained = work.items(f"vocabulary of {type_name}")
-    if type_name not in trained.done:
+    trained = read_vocabulary(place) if work.resume else None
+    if trained is None:
         vocabulary = train_on_map(mapping, local_type, options, work=work)
         write_vocabulary(place, vocabulary, local_type, options)
-        trained.add(type_name, [vocabulary.centres.shape[1], vocabulary.size])
-    num_centres, size = trained.done[type_name]
+    else:
+        vocabulary, _ = trained
+    num_centres, size = vocabulary.centres.shape[1], vocabulary.size
     config = FeatureConfig(type_name, np.dtype(np.float32), size, metric_type="L2")
     spec_of, folder_of = cache(FolderSpec), images_of(folders, "describe")
-    items = work.items(type_name)
-    todo = [
-        (image, spec_of(folder)) for image, folder in folder_of.items() if image not in items.done
-    ]
+    is_written = partial(has_features, output, "global_features", type_name)
+    todo = [(image, spec_of(folder_of[image])) for image in work.unfinished(folder_of, is_written)]
     writer = FeatureWriter(output, "global_features", type_name, config, orphan=True)
     describe = partial(_aggregate, local_type, place, FolderSpec(mapping).key)
-    results = work.map(describe, todo, items.label("VLAD"))
+    results = work.map(describe, todo, resumed_label("VLAD", len(folder_of), len(todo)))
     for (image, _), vector in zip(todo, results, strict=True):
         writer.write(image, vector)
-        items.add(image)
     return {"images": len(folder_of), "clusters": num_centres, "dimensions": size}
 
 
@@ -132,7 +139,7 @@ def _read_once(folder: Path, run: tuple[object, ...]) -> tuple[Vocabulary, VladS
 def write_vocabulary(
     folder: Path, vocabulary: Vocabulary, local_type: str, options: VladOptions
 ) -> None:
-    """Write ``vocabulary.npy``, ``vlad.json`` and the whitening."""
+    """Write ``vocabulary.npy``, the whitening and, last, ``vlad.json``."""
     write_array(folder / VOCABULARY_FILE, vocabulary.centres)
     if vocabulary.whitening is not None:
         write_array(folder / MEAN_FILE, vocabulary.whitening.mean)
@@ -143,7 +150,7 @@ def write_vocabulary(
 def read_vocabulary(folder: Path) -> tuple[Vocabulary, VladSettings] | None:
     """Read the vocabulary of a global feature type, or None."""
     path = folder / VOCABULARY_FILE
-    if not path.is_file():
+    if not (folder / SETTINGS_FILE).is_file():
         return None
     settings = read_json_model(folder / SETTINGS_FILE, VladSettings)
     centres = _read_array(path, "vocabulary")
@@ -221,11 +228,10 @@ def extract_global_features(
 ) -> dict[str, int]:
     """Write global features of all images (orphan layout); return counts for the log."""
     folder_of = images_of(folders, "describe")
-    items = work.items(extractor.name)
+    is_written = partial(has_features, output, "global_features", extractor.name)
     jobs = [
-        (image, folder.image_path(image), folder.read().camera_of(image))
-        for image, folder in folder_of.items()
-        if image not in items.done
+        (image, folder_of[image].image_path(image), folder_of[image].read().camera_of(image))
+        for image in work.unfinished(folder_of, is_written)
     ]
     jobs.sort(key=_size)  # images of equal size can share a batch
     describe = partial(_describe, extractor)
@@ -234,7 +240,7 @@ def extract_global_features(
     )
     writer: FeatureWriter | None = None
     size = 0
-    results = work.map(steps, jobs, items.label(extractor.name))
+    results = work.map(steps, jobs, resumed_label(extractor.name, len(folder_of), len(jobs)))
     for (image, *_), vector in zip(jobs, results, strict=True):
         if writer is None:
             size = len(vector)
@@ -246,8 +252,7 @@ def extract_global_features(
                 f"values, {size} of the images before"
             )
         writer.write(image, vector)
-        items.add(image)
-    return {"images": len(items.done)}
+    return {"images": len(folder_of)}
 
 
 def describe_images(
@@ -300,6 +305,7 @@ class ExtractGlobalFeatures(PipelineStage):
 
     name = "global_features"
     version = 2
+    resumes = True
     uses = ("global_features.name", "global_features.options", *LOCAL_TYPES)
     explained_by = ("global_features",)
     outputs = (GLOBAL_FEATURES,)

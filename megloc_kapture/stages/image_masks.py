@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from operator import attrgetter
 from pathlib import Path
 
@@ -90,48 +90,43 @@ def read_masks(files: Mapping[str, Path], shape: tuple[int, ...]) -> dict[str, M
 
 
 class StandingMasks:
-    """Cached per-camera masks: fixed masks, and unchanging regions by sensor id."""
+    """Per-camera masks: fixed masks, and unchanging regions by sensor id."""
 
     def __init__(self, fixed: Sequence[FixedMask], regions: Mapping[str, UnchangingRegion]) -> None:
         self._fixed, self._regions = tuple(fixed), dict(regions)
         self._used: set[FixedMask] = set()
-        self._drawn: dict[tuple[FixedMask, int, int], Mask] = {}
-        self._combined: dict[tuple[object, ...], dict[str, Mask]] = {}
+        self._standing = lru_cache(maxsize=64)(_standing)
 
     def of(self, sensor_id: str, image: str, camera: Camera) -> dict[str, Mask]:
         """Return the shared masks bool (H, W) of an image by source, in original pixels."""
-        width, height = camera.width, camera.height
         region = self._regions.get(sensor_id)
         fitting = [one for one in self._fixed if one.is_for(sensor_id, image)]
-        mine = tuple(one for one in fitting if not (one.fallback and region))
-        key = (mine, region, width, height)
-        if key not in self._combined:
-            masks = {}
-            if mine:
-                masks["fixed"] = np.logical_and.reduce(
-                    [self._draw(one, width, height) for one in mine]
-                )
-            if region:
-                masks["unchanging"] = region.mask(width, height)
-            self._combined[key] = masks
         self._used.update(fitting)
-        return self._combined[key]
+        mine = tuple(one for one in fitting if not (one.fallback and region))
+        return self._standing(mine, region, camera.width, camera.height)
 
     def unused(self) -> list[FixedMask]:
         return [one for one in self._fixed if one not in self._used]
 
-    def _draw(self, one: FixedMask, width: int, height: int) -> Mask:
-        key = (one, width, height)
-        if key not in self._drawn:
-            mask = (
-                one.drawn(width, height)
-                if one.file is None
-                else read_mask(one.file, (height, width))
-            )
-            if mask is None:
-                raise DataError("no such mask", path=one.file)
-            self._drawn[key] = mask
-        return self._drawn[key]
+
+def _standing(
+    fixed: Sequence[FixedMask], region: UnchangingRegion | None, width: int, height: int
+) -> dict[str, Mask]:
+    masks = {}
+    if fixed:
+        masks["fixed"] = np.logical_and.reduce([_drawn(one, width, height) for one in fixed])
+    if region:
+        masks["unchanging"] = region.mask(width, height)
+    return masks
+
+
+def _drawn(one: FixedMask, width: int, height: int) -> Mask:
+    if one.file is None:
+        return one.drawn(width, height)
+    mask = read_mask(one.file, (height, width))
+    if mask is None:
+        raise DataError("no such mask", path=one.file)
+    return mask
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,6 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Options
 
 PairingMethod = Literal["poses", "covisibility", "retrieval", "sequence", "exhaustive"]
@@ -98,7 +97,6 @@ def pair_map_images(
     retrieval: Retrieval | None,
     restrictions: Restrictions = UNRESTRICTED,
     covisible: KaptureFolder | None = None,
-    work: Work = HERE,
 ) -> list[ImagePair]:
     """Choose sorted pairs of posed map images within coordinate frames, first name before second.
 
@@ -125,7 +123,7 @@ def pair_map_images(
                 if retrieval is None:
                     raise DataError("pairs by retrieval need global features of the map")
                 vectors = vectors_of(retrieval.readers(mapping), names)
-                pairs, similarity = _most_similar(vectors, retrieval, options.top_k, work)
+                pairs, similarity = _most_similar(vectors, retrieval, options.top_k)
             elif method == "poses":
                 pairs = pairs_by_poses([poses[name] for name in names], options.poses)
             elif method == "sequence":
@@ -157,10 +155,10 @@ def _united(
 
 
 def _most_similar(
-    vectors: Sequence[KaptureVectors], retrieval: Retrieval, top_k: int, work: Work
+    vectors: Sequence[KaptureVectors], retrieval: Retrieval, top_k: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return pairs (P, 2), i < j, of each row and its ``top_k`` neighbours, and similarities."""
-    index, similarity = retrieval.rank(vectors, vectors, top_k + 1, work=work)
+    index, similarity = retrieval.rank(vectors, vectors, top_k + 1)
     rows = np.repeat(np.arange(len(index)), index.shape[1])
     both = np.stack([rows, index.ravel()], axis=1)
     # the image ranks among its own results, not always first if it has duplicates
@@ -177,7 +175,6 @@ def pair_queries(
     *,
     retrieval: Retrieval | None,
     restrictions: Restrictions = UNRESTRICTED,
-    work: Work = HERE,
 ) -> list[ImagePair]:
     """Choose candidates of every query among the posed map images that its prior permits."""
     poses = mapping.read().poses()
@@ -199,7 +196,7 @@ def pair_queries(
     )
     for positions, permitted in pools:
         asked = vectors_of(described, [queries[at] for at in positions])
-        index, scores = candidates.of(asked, permitted, options, work)
+        index, scores = candidates.of(asked, permitted, options)
         for at, row, row_scores in zip(positions, index.tolist(), scores.tolist(), strict=True):
             of_query[at] = [
                 ImagePair(queries[at], images[i], score)
@@ -233,7 +230,6 @@ class PairMapping(PipelineStage):
             retrieval=self.options.retrieval(),
             restrictions=Restrictions.read(work.path(SIDE_TABLES)),
             covisible=work.folder(REFERENCE) if self.options.pairs_by_points() else None,
-            work=work,
         )
         write_pairs(work.out / MAPPING_PAIRS, pairs)
         return {"pairs": len(pairs)}
@@ -259,7 +255,6 @@ class PairQueries(PipelineStage):
             self.options.query_pairs,
             retrieval=self.options.retrieval(),
             restrictions=Restrictions.read(work.path(SIDE_TABLES)),
-            work=work,
         )
         write_pairs(work.out / self.layout.candidates(), pairs)
         return {"pairs": len(pairs)}

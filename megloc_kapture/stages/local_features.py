@@ -22,7 +22,8 @@ from megloc_kapture.features.image_bound import (
 )
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import FeatureConfig, FeatureReader, FeatureWriter, KaptureFolder
-from megloc_kapture.io.tables import write_mask_counts
+from megloc_kapture.io.kapture.features import feature_folder, has_features
+from megloc_kapture.io.tables import append_mask_count, read_mask_counts, write_mask_counts
 from megloc_kapture.plugin_loading import checked_array
 from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.preprocessing.masks import with_margin
@@ -35,7 +36,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, in_batches
+from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, in_batches, resumed_label
 from megloc_kapture.values import Camera, LocalFeatures
 
 _SIZE = attrgetter("size")
@@ -61,8 +62,8 @@ def extract_local_features(
     for image, folder in images_of(folders, "extract features from").items():
         camera, has_mask = folder.read().camera_of(image), mask_path(folder, image).is_file()
         jobs.append(_Job(image, spec_of(folder), (camera.width, camera.height), has_mask))
-    items = work.items(extractor.name)
-    todo = [job for job in jobs if job.image not in items.done]
+    is_written = partial(has_features, output, "descriptors", extractor.name)
+    todo = work.unfinished(jobs, lambda job: is_written(job.image))
     todo.sort(key=_SIZE)  # images of equal size can share a batch
     steps: Batched[_Job, LocalFeatures] = Batched(
         partial(_read, mask_margin_px),
@@ -72,18 +73,22 @@ def extract_local_features(
         _SIZE,
     )
     writers: tuple[FeatureWriter, FeatureWriter] | None = None
-    results = work.map(steps, todo, items.label(f"{extractor.name} features"))
+    label = resumed_label(f"{extractor.name} features", len(jobs), len(todo))
+    results = work.map(steps, todo, label)
     for job, features in zip(todo, results, strict=True):
         writers = writers or _writers(output, extractor, features)
+        if job.has_mask:
+            append_mask_count(output, extractor.name, job.image, features.num_masked)
         writers[0].write(job.image, features.keypoints_px)
-        writers[1].write(job.image, features.descriptors)
-        items.add(job.image, [len(features.keypoints_px), features.num_masked])
-    counts = {"images": len(jobs), "keypoints": sum(count for count, _ in items.done.values())}
+        writers[1].write(job.image, features.descriptors)  # last: it marks the image as finished
+    place = feature_folder(output, "keypoints", extractor.name, orphan=True)
+    keypoints = FeatureReader("keypoints", extractor.name, [place])
+    counts = {"images": len(jobs), "keypoints": sum(keypoints.length(job.image) for job in jobs)}
     bound = max_megapixels_of(extractor)
     if reduced := sum(bounded_size(*job.size, bound) != job.size for job in jobs):
         counts["images_reduced"] = reduced
-    masked = {job.image: items.done[job.image][1] for job in jobs if job.has_mask}
-    if masked:
+    if any(job.has_mask for job in jobs):
+        masked = read_mask_counts(output, extractor.name)
         write_mask_counts(output, extractor.name, masked)
         counts |= {"images_with_mask": len(masked), "keypoints_masked": sum(masked.values())}
     return counts
@@ -205,6 +210,7 @@ class ExtractLocalFeatures(PipelineStage):
     """Extract local features of all images; of a given map's, where it brings none."""
 
     name = "local_features"
+    resumes = True
     uses = ("mask_margin_px", *LOCAL_TYPES)
     explained_by = ("local_features",)
     inputs = (Layout.mapping, Layout.query, Layout.reference)

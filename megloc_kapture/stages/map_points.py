@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.colmap import MapImage, TriangulatedPoints, TriangulationOptions, triangulate
@@ -40,8 +38,6 @@ from megloc_kapture.stages.stage import (
 )
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
 
-_IMAGES_AT_ONCE = 1000  # small parts are merged up to this size
-
 
 def triangulate_map(
     mapping: KaptureFolder,
@@ -52,20 +48,17 @@ def triangulate_map(
     *,
     pairs: Sequence[ImagePair] | None = None,
     num_threads: int = 1,
-    work: Work = HERE,
 ) -> dict[str, float]:
     """Triangulate with fixed poses and intrinsics, write the map, and return counts for the log.
 
-    Each feature type has separate points, those of the first type first. Parts of a large map
-    without matches between them are triangulated separately; with known poses the result is the
-    same.
+    Each feature type has separate points, those of the first type first.
 
     Parameters
     ----------
     matches : folder of the verified matches.
     local_types : keypoints types; duplicates are ignored.
     pairs : restrict the matches to these pairs.
-    num_threads : of COLMAP, if no workers share the parts.
+    num_threads : of COLMAP.
     """
     types = tuple(dict.fromkeys([local_types] if isinstance(local_types, str) else local_types))
     data = mapping.read()
@@ -76,15 +69,12 @@ def triangulate_map(
     of_type = {name: matched_pairs(matches.matches(name), images, asked) for name in types}
     for name in types:
         mapping.keypoints(name)
-    specs = FolderSpec(mapping), FolderSpec(matches)
     xyz, errors_px = np.zeros((0, 3)), np.zeros(0)
     observations = {}
     by_type: dict[str, float] = {}
     for name, matched in of_type.items():
-        parts = _unconnected(len(images), matched)
-        threads = 1 if len(parts) > 1 and work.executor is not None else num_threads
-        part = partial(_triangulate_part, specs, name, options, threads, output.absolute())
-        found = _triangulate(part, images, matched, parts, work, f"triangulation of {name}")
+        reader, scratch = matches.matches(name), output.absolute()
+        found = _triangulated(mapping, reader, images, matched, options, num_threads, scratch)
         observations[name] = Observations(
             keypoints_type=name,
             image_names=tuple(images),
@@ -143,75 +133,26 @@ def matched_pairs(
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
-_Part = tuple[list[str], NDArray[np.int64]]  # images, and matching pairs (P, 2) of them
-
-
-def _triangulate(
-    triangulate_part: Callable[[_Part], TriangulatedPoints],
-    images: list[str],
+def _triangulated(
+    mapping: KaptureFolder,
+    reader: MatchesReader,
+    names: Sequence[str],
     pairs: NDArray[np.int64],
-    members: Sequence[NDArray[np.int64]],
-    work: Work,
-    label: str,
-) -> TriangulatedPoints:
-    if len(members) == 1:
-        return triangulate_part((images, pairs))
-    parts = [
-        (
-            [images[row] for row in rows.tolist()],
-            np.searchsorted(rows, pairs[np.isin(pairs[:, 0], rows)]),
-        )
-        for rows in members
-    ]
-    found = list(work.map(triangulate_part, parts, label))
-    before = np.cumsum([0, *(len(one.xyz) for one in found)]).tolist()
-    return TriangulatedPoints(
-        xyz=np.concatenate([one.xyz for one in found]),
-        errors_px=np.concatenate([one.errors_px for one in found]),
-        point_ids=np.concatenate(
-            [one.point_ids + offset for one, offset in zip(found, before, strict=False)]
-        ),
-        image_ids=np.concatenate(
-            [rows[one.image_ids] for one, rows in zip(found, members, strict=True)]
-        ),
-        keypoint_ids=np.concatenate([one.keypoint_ids for one in found]),
-    )
-
-
-def _triangulate_part(
-    specs: tuple[FolderSpec, FolderSpec],
-    local_type: str,
     options: TriangulationOptions,
     num_threads: int,
     scratch: Path,
-    part: _Part,
 ) -> TriangulatedPoints:
-    names, pairs = part
-    mapping, reader = specs[0].open(), specs[1].open().matches(local_type)
-    data, keypoints = mapping.read(), mapping.keypoints(local_type)
+    data, poses, keypoints = (
+        mapping.read(),
+        mapping.read().poses(),
+        mapping.keypoints(reader.type_name),
+    )
     images = [
-        MapImage(image, data.camera_of(image), pose, keypoints.read(image)[:, :2])
+        MapImage(image, data.camera_of(image), poses[image], keypoints.read(image)[:, :2])
         for image in names
-        if (pose := data.cam_from_world(image)) is not None
     ]
     verified = matches_of(reader, names, pairs)
     return triangulate(images, verified, options, num_threads=num_threads, scratch=scratch)
-
-
-def _unconnected(num_images: int, pairs: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Return image rows of the connected components; small ones are merged."""
-    links = csr_array((np.ones(len(pairs)), pairs.T), shape=(num_images, num_images))
-    _, part_of = connected_components(links, directed=False)
-    rows = np.argsort(part_of, kind="stable")
-    groups: list[list[NDArray[np.int64]]] = [[]]
-    size = 0
-    for part in np.split(rows, np.flatnonzero(np.diff(part_of[rows])) + 1):
-        if size and size + len(part) > _IMAGES_AT_ONCE:
-            groups.append([])
-            size = 0
-        groups[-1].append(part)
-        size += len(part)
-    return [np.sort(np.concatenate(group)) for group in groups]
 
 
 def lift_map(
@@ -344,5 +285,4 @@ class TriangulatePoints(PipelineStage):
             work.out / UNREFINED,
             self.options.triangulation,
             num_threads=work.num_threads,
-            work=work,
         )

@@ -21,7 +21,12 @@ from pydantic import Field
 from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, MatchesWriter, read_pairs
-from megloc_kapture.io.tables import PairCount, write_match_counts
+from megloc_kapture.io.tables import (
+    PairCount,
+    append_match_count,
+    read_match_counts,
+    write_match_counts,
+)
 from megloc_kapture.matching.guided_pyramid import verify_best_first
 from megloc_kapture.matching.pose_check import PairEvidence, count_fitting, pose_contradiction
 from megloc_kapture.matching.verification import (
@@ -46,7 +51,15 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, batched, in_batches
+from megloc_kapture.stages.work import (
+    HERE,
+    Batched,
+    FolderSpec,
+    Work,
+    batched,
+    in_batches,
+    resumed_label,
+)
 from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
 
 _log = logging.getLogger(__name__)
@@ -138,9 +151,12 @@ def match_pairs(
     within_one = first.root == second.root
     # within a map (a, b) and (b, a) are one pair, stored in one file
     ordered = sorted({_one_way(pair) if within_one else (pair.query, pair.map) for pair in pairs})
-    named = {f"{image}\0{other}": (image, other) for image, other in ordered}
-    items = work.items(local_type)
-    todo = [pair for name, pair in named.items() if name not in items.done]
+    writer = MatchesWriter(output, local_type, orphan=True)
+    counts: dict[tuple[str, str], PairCount] = {}
+    if work.resume:
+        known = read_match_counts(output, local_type, missing_ok=True)
+        counts = {(row.image, row.other): row for row in known}
+    todo = work.unfinished(ordered, lambda pair: pair in writer and pair in counts)
     jobs: list[_Job] = []
     for image, group in groupby(todo, key=itemgetter(0)):
         jobs += [(image, some) for some in batched((b for _, b in group), _PAIRS_PER_ITEM)]
@@ -151,18 +167,19 @@ def match_pairs(
     steps: Batched[_Job, list[VerifiedMatches]] = Batched(
         read, match, matcher, "match_many", None, verify
     )
-    writer = MatchesWriter(output, local_type, orphan=True)
-    results = work.map(steps, jobs, items.label("matching"))
+    results = work.map(steps, jobs, resumed_label("matching", len(ordered), len(todo)))
     for (image, others), found in zip(jobs, results, strict=True):
         for other, pair in zip(others, found, strict=True):
-            writer.write(image, other, pair.matches, pair.scores)
-            items.add(f"{image}\0{other}", [pair.num_found, len(pair.matches)])
-    counts = [PairCount(*pair, *items.done[name]) for name, pair in named.items()]
-    write_match_counts(output, local_type, counts)
+            count = PairCount(image, other, pair.num_found, len(pair.matches))
+            counts[image, other] = count
+            append_match_count(output, local_type, count)
+            writer.write(image, other, pair.matches, pair.scores)  # marks the pair as finished
+    rows = [counts[pair] for pair in ordered]
+    write_match_counts(output, local_type, rows)
     return {
         "pairs": len(ordered),
-        "pairs_with_matches": sum(count.verified > 0 for count in counts),
-        "matches": sum(count.verified for count in counts),
+        "pairs_with_matches": sum(row.verified > 0 for row in rows),
+        "matches": sum(row.verified for row in rows),
     }
 
 
@@ -418,6 +435,8 @@ def mapping_pairs(work: StageWork, mapping: KaptureFolder) -> list[ImagePair]:
 
 
 class _MatchStage(PipelineStage):
+    resumes = True
+
     def explain(self) -> str:
         options = self.options
         matched = (

@@ -184,24 +184,18 @@ class _Added:
     descriptors: list[NDArray[Any]] = field(default_factory=list)
 
 
-@dataclass(frozen=True, eq=False)
-class _Directed:
-    found: list[VariantMatches]
-    num_variants: int
-    skipped: str
-
-
 class _VariantsOfMap:
     def __init__(self, keypoints: FeatureReader) -> None:
         self._keypoints = keypoints
-        self._found: dict[_Pair, _Directed] = {}
+        # matches by variant, number of variants and reasons of skipped ones
+        self._found: dict[_Pair, tuple[list[VariantMatches], int, str]] = {}
         self.added: dict[str, _Added] = {}
         self.seconds = 0.0
 
     def put(self, image: str, others: Sequence[str], matched: MatchedVariants) -> None:
         self.seconds += matched.seconds
         for other, own, count in zip(others, matched.found, matched.num_variants, strict=True):
-            self._found[image, other] = _Directed(own, count, matched.skipped)
+            self._found[image, other] = own, count, matched.skipped
 
     def combine(
         self, pair: _Pair, base: tuple[NDArray[np.int64], NDArray[Any]], method: PyramidMethod
@@ -210,7 +204,7 @@ class _VariantsOfMap:
         if method.options.mode == "off":
             raise ValueError("only pairs that are tried again are combined")
         directed = self._found[pair], self._found[pair[::-1]]
-        tried = [(side, one) for side, own in enumerate(directed) for one in own.found]
+        tried = [(side, one) for side, (own, *_) in enumerate(directed) for one in own]
         unions = []
         for image in pair:
             stored = self._keypoints.read(image)
@@ -226,10 +220,8 @@ class _VariantsOfMap:
         if combined.best is not None:
             side, one = tried[combined.best]
             best = f"{names[side]} {one.variant}"
-        skipped = [
-            f"{names[side]} {own.skipped}" for side, own in enumerate(directed) if own.skipped
-        ]
-        count = sum(own.num_variants for own in directed)
+        skipped = [f"{names[side]} {why}" for side, (*_, why) in enumerate(directed) if why]
+        count = sum(number for _, number, _ in directed)
         return combined, tried_row(pair, len(base[0]), combined, count, best, " | ".join(skipped))
 
 

@@ -179,6 +179,7 @@ class Stage(ABC):
     Attributes
     ----------
     version : increase it when the output changes for the same options and inputs.
+    resumes : the unfinished output of an interrupted run is kept, and its items are skipped.
     reads, writes : paths in the workspace; a folder includes its contents.
     root : folder of user data to import, or None; the same for a whole workspace.
     placement : device and precision of its networks, in the context of ``run``.
@@ -188,6 +189,7 @@ class Stage(ABC):
     placement: Placement = AUTO
     name: str
     version: ClassVar[int] = 1
+    resumes: ClassVar[bool] = False
     reads: Sequence[str] = ()
     writes: Sequence[str] = ()
 

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,81 +162,49 @@ def write_points(
     return total - len(points)
 
 
-class Cloud(NamedTuple):
-    """World points of depth maps, float64.
-
-    Coordinates (N, 3), colours (N, 3) from 0 to 255, unit normals (N, 3), standard deviations (N,)
-    and image rows (N,).
-    """
-
-    xyz: NDArray[np.float64]
-    colours: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    sigma_m: NDArray[np.float64]
-    image_ids: NDArray[np.float64]
-
-
-def fused_cloud(
-    densified: KaptureFolder,
-    images: dict[str, tuple[str, ...]],
-    agreement: Agreement,
-    *,
-    max_points: int | None = None,
-    work: Work = HERE,
-) -> Cloud:
-    """Fuse the depth maps of images into one cloud.
-
-    A pixel is skipped if an earlier source of its image, by name, has the same surface.
-    ``max_points`` is the approximate number of pixels to sample, deterministically.
-    """
-    records = depth_records(densified.read())
-    cameras = [records[image].camera for image in images if image in records]
-    total = sum(camera.width * camera.height for camera in cameras)
-    share = 1.0 if max_points is None else min(1.0, max_points / max(total, 1))
-    jobs = [
-        (row, image, [other for other in own if other < image and other in images])
-        for row, (image, own) in enumerate(images.items())
-    ]
-    points = partial(_points, FolderSpec(densified), agreement, share)
-    parts = list(work.map(points, jobs, "cloud"))
-    nothing = Cloud(*(np.zeros(shape) for shape in ((0, 3), (0, 3), (0, 3), (0,), (0,))))
-    return Cloud(*(np.concatenate(column) for column in zip(nothing, *parts, strict=True)))
-
-
 def fuse_depth(
     densified: KaptureFolder, cloud: Path, agreement: Agreement, *, work: Work = HERE
 ) -> int:
-    """Write a PLY cloud with normals and deviations; return the number of points."""
+    """Write a PLY cloud with normals and deviations; return the number of points.
+
+    A pixel is skipped if an earlier source of its image, by name, has the same surface.
+    """
     path = densified.root / DEPTH_FILE
     if not path.is_file():
         raise DataError("no densified map: reconstruction/depth.csv is missing", path=path)
-    found = fused_cloud(densified, stereo_images(densified), agreement, work=work)
-    nx, ny, nz = found.normals.T
-    write_ply(cloud, found.xyz, found.colours, nx=nx, ny=ny, nz=nz, deviation=found.sigma_m)
-    return len(found.xyz)
+    images = stereo_images(densified)
+    jobs = [
+        (image, [other for other in own if other < image and other in images])
+        for image, own in images.items()
+    ]
+    parts = work.map(partial(_points, FolderSpec(densified), agreement), jobs, "cloud")
+    nothing = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+    columns = zip(nothing, *parts, strict=True)
+    xyz, colours, normals, sigma_m = (np.concatenate(column) for column in columns)
+    nx, ny, nz = normals.T
+    write_ply(cloud, xyz, colours, nx=nx, ny=ny, nz=nz, deviation=sigma_m)
+    return len(xyz)
 
 
 def _points(
-    spec: FolderSpec, agreement: Agreement, share: float, job: tuple[int, str, Sequence[str]]
-) -> Cloud:
-    (row, image, earlier), folder = job, spec.open()
+    spec: FolderSpec, agreement: Agreement, job: tuple[str, Sequence[str]]
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return world points (N, 3), colours (N, 3), unit normals (N, 3) and deviations (N,)."""
+    (image, earlier), folder = job, spec.open()
     view, depth = _view_with_depth(folder, image)
     others = [_view_with_depth(folder, other) for other in earlier]
     new = (depth > 0) & (agreeing_views(view, depth, others, agreement) == 0)
-    if share < 1:
-        new &= np.random.default_rng(row).random(new.shape) < share
     rows, columns = np.nonzero(new)
     pixels = np.stack([columns, rows, np.ones(len(rows))], axis=1)
     in_camera = pixels @ np.linalg.inv(pinhole_matrix(view.camera)).T * depth[new][:, None]
     sigma = read_beside(folder.root, image, "sigma")
     normals = read_beside(folder.root, image, "normals")
     assert sigma is not None and normals is not None
-    return Cloud(
+    return (
         view.cam_from_world.inverse().apply(in_camera),
         view.image[new].astype(np.float64),
         normals[new].astype(np.float64) @ view.cam_from_world.rotation_matrix(),
         sigma[new].astype(np.float64),
-        np.full(len(rows), float(row)),
     )
 
 

@@ -6,14 +6,13 @@ process only: threads read ahead, one thread computes batches, and the executor 
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain, groupby, islice
 from pathlib import Path
@@ -21,7 +20,6 @@ from typing import Any, Generic, TypeVar
 from uuid import uuid4
 
 from megloc_kapture.errors import MeglocError, PluginError
-from megloc_kapture.io.files import writing
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugin_loading import AUTO, Placement
 
@@ -118,61 +116,6 @@ def is_out_of_memory(error: BaseException) -> bool:
     )
 
 
-class FinishedItems:
-    """Finished items of a stage, kept when a run is interrupted.
-
-    The file has the stage's fingerprint, then a JSON line per item whose files are complete.
-    """
-
-    def __init__(self, path: Path, fingerprint: str) -> None:
-        self._path, self._fingerprint = path, fingerprint
-        self._found: dict[tuple[str, str], Any] = {}
-        for line in self._lines():
-            try:
-                kind, name, values = json.loads(line)
-            except ValueError:  # truncated when the run was killed
-                continue
-            self._found[kind, name] = values
-        self.num_kept = len(self._found)
-
-    def _lines(self) -> list[str]:
-        if not is_resumable(self._path, self._fingerprint):
-            return []
-        return self._path.read_text(encoding="utf-8", errors="replace").splitlines()[1:]
-
-    def of(self, kind: str) -> dict[str, Any]:
-        return {name: values for (of, name), values in self._found.items() if of == kind}
-
-    def add(self, kind: str, name: str, values: Any) -> None:
-        with writing(self._path), open(self._path, "a", encoding="utf-8") as file:
-            if file.tell() == 0:
-                file.write(f"{self._fingerprint}\n")
-            file.write(json.dumps([kind, name, values]) + "\n")
-
-
-def is_resumable(path: Path, fingerprint: str) -> bool:
-    if not path.is_file():
-        return False
-    with open(path, encoding="utf-8", errors="replace") as file:
-        return file.readline() == f"{fingerprint}\n"
-
-
-@dataclass
-class Items:
-    kind: str = ""
-    done: dict[str, Any] = field(default_factory=dict)
-    finished: FinishedItems | None = None
-
-    def label(self, text: str) -> str:
-        return f"{text}, {len(self.done)} kept" if self.done else text
-
-    def add(self, name: str, values: Any = None) -> None:
-        """Note an item as finished, after its files are written."""
-        self.done[name] = values
-        if self.finished is not None:
-            self.finished.add(self.kind, name, values)
-
-
 # threads that read ahead for a GPU, and threads that share a plugin on one
 _READERS = min(os.cpu_count() or 1, 16)
 _THREADS = 4
@@ -256,7 +199,7 @@ class Work:
     ----------
     executor : None means this process.
     num_threads : for libraries with internal threads, such as COLMAP.
-    finished : items finished by an interrupted run; None outside a workspace.
+    resume : skip items whose output files an interrupted run has written.
     force : continue despite contradictory input data.
     placement : device and precision of networks.
     """
@@ -264,7 +207,7 @@ class Work:
     executor: Executor | None = None
     track: Track = untracked
     num_threads: int = 1
-    finished: FinishedItems | None = None
+    resume: bool = False
     force: bool = False
     placement: Placement = AUTO
 
@@ -319,10 +262,13 @@ class Work:
             else:
                 yield from ordered_map(steps.finish, found, self.executor)
 
-    def items(self, kind: str) -> Items:
-        if self.finished is None:
-            return Items()
-        return Items(kind, self.finished.of(kind), self.finished)
+    def unfinished(self, items: Iterable[Item], is_written: Callable[[Item], bool]) -> list[Item]:
+        """Return the items that an interrupted run of the stage has not written."""
+        return [item for item in items if not (self.resume and is_written(item))]
+
+
+def resumed_label(text: str, total: int, todo: int) -> str:
+    return f"{text}, {total - todo} kept" if todo < total else text
 
 
 def _alike(

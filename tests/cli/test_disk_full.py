@@ -40,7 +40,7 @@ def test_eval_stops_cleanly_and_goes_on(
     done.refused(r"/workspace/\.partial/local_features/.*: cannot write: No space left on device")
     assert not (workspace / "local_features").exists()
     (left,) = (workspace / ".partial").iterdir()
-    assert (left / ".items").is_file() and not any(left.rglob(".megloc-*"))
+    assert (left / ".fingerprint").is_file() and not any(left.rglob(".megloc-*"))
     assert (workspace / "stages" / "import.json").is_file()
     small_disk("100m", "remount")
     assert megloc("eval", "kapture", *arguments).status == 0

@@ -175,8 +175,6 @@ def test_a_stopped_run_goes_on_inside_the_stage(runs: Runs) -> None:
     with ThreadPoolExecutor(2) as executor:
         reports = runs.run(executor=executor)
     assert [reports[f"{name}_features"].state for name in ("local", "global")] == ["kept"] * 2
-    assert reports["mapping_matches"].num_kept == 11
-    assert reports["query_matches"].num_kept == 0
     runs.check_undisturbed()
 
 
@@ -189,7 +187,6 @@ def test_changed_code_of_a_plugin_makes_its_stage_run_again(runs: Runs, package:
     assert reports["local_features"].why == "code of patches.plugins.Corners changed"
     assert reports["global_features"].why == "code of patches.plugins.Thumbnail changed"
     assert reports["mapping_matches"].why == "local_features changed"
-    assert all(report.num_kept == 0 for report in reports.values())
     # another module of its package, and what it writes
     (package / "shift.py").write_text("SHIFT = 1\n")
     assert runs.run(last="local_features")["local_features"].why.startswith("code of patches")

@@ -19,7 +19,7 @@ def rank_fused(
     queries: Any, database: Any, top_k: int, *, fusion: FusionOptions, weights: Any = None
 ) -> Found:
     search = FusedSearch(top_k, fusion, weights)
-    return search.ranking([search.lists(queries, database)])
+    return search.find(queries, database)
 
 
 def rank_by_similarity(queries: Any, database: Any, top_k: int) -> Found:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +17,13 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.retrieval.search import FusionOptions, fuse
-from megloc_kapture.stages import candidates
 from megloc_kapture.stages.candidates import (
     UNRESTRICTED,
     QueryPairsOptions,
     Restrictions,
     Retrieval,
-    vectors_of,
 )
 from megloc_kapture.stages.image_pairs import pair_queries
-from megloc_kapture.stages.work import Work
 
 Folders = tuple[KaptureFolder, KaptureFolder]
 SIZES = {"short": 3, "long": 8}
@@ -82,27 +78,6 @@ def two_types(write_features: Any, tmp_path: Path) -> KaptureFolder:
         write_features(tmp_path, "global_features", name, vectors)
     write_sensors(tmp_path / "map", KaptureData())
     return KaptureFolder(tmp_path / "map", features_dirs=[tmp_path])
-
-
-@pytest.mark.parametrize("method", ["ghm", "mean", "reciprocal_rank"])
-@pytest.mark.parametrize("types", [("one",), ("one", "two")])
-def test_parts_of_a_database_give_the_ranking_of_the_whole(
-    two_types: KaptureFolder,
-    two_processes: Executor,
-    monkeypatch: pytest.MonkeyPatch,
-    types: tuple[str, ...],
-    method: str,
-) -> None:
-    fusion = FusionOptions.model_validate({"method": method})
-    retrieval = Retrieval(types, fusion=fusion)
-    images = [f"{image:03}.jpg" for image in range(300)]
-    vectors = vectors_of(retrieval.readers(two_types), images)
-    whole = retrieval.rank(vectors, vectors, 20)
-    monkeypatch.setattr(candidates, "_ROWS", 70)
-    for work in (Work(), Work(two_processes)):
-        index, scores = retrieval.rank(vectors, vectors, 20, work=work)
-        np.testing.assert_array_equal(index, whole[0])
-        np.testing.assert_allclose(scores, whole[1], atol=1e-6)
 
 
 # ----------------------------------------------------------------------------------- restrictions

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +20,7 @@ from megloc_kapture.io.kapture import (
     MatchesWriter,
     write_sensors,
 )
-from megloc_kapture.stages import map_points
 from megloc_kapture.stages.map_points import triangulate_map
-from megloc_kapture.stages.work import Work
 
 
 def test_points_lie_on_the_walls(world: Any, distance_to_walls: Any) -> None:
@@ -126,55 +123,6 @@ def test_only_the_pairs_asked_for_are_used(world: Any, tmp_path: Path) -> None:
         "left/1.png",
         "right/2.png",
     }
-
-
-def test_parts_that_no_match_connects_give_the_map_of_the_whole(
-    world: Any,
-    write_features: Any,
-    tmp_path: Path,
-    two_processes: Executor,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Two copies of the world in one map, whose images are matched across without any match."""
-    source, reader = world.mapping(), world.with_matches("mapping").matches("rootsift")
-    data = KaptureData(sensors=dict(source.read().sensors))
-    for number, (image, pose) in enumerate(sorted(world.map_poses.items())):
-        for copy in ("a", "b"):
-            camera = source.read().record_of(image)[1]
-            data.records_camera[number, camera + copy] = f"{copy}/{image}"
-            data.sensors[camera + copy] = source.read().sensors[camera]
-            data.trajectories[number, camera + copy] = pose
-    write_sensors(tmp_path / "twice", data)
-    features = tmp_path / "features"
-    for kind in KINDS:
-        once = arrays(KaptureFolder(world.root / "map"), kind)
-        both = {f"{copy}/{image}": one for image, one in once.items() for copy in "ab"}
-        write_features(features, kind, "rootsift", both)
-    with MatchesWriter(features, "rootsift", orphan=True) as matches:
-        for a, b in reader.pairs:
-            for copy in ("a", "b"):
-                matches.write(f"{copy}/{a}", f"{copy}/{b}", *reader.read(a, b))
-            matches.write(f"a/{a}", f"b/{b}", np.zeros((0, 2), np.int64), np.zeros(0))
-    twice = KaptureFolder(tmp_path / "twice", features_dirs=[features])
-    options = TriangulationOptions()
-    found = {}
-    for name, at_once, executor in (("whole", 10, None), ("a", 5, None), ("b", 5, two_processes)):
-        monkeypatch.setattr(map_points, "_IMAGES_AT_ONCE", at_once)
-        counts = triangulate_map(
-            twice, twice, "rootsift", tmp_path / name, options, work=Work(executor)
-        )
-        found[name] = KaptureFolder(tmp_path / name)
-        assert counts["images"] == 10 and counts["pairs"] == 2 * len(reader.pairs)
-    parts = found["a"].points3d()
-    num_points = len(world.map().points3d())
-    assert len(parts) == 2 * num_points
-    # each part is what the world alone gives, bit by bit
-    np.testing.assert_array_equal(parts[:num_points], world.map().points3d())
-    np.testing.assert_array_equal(parts[num_points:], world.map().points3d())
-    np.testing.assert_array_equal(parts, found["b"].points3d())
-    np.testing.assert_allclose(parts, found["whole"].points3d(), atol=1e-4)
-    assert observed(found["a"], "rootsift") == observed(found["whole"], "rootsift")
-    found["a"].validate()
 
 
 def test_what_cannot_be_triangulated_is_refused(world: Any, tmp_path: Path) -> None:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.stages.work import FinishedItems, FolderSpec, Work, ordered_map
+from megloc_kapture.stages.work import FolderSpec, ordered_map
 
 
 def test_results_come_in_order_whatever_finishes_first() -> None:
@@ -73,21 +72,3 @@ def test_a_folder_is_opened_once_per_run(world: Any) -> None:
     assert other.open() is not spec.open()
     assert other.open().root == world.mapping().root
     assert other.open().features_dirs == (world.features_dir,)
-
-
-# ------------------------------------------------------------------------------------- kept items
-
-
-def test_finished_items_are_kept_for_the_same_fingerprint(tmp_path: Path) -> None:
-    path = tmp_path / ".items"
-    items = Work(finished=FinishedItems(path, "a")).items("features")
-    for number, name in enumerate(("x.jpg", "y.jpg")):
-        items.add(name, [number])
-    with open(path, "a") as file:
-        file.write('["features", "z.jpg", [')  # killed while it was written
-    again = FinishedItems(path, "a")
-    assert again.num_kept == 2
-    assert Work(finished=again).items("features").done == {"x.jpg": [0], "y.jpg": [1]}
-    assert Work(finished=again).items("vectors").done == {}
-    assert FinishedItems(path, "b").num_kept == 0
-    assert Work().items("features").done == {}

@@ -81,6 +81,12 @@ def feature_folder(root: Path, kind: FeatureKind, type_name: str, *, orphan: boo
     return parent / kind if orphan else parent
 
 
+def has_features(root: Path, kind: ArrayKind, type_name: str, image: str) -> bool:
+    """Return whether an image's file is in a folder of the orphan layout."""
+    folder = feature_folder(root, kind, type_name, orphan=True)
+    return (folder / f"{check_relative(image)}{SUFFIX[kind]}").is_file()
+
+
 def _types_folder(root: Path, kind: FeatureKind, orphan: bool) -> Path:
     if not orphan:
         return Path(root) / "reconstruction" / kind
@@ -322,9 +328,6 @@ class KaptureVectors:
     @property
     def dimension(self) -> int:
         return self._reader.config.dsize
-
-    def part(self, start: int, stop: int) -> KaptureVectors:
-        return KaptureVectors(self._reader, self._images[start:stop])
 
     def read(
         self, start: int, stop: int, out: NDArray[np.float32] | None = None

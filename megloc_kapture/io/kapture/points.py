@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from heapq import merge
 from itertools import count, islice, pairwise
@@ -49,9 +49,8 @@ def read_points3d(path: Path) -> NDArray[np.float64]:
                 points = np.loadtxt(file, delimiter=",", comments="#", ndmin=2)
             except ValueError as error:
                 message = str(error).partition(";")[0]  # without numpy's advice to programmers
-                line = _line_of_another_length(path)
                 message = f"expected 3 or 6 columns in all rows: {message}"
-                raise DataError(message, path=path, line=line) from error
+                raise DataError(message, path=path) from error
     if points.size == 0:
         return np.zeros((0, 6))
     if points.shape[1] not in POINTS_HEADERS:
@@ -60,17 +59,6 @@ def read_points3d(path: Path) -> NDArray[np.float64]:
     if len(bad):
         raise DataError(f"point {bad[0]} is not finite", path=path)
     return points if points.shape[1] == 6 else np.pad(points, ((0, 0), (0, 3)))
-
-
-def _line_of_another_length(path: Path) -> int | None:
-    """Return the first line whose number of columns differs from the first row's."""
-    columns = None
-    for number, text in enumerate(path.read_text(errors="replace").splitlines(), start=1):
-        if text.strip() and not text.startswith("#"):
-            columns = columns or text.count(",")
-            if text.count(",") != columns:
-                return number
-    return None
 
 
 def write_points3d(root: Path, points: ArrayLike) -> None:
@@ -119,17 +107,17 @@ class Observations:
 def read_observations(path: Path) -> dict[str, Observations]:
     images, types = _numbers(), _numbers()
     blocks: list[tuple[NDArray[np.integer], ...]] = []
-    number = 1
-    with reading(path), open(path, encoding="utf-8-sig") as file:
-        while lines := _read_lines(file.readlines, path):
-            if number == 1:
-                check_version(path, lines[0], required=False)
-            try:
+    with reading(path), named(path), open(path, encoding="utf-8-sig") as file:
+        try:
+            while lines := file.readlines(_BLOCK_CHARACTERS):
+                if not blocks:
+                    check_version(path, lines[0], required=False)
                 blocks.append(_parse(lines, images, types))
-            except (ValueError, OverflowError, DataError):
-                _raise_for_line(path, lines, number)
-                raise
-            number += len(lines)
+        except UnicodeDecodeError as error:
+            raise DataError("not a text file in UTF-8") from error
+        except (ValueError, OverflowError) as error:
+            message = f"expected {OBSERVATIONS_HEADER.removeprefix('# ')}, ids from 0 on"
+            raise DataError(message) from error
     if not blocks:
         return {}
     points, type_ids, image_ids, keypoints = (
@@ -151,13 +139,6 @@ def read_observations(path: Path) -> dict[str, Observations]:
             keypoints[rows],
         ).sorted_by_point()
     return found
-
-
-def _read_lines(readlines: Callable[[int], list[str]], path: Path) -> list[str]:
-    try:
-        return readlines(_BLOCK_CHARACTERS)
-    except UnicodeDecodeError as error:
-        raise DataError("not a text file in UTF-8", path=path) from error
 
 
 def _numbers() -> defaultdict[str, int]:
@@ -213,16 +194,6 @@ def _integers(texts: Sequence[str]) -> NDArray[np.int64]:
     if len(numbers) != len(texts):
         raise ValueError("not an integer")
     return numbers
-
-
-def _raise_for_line(path: Path, lines: Sequence[str], first: int) -> None:
-    for number, line in enumerate(lines, first):
-        with named(path, number):
-            try:
-                _parse([line], _numbers(), _numbers())
-            except (ValueError, OverflowError) as error:
-                message = f"expected {OBSERVATIONS_HEADER.removeprefix('# ')}, ids from 0 on"
-                raise DataError(message) from error
 
 
 def write_observations(root: Path, observations: Mapping[str, Observations]) -> None:

@@ -178,9 +178,9 @@ def test_the_layout_of_observations_is_kapture_s(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.usefixtures("small_blocks")
-def test_bad_observations_name_file_and_line(tmp_path: Path, row: str, match: str) -> None:
+def test_bad_observations_name_the_file(tmp_path: Path, row: str, match: str) -> None:
     content = OBSERVATIONS + "0, t, a, 1, b, 2\n" * 20 + row + "\n3, t, a, 1\n"
     path = file(tmp_path / "o.txt", content)
     with pytest.raises(DataError, match=match) as caught:
         read_observations(path)
-    assert f"{path}:23: " in str(caught.value)
+    assert str(path) in str(caught.value)
