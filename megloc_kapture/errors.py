@@ -11,8 +11,8 @@ from pathlib import Path
 class MeglocError(Exception):
     """Base of every error raised on purpose.
 
-    The message is one line: problem, place, remedy. The command line prints it and exits with 2;
-    any other exception is an internal error.
+    The message is one line with problem, location and remedy. The command line prints it and exits
+    with 2; any other exception is an internal error.
     """
 
     def lines(self) -> list[str]:
@@ -26,8 +26,8 @@ class DataError(MeglocError):
     def __init__(
         self, message: str, *, path: Path | str | None = None, line: int | None = None
     ) -> None:
-        where = "" if path is None else f"{path}: " if line is None else f"{path}:{line}: "
-        super().__init__(where + message)
+        location = "" if path is None else f"{path}: " if line is None else f"{path}:{line}: "
+        super().__init__(location + message)
         self.message = message
         self.path = path
         self.line = line
@@ -40,7 +40,7 @@ class DataError(MeglocError):
 def require(
     condition: object, message: str, *, path: Path | str | None = None, line: int | None = None
 ) -> None:
-    """Raise DataError unless the condition is true; the message is formatted in any case."""
+    """Raise DataError if the condition is false. Callers format the message either way."""
     if not condition:
         raise DataError(message, path=path, line=line)
 
@@ -50,7 +50,7 @@ class OptionError(MeglocError):
 
 
 def check_option(condition: object, message: str) -> None:
-    """Raise OptionError unless the condition is true; the message is formatted in any case."""
+    """Raise OptionError if the condition is false. Callers format the message either way."""
     if not condition:
         raise OptionError(message)
 
@@ -66,11 +66,13 @@ class PluginError(MeglocError):
 def suggestion(name: str, known: Iterable[str], *, listed: str = "known: ") -> str:
     """Return a message with the most similar known name, and all names."""
     names = list(known)
-    near = get_close_matches(name, names, n=1)
-    return f"{f'did you mean {near[0]!r}? ' if near else ''}{listed}{', '.join(names) or 'none'}"
+    similar = get_close_matches(name, names, n=1)
+    return (
+        f"{f'did you mean {similar[0]!r}? ' if similar else ''}{listed}{', '.join(names) or 'none'}"
+    )
 
 
-# packages of an extra, and the extra
+# imported package: the extra that installs it
 _EXTRAS = {
     "torch": "torch",
     "kornia": "kornia",

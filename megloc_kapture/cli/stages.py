@@ -1,4 +1,4 @@
-"""Commands of single stages: images, features, matches and points, and plugin stages.
+"""Commands for single stages: images, features, matches, points, and plugin stages.
 
 Built-in commands write plain kapture data; a plugin stage runs in a workspace.
 """
@@ -72,13 +72,13 @@ class StageCommand(Choosing, Working):
 def only_type(folder: KaptureFolder, kind: str, asked: str | None) -> str:
     """Return the requested type, or the only type of a kind."""
     types = folder.types(kind)  # type: ignore[arg-type]
-    there = ", ".join(types)
+    present = ", ".join(types)
     if asked in types or (asked is None and len(types) == 1):
         return asked or types[0]
     if asked is not None:
-        reason = f"no {kind} of type {asked!r}; there are: {there or 'none'}"
+        reason = f"no {kind} of type {asked!r}; there are: {present or 'none'}"
     elif types:
-        reason = f"several types of {kind}, name one: {there}"
+        reason = f"several types of {kind}, choose one: {present}"
     else:
         reason = f"no {kind}; give their folder with --features-dir"
     raise OptionError(f"{folder.root}: {reason}")
@@ -185,7 +185,7 @@ class Triangulate(Reading, StageCommand):
 def _read_pairs_of(path: Path, first: KaptureFolder, second: KaptureFolder) -> list[ImagePair]:
     """Read pairs and check that their images exist in the two folders."""
     pairs = read_pairs(path)
-    known_first, known_second = (set(one.read().image_names()) for one in (first, second))
+    known_first, known_second = (set(f.read().image_names()) for f in (first, second))
     for pair in pairs:
         require(pair.query in known_first, f"no image {pair.query} in {first.root}", path=path)
         require(pair.map in known_second, f"no image {pair.map} in {second.root}", path=path)

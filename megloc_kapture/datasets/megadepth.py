@@ -55,7 +55,7 @@ class _Image:
 def import_megadepth(
     root: Path, output: Path, options: MegaDepthOptions | None = None, *, work: Work = HERE
 ) -> dict[str, int]:
-    """Write ``output/SCENE`` of each scene; images without metric depth are omitted."""
+    """Write each scene as ``output/SCENE``; images without metric depth are omitted."""
     options = options or MegaDepthOptions()
     scenes = [check_component(name) for name in options.scenes] or _scenes(root)
     require(scenes, f"neither {_UNDISTORTED}/SCENE nor {_SCENE_INFO}/SCENE.npz", path=root)
@@ -106,18 +106,18 @@ def _images(root: Path, scene: str) -> Iterator[_Image]:
 
 
 def _of_model(root: Path, scene: str, model: Path, folder: Path) -> Iterator[_Image]:
-    found = read_colmap_model(model, with_points=False)
-    for image in sorted(found.images, key=lambda one: one.name):
+    reconstruction = read_colmap_model(model, with_points=False)
+    for image in sorted(reconstruction.images, key=lambda image: image.name):
         path = safe_join(folder, image.name)
         depth = _depth_of(root, scene, image.name)
         if path.is_file() and depth is not None:
-            yield _Image(path, depth, found.cameras[image.camera_id], image.cam_from_world)
+            yield _Image(path, depth, reconstruction.cameras[image.camera_id], image.cam_from_world)
 
 
 def _depth_of(root: Path, scene: str, image: str) -> Path | None:
     name = str(PurePosixPath(image).with_suffix(".h5"))
-    places = (safe_join(root / folder.format(scene), name) for folder in _DEPTHS)
-    return next((path for path in places if path.is_file()), None)
+    paths = (safe_join(root / folder.format(scene), name) for folder in _DEPTHS)
+    return next((path for path in paths if path.is_file()), None)
 
 
 def _of_table(root: Path, scene: str, table: Path) -> Iterator[_Image]:
@@ -126,8 +126,8 @@ def _of_table(root: Path, scene: str, table: Path) -> Iterator[_Image]:
             images, intrinsics, poses = (file[name] for name in _ARRAYS)
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise DataError(
-            "its arrays are Python objects or broken, and pickles are not read; docs/training.md "
-            f"has the lines that make plain arrays of them ({error})",
+            "its arrays are Python objects, which are not read, or broken; docs/training.md "
+            f"shows how to convert them to plain arrays ({error})",
             path=table,
         ) from error
     shapes = [(len(images), *shape) for shape in ((), (3, 3), (4, 4))]
@@ -153,7 +153,7 @@ def _write_scene(output: Path, images: Sequence[_Image] | Iterator[_Image]) -> i
         if depth_m is None:
             continue
         name = f"images/{image.path.name}"
-        require(name not in links, "the scene has two images of this name", path=image.path)
+        require(name not in links, "the scene has two images with this name", path=image.path)
         links[name] = image.path
         sensor, depth_sensor, rig = f"{number}", f"{number}_depth", f"{number}_rig"
         depth_camera = scaled_camera(image.camera, depth_m.shape[1], depth_m.shape[0])

@@ -48,7 +48,8 @@ class DatasetCard(Options):
 
     def without(self, root: Path, absent: Sequence[str]) -> DataError:
         return DataError(
-            f"not {self.title}, no folder {' and '.join(absent)}; the root must contain {self.layout}",
+            f"not {self.title}, no folder {' and '.join(absent)}; the root must contain "
+            f"{self.layout}",
             path=root,
         )
 

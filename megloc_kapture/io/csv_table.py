@@ -1,6 +1,6 @@
 """CSV tables with a header row, mapped to records.
 
-The header names the columns, in any order, so that a table edited in a spreadsheet still reads. A
+The header names the columns in any order, so a table edited in a spreadsheet stays readable. A
 :class:`Table` takes its columns from the annotations of a record type, or from a dictionary.
 """
 
@@ -38,13 +38,13 @@ from megloc_kapture.io.files import (
 from megloc_kapture.values import RigidTransform
 
 RowT = TypeVar("RowT")
-_MAX_UNIT_ERROR = 1e-6  # of the length of a quaternion written with all digits
+_MAX_UNIT_ERROR = 1e-6  # of a quaternion's norm
 
 
 def read_csv_table(
     path: Path | str, columns: Sequence[str], *, optional: Sequence[str] = ()
 ) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield ``(line, row)`` for each non-empty row, without absent ``optional`` columns."""
+    """Yield ``(line, row)`` for each non-empty row, without missing ``optional`` columns."""
     reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
     try:
         header = next(reader, [])
@@ -56,7 +56,7 @@ def read_csv_table(
             raise DataError(message, path=path, line=1)
         for fields in filter(None, reader):
             if len(fields) != len(header):
-                message = f"{len(fields)} fields where the header names {len(header)}"
+                message = f"{len(fields)} fields, but the header names {len(header)}"
                 raise DataError(message, path=path, line=reader.line_num)
             yield reader.line_num, dict(zip(header, fields, strict=True))
     except csv.Error as error:
@@ -115,7 +115,7 @@ def _choice(values: Mapping[str, Any], write: Callable[[Any], str] = str) -> Col
 
 
 def list_of(separator: str) -> Column:
-    """Return a column of tuples of texts, which must not contain the separator."""
+    """Return a column of tuples of strings, which must not contain the separator."""
     return Column(
         f"a list separated by {separator!r}",
         lambda text: tuple(text.split(separator)) if text else (),
@@ -124,7 +124,7 @@ def list_of(separator: str) -> Column:
 
 
 def number(format_spec: str, most: float = math.inf) -> Column:
-    """Return a column of numbers; with ``most``, of those from 0 to it."""
+    """Return a column of numbers; ``most`` restricts them to the range from 0 to it."""
 
     def read(text: str) -> float:
         value = float(text)
@@ -137,7 +137,7 @@ def number(format_spec: str, most: float = math.inf) -> Column:
 
 
 def or_empty(column: Column, empty: Any = None) -> Column:
-    """Return the same column, with empty cells for ``empty`` (None or NaN)."""
+    """Return the column with ``empty`` (None or NaN) as empty cells."""
     return Column(
         f"{column.expected}, or empty",
         lambda text: column.read(text) if text else empty,
@@ -148,7 +148,7 @@ def or_empty(column: Column, empty: Any = None) -> Column:
 ImageName = Annotated[str, Column("a plain relative path", check_relative, check_relative)]
 _BY_TYPE: dict[Any, Column] = {
     str: Column("text"),
-    int: Column("a whole number from 0 on", _count),
+    int: Column("a whole number, 0 or more", _count),
     # kapture forbids the comma in image names
     tuple[str, ...]: list_of(","),
     RigidTransform: Column(
@@ -172,10 +172,10 @@ def _column(hint: Any) -> Column:
 
 
 class Table(Generic[RowT]):
-    """A CSV table whose rows are records of one type, or tuples if columns are given by name.
+    """A CSV table whose rows are records of one type, or tuples for columns from a dictionary.
 
-    ``keys`` are groups of columns that must be unique; ``later`` columns, which older files lack,
-    get the record's defaults.
+    ``keys`` are groups of columns that must be unique; ``later`` columns may be absent, as in
+    older files, and then have the record's defaults.
     """
 
     def __init__(
@@ -207,7 +207,7 @@ class Table(Generic[RowT]):
         return rows
 
     def read_if_there(self, path: Path) -> list[RowT]:
-        """Read the records of a file, none if it is absent."""
+        """Read the records of a file; return an empty list if it is absent."""
         return self.read(path) if path.exists() else []
 
     def write(self, path: Path | str, rows: Iterable[Any]) -> None:

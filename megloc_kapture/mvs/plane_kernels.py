@@ -1,7 +1,7 @@
-"""Compiled loops of stereo: slanted planes, and the deviations of their depth.
+"""Compiled loops of stereo: PatchMatch with slanted planes, and the uncertainty of their depth.
 
-A plane is the inverse depth ``w + wx dx + wy dy`` at an offset in pixels, linear in a pinhole
-image.
+A plane is stored as its inverse depth ``w + wx dx + wy dy`` at a pixel offset (dx, dy), which is
+exact in a pinhole image.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-untyped-decorators
@@ -25,7 +25,7 @@ def _part_score(values, weights, reach, source, u, v, ux, uy, vx, vy):
     k = 0
     for i in range(-reach, reach + 1):
         for j in range(-reach, reach + 1):
-            weight, own = weights[k], values[k]
+            weight, template = weights[k], values[k]
             k += 1
             right, below = u + ux * j + uy * i, v + vx * j + vy * i
             if weight <= 0 or not (
@@ -39,18 +39,18 @@ def _part_score(values, weights, reach, source, u, v, ux, uy, vx, vy):
             lower += across * (source[top + 1, left + 1] - source[top + 1, left])
             value = upper + down * (lower - upper)
             total += weight
-            r += weight * own
-            r2 += weight * own * own
+            r += weight * template
+            r2 += weight * template * template
             s += weight * value
             s2 += weight * value * value
-            sr += weight * own * value
+            sr += weight * template * value
     if not total >= 0.5:
         return np.float32(-2)
-    own_variance = r2 / total - (r / total) ** 2
+    template_variance = r2 / total - (r / total) ** 2
     variance = s2 / total - (s / total) ** 2
-    if not (own_variance > _FLAT and variance > _FLAT):
+    if not (template_variance > _FLAT and variance > _FLAT):
         return np.float32(-2)
-    score = (sr / total - r * s / total**2) / math.sqrt(own_variance * variance)
+    score = (sr / total - r * s / total**2) / math.sqrt(template_variance * variance)
     return np.float32(score)
 
 
@@ -104,7 +104,7 @@ def _plane_score(values, weights, reach, y, x, plane, source, infinity, baseline
 
 @compiled_loop
 def _plane_cost(values, weights, reach, y, x, plane, sources, infinities, baselines):
-    """Return 1 - mean of the best scores over the sources; 2 where invisible."""
+    """Return 1 - mean of the best scores over the sources; 2 if invisible."""
     first, second = np.float32(-2), np.float32(-2)
     for s in range(len(sources)):
         score = _plane_score(
@@ -169,64 +169,64 @@ def refine_planes(
     """Run one pass of PatchMatch over slanted planes (H, W, 3) (Bleyer et al., BMVC 2011), in
     place.
 
-    Rows are traversed alternately down and up. Candidates are the planes of two previous neighbours
-    and three random changes: depth, slope, and both at half size. ``costs`` (H, W) are computed on
-    turn 0; ``step`` is about a pixel's motion; ``limits`` bound the inverse depth.
+    Passes alternate in direction. Candidates are the planes of two previous neighbours and three
+    random changes: depth, slope, and both at half size. ``costs`` (H, W) are computed in pass
+    ``turn`` 0; ``step`` moves a projection by about a pixel; ``limits`` bound the inverse depth.
     """
     height, width = reference.shape
     count = (2 * reach + 1) ** 2
     values, weights = np.empty(count, np.float32), np.empty(count, np.float32)
-    tried = np.empty(3, np.float64)
-    way = 1 if turn % 2 == 0 else -1
+    candidate = np.empty(3, np.float64)
+    direction = 1 if turn % 2 == 0 else -1
     size = step * 0.5**turn
     for i in range(height):
-        y = i if way > 0 else height - 1 - i
+        y = i if direction > 0 else height - 1 - i
         for j in range(width):
-            x = j if way > 0 else width - 1 - j
-            own = planes[y, x]
+            x = j if direction > 0 else width - 1 - j
+            current = planes[y, x]
             if not _window(reference, reach, y, x, tone, values, weights):
                 costs[y, x] = np.float32(2)
                 continue
             if turn == 0:
                 costs[y, x] = _plane_cost(
-                    values, weights, reach, y, x, own, sources, infinities, baselines
+                    values, weights, reach, y, x, current, sources, infinities, baselines
                 )
             for k in range(5):
                 if k == 0 or k == 1:
-                    from_y, from_x = (y - way, x) if k == 0 else (y, x - way)
+                    from_y, from_x = (y - direction, x) if k == 0 else (y, x - direction)
                     if from_y < 0 or from_y >= height or from_x < 0 or from_x >= width:
                         continue
                     other = planes[from_y, from_x]
-                    tried[1], tried[2] = other[1], other[2]
-                    tried[0] = other[0] + way * (other[2] if k == 0 else other[1])
+                    candidate[1], candidate[2] = other[1], other[2]
+                    candidate[0] = other[0] + direction * (other[2] if k == 0 else other[1])
                 else:
                     scale = size if k < 4 else 0.5 * size
-                    tried[0], tried[1], tried[2] = own[0], own[1], own[2]
+                    candidate[0], candidate[1], candidate[2] = current[0], current[1], current[2]
                     if k != 3:
-                        tried[0] += scale * _noise(y, x, turn, 3 * k)
+                        candidate[0] += scale * _noise(y, x, turn, 3 * k)
                     if k != 2:
-                        tried[1] += scale / reach * _noise(y, x, turn, 3 * k + 1)
-                        tried[2] += scale / reach * _noise(y, x, turn, 3 * k + 2)
-                if tried[0] < limits[0] or tried[0] > limits[1]:
+                        candidate[1] += scale / reach * _noise(y, x, turn, 3 * k + 1)
+                        candidate[2] += scale / reach * _noise(y, x, turn, 3 * k + 2)
+                if candidate[0] < limits[0] or candidate[0] > limits[1]:
                     continue
                 cost = _plane_cost(
-                    values, weights, reach, y, x, tried, sources, infinities, baselines
+                    values, weights, reach, y, x, candidate, sources, infinities, baselines
                 )
                 if cost < costs[y, x]:
                     costs[y, x] = cost
-                    own[0], own[1], own[2] = tried[0], tried[1], tried[2]
+                    current[0], current[1], current[2] = candidate[0], candidate[1], candidate[2]
 
 
 @compiled_loop
 def plane_deviations(
     reference, sources, infinities, baselines, planes, reach, tone, calibration, out
 ):
-    """Estimate the standard deviation of every pixel's inverse depth, 0 where invisible.
+    """Estimate the standard deviation of each pixel's inverse depth, 0 if invisible.
 
     The least-squares bound for a window of N pixels with correlation rho, gradient g and motion m
     per inverse depth along the epipolar line is ``(1 - rho^2) Var / (N mean((g m)^2))``, averaged
-    over the sources. A matching error of ``calibration[0]`` pixels is added to ``calibration[1]``
-    times its root.
+    over the sources. Its root is multiplied by ``calibration[1]``, and a matching error of
+    ``calibration[0]`` pixels is added in quadrature.
     """
     height, width = reference.shape
     count = (2 * reach + 1) ** 2
@@ -259,7 +259,7 @@ def plane_deviations(
                     gyy += weight * gy * gy
                     variance += weight * (reference[row, column] - mean) ** 2
             plane = planes[y, x]
-            known, moved, seen = 0.0, 0.0, 0
+            information, motion2, num_visible = 0.0, 0.0, 0
             for s in range(len(sources)):
                 rho = _plane_score(
                     values, weights, reach, y, x, plane, sources[s], infinities[s], baselines[s]
@@ -282,9 +282,11 @@ def plane_deviations(
                 mx, my = (vy * du - uy * dv) / determinant, (ux * dv - vx * du) / determinant
                 slope = gxx * mx * mx + 2.0 * gxy * mx * my + gyy * my * my
                 noise = max(1.0 - float(rho) ** 2, 1e-3) * variance
-                known += count * slope / noise
-                seen += 1
-                moved = max(moved, du * du + dv * dv)
-            if known > 0.0 and moved > 0.0:
-                bound = calibration[1] ** 2 * seen / known + calibration[0] ** 2 / moved
+                information += count * slope / noise
+                num_visible += 1
+                motion2 = max(motion2, du * du + dv * dv)
+            if information > 0.0 and motion2 > 0.0:
+                bound = (
+                    calibration[1] ** 2 * num_visible / information + calibration[0] ** 2 / motion2
+                )
                 out[y, x] = np.float32(math.sqrt(bound))

@@ -23,10 +23,10 @@ from megloc_kapture.io.weights import WeightsFile, find_weights, read_weights, s
 from megloc_kapture.values import Device, Options
 
 _log = logging.getLogger(__name__)
-_computing = RLock()
+_gpu_lock = RLock()
 AnyOptions = TypeVar("AnyOptions", bound=Options)
 Net = TypeVar("Net", bound=nn.Module)
-_making = Lock()
+_loading_lock = Lock()
 
 
 class NetworkOptions(Options):
@@ -38,12 +38,12 @@ class NetworkOptions(Options):
 
 @cache
 def pick_device(device: Device) -> torch.device:
-    """Return the chosen device; OptionError without the GPU."""
+    """Return the torch device; OptionError if this machine lacks it."""
     count = torch.cuda.device_count() if device != "cpu" and torch.cuda.is_available() else 0
     if device == "cpu" or (device == "auto" and not count):
         return torch.device("cpu")
     if not count:
-        raise OptionError(f"device={device}: this machine has no GPU that torch can use; take auto")
+        raise OptionError(f"device={device}: this machine has no GPU that torch can use; use auto")
     if int(device.partition(":")[2] or 0) >= count:
         raise OptionError(f"device={device}: this machine has {count} GPUs, the first is cuda:0")
     return torch.device("cuda", int(device.partition(":")[2] or 0))
@@ -57,13 +57,13 @@ def inference(device: torch.device, half_precision: bool = False) -> Iterator[No
     if half_precision and device.type == "cpu" and not has_bfloat16():
         _warn_of_slow_half()
     # TF32 is a setting of the process, so only one thread computes at a time
-    alone = _computing if device.type == "cuda" else nullcontext()
-    with alone, without_tf32(device), torch.inference_mode(), autocast:
+    exclusive = _gpu_lock if device.type == "cuda" else nullcontext()
+    with exclusive, without_tf32(device), torch.inference_mode(), autocast:
         yield
 
 
 def has_bfloat16() -> bool:
-    """Return whether this processor has bfloat16, without which convolutions are very slow."""
+    """Return whether this processor supports bfloat16; emulated convolutions are very slow."""
     return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
@@ -85,13 +85,13 @@ def without_tf32(device: torch.device) -> Iterator[None]:
     if hasattr(products, "fp32_precision"):  # torch 2.9 refuses a mix with the older settings
         convolutions, name, exact = convolutions.conv, "fp32_precision", "ieee"
     settings = products, convolutions
-    before = [getattr(setting, name) for setting in settings]
+    previous = [getattr(setting, name) for setting in settings]
     for setting in settings:
         setattr(setting, name, exact)
     try:
         yield
     finally:
-        for setting, value in zip(settings, before, strict=True):
+        for setting, value in zip(settings, previous, strict=True):
             setattr(setting, name, value)
 
 
@@ -114,8 +114,8 @@ def sized_tensor(
 ) -> torch.Tensor:
     """Convert an RGB image, uint8 (H, W, 3), to float32 (1, 3, h, w) in [0, 1], with a size limit.
 
-    Beyond ``max_size_px`` pixels are unrounded area means, as in hloc. Sides round half to even,
-    and are at least 1.
+    Larger images are reduced by area averaging without rounding, as in hloc. Sides are rounded half
+    to even, to at least 1.
     """
     height, width = image.shape[:2]
     if max_size_px is None or max(height, width) <= max_size_px:
@@ -127,7 +127,7 @@ def sized_tensor(
 
 
 def batch_counters(module: nn.Module) -> set[str]:
-    """Return keys of batch counters, missing in ONNX and torch before 0.4.1."""
+    """Return keys of batch counters, absent from weights of ONNX and torch before 0.4.1."""
     return {key for key in module.state_dict() if key.endswith("num_batches_tracked")}
 
 
@@ -143,30 +143,30 @@ def load_strictly(
         for key in sorted(set(expected) & set(tensors))
         if tensors[key].shape != expected[key].shape
     ]
-    wrong = [
+    problems = [
         f"{len(keys)} {what}: {first_few(keys)}"
         for what, keys in (
             ("missing keys", missing),
             ("unexpected keys", unexpected),
-            ("keys of another shape", reshaped),
+            ("keys with another shape", reshaped),
         )
         if keys
     ]
-    if wrong:
+    if problems:
         raise DataError(
-            f"this file does not fit {type(module).__name__}; {'; '.join(wrong)}", path=where
+            f"this file does not fit {type(module).__name__}; {'; '.join(problems)}", path=where
         )
     if not any(getattr(tensor, "is_shared_file", False) for tensor in tensors.values()):
         module.load_state_dict(dict(tensors), strict=False)
         return module
     # memory-mapped parameters, shared by all processes
-    own = {
+    parameters = {
         key: value
         if getattr(value, "is_shared_file", False) and value.dtype == expected[key].dtype
         else torch.empty(value.shape, dtype=expected[key].dtype).copy_(value)
         for key, value in tensors.items()
     }
-    module.load_state_dict(own, strict=False, assign=True)
+    module.load_state_dict(parameters, strict=False, assign=True)
     return module
 
 
@@ -198,22 +198,25 @@ class Checkpointed(Generic[AnyOptions]):
         file: WeightsFile | None = None,
         channels_last: bool = False,
     ) -> tuple[Any, torch.device]:
-        """Return the network, made once per process, and its device.
+        """Return the network, loaded once per process, and its device.
 
         Parameters
         ----------
-        load : builds it from a checkpoint's tensors, the file's name and the arguments.
+        load : builds the network from a checkpoint's tensors, its file name and the arguments.
         file : replaces the option's checkpoint.
         channels_last : layout of the weights on a CPU, where it is faster; see in_fast_layout.
         """
         wanted: Any = self.options
         device = pick_device(wanted.device)
-        with _making:
-            return _made(load, file or self._weights, device, channels_last, *arguments), device
+        with _loading_lock:
+            chosen = file or self._weights
+            return _load_cached(load, chosen, device, channels_last, *arguments), device
 
 
 @lru_cache(maxsize=12)
-def _made(load: Any, file: WeightsFile, device: Any, channels_last: bool, *arguments: Any) -> Any:
+def _load_cached(
+    load: Any, file: WeightsFile, device: Any, channels_last: bool, *arguments: Any
+) -> Any:
     network = load(read_weights(file), str(file.path), *arguments).eval().to(device)
     if channels_last and device.type == "cpu":
         network.to(memory_format=torch.channels_last)
@@ -223,7 +226,7 @@ def _made(load: Any, file: WeightsFile, device: Any, channels_last: bool, *argum
 def state_bytes(
     model: torch.nn.Module, optimizer: torch.optim.Optimizer, more: Mapping[str, Any]
 ) -> bytes:
-    """Serialise the state; ``more`` has numbers, texts and lists of them, including ``step``."""
+    """Serialise the state; ``more`` has numbers, strings and lists of them, including ``step``."""
     stream = io.BytesIO()
     content = {**more, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
     torch.save(content, stream)
@@ -240,5 +243,5 @@ def load_state(
         return {**content, "step": int(content["step"])}
     except Exception as error:  # torch raises many kinds on damaged files
         raise DataError(
-            "not the state of this training, or damaged; -f begins again", path=path
+            "is damaged, or the state of another training; -f starts over", path=path
         ) from error

@@ -12,13 +12,13 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-# channels of each stage's convolutions; a pooling ends each stage
+# channels of each stage's convolutions; each stage ends with a pooling
 _VGG_STAGES = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
 Depth = Literal[50, 101]
 RESNET_BLOCKS: dict[Depth, tuple[int, int, int, int]] = {50: (3, 4, 6, 3), 101: (3, 4, 23, 3)}
 RESNET_DEPTHS: dict[int, Depth] = {6: 50, 23: 101}
 RESNET_WIDTHS, RESNET_EXPANSION = (64, 128, 256, 512), 4
-# of ImageNet, RGB in [0, 1]
+# ImageNet's statistics, RGB in [0, 1]
 IMAGENET_MEAN, IMAGENET_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 # lower bound of activations: powers and gradients stay finite
 _MINIMUM = 1e-6
@@ -42,9 +42,9 @@ class Vgg16Features(nn.Sequential):
         super().__init__(*layers[: last + 1])
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the activation (B, C, h, w) of the last layer for (B, 3, H, W), left unchanged."""
+        """Return the last layer's activation (B, C, h, w) of images (B, 3, H, W)."""
         for layer in self:
-            # in place: maps of a large image have 200 MB
+            # in place: feature maps of a large image take 200 MB
             x = torch.relu_(x) if isinstance(layer, nn.ReLU) else layer(x)
         return x
 
@@ -58,8 +58,8 @@ def imagenet_normalised(image: torch.Tensor) -> torch.Tensor:
 class Bottleneck(nn.Module):
     """Bottleneck block of a ResNet, with the stride on the 3x3 convolution.
 
-    ``strided_first``: stride on the first 1x1 instead; ``bias`` and ``epsilon``: of convolutions
-    and normalisations.
+    ``strided_first`` puts the stride on the first 1x1 convolution instead. ``bias`` is of the
+    convolutions, ``epsilon`` of the normalisations.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class Bottleneck(nn.Module):
 
 
 class ResNet(nn.Module):
-    """ResNet-50 or ResNet-101; ``dilated`` is output stride 16 instead of 32."""
+    """ResNet-50 or ResNet-101; ``dilated`` gives output stride 16 instead of 32."""
 
     def __init__(self, depth: Depth, *, dilated: bool = False) -> None:
         super().__init__()
@@ -121,7 +121,7 @@ class ResNet(nn.Module):
             self.add_module(f"layer{number}", stage)
 
     def forward(self, image: torch.Tensor) -> list[torch.Tensor]:
-        """Return features of the four stages, with 256, 512, 1024 and 2048 channels."""
+        """Return features (B, C, h, w) of the four stages: C is 256, 512, 1024 and 2048."""
         x = F.relu(self.bn1(self.conv1(image)), inplace=True)
         x = F.max_pool2d(x, 3, stride=2, padding=1)
         features = []
@@ -137,6 +137,6 @@ def generalized_mean(features: torch.Tensor, power: torch.Tensor | float) -> tor
     ``features`` (B, C, H, W) are clamped to 1e-6; the result is at least float32. ``power`` is not
     0.
     """
-    # a third power overflows half precision at 41
+    # the third power of 41 overflows half precision
     values = features if features.dtype == torch.float64 else features.float()
     return values.clamp(min=_MINIMUM).pow(power).mean(dim=(2, 3)).pow(1.0 / power)

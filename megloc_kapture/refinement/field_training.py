@@ -75,7 +75,7 @@ class FieldTrainingOptions(NetworkOptions):
 
 
 class FieldTrainer:
-    """A field, its training pixels and its optimizer; holds out some of eight or more ``views``."""
+    """Trainer of a field on ``views``; every ``held_out_every``-th view is held out."""
 
     def __init__(
         self,
@@ -107,11 +107,13 @@ class FieldTrainer:
         self._step, self._seconds = 0, 0.0
 
     def resume(self, state: bytes, path: Path) -> None:
-        """Restore a state passed to ``keep``; DataError if damaged or of another training."""
-        found = load_state(state, path, self._field.module, self._optimizer)
-        if found.get("training") != self._fingerprint:
-            raise DataError("is of other options or images; -f begins again", path=path)
-        self._step, self._seconds = found["step"], float(found["seconds"])
+        """Restore a state passed to ``keep``; DataError if damaged or from another training."""
+        content = load_state(state, path, self._field.module, self._optimizer)
+        if content.get("training") != self._fingerprint:
+            raise DataError(
+                "is from a training with other options or images; -f starts over", path=path
+            )
+        self._step, self._seconds = content["step"], float(content["seconds"])
 
     @cached_property
     def _fingerprint(self) -> str:
@@ -130,17 +132,17 @@ class FieldTrainer:
         ``keep`` receives the state.
         """
         options, field = self.options, self._field
-        started = time.monotonic() - self._seconds
-        shown = max(options.steps // 5, 1)
+        start_s = time.monotonic() - self._seconds
+        report_every = max(options.steps // 5, 1)
         generator = torch.Generator()
         for step in range(self._step, options.steps):
-            done, self._seconds = step / options.steps, time.monotonic() - started
+            progress_share, self._seconds = step / options.steps, time.monotonic() - start_s
             if options.minutes is not None:
-                done = max(done, self._seconds / 60 / options.minutes)
-            if done >= 1:
+                progress_share = max(progress_share, self._seconds / 60 / options.minutes)
+            if progress_share >= 1:
                 break
             for group, rate in zip(self._optimizer.param_groups, self._rates, strict=True):
-                group["lr"] = rate * _DECAY**done * min(1.0, (step + 1) / 50)
+                group["lr"] = rate * _DECAY**progress_share * min(1.0, (step + 1) / 50)
             seeds = np.random.SeedSequence([options.seed, step])
             generator.manual_seed(int(seeds.generate_state(1, np.uint64)[0]))
             with _compiling() if options.compiled else nullcontext():
@@ -149,9 +151,13 @@ class FieldTrainer:
             if self._step == options.steps:
                 break
             if keep is not None and self._step % _KEEP_EVERY == 0:
-                more = {"step": self._step, "seconds": self._seconds, "training": self._fingerprint}
-                keep(state_bytes(field.module, self._optimizer, more))
-            if progress is not None and self._step % shown == 0:
+                counters = {
+                    "step": self._step,
+                    "seconds": self._seconds,
+                    "training": self._fingerprint,
+                }
+                keep(state_bytes(field.module, self._optimizer, counters))
+            if progress is not None and self._step % report_every == 0:
                 scores = [field.held_out_psnr(view) for view in self._held_out[:2]]
                 progress(self._step, self._seconds, scores)
         field.module.requires_grad_(False)
@@ -176,7 +182,8 @@ class FieldTrainer:
 def _compiling() -> Iterator[None]:
     """Enable torch.compile, with its cache keyed by processor.
 
-    torch caches graphs by content only: one compiled for AVX2 writes past its arrays under AVX-512.
+    torch caches graphs by content only: a graph compiled for AVX2 writes out of bounds with
+    AVX-512.
     """
     from torch._dynamo.exc import TorchDynamoException
 
@@ -200,18 +207,18 @@ def _groups(module: FieldModule) -> list[dict[str, object]]:
 
 class _Pixels:
     def __init__(self, views: Sequence[FieldView], max_side_px: int) -> None:
-        found = [pixels_of(view, max_side_px) for view in views]
-        self._cameras = list(dict.fromkeys(camera for camera, *_ in found))
-        self._camera_of = np.array([self._cameras.index(camera) for camera, *_ in found])
+        pixels = [pixels_of(view, max_side_px) for view in views]
+        self._cameras = list(dict.fromkeys(camera for camera, *_ in pixels))
+        self._camera_of = np.array([self._cameras.index(camera) for camera, *_ in pixels])
         self._poses = [view.cam_from_world for view in views]
-        self._starts = np.cumsum([0, *(len(rgb) for _, rgb, _, _ in found)])
-        self._rgb = np.concatenate([rgb for _, rgb, _, _ in found])
-        self._usable = np.flatnonzero(np.concatenate([usable for _, _, usable, _ in found]))
+        self._starts = np.cumsum([0, *(len(rgb) for _, rgb, _, _ in pixels)])
+        self._rgb = np.concatenate([rgb for _, rgb, _, _ in pixels])
+        self._usable = np.flatnonzero(np.concatenate([usable for _, _, usable, _ in pixels]))
         if not len(self._usable):
             raise DataError("masks leave no pixel to train on")
         self._depth = None
-        if any(depth is not None for *_, depth in found):
-            depths = [np.zeros(len(rgb), np.float32) if z is None else z for _, rgb, _, z in found]
+        if any(depth is not None for *_, depth in pixels):
+            depths = [np.zeros(len(rgb), np.float32) if z is None else z for _, rgb, _, z in pixels]
             self._depth = np.concatenate(depths)
         self._rotations = np.stack([pose.rotation_matrix() for pose in self._poses])
         self._centres = np.stack([pose.center() for pose in self._poses])
@@ -235,27 +242,27 @@ class _Pixels:
         return FieldFrame(centre=(x, y, z), scale=scale, near=near, far=far)
 
     def _points(self, rows: NDArray[np.int64], depth: Floats) -> NDArray[np.float64]:
-        image, rays = self._lines(rows)
+        image, rays = self._world_rays(rows)
         return np.asarray(self._centres[image] + rays * depth[rows, None])
 
-    def _lines(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def _world_rays(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         image = np.searchsorted(self._starts, rows, side="right") - 1
         rays = np.empty((len(rows), 3))
         camera_of = self._camera_of[image]
         for number in np.unique(camera_of):
-            which = camera_of == number
+            of_camera = camera_of == number
             camera = self._cameras[number]
-            y, x = np.divmod(rows[which] - self._starts[image[which]], camera.width)
-            # only for these pixels: a map may have a camera for each image
-            rays[which] = bearing_rays(camera, np.stack([x + 0.5, y + 0.5], axis=1))
+            y, x = np.divmod(rows[of_camera] - self._starts[image[of_camera]], camera.width)
+            # rays of these pixels only: a map may have as many cameras as images
+            rays[of_camera] = bearing_rays(camera, np.stack([x + 0.5, y + 0.5], axis=1))
         return image, np.einsum("nj,njk->nk", rays, self._rotations[image])
 
     def batch(
         self, field: NeuralField, count: int, generator: torch.Generator
     ) -> tuple[Rays, torch.Tensor]:
-        drawn = torch.randint(len(self._usable), (count,), generator=generator).numpy()
-        rows = self._usable[drawn]
-        image, directions = self._lines(rows)
+        chosen = torch.randint(len(self._usable), (count,), generator=generator).numpy()
+        rows = self._usable[chosen]
+        image, directions = self._world_rays(rows)
         frame, device = field.frame, field.device
 
         def tensor(values: NDArray[np.floating]) -> torch.Tensor:

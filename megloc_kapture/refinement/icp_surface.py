@@ -1,4 +1,4 @@
-"""Clouds and surfaces for ICP: points of depth maps, normals and fits.
+"""Point clouds and surfaces for ICP: points from depth maps, normals and fits.
 
 The adapter of small_gicp runs with one thread: its voxel grid is not deterministic with more.
 """
@@ -21,11 +21,11 @@ from megloc_kapture.plugins import DepthView
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Floats = NDArray[np.float64]
-NORMAL_NEIGHBOURS = 20  # for a normal; small_gicp's default
+NORMAL_NEIGHBOURS = 20  # small_gicp's default
 _MAX_ITERATIONS = 20
 _ROTATION_EPSILON_RAD = 1e-4
 _TRANSLATION_EPSILON_M = 1e-4
-_CONVERGED = 5e-5  # radians and metres, a hundredth of the required accuracy
+_CONVERGED = 5e-5  # radians and metres: a hundredth of the required accuracy
 # Cauchy scale with 95 % efficiency under Gaussian noise
 _CAUCHY_EFFICIENT = 2.385
 
@@ -57,8 +57,8 @@ def depth_cloud(
 ) -> Floats:
     """Return the points (N, 3) of a depth map in the frame of its image, in metres.
 
-    Pixels without depth, too far, at depth edges (sensors smear them: Khoshelham and Elberink,
-    Sensors 12(2), 2012) and hidden by the image's mask are dropped.
+    Pixels are dropped that have no depth or too large a depth, are at depth edges (sensors smear
+    them: Khoshelham and Elberink, Sensors 12(2), 2012) or are masked in the image.
     """
     options = options or DepthCloudOptions()
     depth = np.asarray(view.depth_m, np.float32)
@@ -127,7 +127,7 @@ def downsample(points: Floats, voxel_m: float) -> Floats:
 
 
 def surface_of(points: Floats) -> Surface:
-    """Estimate the surface through points (N, 3) near the origin; see :func:`downsample`."""
+    """Estimate the surface through points (N, 3); they must be near the origin."""
     cloud = small_gicp.PointCloud(np.ascontiguousarray(points))
     tree = small_gicp.KdTree(cloud)
     small_gicp.estimate_normals(cloud, tree, min(NORMAL_NEIGHBOURS, len(points)))
@@ -139,7 +139,7 @@ def fit_to_surface(
 ) -> RigidTransform | None:
     """Fit points (N, 3) to a surface: point-to-plane ICP by Levenberg-Marquardt (``PLANE_ICP``).
 
-    None without correspondences within ``max_distance_m``.
+    Return None without correspondences within ``max_distance_m``.
     """
     start = np.eye(4)
     start[:3, :3] = surface_from_points.rotation_matrix()
@@ -153,10 +153,10 @@ def fit_to_surface(
         rotation_epsilon=_ROTATION_EPSILON_RAD,
         translation_epsilon=_TRANSLATION_EPSILON_M,
     )
-    moved = np.array(result.T_target_source)
-    if result.num_inliers == 0 or not np.isfinite(moved).all():
+    target_from_source = np.array(result.T_target_source)
+    if result.num_inliers == 0 or not np.isfinite(target_from_source).all():
         return None
-    return RigidTransform.from_matrix(moved[:3, :3], moved[:3, 3])
+    return RigidTransform.from_matrix(target_from_source[:3, :3], target_from_source[:3, 3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,10 +180,10 @@ def surface_fit(
     far_m: float,
 ) -> SurfaceFit:
     rotation = surface_from_points.rotation_matrix()
-    moved = surface_from_points.apply(points)
-    rows, distances = surface.nearest(moved)
+    transformed = surface_from_points.apply(points)
+    rows, distances = surface.nearest(transformed)
     normals = surface.normals[rows]
-    residuals = np.einsum("ni,ni->n", moved - surface.points[rows], normals)
+    residuals = np.einsum("ni,ni->n", transformed - surface.points[rows], normals)
     near, far = distances <= near_m, distances <= far_m
     return SurfaceFit(
         overlap=float(near.mean()) if len(near) else 0.0,
@@ -196,10 +196,10 @@ def surface_fit(
 
 
 def condition_number(fit: SurfaceFit) -> float:
-    """Return the condition number of the fit's normal matrix; infinite for fewer than 6 points.
+    """Return the condition number of the fit's normal matrix; infinite with fewer than 6 points.
 
-    Points are centred and scaled, so that rotation and translation weigh alike (Gelfand et al.,
-    3DIM 2003, section 2).
+    Points are centred and scaled, so that rotation and translation have equal weight (Gelfand et
+    al., 3DIM 2003, section 2).
     """
     if len(fit.points) < 6:
         return np.inf
@@ -213,7 +213,7 @@ def condition_number(fit: SurfaceFit) -> float:
 def fit_covariance(fit: SurfaceFit) -> Floats:
     """Estimate the covariance (6, 6) of ``cam_from_world``, rotation first, left perturbation.
 
-    Residuals count as independent; systematic sensor errors are not included.
+    Residuals are assumed independent; systematic sensor errors are not included.
     """
     jacobian = np.column_stack([np.cross(fit.points, fit.normals), fit.normals])
     deviation = deviation_by_median(fit.residuals_m)
@@ -229,34 +229,34 @@ def fit_weighted(
 ) -> RigidTransform | None:
     """Refine a fit of points (N, 3) to a nearby surface, point to plane, weighted by noise (N,).
 
-    Gauss-Newton on Cauchy's loss. None for fewer than six points within ``max_distance_m`` or an
-    undetermined transform.
+    Gauss-Newton with a Cauchy loss. Return None with fewer than six points within
+    ``max_distance_m``, or if the transform is undetermined.
     """
     transform = surface_from_points
     for _ in range(_MAX_ITERATIONS):
-        moved = transform.apply(points)
-        rows, distances = surface.nearest(moved)
+        transformed = transform.apply(points)
+        rows, distances = surface.nearest(transformed)
         near = distances <= max_distance_m
         if near.sum() < 6:
             return None
-        normals, moved = surface.normals[rows[near]], moved[near]
-        residuals = np.einsum("ni,ni->n", moved - surface.points[rows[near]], normals)
+        normals, transformed = surface.normals[rows[near]], transformed[near]
+        residuals = np.einsum("ni,ni->n", transformed - surface.points[rows[near]], normals)
         relative = residuals / noise[near]
         scale = deviation_by_median(relative)
         if scale == 0:
             return transform
         weights = 1.0 / (1.0 + (relative / (_CAUCHY_EFFICIENT * scale)) ** 2) / noise[near] ** 2
-        # about the points' centre, rotation and translation are nearly independent
+        # at the origin of the points, rotation and translation are nearly uncorrelated
         origin = np.array(transform.translation)
-        jacobian = np.column_stack([np.cross(moved - origin, normals), normals])
+        jacobian = np.column_stack([np.cross(transformed - origin, normals), normals])
         weighted = jacobian * weights[:, None]
         try:
             step = -np.linalg.solve(weighted.T @ jacobian, weighted.T @ residuals)
         except np.linalg.LinAlgError:
             return None
-        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        rotation = Rotation.from_rotvec(step[:3]).as_matrix()
         transform = RigidTransform.from_matrix(
-            turn @ transform.rotation_matrix(), origin + step[3:]
+            rotation @ transform.rotation_matrix(), origin + step[3:]
         )
         if np.linalg.norm(step) < _CONVERGED:
             break

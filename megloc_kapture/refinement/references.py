@@ -1,4 +1,4 @@
-"""Reference images of refinement by rendering: choice, preparation and map consistency.
+"""Reference images for refinement by rendering: selection, preparation, map consistency.
 
 Consistency is tested by leave-one-out refinement of map images (Stone, JRSS B 1974) against images
 with another viewing angle. An image contradicts the map if its displacement exceeds the claimed
@@ -30,13 +30,13 @@ from megloc_kapture.refinement.pyramid import (
 from megloc_kapture.values import Camera, RigidTransform
 
 _FORWARD = np.array([0.0, 0.0, 1.0])
-# images with known displacement that suffice, that are required (all of five on the wrong side of a
-# median has a chance of 1 in 32), and that are tried
+# numbers of held-out images: displacements that suffice, displacements required (all five are on
+# the wrong side of the true median with a chance of 1 in 32), and images tried
 MAX_TESTED, MIN_TESTED, MAX_TRIED = 24, 5, 96
 # baseline over distance of the surfaces: an angle of about 6 deg between views
 _MIN_PARALLAX = 0.1
-# candidate references: nearest ones whose overlap is bounded, and best ones whose overlap is
-# measured
+# candidate references: nearest images, of which the overlap is bounded, and those of largest
+# bound, of which the overlap is measured
 _NEAREST, _BEST = 200, 6
 _ASKED_POINTS = 300
 _MIN_SHARED = 0.1
@@ -45,7 +45,7 @@ _RESOLVED_PX = 0.05
 
 
 class ReferenceImages:
-    """Finder of map images, by their ``cam_from_world``, that may overlap with a camera."""
+    """Index of map images by ``cam_from_world``, for those that may overlap with a camera."""
 
     def __init__(self, poses: Mapping[str, RigidTransform]) -> None:
         self.names = tuple(sorted(poses))
@@ -63,22 +63,23 @@ class ReferenceImages:
         max_angle_deg: float = 60.0,
         min_distance_m: float = 0.0,
     ) -> list[str]:
-        """Return images with a similar viewing direction, nearest first, half from ``first``.
+        """Return images with a similar viewing direction, preferably half of them from ``first``.
 
-        ``first`` are images that match; ``only_first`` uses no others.
+        Each half is ordered by distance. ``first`` are images with matches; ``only_first`` excludes
+        all others.
         """
         forward = cam_from_world.rotation_matrix()[2]
         facing = self._directions @ forward >= np.cos(np.deg2rad(max_angle_deg))
         distances = np.linalg.norm(self._centers - cam_from_world.center(), axis=1)
         usable = facing & (distances >= min_distance_m)
-        order = [int(at) for at in np.argsort(distances, kind="stable") if usable[at]]
+        order = [int(row) for row in np.argsort(distances, kind="stable") if usable[row]]
         known = set(first)
-        chosen = [at for at in order if self.names[at] in known]
+        chosen = [row for row in order if self.names[row] in known]
         if only_first:
-            return [self.names[at] for at in chosen[:max_references]]
+            return [self.names[row] for row in chosen[:max_references]]
         chosen = chosen[: (max_references + 1) // 2]
-        chosen += [at for at in order if at not in set(chosen)][: max_references - len(chosen)]
-        return [self.names[at] for at in chosen]
+        chosen += [row for row in order if row not in set(chosen)][: max_references - len(chosen)]
+        return [self.names[row] for row in chosen]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +91,7 @@ class RenderingQuery:
 
 @dataclass(frozen=True, eq=False)
 class RenderingReference:
-    """A map image with depth, maybe of another camera, to warp into the query."""
+    """A map image to warp into the query, with depth that may be from another camera."""
 
     image: NDArray[np.uint8]
     camera: Camera
@@ -130,7 +131,7 @@ def pyramid_of(view: RenderingQuery | RenderingReference, options: RenderingOpti
 
 @dataclass(frozen=True)
 class Displacement:
-    """Displacement of an image by refinement from a presumably right pose."""
+    """Displacement of a map image when its pose, presumably correct, is refined."""
 
     moved_m: float
     turned_deg: float
@@ -138,7 +139,7 @@ class Displacement:
     # claimed_m, claimed_deg: standard deviations by the claimed covariance
     claimed_m: float
     claimed_deg: float
-    squared_distance: float  # of the poses by that covariance; six degrees of freedom
+    squared_distance: float  # Mahalanobis, by that covariance; six degrees of freedom
 
     @property
     def contradicts(self) -> bool:
@@ -149,7 +150,7 @@ class Displacement:
 class Consistency:
     images: int
     contradicting: int
-    # separate medians of their displacements; None without tests
+    # per component; None if no image was tested
     median: Displacement | None
     reason: str  # of inconsistency; empty if consistent
 
@@ -162,21 +163,21 @@ class Consistency:
 class HoldsOut(Protocol):
     name: str
     require_consistent_map: bool
-    """If true, poses may be refined only in a map that was found consistent."""
+    """If true, poses may be refined only in a map that is tested to be consistent."""
 
     def hold_out(
         self, image: str, images: ReferenceImages, scene: RankingScene
     ) -> Displacement | None:
-        """Return the displacement of a map image; None where the others do not determine it."""
+        """Return the displacement of a map image; None if other images do not determine it."""
         ...
 
 
 def spread_names(names: Sequence[str]) -> list[str]:
-    """Return at most ``MAX_TRIED`` names in van der Corput's order: prefixes are spread evenly."""
+    """Return at most ``MAX_TRIED`` names in van der Corput order: every prefix is spread evenly."""
     names = sorted(names)
     bits = max(len(names) - 1, 1).bit_length()
     order = (int(f"{k:0{bits}b}"[::-1], 2) for k in range(1 << bits))
-    return [names[at] for at in order if at < len(names)][:MAX_TRIED]
+    return [names[row] for row in order if row < len(names)][:MAX_TRIED]
 
 
 def judge_consistency(displacements: Iterable[Displacement | None]) -> Consistency:
@@ -188,7 +189,9 @@ def judge_consistency(displacements: Iterable[Displacement | None]) -> Consisten
             if len(known) == MAX_TESTED:
                 break
     if not known:
-        return Consistency(0, 0, None, "no map image with depth is seen by others from elsewhere")
+        return Consistency(
+            0, 0, None, "no map image with depth overlaps with images from other viewpoints"
+        )
     names = Displacement.__dataclass_fields__
     median = Displacement(
         *(float(np.median([getattr(each, name) for each in known])) for name in names)
@@ -197,13 +200,13 @@ def judge_consistency(displacements: Iterable[Displacement | None]) -> Consisten
     reason = ""
     if len(known) < MIN_TESTED:
         reason = (
-            f"the map's consistency is not known: {len(known)} of its images are seen by others "
-            f"from elsewhere, at least {MIN_TESTED} are needed"
+            f"the map's consistency is not known: {len(known)} of its images overlap with "
+            f"images from other viewpoints, at least {MIN_TESTED} are needed"
         )
     elif 2 * contradicting > len(known):
         reason = (
             f"the map contradicts itself: {contradicting} of {len(known)} held-out images would "
-            f"move by more than claimed, all by {median.moved_m:.3f} m, "
+            f"move by more than their uncertainty, all of them by {median.moved_m:.3f} m, "
             f"{median.turned_deg:.2f} deg, {median.moved_px:.1f} px (medians)"
         )
     return Consistency(len(known), contradicting, median, reason)
@@ -212,20 +215,20 @@ def judge_consistency(displacements: Iterable[Displacement | None]) -> Consisten
 def references_elsewhere(
     view: RenderingReference, images: ReferenceImages, scene: RankingScene
 ) -> list[RenderingReference]:
-    """Return images of the map with another viewing angle, those with most overlap first."""
-    own = lifted(view)
-    points = own.points[:: max(1, len(own.points) // _ASKED_POINTS)]
+    """Return overlapping map images from other viewpoints, largest overlap first."""
+    surface = lifted(view)
+    points = surface.points[:: max(1, len(surface.points) // _ASKED_POINTS)]
     if len(points) == 0:
         return []
     distance_m = float(np.median(view.cam_from_world.apply(points)[:, 2]))
-    near = images.near(
+    neighbours = images.near(
         view.cam_from_world, (), max_references=_NEAREST, min_distance_m=_MIN_PARALLAX * distance_m
     )
-    best = sorted(near, key=lambda name: -_share_inside(points, name, scene))[:_BEST]
-    found = [each for name in best if (each := reference_of(name, scene)) is not None]
-    shared = [_share_seen(view, own, each) for each in found]
+    best = sorted(neighbours, key=lambda name: -_share_inside(points, name, scene))[:_BEST]
+    candidates = [each for name in best if (each := reference_of(name, scene)) is not None]
+    shared = [_share_seen(view, surface, each) for each in candidates]
     order = np.argsort(-np.array(shared), kind="stable")
-    return [found[k] for k in order if shared[k] >= _MIN_SHARED]
+    return [candidates[k] for k in order if shared[k] >= _MIN_SHARED]
 
 
 def _share_inside(points: NDArray[np.float64], name: str, scene: RankingScene) -> float:
@@ -234,8 +237,8 @@ def _share_inside(points: NDArray[np.float64], name: str, scene: RankingScene) -
     return float(in_image(camera, project(camera, pose, ahead)).sum() / len(points))
 
 
-def _share_seen(view: RenderingReference, own: DepthPoints, other: RenderingReference) -> float:
+def _share_seen(view: RenderingReference, surface: DepthPoints, other: RenderingReference) -> float:
     points = lifted(other)
-    seen = visibility([own, points], view.camera, view.cam_from_world).seen[1]
-    free = DepthPoints(points.points[seen], points.px[seen])
-    return float(visibility([free], view.camera, view.cam_from_world).covered.mean())
+    visible = visibility([surface, points], view.camera, view.cam_from_world).seen[1]
+    unoccluded = DepthPoints(points.points[visible], points.px[visible])
+    return float(visibility([unoccluded], view.camera, view.cam_from_world).covered.mean())

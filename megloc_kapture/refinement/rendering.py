@@ -2,7 +2,7 @@
 
 :mod:`megloc_kapture.refinement.photometric` aligns them, and
 :mod:`megloc_kapture.refinement.acceptance` accepts or rejects the result. Alignment converges only
-from a few pixels, so it begins at a coarse level, from several perturbed poses.
+from a few pixels away, so it begins at a coarse level, from several perturbed poses.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ from megloc_kapture.refinement.references import (
 from megloc_kapture.values import Camera, RigidTransform
 
 _MAX_STARTS, _START_POINTS = 5, 2500
-# convergence in pixels of a level: at the finest level, and at the others
+# a step this small, in pixels of the level, ends alignment: at the finest level, and at the others
 _LAST_STEP_PX, _COARSE_STEP_PX = 0.01, 0.2
 # pixels of a level per chosen point, and points of a reference on coarse levels
 _PX_PER_POINT, _COARSE_POINTS = 24, 3200
-# decrease of the cost, in standard errors, that needs no check of the start
+# decrease of the cost, in standard errors, above which the unperturbed start is not tried
 _CLEAR = 4.0
 
 
@@ -61,7 +61,7 @@ def refine_by_rendering(
     cam_from_world: RigidTransform,
     options: RenderingOptions | None = None,
 ) -> PoseRefinement:
-    """Refine the pose of an image, in metres, by references lifted by their depth.
+    """Refine the pose of an image, in metres, by warping references with depth into it.
 
     ``measures`` of the result: cost (robust loss, 0 to 0.5), correlation and overlap before and
     after, decrease of the cost in standard errors, motion in m and deg, points and references.
@@ -79,7 +79,7 @@ def judge_by_rendering(
     *,
     judged: NDArray[np.bool_] | None = None,
 ) -> PoseRefinement:
-    """Judge a pose found by other means, after alignment at the finest level.
+    """Judge a pose from another method, after alignment at the finest level.
 
     ``judged``: bool (H, W), pixels of the query for acceptance, all by default.
     """
@@ -92,24 +92,24 @@ def displacement_by_rendering(
     cam_from_world: RigidTransform,
     options: RenderingOptions | None = None,
 ) -> Displacement | None:
-    """Return the displacement by :func:`refine_by_rendering` from a presumably right pose.
+    """Return the displacement by :func:`refine_by_rendering` of a presumably correct pose.
 
-    For a rejected pose, the distance to the nearest minimum. None where overlap or correlation is
-    too small, or the minimum is out of bounds.
+    If the result is rejected, the displacement is that of the nearest minimum. None if overlap or
+    correlation is too small, or the minimum is out of bounds.
     """
     options = options or RenderingOptions()
-    refining = _Refining(query, references, options)
-    refined = refining.refine(cam_from_world)
+    refiner = _Refining(query, references, options)
+    refined = refiner.refine(cam_from_world)
     if not refined.accepted:
-        refined = refining.judge(cam_from_world, cam_from_world, None)
-    found = refined.measures
-    if "squared_distance" not in found or (
-        found["moved_m"] > options.max_translation_m
-        or found["turned_deg"] > options.max_rotation_deg
-        or found["correlation_after"] < options.min_correlation
+        refined = refiner.judge(cam_from_world, cam_from_world, None)
+    result = refined.measures
+    if "squared_distance" not in result or (
+        result["moved_m"] > options.max_translation_m
+        or result["turned_deg"] > options.max_rotation_deg
+        or result["correlation_after"] < options.min_correlation
     ):
         return None
-    return Displacement(**{name: found[name] for name in Displacement.__dataclass_fields__})
+    return Displacement(**{name: result[name] for name in Displacement.__dataclass_fields__})
 
 
 class _Refining:
@@ -134,7 +134,7 @@ class _Refining:
         clear = searched.accepted and searched.measures["significance"] >= _CLEAR
         if clear or coarsest == 0:
             return searched
-        # perturbed starts may lead away from a pose that was nearly right
+        # the best perturbed start may lead away from a nearly correct pose
         direct = self._decide(start, overlap, self._align(0, start, sight))
         if not searched.accepted:
             return direct if direct.accepted else searched
@@ -146,10 +146,10 @@ class _Refining:
         sight, overlap = self._visibility(pose)
         if overlap < self.least_overlap:
             return _uncovered(start, overlap)
-        found = self._align(0, pose, sight)
-        if found is not None and judged is not None:
-            found = replace(found, problem=found.problem.within(judged))
-        return self._decide(start, overlap, found)
+        candidate = self._align(0, pose, sight)
+        if candidate is not None and judged is not None:
+            candidate = replace(candidate, problem=candidate.problem.within(judged))
+        return self._decide(start, overlap, candidate)
 
     def _visibility(self, pose: RigidTransform) -> tuple[Visibility, float]:
         sight = visibility(self.points, self.camera, pose)
@@ -163,27 +163,27 @@ class _Refining:
         if len(problem.chosen.points) < MIN_POINTS:
             return None
         pose = self._best_perturbation(problem, start)
-        found = self._align(coarsest, pose, sight)
+        candidate = self._align(coarsest, pose, sight)
         for number in range(coarsest - 1, -1, -1):
-            if found is None:
+            if candidate is None:
                 break
-            pose = found.alignment.cam_from_world
+            pose = candidate.alignment.cam_from_world
             if number == coarsest - 1:  # later steps are too small to change visibility
                 sight = visibility(self.points, self.camera, pose)
-            found = self._align(number, pose, sight)
-        return found
+            candidate = self._align(number, pose, sight)
+        return candidate
 
     def _align(self, number: int, pose: RigidTransform, sight: Visibility) -> Candidate | None:
         problem = self._problem(number, pose, sight)
         if len(problem.chosen.points) < MIN_POINTS:
             return None
-        found = problem.nuisance_at(pose)
+        alignment = problem.nuisance_at(pose)
         for step_px in (_COARSE_STEP_PX, _COARSE_STEP_PX if number else _LAST_STEP_PX):
             # occlusion estimates improve with the pose
-            unhidden = unoccluded_points(problem, found)
-            free = problem.subset(unhidden) if unhidden.sum() >= MIN_POINTS else problem
-            found = minimise(free, found, last_step_px=step_px, rounds=1 if number else 2)
-        return Candidate(problem, free, found)
+            unoccluded = unoccluded_points(problem, alignment)
+            free = problem.subset(unoccluded) if unoccluded.sum() >= MIN_POINTS else problem
+            alignment = minimise(free, alignment, last_step_px=step_px, rounds=1 if number else 2)
+        return Candidate(problem, free, alignment)
 
     def _problem(self, number: int, pose: RigidTransform, sight: Visibility) -> LevelProblem:
         level = self.query_levels[number]
@@ -200,13 +200,13 @@ class _Refining:
         return max(tried, key=partial(correlation, fewer)).cam_from_world
 
     def _decide(
-        self, start: RigidTransform, old_overlap: float, found: Candidate | None
+        self, start: RigidTransform, old_overlap: float, candidate: Candidate | None
     ) -> PoseRefinement:
-        if found is None:
+        if candidate is None:
             reason = f"fewer than {MIN_POINTS} points to compare"
             return PoseRefinement(start, reason, {"overlap_before": old_overlap})
-        _, overlap = self._visibility(found.alignment.cam_from_world)
-        return accept_or_keep(start, found, (old_overlap, overlap), self.options)
+        _, overlap = self._visibility(candidate.alignment.cam_from_world)
+        return accept_or_keep(start, candidate, (old_overlap, overlap), self.options)
 
 
 def _uncovered(start: RigidTransform, overlap: float) -> PoseRefinement:
@@ -253,5 +253,5 @@ class Rendering:
                 used.append(reference)
         if not used:
             return PoseRefinement(cam_from_world, "no reference image has depth")
-        seen = RenderingQuery(scene.query_image(query), camera, scene.query_mask(query))
-        return refine_by_rendering(seen, used, cam_from_world, self.options)
+        view = RenderingQuery(scene.query_image(query), camera, scene.query_mask(query))
+        return refine_by_rendering(view, used, cam_from_world, self.options)

@@ -13,9 +13,9 @@ from pydantic import Field
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.values import Options
 
-_BLOCK_ELEMENTS = 1 << 24  # similarities held at once, per feature: 64 MiB of float32
+_BLOCK_ELEMENTS = 1 << 24  # similarities in memory, per feature: 64 MiB of float32
 _VECTOR_ELEMENTS = 1 << 25  # of a block of database rows, per feature: 128 MiB of float32
-_MOST_ROWS = 1 << 14  # of a block, however short they are
+_MOST_ROWS = 1 << 14  # of a block, even if its vectors are short
 Float32 = NDArray[np.float32]
 Matrices = Sequence[NDArray[np.floating[Any]]]
 Found = tuple[NDArray[np.int64], Float32]
@@ -60,7 +60,9 @@ def common_length(sources: Sequence[VectorBlocks]) -> int:
     """Return the number of rows of all sources; DataError if they differ."""
     lengths = {len(source) for source in sources}
     if len(lengths) != 1:
-        raise DataError(f"features of one set of images have {sorted(lengths)} rows")
+        raise DataError(
+            f"global features of the same images differ in their number of rows: {sorted(lengths)}"
+        )
     return lengths.pop()
 
 
@@ -77,9 +79,9 @@ class FusedSearch:
     ) -> list[Found]:
         """Rank the rows: one ranking, or one per feature for fusion of ranks.
 
-        ``queries`` and ``database`` have (Q, D_i) and (M, D_i) per feature. A ranking has indices
-        int64 (Q, min(K, M)), best first, ties in the database's order, and scores float32; K is
-        ``top_k``, or more for fusion of ranks.
+        ``queries`` and ``database`` have arrays (Q, D_i) and (M, D_i) per feature. A ranking has
+        indices int64 (Q, min(K, M)), best first, ties in the database's order, and scores float32;
+        K is ``top_k``, or more if ranks are fused.
         """
         if len(queries) == 0 or len(queries) != len(database):
             raise OptionError(
@@ -121,15 +123,17 @@ def _search(
     num_queries, num_rows = len(vectors[0]), common_length(sources)
     step = _VECTOR_ELEMENTS // max(1, *(source.dimension for source in sources))
     step = max(1, min(step, _MOST_ROWS, _BLOCK_ELEMENTS))
-    at_once = min(max(1, _BLOCK_ELEMENTS // step), num_queries)
+    queries_per_block = min(max(1, _BLOCK_ELEMENTS // step), num_queries)
     num_rankings = len(combine([np.zeros((0, 0), np.float32)] * len(sources)))
     best = [_BestRows(num_queries, min(length, num_rows)) for _ in range(num_rankings)]
     for left in range(0, num_rows, step) if num_queries else ():
         right = min(left + step, num_rows)
         blocks = [source.read(left, right) for source in sources]
-        for first in range(0, num_queries, at_once):
-            some = slice(first, first + at_once)
-            products = [rows[some] @ block.T for rows, block in zip(vectors, blocks, strict=True)]
+        for first in range(0, num_queries, queries_per_block):
+            block_queries = slice(first, first + queries_per_block)
+            products = [
+                rows[block_queries] @ block.T for rows, block in zip(vectors, blocks, strict=True)
+            ]
             for scores, ranking in zip(combine(products), best, strict=True):
                 ranking.add(first, left, scores)
     return [(ranking.rows, ranking.scores) for ranking in best]
@@ -154,15 +158,15 @@ class _BestRows:
 
     def add(self, first_query: int, first_row: int, scores: NDArray[np.floating[Any]]) -> None:
         """Add scores (q, b) of queries and database rows; blocks come in the database's order."""
-        known = slice(first_query, first_query + len(scores))
+        block = slice(first_query, first_query + len(scores))
         top_k = self.rows.shape[1]
-        found, columns = _first_best(np.asarray(scores, np.float32), top_k)
-        both = np.concatenate([self.scores[known], found], axis=1)
-        rows = np.concatenate([self.rows[known], first_row + columns], axis=1)
-        # known rows come first, so that they win ties
-        order = np.argsort(-both, axis=1, kind="stable")[:, :top_k]
-        self.scores[known] = np.take_along_axis(both, order, axis=1)
-        self.rows[known] = np.take_along_axis(rows, order, axis=1)
+        new_scores, columns = _first_best(np.asarray(scores, np.float32), top_k)
+        merged = np.concatenate([self.scores[block], new_scores], axis=1)
+        rows = np.concatenate([self.rows[block], first_row + columns], axis=1)
+        # previous rows come first, so that they win ties
+        order = np.argsort(-merged, axis=1, kind="stable")[:, :top_k]
+        self.scores[block] = np.take_along_axis(merged, order, axis=1)
+        self.rows[block] = np.take_along_axis(rows, order, axis=1)
 
 
 def _first_best(scores: Float32, count: int) -> tuple[Float32, NDArray[np.int64]]:
@@ -173,7 +177,7 @@ def _first_best(scores: Float32, count: int) -> tuple[Float32, NDArray[np.int64]
     bound = np.partition(scores, width - count, axis=1)[:, width - count, None]
     chosen = scores >= bound
     surplus = np.count_nonzero(chosen, axis=1) - count
-    for row in np.flatnonzero(surplus):  # ties with the last one
+    for row in np.flatnonzero(surplus):  # ties with the last selected score
         equal = np.flatnonzero(scores[row] == bound[row])
         chosen[row, equal[len(equal) - surplus[row] :]] = False
     columns = np.nonzero(chosen)[1].reshape(height, count)
@@ -193,8 +197,8 @@ class FusionOptions(Options):
 
     method: FusionMethod = Field(
         default="ghm",
-        description="ghm: generalized harmonic mean; early: of concatenated vectors; "
-        "reciprocal_rank: of ranks",
+        description="ghm: generalized harmonic mean; early: concatenated vectors; "
+        "reciprocal_rank: ranks",
     )
 
     def fuses_ranks(self) -> bool:
@@ -261,22 +265,22 @@ def fuse_rankings(
 def greedy_coverage(
     keypoint_ids: Sequence[NDArray[np.int64]], keep: int
 ) -> tuple[list[int], list[int]]:
-    """Choose images one by one by the keypoints that the previous ones do not match.
+    """Choose images greedily by the number of matched keypoints that they add.
 
-    The matches alone would prefer neighbours of the best image. Greedy maximum coverage (Nemhauser,
-    Wolsey and Fisher, 1978). ``keypoint_ids`` are each image's matched query keypoints. Returns at
-    most ``keep`` indices, and the number of keypoints that each adds.
+    The number of matches would prefer neighbours of the best image. This is greedy maximum coverage
+    (Nemhauser, Wolsey and Fisher, 1978). ``keypoint_ids`` are each image's matched query keypoints.
+    Returns at most ``keep`` indices, and the number of keypoints that each adds.
     """
     size = max((int(ids.max()) + 1 for ids in keypoint_ids if len(ids)), default=0)
     missing = np.ones(size, dtype=bool)
-    left = list(range(len(keypoint_ids)))
+    remaining = list(range(len(keypoint_ids)))
     order: list[int] = []
     added: list[int] = []
-    while left and len(order) < keep:
-        gains = {at: int(missing[keypoint_ids[at]].sum()) for at in left}
-        best = max(left, key=lambda at: (gains[at], len(keypoint_ids[at]), -at))
+    while remaining and len(order) < keep:
+        gains = {row: int(missing[keypoint_ids[row]].sum()) for row in remaining}
+        best = max(remaining, key=lambda row: (gains[row], len(keypoint_ids[row]), -row))
         missing[keypoint_ids[best]] = False
-        left.remove(best)
+        remaining.remove(best)
         order.append(best)
         added.append(gains[best])
     return order, added

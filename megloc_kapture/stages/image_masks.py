@@ -35,8 +35,7 @@ from megloc_kapture.stages.local_features import mask_path, read_image_of, read_
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, Options
 
-# at this quality half of the keypoints move by less than 0.03 px, at a third of the size
-# as PNG
+# median motion of keypoints 0.03 px, and a third of the size of PNG
 JPEG_QUALITY = 98
 
 Mask = NDArray[np.bool_]
@@ -68,19 +67,19 @@ def mask_files(
     """Find mask files by image and source (``own`` or ``user``)."""
     if user_masks is not None and not user_masks.is_dir():
         raise DataError("no such folder of masks", path=user_masks)
-    found = {}
+    files_of = {}
     for image in images:
         paths = {"own": mask_path(folder, image)}
         if user_masks is not None:
             paths["user"] = user_masks / f"{image}.png"
-        found[image] = {source: path for source, path in paths.items() if path.is_file()}
-    if user_masks is not None and not any("user" in files for files in found.values()):
-        example = next(iter(found), "a/b.jpg")
+        files_of[image] = {source: path for source, path in paths.items() if path.is_file()}
+    if user_masks is not None and not any("user" in files for files in files_of.values()):
+        example = next(iter(files_of), "a/b.jpg")
         raise DataError(
-            f"no mask of any image in it; that of {example} is looked for as {example}.png",
+            f"no mask of any image in this folder; the mask of {example} would be {example}.png",
             path=user_masks,
         )
-    return found
+    return files_of
 
 
 def read_masks(files: Mapping[str, Path], shape: tuple[int, ...]) -> dict[str, Mask]:
@@ -90,7 +89,7 @@ def read_masks(files: Mapping[str, Path], shape: tuple[int, ...]) -> dict[str, M
 
 
 class StandingMasks:
-    """Per-camera masks: fixed masks, and unchanging regions by sensor id."""
+    """Cached per-camera masks: fixed masks, and static regions by sensor id."""
 
     def __init__(self, fixed: Sequence[FixedMask], regions: Mapping[str, UnchangingRegion]) -> None:
         self._fixed, self._regions = tuple(fixed), dict(regions)
@@ -98,15 +97,15 @@ class StandingMasks:
         self._standing = lru_cache(maxsize=64)(_standing)
 
     def of(self, sensor_id: str, image: str, camera: Camera) -> dict[str, Mask]:
-        """Return the shared masks bool (H, W) of an image by source, in original pixels."""
+        """Return an image's per-camera masks by source, bool (H, W), in original pixels."""
         region = self._regions.get(sensor_id)
-        fitting = [one for one in self._fixed if one.is_for(sensor_id, image)]
+        fitting = [fixed for fixed in self._fixed if fixed.is_for(sensor_id, image)]
         self._used.update(fitting)
-        mine = tuple(one for one in fitting if not (one.fallback and region))
-        return self._standing(mine, region, camera.width, camera.height)
+        applied = tuple(fixed for fixed in fitting if not (fixed.fallback and region))
+        return self._standing(applied, region, camera.width, camera.height)
 
     def unused(self) -> list[FixedMask]:
-        return [one for one in self._fixed if one not in self._used]
+        return [fixed for fixed in self._fixed if fixed not in self._used]
 
 
 def _standing(
@@ -114,18 +113,18 @@ def _standing(
 ) -> dict[str, Mask]:
     masks = {}
     if fixed:
-        masks["fixed"] = np.logical_and.reduce([_drawn(one, width, height) for one in fixed])
+        masks["fixed"] = np.logical_and.reduce([_drawn(each, width, height) for each in fixed])
     if region:
         masks["unchanging"] = region.mask(width, height)
     return masks
 
 
-def _drawn(one: FixedMask, width: int, height: int) -> Mask:
-    if one.file is None:
-        return one.drawn(width, height)
-    mask = read_mask(one.file, (height, width))
+def _drawn(fixed: FixedMask, width: int, height: int) -> Mask:
+    if fixed.file is None:
+        return fixed.drawn(width, height)
+    mask = read_mask(fixed.file, (height, width))
     if mask is None:
-        raise DataError("no such mask", path=one.file)
+        raise DataError("no such mask", path=fixed.file)
     return mask
 
 
@@ -138,7 +137,7 @@ class ClassMasks:
 
     @classmethod
     def of(cls, segmenter: Segmenter, dynamic: Sequence[str] | None = None) -> ClassMasks:
-        """Create from the dynamic classes, by default the segmenter's."""
+        """Create with the given dynamic classes, by default the segmenter's."""
         wanted = segmenter.dynamic if dynamic is None else dynamic
         unknown = sorted(set(wanted) - set(segmenter.classes))
         if unknown:
@@ -167,25 +166,23 @@ class ClassMasks:
 def find_unchanging_regions(
     folder: KaptureFolder, sequences: Sequence[KaptureFolder] = (), *, work: Work = HERE
 ) -> dict[str, UnchangingRegion]:
-    """Find the unchanging region of each camera, by sensor id; falsy with a reason if not found.
+    """Find the static region of each camera, by sensor id; without one it is false, with a reason.
 
-    ``sequences`` are folders with more images of these cameras: the map's, for queries.
+    ``sequences`` are folders with more images of these cameras: for queries, the map.
     """
     chosen: dict[str, list[tuple[Path, Camera]]] = {}
     regions: dict[str, UnchangingRegion] = {}
     for sensor in sorted({sensor for _, sensor in folder.read().records_camera}):
         images = _images_of(sensor, [folder, *sequences])
         if len(images) < MIN_IMAGES:
-            reason = (
-                f"it has {len(images)} images, and at least {MIN_IMAGES} of a sequence are needed"
-            )
+            reason = f"it has {len(images)} images; at least {MIN_IMAGES} of a sequence are needed"
             regions[sensor] = UnchangingRegion((), reason)
         else:
             number = min(len(images), MAX_IMAGES)
-            picked = np.linspace(0, len(images) - 1, number).round().astype(int)
-            chosen[sensor] = [images[k] for k in picked]
-    everything = [image for images in chosen.values() for image in images]
-    results = iter(work.map(_edges, everything, "unchanging regions"))
+            rows = np.linspace(0, len(images) - 1, number).round().astype(int)
+            chosen[sensor] = [images[k] for k in rows]
+    jobs = [image for images in chosen.values() for image in images]
+    results = iter(work.map(_edges, jobs, "unchanging regions"))
     for sensor, images in chosen.items():
         regions[sensor] = find_unchanging_region(next(results) for _ in images)
     for _ in results:  # exhaust the iterator so that the progress bar completes
@@ -199,8 +196,8 @@ def _images_of(sensor: str, folders: Sequence[KaptureFolder]) -> list[tuple[Path
         data = folder.read()
         if sensor not in data.sensors or data.sensors[sensor].sensor_type != "camera":
             continue
-        taken = sorted((t, image) for (t, s), image in data.records_camera.items() if s == sensor)
-        for _, image in taken:
+        records = sorted((t, image) for (t, s), image in data.records_camera.items() if s == sensor)
+        for _, image in records:
             camera = data.camera_of(image)
             if not images or _SIZE(camera) == _SIZE(images[0][1]):
                 images.append((folder.image_path(image), camera))

@@ -1,6 +1,6 @@
 """Stage: resized, undistorted and masked images, as a new kapture without features and points.
 
-Names, poses, rigs, records and sensor ids stay. Unchanged files and depth maps are linked.
+Names, poses, rigs, records and sensor ids are kept. Unchanged files and depth maps are linked.
 """
 
 from __future__ import annotations
@@ -82,9 +82,9 @@ def _process(
         write(sensors / CLASSES / f"{image}.png", frame.labels)
     if frame.mask is None:
         return {}
-    together = frame.mask
-    write(sensors / "masks" / f"{image}.png", together.astype(np.uint8) * 255)
-    masks = {**frame.masks, "all": together}
+    combined = frame.mask
+    write(sensors / "masks" / f"{image}.png", combined.astype(np.uint8) * 255)
+    masks = {**frame.masks, "all": combined}
     return {source: float((~mask).mean()) for source, mask in masks.items()}
 
 
@@ -99,11 +99,11 @@ def preprocess_images(
 ) -> dict[str, float]:
     """Write a kapture with pre-processed images, cameras and masks.
 
-    Return counts for the log, with the share of all pixels that each source of masks covers.
+    Return counts for the log, including the share of pixels masked by each source.
 
     ``sensors/masks/IMAGE.png`` (0 = ignore) exists for images with masked or invalid pixels,
-    ``sensors/classes`` has the segmenter's labels. ``sequences`` are more folders for finding
-    unchanging regions: the map's, for queries.
+    ``sensors/classes`` has the segmenter's labels. ``sequences`` are more folders in which to find
+    static regions: for queries, the map.
     """
     output = Path(output)
     if output.resolve().is_relative_to(folder.root.resolve()):
@@ -116,7 +116,7 @@ def preprocess_images(
     regions: dict[str, UnchangingRegion] = {}
     if options.masks.unchanging:
         regions = find_unchanging_regions(folder, sequences, work=work)
-    remarks = _remarks(regions, any(one.fallback for one in options.masks.fixed))
+    remarks = _remarks(regions, any(fixed.fallback for fixed in options.masks.fixed))
     standing = StandingMasks(options.masks.fixed, regions)
 
     _unlink_folders(output)
@@ -141,10 +141,10 @@ def preprocess_images(
     results = work.map(process, jobs(), "pre-processing", len(images), plugins=plugins)
     shares: Counter[str] = Counter()
     num_masked = 0
-    for found in results:
-        num_masked += bool(found)
-        shares.update(found)
-    remarks += [f"a fixed mask fits no image: {one.camera}" for one in standing.unused()]
+    for image_shares in results:
+        num_masked += bool(image_shares)
+        shares.update(image_shares)
+    remarks += [f"a fixed mask fits no image: {mask.camera}" for mask in standing.unused()]
     for remark in remarks:
         _log.warning("%s", remark)
     return {
@@ -176,7 +176,7 @@ def _plans(data: KaptureData, options: FrameOptions) -> dict[str, FramePlan]:
 
 
 def _remarks(regions: Mapping[str, UnchangingRegion], have_fallback: bool) -> list[str]:
-    """Report cameras without an unchanging region; raise if none has one, without a fallback."""
+    """Report cameras without a static region; if all lack it, a fallback is required."""
     remarks = [f"camera {name}: {r.reason}" for name, r in sorted(regions.items()) if not r]
     if regions and not (have_fallback or any(region.frontier for region in regions.values())):
         raise OptionError(f"no unchanging region can be found: {remarks[0]}")
@@ -194,11 +194,11 @@ def _with_cameras(data: KaptureData, plans: Mapping[str, FramePlan]) -> KaptureD
 
 
 def _unlink_folders(output: Path) -> None:
-    """Remove linked folders, through which user data would be overwritten."""
+    """Remove linked folders, so that user data behind the links is not overwritten."""
     for name in ("records_data", "masks", CLASSES):
-        place = output / "sensors" / name
-        if place.is_symlink():
-            place.unlink()
+        path = output / "sensors" / name
+        if path.is_symlink():
+            path.unlink()
 
 
 def _link_records(folder: KaptureFolder, output: Path, plans: Mapping[str, FramePlan]) -> bool:
@@ -238,18 +238,20 @@ class Preprocess(PipelineStage):
     def external(self) -> Mapping[str, str]:
         masks = self.options.preprocessing.masks
         drawn = [fixed.file for fixed in masks.fixed if fixed.file is not None]
-        found = {f"mask {path}": files_fingerprint(Path("/"), [path.resolve()]) for path in drawn}
+        fingerprints = {
+            f"mask {path}": files_fingerprint(Path("/"), [path.resolve()]) for path in drawn
+        }
         if masks.user_masks is not None:
             root = masks.user_masks.resolve()
-            found["user masks"] = files_fingerprint(root, root.rglob("*.png"))
-        return found
+            fingerprints["user masks"] = files_fingerprint(root, root.rglob("*.png"))
+        return fingerprints
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         mapping, *queries = work.folders((MAPPING, QUERY))
         options, counts = self.options.preprocessing, dict[str, float]()
         for folder in (mapping, *queries):
             name, out = folder.root.name, work.out / PREPROCESSED / folder.root.name
-            # queries of one camera may be few, or all taken at night
+            # a camera may have few queries, or only night queries
             others = [] if folder is mapping else [mapping]
             found = preprocess_images(folder, out, options, sequences=others, work=work)
             counts |= {f"{name}_{key}": count for key, count in found.items()}

@@ -37,7 +37,7 @@ from megloc_kapture.training.labels import (
 )
 from megloc_kapture.values import Options, RigidTransform
 
-# candidates, whose overlap is then measured
+# candidate pairs, before their overlap is measured
 _CANDIDATES = PairsByPosesOptions(num_neighbours=40, max_angle_deg=90)
 _VIEWS_KEPT = 64
 
@@ -81,14 +81,14 @@ class PairOptions(Options):
     @classmethod
     def _ascend(cls, bounds: tuple[float, ...]) -> tuple[float, ...]:
         if len(bounds) < 2 or bounds[0] < 0 or any(a >= b for a, b in pairwise(bounds)):
-            raise ValueError("overlap_bins are two or more shares, each larger than the one before")
+            raise ValueError("overlap_bins must be two or more ascending bounds")
         return bounds
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingPair:
     images: tuple[Image, Image]  # uint8 (H, W, 3), RGB
-    keys: tuple[str, str] | None  # cache keys; None for images that do not recur
+    keys: tuple[str, str] | None  # cache keys; None for images drawn only once
     label: Labelling  # labels of keypoints (N, 2) and (M, 2) of the images
     # None under a homography
     views: tuple[PosedView, PosedView] | None = None
@@ -117,7 +117,7 @@ class PosedPairs:
         overlaps = np.fromiter(measured, np.float64, len(near))
         if not len(near):
             raise DataError(
-                "no two images have a pose and a depth map of their moment (trajectories.txt, "
+                "no two images have a pose and a depth map with their timestamp (trajectories.txt, "
                 "records_depth.txt)",
                 path=folder.root,
             )
@@ -129,7 +129,7 @@ class PosedPairs:
         if not self._bins:
             raise DataError(
                 f"no pair of images overlaps by {options.overlap_bins[0]:g} to "
-                f"{options.overlap_bins[-1]:g}; the {len(near)} that are near overlap by "
+                f"{options.overlap_bins[-1]:g}; the {len(near)} candidate pairs overlap by "
                 f"{overlaps.min():.2f} to {overlaps.max():.2f}",
                 path=folder.root,
             )
@@ -193,7 +193,7 @@ PairSource = PosedPairs | Photographs
 
 
 def reduced_size(width: int, height: int, max_size_px: int) -> tuple[int, int]:
-    """Return width and height reduced to a longer side."""
+    """Return the size, reduced to a longer side of at most ``max_size_px``."""
     scale = min(1.0, max_size_px / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
@@ -207,16 +207,16 @@ def random_view(
 ) -> tuple[Image, Floats]:
     """Warp a random quadrilateral inside a photograph to a view of a size (w, h).
 
-    Returns the view, uint8 (h, w, 3), and ``view_from_image``, float64 (3, 3), for pixels whose
-    first centre is (0.5, 0.5).
+    Returns the view, uint8 (h, w, 3), and ``view_from_image``, float64 (3, 3), for pixel
+    coordinates with the first centre at (0.5, 0.5).
     """
     width, height = size
     sides = np.array([image.shape[1], image.shape[0]], np.float64)
     rectangle = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64) * size
-    moved = rectangle + rng.uniform(-1, 1, (4, 2)) * options.perspective * np.array(size)
+    perturbed = rectangle + rng.uniform(-1, 1, (4, 2)) * options.perspective * np.array(size)
     angle = np.radians(rng.uniform(-1, 1) * options.max_angle_deg)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    corners = (moved - rectangle.mean(axis=0)) @ turn.T
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    corners = (perturbed - rectangle.mean(axis=0)) @ rotation.T
     extent = np.ptp(corners, axis=0)
     # the largest part of the photograph that fits, times the scale
     corners *= rng.uniform(options.min_scale, 1.0) * (sides / extent).min()
@@ -248,5 +248,5 @@ def relit(image: Image, rng: np.random.Generator, strength: float = 1.0) -> Imag
     level += rng.normal(0, noise, level.shape).astype(np.float32)
     lit = np.clip(255 * level, 0, 255).astype(np.uint8)
     quality = int(rng.integers(100 - int(60 * strength), 101))
-    done, encoded = cv2.imencode(".jpg", lit, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), np.uint8) if done else lit
+    encodes, encoded = cv2.imencode(".jpg", lit, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), np.uint8) if encodes else lit

@@ -1,6 +1,6 @@
 """Training of matchers and descriptors: a seeded loop, its options and its files.
 
-A step's pairs depend on seed and step only, so the state is networks, optimizer and step.
+A step's pairs depend on seed and step only, so the state consists of networks, optimizer and step.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ COLUMNS = (
     *("step", "learning_rate", "loss", "held_out_loss", "precision", "recall"),
     *(f"auc_{bound}" for bound in AUC_DEG),
 )
-_LAST_RATE = 0.01  # of the first
+_LAST_RATE = 0.01  # relative to the initial rate
 _MAX_GRADIENT = 1.0  # norm
 
 
@@ -104,7 +104,7 @@ class DescriptorOptions(TrainingOptions):
 @dataclass
 class TrainingState:
     step: int
-    rows: list[list[float]]  # of the curves so far, COLUMNS; NaN where nothing is held out
+    rows: list[list[float]]  # curves so far, by COLUMNS; NaN if nothing is held out
 
     @classmethod
     def resume(
@@ -167,7 +167,7 @@ class Trainer:
         options, losses = self.options, []
         steps = range(state.step, options.steps)
         threaded = ThreadPoolExecutor(threads) if threads > 1 else nullcontext()
-        # once for all threads: those that extract features would switch it during a step
+        # set for all threads: feature extraction in a thread would toggle it during a step
         with without_tf32(self._device), threaded as pool:
             prepared = ordered_map(
                 lambda step: self._pairs(sources, step), steps, pool, window=2 * threads
@@ -193,14 +193,14 @@ class Trainer:
         }
 
     def evaluate(self) -> list[float]:
-        """Return means over the held-out sources, COLUMNS from the fourth on; NaN without any."""
+        """Return COLUMNS from the fourth on, means over the held-out sources; NaN without any."""
         self.model.eval()
         self.results = {
             name: held_out_result(self.model, pairs) for name, pairs in self._held_out.items()
         }
         if not self.results:
             return [float("nan")] * (len(COLUMNS) - 3)
-        rows = [(one.loss, one.precision, one.recall, *one.auc) for one in self.results.values()]
+        rows = [(r.loss, r.precision, r.recall, *r.auc) for r in self.results.values()]
         return [float(value) for value in np.mean(rows, axis=0)]
 
     def _step(self, step: int, batch: Sequence[PreparedPair]) -> float:
@@ -216,7 +216,7 @@ class Trainer:
         value = float(loss.detach())
         if not np.isfinite(value):
             raise OptionError(
-                f"the loss of step {step + 1} is {value}; begin again with a smaller learning_rate"
+                f"the loss of step {step + 1} is {value}; start over with a smaller learning_rate"
             )
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.model.parameters(), _MAX_GRADIENT)
@@ -228,12 +228,12 @@ class Trainer:
         return self.options.learning_rate * _LAST_RATE ** max(0.0, (step - half) / half)
 
     def _pairs(self, sources: Sequence[PairSource], step: int) -> list[PreparedPair]:
-        found = []
+        batch = []
         for number in range(self.options.pairs_per_step):
             rng = np.random.default_rng([self.options.seed, step, number])
             source = sources[int(rng.integers(len(sources)))]
-            found.append(self._frozen.prepare(source.draw(rng)))
-        return found
+            batch.append(self._frozen.prepare(source.draw(rng)))
+        return batch
 
 
 TASKS: dict[str, type[TrainingOptions]] = {
@@ -255,7 +255,7 @@ class TrainingData:
             raise OptionError("nothing to train on: give a kapture with depth, or photographs")
         both = {path.resolve() for path in trained} & {f.root.resolve() for f in self.held_out}
         if both:
-            raise OptionError(f"{min(both)}: is trained on and held out")
+            raise OptionError(f"{min(both)}: is used for training and held out")
         if len({folder.root.name for folder in self.held_out}) < len(self.held_out):
             raise OptionError("held-out folders need different names")
 
@@ -317,11 +317,11 @@ class _Files:
         except (DataError, ValueError, AttributeError):
             known = None
         if known is None:
-            raise OutputError(f"{self.output}: is of no training; -f replaces it")
+            raise OutputError(f"{self.output}: was not written by a training; -f replaces it")
         if known != record:
             changed = sorted(k for k in {*known, *record} if known.get(k) != record.get(k))
             raise OutputError(
-                f"{self.manifest}: is of another training ({', '.join(changed)}); -f begins again"
+                f"{self.manifest}: is from another training ({', '.join(changed)}); -f starts over"
             )
 
     def write(self, trainer: Trainer, state: TrainingState, record: Mapping[str, Any]) -> None:
@@ -339,6 +339,6 @@ class _Files:
         write_csv_table(self.output.with_suffix(".csv"), COLUMNS, rows)
         results = {name: asdict(result) for name, result in trainer.results.items()}
         write_json(self.manifest, {"training": record, "step": state.step, "held_out": results})
-        # last: the state says that the rest is complete
+        # last: a state means that the other files are complete
         more = {"step": state.step, "rows": state.rows}
         write_bytes(self.state, state_bytes(model, trainer.optimizer, more))

@@ -113,7 +113,7 @@ def test_an_interrupted_training_goes_on(
         "train-field writes one"
     )
     monkeypatch.setattr(field_training.FieldTrainer, "_learn", learn)
-    megloc(*command, "--seed", "1").refused("of other options or images; -f begins again")
+    megloc(*command, "--seed", "1").refused("with other options or images; -f starts over")
     steps: list[int] = []
     monkeypatch.setattr(
         field_training.FieldTrainer, "_learn", lambda t, g: (steps.append(t._step), learn(t, g))

@@ -24,7 +24,7 @@ def test_a_checkpoint_goes_in_whole_or_not_at_all() -> None:
     for tensors, message in (
         ({"bias": whole["bias"]}, "1 missing keys: weight"),
         (whole | {"extra": torch.ones(1)}, "1 unexpected keys: extra"),
-        (whole | {"bias": torch.ones(3)}, r"1 keys of another shape: bias is \(3,\), not \(2,\)"),
+        (whole | {"bias": torch.ones(3)}, r"1 keys with another shape: bias is \(3,\), not \(2,\)"),
         (
             {f"k{number}": torch.ones(1) for number in range(7)},
             "2 missing keys: bias, weight; 7 unexpected keys: k0, k1, k2, k3, k4 and 2 more",

@@ -43,7 +43,8 @@ def test_refinement_is_turned_on_and_off_in_one_workspace(fountain: Path, tmp_pa
         table = pandas.read_csv(workspace.path("localized/status.csv"), keep_default_na=False)
         said = set(table["refinement"])
         if options is refined:
-            assert said == {"rendering: no map image with depth is seen by others from elsewhere"}
+            reason = "no map image with depth overlaps with images from other viewpoints"
+            assert said == {f"rendering: {reason}"}
             assert folder_bytes(workspace.path("localized_unrefined")) == plain
         else:
             assert said == {""}

@@ -147,9 +147,9 @@ def test_interrupted_and_resumed_is_uninterrupted(monkeypatch: pytest.MonkeyPatc
     resumed, _ = trainer.train(keep=states.append)
     expected = whole.module.state_dict()
     assert all(torch.equal(expected[n], v) for n, v in resumed.module.state_dict().items())
-    with pytest.raises(DataError, match=r"state\.pt: .* -f begins again"):
+    with pytest.raises(DataError, match=r"state\.pt: .* -f starts over"):
         FieldTrainer(views(4), QUICK).resume(states[0], path)
-    with pytest.raises(DataError, match=r"state\.pt: not the state .* or damaged"):
+    with pytest.raises(DataError, match=r"state\.pt: is damaged, or the state"):
         trainer.resume(states[0][:-100], path)
 
 

@@ -244,7 +244,7 @@ def test_images_that_say_nothing_of_each_other(corner: Map, verdict: Verdict) ->
         for k, r in enumerate(rotations)
     }
     found = verdict(there)
-    assert found.images == 0 and "seen by others from elsewhere" in found.reason
+    assert found.images == 0 and "overlaps with images from other viewpoints" in found.reason
     # and without depth
     found = verdict(with_depth(corner, lambda view: {"depth_m": np.zeros_like(view.depth_m)}))
     assert found == Consistency(0, 0, None, found.reason) and "depth" in found.reason

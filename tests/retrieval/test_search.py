@@ -146,7 +146,7 @@ ONE, MORE, WIDE = np.zeros((2, 4)), np.zeros((3, 4)), np.zeros((3, 5))
 @pytest.mark.parametrize(
     ("queries", "database", "weights", "match"),
     [
-        ([ONE, ONE], [ONE, MORE], None, r"\[2, 3\] rows"),
+        ([ONE, ONE], [ONE, MORE], None, r"number of rows: \[2, 3\]"),
         ([ONE], [WIDE], None, "different dimensions"),
         ([ONE, ONE], [ONE], None, "2 global features of the queries, 1 of the map"),
         ([ONE, ONE], [ONE, ONE], [1.0, 0.0], "weights"),

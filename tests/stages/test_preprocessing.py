@@ -305,7 +305,7 @@ def test_a_bonnet_is_found_with_the_maps_images(
         return KaptureFolder(root)
 
     mapping, query = drive("mapping", 12, 100), drive("query", 2, 200)
-    few = "camera cam: it has 2 images, and at least 10 of a sequence are needed"
+    few = "camera cam: it has 2 images; at least 10 of a sequence are needed"
     with pytest.raises(OptionError, match=few):
         run(query, tmp_path / "few", {"unchanging": True})
     # a strip that stands in where no region is found

@@ -227,15 +227,17 @@ def test_what_cannot_be_trained_is_refused(
         train(options(files, learning_rate=1e30), data, output)
     assert not output.exists()
     train(chosen, data, output)
-    with pytest.raises(OutputError, match=r"x\.json: is of another training \(options\); -f"):
+    with pytest.raises(OutputError, match=r"x\.json: is from another training \(options\); -f"):
         train(options(files, steps=4), data, output)
     output.with_suffix(".state.pt").write_bytes(b"PK damaged")
-    with pytest.raises(DataError, match=r"x\.state\.pt: not the state of this training"):
+    with pytest.raises(
+        DataError, match=r"x\.state\.pt: is damaged, or the state of another training"
+    ):
         train(chosen, data, output)
     assert train(options(files, steps=4), data, output, force=True)["step"] == 4
     mine = tmp_path / "mine.safetensors"
     mine.write_bytes(b"of somebody else")
-    with pytest.raises(OutputError, match="is of no training"):
+    with pytest.raises(OutputError, match="was not written by a training"):
         train(chosen, data, mine)
     assert mine.read_bytes() == b"of somebody else"
     with pytest.raises(OptionError, match=r"256 dimensions; xfeat has 64"):

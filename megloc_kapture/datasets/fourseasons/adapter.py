@@ -1,7 +1,7 @@
 """4Seasons and the MLAD challenges: localization of one recording in another.
 
-Relocalization files of a challenge below the root select the recordings and the queries, and assign
-a nearby keyframe to each query.
+A challenge's relocalization files, anywhere below the root, select the recordings and the queries,
+and assign a nearby keyframe to each query.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from megloc_kapture.io.kapture import KaptureData
 from megloc_kapture.values import Options, RigidTransform
 
 NAME = "4seasons"
-# of other long-term benchmarks, used without a challenge
+# thresholds of other long-term benchmarks, for runs without a challenge
 _GENERAL_THRESHOLDS = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 
 
@@ -73,7 +73,7 @@ class FourSeasonsOptions(Options):
         default=1,
         ge=0,
         le=2,
-        description="keyframes with less are dropped: 2 fused with GNSS, 1 interpolated, 0 none",
+        description="lowest quality of keyframes to use: 2 fused with GNSS, 1 interpolated, 0 none",
     )
 
 
@@ -107,7 +107,7 @@ class FourSeasons:
         chosen = self._select(root, missing)
         poses = self._reference_poses(chosen.references, missing)
         frame = LocalFrame.around(poses[chosen.references[0].name])
-        local = {name: frame.cams_from_local(of) for name, of in poses.items()}
+        local = {name: frame.cams_from_local(keyframes) for name, keyframes in poses.items()}
         mapping = ImageRecords(suffixes, missing, self.options.stereo)
         for recording in chosen.references:
             self._add_map(mapping, recording, root, local[recording.name])
@@ -115,8 +115,8 @@ class FourSeasons:
         truth: dict[tuple[int, str], RigidTransform] = {}
         cars: dict[str, str] = {}
         for recording in chosen.queries:
-            found = self._poses(recording, missing) if frame.earth_from_scene else None
-            known = {} if found is None else frame.cams_from_local(found)
+            published = self._poses(recording, missing) if frame.earth_from_scene else None
+            known = {} if published is None else frame.cams_from_local(published)
             times = self._query_times(recording, known, chosen.files, missing)
             calibration = recording.calibration(root)
             cars[recording.name] = query.add(recording, calibration, times)
@@ -130,7 +130,9 @@ class FourSeasons:
             groups[image] = groups[image].model_copy(update={"condition": condition})
         query_gt = _known_poses(query.data, truth, truth_folder)
         used = (*chosen.references, *chosen.queries)
-        rules: dict[str, Any] = {"conditions": tuple(one.name for one in chosen.queries)}
+        rules: dict[str, Any] = {
+            "conditions": tuple(recording.name for recording in chosen.queries)
+        }
         if not chosen.files:  # no challenge: write absolute poses in ECEF
             rules |= {"thresholds": _GENERAL_THRESHOLDS, "pose_file": "ltvl"}
         return OfficialDataset(
@@ -162,18 +164,18 @@ class FourSeasons:
     def _reference_poses(
         self, references: Sequence[Recording], missing: Missing
     ) -> dict[str, KeyframePoses]:
-        found = {}
+        poses_of = {}
         for recording in references:
             # each poses.txt has a separate frame
-            poses = self._poses(recording, missing, on_earth=len(references) > 1)
-            if poses is None:
+            keyframes = self._poses(recording, missing, on_earth=len(references) > 1)
+            if keyframes is None:
                 raise DataError(
                     f"no poses for the map: {GNSS_POSES} and {TRANSFORMATIONS} are needed"
                     + (f", or {POSES}" if len(references) == 1 else ""),
                     path=recording.folder,
                 )
-            found[recording.name] = poses
-        return found
+            poses_of[recording.name] = keyframes
+        return poses_of
 
     def _add_map(
         self,
@@ -187,9 +189,9 @@ class FourSeasons:
             times = recording.times_on_disk(CAMERAS[0])
         calibration = recording.calibration(root)
         car = mapping.add(recording, calibration, times)
-        taken = {timestamp for timestamp, _ in mapping.data.records_camera}
+        timestamps = {timestamp for timestamp, _ in mapping.data.records_camera}
         for timestamp, pose in cams_from_local.items():
-            if timestamp in taken:
+            if timestamp in timestamps:
                 mapping.data.trajectories[timestamp, car] = pose
 
     def _query_times(
@@ -199,13 +201,13 @@ class FourSeasons:
         files: Sequence[RelocalizationFile],
         missing: Missing,
     ) -> list[int]:
-        asked = {row.query for f in files if f.target == recording.name for row in f.rows}
-        wanted = asked or set(poses)
-        if self.options.frames == "all" or not wanted:
-            wanted = asked | set(recording.times_on_disk(CAMERAS[0]))
-        if not wanted:
+        requested = {row.query for f in files if f.target == recording.name for row in f.rows}
+        times = requested or set(poses)
+        if self.options.frames == "all" or not times:
+            times = requested | set(recording.times_on_disk(CAMERAS[0]))
+        if not times:
             missing.require(recording.image_file(0, CAMERAS[0]).parent)
-        return sorted(wanted)
+        return sorted(times)
 
 
 def _known_poses(
@@ -213,7 +215,7 @@ def _known_poses(
     published: Mapping[tuple[int, str], RigidTransform],
     truth_folder: KaptureData | None,
 ) -> KaptureData | None:
-    """Return the queries with published poses, else with poses of ``ground_truth/``."""
+    """Return the queries with their published poses, or those in ``ground_truth/``."""
     times = {timestamp for timestamp, _ in query.records_camera}
     poses = {key: pose for key, pose in published.items() if key[0] in times}
     known = with_poses(query, poses)
@@ -227,20 +229,20 @@ def _known_poses(
 def _image_groups(
     chosen: Selection, mapping: KaptureData, query: KaptureData
 ) -> dict[str, ImageGroup]:
-    """Return the groups; conditions are recordings, only (requested) left images are scored."""
+    """Return image groups: conditions are recordings; only (requested) left images are scored."""
     groups = {
         image: ImageGroup(location=image.partition("/")[0]) for image in mapping.image_names()
     }
-    asked = {
+    requested = {
         chosen.recordings[file.target].image(row.query, CAMERAS[0])
         for file in chosen.files
         for row in file.rows
     }
-    asked_recordings = {file.target for file in chosen.files}
+    requested_recordings = {file.target for file in chosen.files}
     for (timestamp, _), image in query.records_camera.items():
         name = image.partition("/")[0]
         left = image == chosen.recordings[name].image(timestamp, CAMERAS[0])
-        scored = left and (name not in asked_recordings or image in asked)
+        scored = left and (name not in requested_recordings or image in requested)
         groups[image] = ImageGroup(condition=name, scored=scored)
     return groups
 
@@ -258,9 +260,9 @@ def _summary(
         for recording in recordings:
             counts.append(Count(f"{recording.name}: {part} images", images.count(recording.name)))
             if recording.name in poses:
-                good = poses[recording.name]
-                rows = len(good.scene_from_cam) + len(good.dropped)
-                counts.append(Count("  keyframes with a pose", len(good.scene_from_cam), rows))
+                keyframes = poses[recording.name]
+                rows = len(keyframes.scene_from_cam) + len(keyframes.dropped)
+                counts.append(Count("  keyframes with a pose", len(keyframes.scene_from_cam), rows))
     counts += [file.count() for file in chosen.files]
     counts.append(Count("images with a pose in the map", len(mapping.poses())))
     counts.append(Count("queries", len(query.records_camera)))
@@ -276,11 +278,11 @@ def _remarks(
     min_fusion_quality: int,
 ) -> list[str]:
     remarks = []
-    for name, of in poses.items():
-        if of.dropped:
+    for name, keyframes in poses.items():
+        if keyframes.dropped:
             remarks.append(
-                f"{name}: {len(of.dropped)} keyframes are left out, their fusion quality is below "
-                f"{min_fusion_quality} (min_fusion_quality)."
+                f"{name}: {len(keyframes.dropped)} keyframes are left out: their fusion quality "
+                f"is below {min_fusion_quality} (min_fusion_quality)."
             )
     if frame.earth_from_scene is None:
         remarks.append(

@@ -31,9 +31,9 @@ _PALETTE = (
     *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"),
     *("#7a5195", "#8c6d31", "#5f6b7a", "#9a1750"),
 )
-# larger scatter plots are pixels inside the SVG
+# scatter plots with more points are rasterized inside the SVG
 _RASTER_ABOVE = 3000
-# smaller errors are drawn at these, because a logarithmic axis has no zero
+# smaller errors are clipped to these, because a logarithmic axis has no zero
 _SMALLEST_POSITION_M, _SMALLEST_ANGLE_DEG = 1e-4, 1e-3
 
 _STYLE: dict[Any, Any] = {
@@ -96,10 +96,12 @@ def error_curves(evaluations: Sequence[Evaluation]) -> bytes:
             curves = {e.label: getattr(e.errors, kind) for e in evaluations}
             if not evaluations[1:]:
                 errors = getattr(first.errors, kind)
-                curves = {name: errors[own] for name, own in first.members.items()}
-            every = np.concatenate([*curves.values(), bounds]).clip(smallest)
-            seen = every[np.isfinite(every)]
-            low, high = (smallest, 1.0) if not seen.size else (seen.min() / 1.5, seen.max() * 1.5)
+                curves = {name: errors[rows] for name, rows in first.members.items()}
+            pooled = np.concatenate([*curves.values(), bounds]).clip(smallest)
+            finite = pooled[np.isfinite(pooled)]
+            low, high = (
+                (smallest, 1.0) if not finite.size else (finite.min() / 1.5, finite.max() * 1.5)
+            )
             for name, errors in curves.items():
                 total = len(curves) > 1 and name == "all"
                 values = np.sort(errors[np.isfinite(errors)].clip(smallest))
@@ -125,7 +127,7 @@ def error_curves(evaluations: Sequence[Evaluation]) -> bytes:
 
 
 def errors_against_inliers(evaluation: Evaluation) -> bytes | None:
-    """Plot position errors against inliers; None if no inliers are known."""
+    """Plot position errors against inliers; return None if no inliers are known."""
     known = [
         q for q in evaluation.queries if q.num_inliers is not None and np.isfinite(q.position_m)
     ]
@@ -170,7 +172,11 @@ def confidence_curves(confidence: Confidence) -> bytes:
         reliability.set(xlim=(-2, 104), ylim=(-2, 110))
         coverage, risk = 100 * np.array(confidence.coverage), 100 * np.array(confidence.risk)
         curve.step(coverage, risk, where="post", color=_INK)
-        curve.set(xlabel="queries answered (%)", ylabel="wrong among them (%)", xlim=(0, 102))
+        curve.set(
+            xlabel="queries with an accepted pose (%)",
+            ylabel="wrong poses among them (%)",
+            xlim=(0, 102),
+        )
         curve.set(ylim=(0, max(5.0, 1.1 * float(risk.max(initial=0.0)))))
         return _svg(figure)
 
@@ -178,7 +184,7 @@ def confidence_curves(confidence: Confidence) -> bytes:
 def views_from_above(
     queries: Sequence[QueryResult], map_poses: Poses, frames: Mapping[str, str], unit: str
 ) -> dict[str, bytes]:
-    """Plot cameras of the map, truths and estimates from above, per coordinate frame.
+    """Plot map cameras, true and estimated positions from above, per coordinate frame.
 
     ``frames`` maps images to frames, if the dataset has several.
     """
@@ -189,10 +195,10 @@ def views_from_above(
     of_query = [frame_of_query(query, frames) for query in queries]
     of_query = [frame if frame in names else names[0] for frame in of_query]
     for name in names:
-        here = [query for query, frame in zip(queries, of_query, strict=True) if frame == name]
+        in_frame = [query for query, frame in zip(queries, of_query, strict=True) if frame == name]
         poses = [map_poses[image] for image, frame in mapped.items() if frame == name]
-        if any(query.cam_from_world or query.truth for query in here):
-            figures[name] = _from_above(here, poses, unit)
+        if any(query.cam_from_world or query.truth for query in in_frame):
+            figures[name] = _from_above(in_frame, poses, unit)
     return figures
 
 
@@ -204,30 +210,30 @@ def _from_above(queries: Sequence[QueryResult], mapped: list[RigidTransform], un
     quats, translations = stack_poses(spanning)
     axes_of_page, labels = top_view(quats, camera_centers(quats, translations))
 
-    def seen(poses: Sequence[RigidTransform | None]) -> NDArray[np.float64]:
+    def page_xy(poses: Sequence[RigidTransform | None]) -> NDArray[np.float64]:
         return camera_centers(*stack_poses([pose for pose in poses if pose])) @ axes_of_page.T
 
-    points = seen(spanning)
+    points = page_xy(spanning)
     low, high = points.min(axis=0), points.max(axis=0)
     size = max(float((high - low).max()), 1.0)
-    # a straight path must not give a figure without height
+    # a straight path must not give a figure of zero height
     half = np.maximum((high - low) / 2, 0.12 * size) + 0.06 * size
     low, high = (low + high) / 2 - half, (low + high) / 2 + half
     number = len(mapped) + len(queries)
     shrink, raster = float(np.clip(np.sqrt(800 / number), 0.3, 1.0)), number > _RASTER_ABOVE
 
-    def dots(poses: Sequence[RigidTransform | None], size: float, label: str, **look: Any) -> None:
+    def dots(poses: Sequence[RigidTransform | None], size: float, label: str, **style: Any) -> None:
         if len(poses):
-            xy = seen(poses)
-            look = {"linewidths": 1.3 * shrink, "rasterized": raster, **look}
-            axes.scatter(xy[:, 0], xy[:, 1], s=size * shrink, label=label, **look)
+            xy = page_xy(poses)
+            style = {"linewidths": 1.3 * shrink, "rasterized": raster, **style}
+            axes.scatter(xy[:, 0], xy[:, 1], s=size * shrink, label=label, **style)
 
     width, height = (high - low).tolist()
     with _figure(10.5, float(np.clip(10.0 * height / width, 3.0, 6.5)) + 0.6) as figure:
         axes = figure.subplots()
         dots(mapped, 10, "map cameras", c="#b8c4d0")
         joined = [query for query in posed if query.truth is not None]
-        ends = [seen([getattr(q, kind) for q in joined]) for kind in ("truth", "cam_from_world")]
+        ends = [page_xy([getattr(q, kind) for q in joined]) for kind in ("truth", "cam_from_world")]
         segments = list(np.stack(ends, axis=1))
         axes.add_collection(LineCollection(segments, colors=_MISS, rasterized=raster, alpha=0.6))
         green: dict[str, Any] = {"facecolors": "none", "edgecolors": "#009e73"}

@@ -27,7 +27,7 @@ Points = NDArray[np.float64]
 
 _BOX = (400, 300)
 _GAP_PX, _MAX_LINES = 6, 120
-# candidates that are searched for the one with most matches
+# number of candidates compared to find the one with the most matches
 _CANDIDATES_COMPARED = 50
 # distance of a match from its epipolar line
 _MAX_ERROR_PX = 8.0
@@ -46,7 +46,7 @@ class Picture:
 def worst_pictures(
     queries: Sequence[QueryResult], context: ResultContext, map_poses: Poses
 ) -> list[Picture]:
-    """Draw queries next to the candidate with most matches, else the nearest map image.
+    """Draw queries next to the candidate with the most matches, else the nearest map image.
 
     Images that are missing or broken are left out: a report without a picture is better than no
     report.
@@ -56,11 +56,11 @@ def worst_pictures(
     for query in queries:
         with contextlib.suppress(DataError):
             if context.queries is not None:
-                pictures.append(_beside(query, context, context.queries, map_poses, readers))
+                pictures.append(_draw_pair(query, context, context.queries, map_poses, readers))
     return pictures
 
 
-# keypoints of queries, those of the map, and matches between them
+# keypoints of the queries, keypoints of the map, and matches between them
 _Readers = tuple[FeatureReader, FeatureReader, MatchesReader]
 
 
@@ -88,13 +88,13 @@ def _stored_matches(
         if (query, image) in readers[2] and image in readers[1]:
             ids = readers[2].read(query, image)[0]
             map_keypoints = np.asarray(readers[1].read(image)[:, :2], np.float64)
-            last = ids.max(axis=0, initial=-1)
-            if len(ids) and last[0] < len(keypoints) and last[1] < len(map_keypoints):
+            max_ids = ids.max(axis=0, initial=-1)
+            if len(ids) and max_ids[0] < len(keypoints) and max_ids[1] < len(map_keypoints):
                 matches[image] = keypoints[ids[:, 0]], map_keypoints[ids[:, 1]]
     return matches
 
 
-def _beside(
+def _draw_pair(
     query: QueryResult,
     context: ResultContext,
     folder: KaptureFolder,
@@ -104,7 +104,7 @@ def _beside(
     left, scale = _read(folder, query.image)
     matches = _stored_matches(readers, query.image, query.candidates[:_CANDIDATES_COMPARED])
     best = max(matches, key=lambda image: len(matches[image][0]), default="")
-    pose, which = (query.truth, "true") if query.truth else (query.cam_from_world, "estimated")
+    pose, kind = (query.truth, "true") if query.truth else (query.cam_from_world, "estimated")
     if not best and pose is not None and map_poses:
         center = pose.center()
         best = min(map_poses, key=lambda i: float(np.linalg.norm(map_poses[i].center() - center)))
@@ -119,10 +119,10 @@ def _beside(
         cameras = folder.read().camera_of(query.image), context.mapping.read().camera_of(best)
         agree = fits_poses(query_px, map_px, *cameras, map_poses[best] @ pose.inverse())
         colors = np.where(agree, AGREES, DISAGREES)
-        facts.append(f"{int(agree.sum())} of them agree with the {which} pose")
+        facts.append(f"{int(agree.sum())} of them agree with the {kind} pose")
     if pose is not None and best in map_poses:
-        apart = float(np.linalg.norm(pose.center() - map_poses[best].center()))
-        facts.append(f"{apart:.1f} {context.unit} from the {which} place")
+        distance = float(np.linalg.norm(pose.center() - map_poses[best].center()))
+        facts.append(f"{distance:.1f} {context.unit} from the {kind} position")
     drawn = spread(len(query_px), _MAX_LINES)
     points = query_px[drawn] * scale, map_px[drawn] * right_scale
     element = side_by_side(left, right, points, colors[drawn].tolist(), query.image)
@@ -145,8 +145,10 @@ def fits_poses(
     t = np.array(map_from_query.translation)
     normals = np.cross(map_rays, t) @ map_from_query.rotation_matrix()
     with np.errstate(invalid="ignore", divide="ignore"):
-        off = np.abs(np.einsum("ij,ij->i", normals, rays)) / np.linalg.norm(normals[:, :2], axis=1)
-    return np.asarray(~(off * focal_px(query_camera) > _MAX_ERROR_PX))
+        errors = np.abs(np.einsum("ij,ij->i", normals, rays)) / np.linalg.norm(
+            normals[:, :2], axis=1
+        )
+    return np.asarray(~(errors * focal_px(query_camera) > _MAX_ERROR_PX))
 
 
 def image_tag(pixels: Pixels, name: str) -> Markup:

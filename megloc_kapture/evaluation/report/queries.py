@@ -34,7 +34,7 @@ _CONFIDENCES = (0.95, 0.8, 0.6)
 
 
 def query_facts(query: QueryResult) -> list[str]:
-    """Return the outcome of a query in words."""
+    """Return the outcome of a query as phrases for the report."""
     facts = []
     if query.outcome == "missing":
         facts.append(f"no pose ({query.reason})" if query.reason else "no pose")
@@ -51,7 +51,7 @@ def query_facts(query: QueryResult) -> list[str]:
 
 
 def shown_queries(evaluation: Evaluation) -> list[QueryResult]:
-    """Return the queries with truth and colours, the worst first; ``image`` is an image's name."""
+    """Return the queries with truth and colours, worst first; ``image`` is the dataset's name."""
     shown = []
     for query in evaluation.queries:
         candidates = query.candidates
@@ -74,7 +74,7 @@ def shown_queries(evaluation: Evaluation) -> list[QueryResult]:
 
 
 def _worst_first(query: QueryResult) -> tuple[float, float, float, str]:
-    """Sort by no pose, then by error, confidence, number of inliers, name."""
+    """Return a sort key: no pose first, then by error, confidence, number of inliers, name."""
     error = 0.0 if math.isnan(query.position_m) else query.position_m
     confidence = query.confidence if query.confidence is not None else 1.0
     badness = math.inf if query.cam_from_world is None else error
@@ -89,7 +89,7 @@ def _color(query: QueryResult, thresholds: Sequence[Threshold]) -> tuple[str, st
                 return color, f"within {threshold}"
         return _SCALE[-1], f"beyond {shown[-1]}"
     if query.confidence is None:
-        return UNKNOWN_COLOR, "pose, confidence not known"
+        return UNKNOWN_COLOR, "pose, confidence unknown"
     for color, least in zip(_SCALE, _CONFIDENCES, strict=False):
         if query.confidence >= least:
             return color, f"confidence {least:g} or more"
@@ -97,7 +97,7 @@ def _color(query: QueryResult, thresholds: Sequence[Threshold]) -> tuple[str, st
 
 
 def frame_of_query(query: QueryResult, frames: Mapping[str, str]) -> str:
-    """Return the frame of a query or of its best candidate with one, else its condition."""
+    """Return the frame of a query, else of its best candidate with a frame, else the condition."""
     known = (frames[image] for image in (query.image, *query.candidates) if image in frames)
     return next(known, query.condition)
 
@@ -119,9 +119,9 @@ def worst_queries(queries: Sequence[QueryResult]) -> list[QueryResult]:
 
 @dataclass(eq=False)
 class StoredInliers:
-    """Inliers of queries, found again from the stored matches, keypoints, map points and poses.
+    """Inliers of queries, recomputed from the stored matches, keypoints, map points and poses.
 
-    Data that are missing or broken are skipped: a picture without inliers is better than none.
+    Missing or broken data are skipped: a picture without inliers is better than none.
     """
 
     context: ResultContext
@@ -183,7 +183,7 @@ def spread(number: int, most: int) -> NDArray[np.int64]:
     return np.unique(np.linspace(0, number - 1, min(number, most)).round().astype(np.int64))
 
 
-# length of the mean "down" below which cameras agree on no vertical
+# length of the mean downward direction below which the cameras have no common vertical
 _MIN_AGREEMENT = 0.5
 # a vertical this close to a world axis is snapped to it, for labels x, y and z
 _AXIS_COSINE = float(np.cos(np.deg2rad(15.0)))
@@ -194,8 +194,8 @@ def top_view(
 ) -> tuple[NDArray[np.float64], tuple[str, str]]:
     """Look down on cameras ``cam_from_world`` (N, 4) with centres (N, 3), N at least 1.
 
-    Vertical is the mean downward direction of the images, or without agreement the direction in
-    which the centres spread least. Returns directions (2, 3) of the world that are right and up on
+    The vertical is the mean downward direction of the images, or if they disagree the direction of
+    least spread of the centres. Returns directions (2, 3) of the world that are right and up on
     the page, orthonormal, and labels of these axes.
     """
     down = rotate(invert_quats(quats_wxyz), np.array([0.0, 1.0, 0.0])).mean(axis=0)
@@ -206,11 +206,11 @@ def top_view(
     nearest = int(np.argmax(np.abs(upward)))
     if abs(upward[nearest]) >= _AXIS_COSINE:
         first, second = (nearest + 1) % 3, (nearest + 2) % 3
-        if upward[nearest] < 0:  # swapped, so that the page is not mirrored
+        if upward[nearest] < 0:  # swap, so that the page is not mirrored
             first, second = second, first
         return np.eye(3)[[first, second]], ("xyz"[first], "xyz"[second])
     right = axes[0] - (axes[0] @ upward) * upward
-    if np.linalg.norm(right) < 1e-6:  # the cameras stand on one vertical line
+    if np.linalg.norm(right) < 1e-6:  # the cameras are on one vertical line
         right = np.eye(3)[int(np.argmin(np.abs(upward)))]
         right = right - (right @ upward) * upward
     right = _signed(right / np.linalg.norm(right))
