@@ -12,6 +12,7 @@ z forward. nerfstudio uses OpenGL's axes: x right, y up, z back.
 from __future__ import annotations
 
 import json
+import logging
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -39,6 +40,7 @@ from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.stages.local_features import check_size
 from megloc_kapture.values import ONE_FOCAL_MODELS, Camera, RigidTransform
 
+_log = logging.getLogger(__name__)
 _MAP_COLOUR, _QUERY_COLOUR = (120, 120, 120), (220, 50, 32)
 # fx fy cx cy and distortion, in COLMAP's parameter order
 _NERFSTUDIO: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -252,6 +254,7 @@ def export(
             if undistort:
                 export_undistorted(scene, out)
             elif name == "colmap":
+                _hint_at_undistort(scene)
                 export_colmap(scene, out)
             else:
                 export_nerfstudio(scene, out, beside=output)
@@ -263,6 +266,16 @@ def export(
     else:
         export_ply(scene, output)
     return len(scene.images)
+
+
+def _hint_at_undistort(scene: Scene) -> None:
+    models = {image.camera.model for image in scene.images}
+    if distorted := sorted(models - {"PINHOLE", "SIMPLE_PINHOLE"}):
+        _log.warning(
+            "programs for Gaussian splatting refuse %s cameras; --undistort writes PINHOLE "
+            "cameras and images/ for them",
+            distorted[0],
+        )
 
 
 def _scene(

@@ -326,7 +326,7 @@ class Photographs(Queries):
         if every is not None and every < 1:
             raise OptionError(f"every {every}th frame cannot be taken; give 1 or more")
         roots = [Path(path) for path in paths]
-        files = _named_files(roots)
+        files, self.passed_over = _named_files(roots)
         self.root = roots[0] if roots[0].is_dir() else roots[0].parent
         self.without_row: list[str] = []
         self._calibrated = {k: v for root in roots for k, v in _calibrated(root).items()}
@@ -354,14 +354,15 @@ class Photographs(Queries):
         return all(image.camera.focal_deviation == 0 for image in self._images.values())
 
     def describe(self) -> list[str]:
-        """Describe the images missing from the camera list."""
-        if not (names := self.without_row):
-            return []
-        more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-        return [
-            f"{len(names)} images are not in the list of cameras, their cameras are estimated: "
-            f"{', '.join(names[:5])}{more}"
-        ]
+        """Describe skipped files and images missing from the camera list."""
+        lines = []
+        if self.passed_over:
+            said = f"{len(self.passed_over)} files that are no images are left out"
+            lines.append(f"{said}: {_first(self.passed_over)}")
+        if self.without_row:
+            said = f"{len(self.without_row)} images are not in the list of cameras"
+            lines.append(f"{said}, their cameras are estimated: {_first(self.without_row)}")
+        return lines
 
     def check(self) -> None:
         """Do nothing: everything else needs pixels."""
@@ -435,6 +436,11 @@ class Photographs(Queries):
             self._add(f"{name}/{frame}", folder / frame, camera, is_frame=True)
 
 
+def _first(names: Sequence[str]) -> str:
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    return ", ".join(names[:5]) + more
+
+
 def _calibrated(root: Path) -> dict[str, Camera]:
     if not is_kapture(root):
         return {}
@@ -445,13 +451,16 @@ def _calibrated(root: Path) -> dict[str, Camera]:
     return found
 
 
-def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
+def _named_files(paths: Sequence[Path]) -> tuple[dict[str, Path], list[str]]:
     found: dict[str, Path] = {}
+    others: list[str] = []
     for path in paths:
         if is_kapture(path):
             files = _images_of_kapture(KaptureFolder(path))
         elif path.is_dir():
-            files = {str(file.relative_to(path)): file for file in _images_below(path)}
+            wanted, passed_over = _images_below(path)
+            files = {str(file.relative_to(path)): file for file in wanted}
+            others += [str(file.relative_to(path)) for file in passed_over]
             if not files:
                 raise DataError("no image or video in this folder", path=path)
         elif path.exists():
@@ -469,7 +478,7 @@ def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
                 )
             _check_name(name, file)
             found[name] = file
-    return dict(sorted(found.items()))
+    return dict(sorted(found.items())), others
 
 
 def _images_of_kapture(folder: KaptureFolder) -> dict[str, Path]:
@@ -483,7 +492,7 @@ def _images_of_kapture(folder: KaptureFolder) -> dict[str, Path]:
     return {name: folder.image_path(name) for name in data.image_names()}
 
 
-def _images_below(folder: Path) -> list[Path]:
+def _images_below(folder: Path) -> tuple[list[Path], list[Path]]:
     found, seen = list[Path](), set[str]()
     for place, folders, files in os.walk(folder, followlinks=True):
         here, real = Path(place), os.path.realpath(place)
@@ -497,7 +506,8 @@ def _images_below(folder: Path) -> list[Path]:
         folders[:] = sorted(shown, key=lambda name: ((here / name).is_symlink(), name))
         found += [here / name for name in files if not name.startswith(".")]
     named = {*WRITABLE_SUFFIXES, *UNREAD_SUFFIXES, *VIDEO_SUFFIXES}
-    return sorted(path for path in found if path.suffix.lower() in named or is_image(path))
+    wanted = {path for path in found if path.suffix.lower() in named or is_image(path)}
+    return sorted(wanted), sorted(set(found) - wanted)
 
 
 def _check_name(name: str, path: Path) -> None:
