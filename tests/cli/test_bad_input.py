@@ -87,11 +87,11 @@ MAPS: dict[str, tuple[Spoil, str]] = {
     "record column": (line(RECORDS, 5, NO_COLUMN), r"records_camera\.txt:5: .*columns"),
     "point column": (
         line("reconstruction/points3d.txt", 10, NO_COLUMN),
-        r"points3d\.txt:10: .*columns",
+        r"points3d\.txt: .*columns",
     ),
     "observation column": (
         line("reconstruction/observations.txt", 7, NO_COLUMN),
-        r"observations\.txt:7: ",
+        r"observations\.txt: expected point3d_id",
     ),
     "config column": (line(f"{KEYPOINTS}/keypoints.txt", 3, NO_COLUMN), r"keypoints\.txt:3: "),
     "pose of nan": (line(TIMES, 3, NAN), r"trajectories\.txt:3: .*nan"),
