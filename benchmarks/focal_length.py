@@ -63,12 +63,11 @@ def localized(
     name, *folders = place
     opened = KaptureMap.open(Path(folders[0]))
     truth = KaptureFolder(Path(folders[2])).read()
-    keys = "localization.pose.seed", "query_verification.seed"
     localizers = {
         seed: Localizer(
             opened,
             options=options_of_preset(
-                assignments={"localization.min_confidence": 0.0, **dict.fromkeys(keys, seed)}
+                assignments={"localization.min_confidence": 0.0, "localization.pose.seed": seed}
             ),
         )
         for seed in seeds

@@ -33,7 +33,6 @@ from timing import table  # noqa: E402
 
 SEEDED = (
     "global_features.options.seed",
-    "query_verification.seed",
     "localization.pose.seed",
 )
 THRESHOLDS = ((0.05, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))

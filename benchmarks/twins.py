@@ -5,8 +5,8 @@
 A twin's images are the same bytes on every processor; what is computed from them is not. Features
 and networks use what instructions a processor has, so keypoints differ in their last bits, and a
 query whose inliers hardly suffice is found on one and lost on another. A seed changes as much: the
-vocabulary, the verification of query pairs, triangulation, pose estimation. The range over seeds is
-therefore what to expect elsewhere. Arguments that are not known here go to ``megloc eval``.
+vocabulary, triangulation, pose estimation. The range over seeds is therefore what to expect
+elsewhere. Arguments that are not known here go to ``megloc eval``.
 """
 
 from __future__ import annotations

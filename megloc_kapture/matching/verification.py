@@ -58,7 +58,6 @@ class TwoViewOptions(Options):
     max_iterations: int = Field(
         default=100, gt=0, description="of RANSAC; use more for matchers with uninformative scores"
     )
-    seed: int = Field(default=0, ge=0, description="seed of RANSAC's samples")
 
 
 def essential_matrix(b_from_a: RigidTransform) -> Floats:
@@ -302,7 +301,7 @@ def _ransac(
         "min_iterations": _MIN_ITERATIONS,
         "max_iterations": options.max_iterations,
         "success_prob": _CONFIDENCE,
-        "seed": options.seed,
+        "seed": 0,
     }
     pixels = rays_a[:, :2] * focal, rays_b[:, :2] * focal
     return poselib.estimate_relative_pose(*pixels, pinhole, pinhole, ransac | sampling, refinement)
