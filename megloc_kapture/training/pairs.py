@@ -21,7 +21,7 @@ from pydantic import Field, field_validator
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.images import is_image, read_depth_map, read_image_rgb
-from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.mapping.pairs import PairsByPosesOptions, pairs_by_poses
 from megloc_kapture.plugins import DepthView
 from megloc_kapture.preprocessing.frames import resized, scaled_camera
@@ -103,24 +103,40 @@ class TrainingPair:
 
 
 class PosedPairs:
-    """Pairs of a kapture's images with poses and depth, drawn evenly by overlap."""
+    """Pairs of a kapture's images with poses and depth, drawn evenly by overlap.
 
-    def __init__(self, folder: KaptureFolder, options: PairOptions, work: Work = HERE) -> None:
+    ``measured`` is a file of pairs with overlaps, read if present, else written.
+    """
+
+    def __init__(
+        self,
+        folder: KaptureFolder,
+        options: PairOptions,
+        work: Work = HERE,
+        measured: Path | None = None,
+    ) -> None:
         self.folder, self._kapture, self._options = folder.root, folder, options
         data = folder.read()
         poses, records = data.poses(), depth_records(data)
         self._poses, self._records = poses, records
         self._names = [name for name in sorted(poses) if name in records]
         self._view = lru_cache(maxsize=_VIEWS_KEPT)(self._read_view)
-        near = pairs_by_poses([poses[name] for name in self._names], _CANDIDATES)
-        measured = work.track((self._overlap(i, j) for i, j in near), len(near), "overlap")
-        overlaps = np.fromiter(measured, np.float64, len(near))
+        if measured is not None and measured.is_file():
+            near, overlaps = self._read_overlaps(measured)
+        else:
+            near = pairs_by_poses([poses[name] for name in self._names], _CANDIDATES)
+            shares = work.track((self._overlap(i, j) for i, j in near), len(near), "overlap")
+            overlaps = np.fromiter(shares, np.float64, len(near))
         if not len(near):
             raise DataError(
                 "no two images have a pose and a depth map with their timestamp (trajectories.txt, "
                 "records_depth.txt)",
                 path=folder.root,
             )
+        if measured is not None and not measured.is_file():
+            named = ((self._names[i], self._names[j]) for i, j in near)
+            scored = zip(named, overlaps, strict=True)
+            write_pairs(measured, [ImagePair(*names, float(share)) for names, share in scored])
         self._bins = [
             near[(overlaps >= low) & (overlaps < high)]
             for low, high in pairwise(options.overlap_bins)
@@ -148,6 +164,15 @@ class PosedPairs:
 
     def counts(self) -> dict[str, int]:
         return {"images": len(self._names), "pairs": sum(map(len, self._bins))}
+
+    def _read_overlaps(self, path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        row_of = {name: row for row, name in enumerate(self._names)}
+        pairs = read_pairs(path)
+        if not all(pair.query in row_of and pair.map in row_of for pair in pairs):
+            raise DataError(f"lists images that are not in {self.folder}", path=path)
+        rows = [(row_of[pair.query], row_of[pair.map]) for pair in pairs]
+        near = np.array(rows, np.int64).reshape(-1, 2)
+        return near, np.array([pair.score for pair in pairs], np.float64)
 
     def _overlap(self, first: int, second: int) -> float:
         a, b = self._view(self._names[first]), self._view(self._names[second])

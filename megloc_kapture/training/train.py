@@ -273,8 +273,9 @@ def train(
 
     Each evaluation writes ``output`` (``X.safetensors``), for descriptors trained through SuperGlue
     also ``X-superglue.safetensors``, the manifest ``X.json``, the curves ``X.csv`` and
-    ``X.state.pt``, from which the same call resumes. ``force`` replaces another training's files;
-    ``threads`` prepare pairs. Returns the last row of the curves.
+    ``X.state.pt``, from which the same call resumes; ``X.overlaps`` is written before. ``force``
+    replaces another training's files; ``threads`` prepare pairs. Returns the last row of the
+    curves.
     """
     if output.suffix != ".safetensors":
         raise OptionError(f"{output}: the file to write must end in .safetensors")
@@ -282,8 +283,11 @@ def train(
     files, trainer = _Files(output), Trainer(options)
     resumes = not force and (output.exists() or files.manifest.exists())
     if not resumes:
-        remove(files.state)
-    posed = [PosedPairs(folder, options.pairs, work) for folder in [*data.kaptures, *data.held_out]]
+        files.begin()
+    posed = [
+        PosedPairs(folder, options.pairs, work, files.overlaps / f"{number:03d}.txt")
+        for number, folder in enumerate([*data.kaptures, *data.held_out])
+    ]
     sources: list[PairSource] = [*posed[: len(data.kaptures)]]
     sources += [Photographs(folder, options.pairs) for folder in data.photographs]
     held_out = {source.folder.name: source for source in posed[len(data.kaptures) :]}
@@ -309,6 +313,11 @@ class _Files:
     def __init__(self, output: Path) -> None:
         self.output = output
         self.state, self.manifest = output.with_suffix(".state.pt"), output.with_suffix(".json")
+        self.overlaps = output.with_suffix(".overlaps")
+
+    def begin(self) -> None:
+        remove(self.state)
+        remove(self.overlaps)
 
     def check(self, record: Mapping[str, Any]) -> None:
         """Raise OutputError unless the files are of the same training."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,7 @@ from scipy.ndimage import map_coordinates
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.images import write_image
-from megloc_kapture.io.kapture import KaptureFolder
+from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.training.pairs import (
     HomographyOptions,
     PairOptions,
@@ -42,6 +43,20 @@ def test_pairs_overlap_as_asked_for(walk: Path) -> None:
             moved.append(np.linalg.norm(b_from_a.center()))
         baselines[low] = np.mean(moved)
     assert baselines[0.3] > baselines[0.5] + 0.4
+
+
+def test_overlaps_are_measured_once(walk: Path, tmp_path: Path) -> None:
+    path = tmp_path / "overlaps" / "0.txt"
+    source = PosedPairs(KaptureFolder(walk), SMALL, measured=path)
+    pairs = read_pairs(path)
+    assert len(pairs) == 10 and 0.5 < max(pair.score for pair in pairs) < 1
+    # what stands there is taken: all but one pair overlap too much
+    write_pairs(path, [replace(p, score=0.99) for p in pairs[1:]] + [replace(pairs[0], score=0.2)])
+    again = PosedPairs(KaptureFolder(walk), SMALL, measured=path)
+    assert again.counts()["pairs"] == 1 < source.counts()["pairs"]
+    write_pairs(path, [ImagePair("elsewhere.png", "1.png", 0.2)])
+    with pytest.raises(DataError, match=r"0\.txt: lists images that are not in "):
+        PosedPairs(KaptureFolder(walk), SMALL, measured=path)
 
 
 def test_a_pair_is_its_images_reduced_and_its_geometry(walk: Path) -> None:

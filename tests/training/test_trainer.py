@@ -124,9 +124,10 @@ def test_interrupted_and_resumed_is_uninterrupted(
     assert state["step"] == 4
     # threads change nothing beyond rounding
     assert train(chosen, data, parts, threads=3) == pytest.approx(last, rel=1e-5)
-    names = ["x.csv", "x.json", "x.safetensors", "x.state.pt"]
+    names = ["x.csv", "x.json", "x.safetensors", "x.state.pt", "x.overlaps"]
     names += ["x-superglue.safetensors"]
     assert sorted(path.name for path in parts.parent.iterdir()) == sorted(names)
+    assert len(list((parts.parent / "x.overlaps").iterdir())) == 2
     # what is done is done
     before = parts.stat().st_mtime_ns
     assert train(chosen, data, parts) == pytest.approx(last, rel=1e-5)
