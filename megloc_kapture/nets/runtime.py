@@ -54,7 +54,7 @@ def inference(device: torch.device, half_precision: bool = False) -> Iterator[No
     """Disable gradients; half precision is float16 on a GPU, bfloat16 on a CPU, and never TF32."""
     half = torch.float16 if device.type == "cuda" else torch.bfloat16
     autocast = torch.autocast(device.type, dtype=half, enabled=half_precision)
-    if half_precision and device.type == "cpu" and not has_bfloat16():
+    if half_precision and device.type == "cpu":
         _warn_of_slow_half()
     # TF32 is a setting of the process, so only one thread computes at a time
     exclusive = _gpu_lock if device.type == "cuda" else nullcontext()
@@ -62,14 +62,10 @@ def inference(device: torch.device, half_precision: bool = False) -> Iterator[No
         yield
 
 
-def has_bfloat16() -> bool:
-    """Return whether this processor supports bfloat16; emulated convolutions are very slow."""
-    return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
-
-
 @cache
 def _warn_of_slow_half() -> None:
-    _log.warning("this processor has no bfloat16: half precision is 100 times slower than full")
+    if not torch.ops.mkldnn._is_mkldnn_bf16_supported():
+        _log.warning("this processor has no bfloat16: half precision is 100 times slower than full")
 
 
 @contextmanager
