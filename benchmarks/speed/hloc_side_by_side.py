@@ -153,8 +153,9 @@ def prepared(options: argparse.Namespace, root: Path) -> dict[str, Any]:
     job["map_txt"], job["query_txt"] = (str(root / name) for name in ("map.txt", "query.txt"))
     describe = [*mapping, *query, *features, "--features", "vlad", "-o", job["kapture"], "-f"]
     megloc("extract-global", *describe, "--set", "global_features.options.num_clusters=64")
-    similar = ("--set", f"mapping_pairs.top_k={options.candidates}")
-    similar = similar if options.lightglue else ()
+    similar: list[str] = []
+    if options.lightglue:
+        similar = ["--set", f"mapping_pairs.top_k={options.candidates}"]
     megloc("pairs-mapping", *mapping, *features, *similar, "-o", job["map_txt"])
     candidates = ("--topk", str(options.candidates))
     megloc("pairs-query", *mapping, *query, *features, *candidates, "-o", job["query_txt"])
