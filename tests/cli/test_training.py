@@ -204,7 +204,7 @@ def test_poses_are_refined_by_it_or_stay(
         *("--by", "field", "--set", chosen),
     )
     # six steps do not make a field that matches anything
-    assert done.out.startswith("4 poses, 0 accepted by field;"), done.err
+    assert done.out.startswith("4 queries, 0 accepted by field;"), done.err
     for text in pandas.read_csv(out / "status.csv")["refinement"]:
         assert text.startswith("field: query and rendering: ")
 
