@@ -73,7 +73,7 @@ def test_aachen_in_both_forms_gives_the_same_pose_file(
     )
     doubted = megloc(*again, "--set", "localization.min_confidence=1")
     kept = len((runs[1] / NAME).read_text().splitlines())
-    told = re.search(r"(\d+) queries that the pose file lacks had a pose of too", doubted.err)
+    told = re.search(r"(\d+) poses had too little confidence", doubted.err)
     assert told is not None and kept + int(told[1]) >= len(rows) > kept, doubted.err
     trusted = megloc(*again, "--set", "localization.min_confidence=0")
     assert len((runs[1] / NAME).read_text().splitlines()) >= len(rows)

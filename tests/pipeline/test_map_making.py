@@ -98,7 +98,7 @@ def test_a_model_of_poses_alone_is_mapped_anew(
     model.write_binary(workspace / "sparse" / "0")
     (tmp_path / "map").mkdir()
     counts = import_colmap(find_colmap(workspace), tmp_path / "map")
-    assert "the model has no points; its images are mapped anew with its poses" in caplog.text
+    assert "the model has no points; its images are mapped again with its poses" in caplog.text
     folder = KaptureFolder(tmp_path / "map")
     folder.validate(deep=True)
     assert counts["points"] == len(folder.points3d()) > 100
