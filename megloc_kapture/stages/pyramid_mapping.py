@@ -328,15 +328,6 @@ class _AgainStage(PipelineStage):
     ) -> tuple[KaptureFolder, KaptureFolder, list[ImagePair]]:
         """Return the folders of the first and second images, and the pairs."""
 
-    @abstractmethod
-    def _pyramid(
-        self,
-        folders: tuple[KaptureFolder, KaptureFolder],
-        pairs: Sequence[ImagePair],
-        method: PyramidMethod,
-        **how: Any,
-    ) -> dict[str, float]: ...
-
     def run(self, work: StageWork) -> Mapping[str, float]:
         options, out = self.options, work.out / self.writes[0]
         verification, second_matcher = self._verification(), options.make_second_matcher()
@@ -344,12 +335,13 @@ class _AgainStage(PipelineStage):
         for extractor in self._extractors():
             name = extractor.name
             first, second, pairs = self._inputs(work, name)
+            within_one = first.root == second.root
             rows = _match_counts(work.path(self.matches), name)
             if second_matcher is not None:
                 best = best_pairs(
                     {pair: rows[pair].verified for pair in _named(pairs) & rows.keys()},
                     options.second_matching.pairs,
-                    of_both=first.root == second.root,
+                    of_both=within_one,
                 )
                 again = [ImagePair(*pair, 1.0) for pair in best]
                 matched = match_pairs(
@@ -364,9 +356,11 @@ class _AgainStage(PipelineStage):
                 )
                 first = first.with_features([out, *first.features_dirs])
                 num_found = {pair: row.matches for pair, row in rows.items()}
-                found = self._pyramid(
-                    (first, second), pairs, method, output=out, num_found=num_found, work=work
-                )
+                how: dict[str, Any] = {"num_found": num_found, "work": work}
+                if within_one:
+                    found = pyramid_mapping(first, pairs, name, method, out, **how)
+                else:
+                    found = pyramid_queries(first, second, pairs, name, method, out, **how)
                 counts |= {f"{name} {key}": count for key, count in found.items()}
         return counts
 
@@ -410,15 +404,6 @@ class PyramidMapping(_AgainStage):
         mapping = work.folder(self.layout.mapping(), FEATURES, MAPPING_MATCHES)
         return mapping, mapping, mapping_pairs(work, mapping)
 
-    def _pyramid(
-        self,
-        folders: tuple[KaptureFolder, KaptureFolder],
-        pairs: Sequence[ImagePair],
-        method: PyramidMethod,
-        **how: Any,
-    ) -> dict[str, float]:
-        return pyramid_mapping(folders[0], pairs, method.extractor.name, method, **how)
-
 
 class PyramidQueries(_AgainStage):
     """Match queries with candidates again; see :class:`PyramidMapping`."""
@@ -446,12 +431,3 @@ class PyramidQueries(_AgainStage):
         described = mapping.descriptors(local_type)
         pairs = read_pairs(work.path(QUERY_PAIRS))
         return query, mapping, [pair for pair in pairs if pair.map in described]
-
-    def _pyramid(
-        self,
-        folders: tuple[KaptureFolder, KaptureFolder],
-        pairs: Sequence[ImagePair],
-        method: PyramidMethod,
-        **how: Any,
-    ) -> dict[str, float]:
-        return pyramid_queries(*folders, pairs, method.extractor.name, method, **how)
