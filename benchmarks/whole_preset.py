@@ -100,7 +100,6 @@ aslfeat = { options = { max_keypoints = 400 } }
 # few matches, and poses by chance, so that there are points and places to choose between
 [options.triangulation]
 two_view_tracks = true
-min_angle_deg = 0.5
 
 [options.localization.pose]
 min_inliers = 6

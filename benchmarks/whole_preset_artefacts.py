@@ -224,7 +224,7 @@ _ARTEFACTS: dict[str, dict[str, Reader]] = {
         "localized": _folder,
         "localized/status.csv": _table,
         "localized/clusters.csv": _table,
-        "localized/refinement.csv": _table,
+        "localized/poses.csv": _table,
         "timing_refinement.csv": _table,
     },
     "submission": {"submissions": _file},
