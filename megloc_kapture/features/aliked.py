@@ -66,20 +66,20 @@ class Aliked(LocalNetwork[AlikedOptions]):
     def extract_many(self, images: Images, masks: Masks) -> list[LocalFeatures]:
         net, device = self.network(aliked_from)
         with inference(device, self.options.half_precision):
-            found = net(torch.cat([image_tensor(image, device) for image in images]))
+            maps = net(torch.cat([image_tensor(image, device) for image in images]))
         with inference(device):
-            return [self._selected(net, *each) for each in zip(found, masks, strict=True)]
+            return [self._selected(net, *each) for each in zip(maps, masks, strict=True)]
 
     def _selected(
         self, net: AlikedNet, maps: AlikedMaps, mask: NDArray[np.bool_] | None
     ) -> LocalFeatures:
         options, scores = self.options, maps.scores
-        found = select_pixels(
+        keypoints = select_pixels(
             suppress_non_maxima(scores, options.nms_radius),
             threshold=options.threshold,
             border=options.nms_radius,
         )
-        xy = soft_argmax(scores, found.xy, options.nms_radius, _TEMPERATURE)
+        xy = soft_argmax(scores, keypoints.xy, options.nms_radius, _TEMPERATURE)
         height, width = scores.shape
         read = read_bilinear(scores.reshape(-1, 1), xy[:, 1], xy[:, 0], (height, width))
         # the network's first pixel centre is (0, 0), COLMAP's (0.5, 0.5)
@@ -135,16 +135,16 @@ class AlikedNet(nn.Module):
             functional.selu(tap(level), inplace=True)
             for tap, level in ((self.conv2, level2), (self.conv3, level3), (self.conv4, level4))
         ]
-        found = []
+        maps = []
         for k in range(len(images)):
-            own = [level[k : k + 1] for level in coarse]
+            levels = [level[k : k + 1] for level in coarse]
             fine = _level(level1[k : k + 1])
             # half precision would tie scores, and ties make duplicate keypoints
             with torch.autocast(images.device.type, enabled=False):
-                scores = torch.sigmoid(self._score_logits(fine, own)[0, 0])
+                scores = torch.sigmoid(self._score_logits(fine, levels)[0, 0])
             scores = scores[top : top + height, left : left + width]
-            found.append(AlikedMaps(self, scores, (top, left), fine, [_level(one) for one in own]))
-        return found
+            maps.append(AlikedMaps(self, scores, (top, left), fine, [_level(x) for x in levels]))
+        return maps
 
     def _score_logits(self, fine: _Level, coarse: list[torch.Tensor]) -> torch.Tensor:
         first, *others = (

@@ -82,7 +82,7 @@ class AslFeat(LocalNetwork[AslFeatOptions]):
         # without contrast the network would see only its zero padding
         usable = [k for k, gray in enumerate(grays) if gray.min() != gray.max()]
         of_image = [_scales(grays[k]) if self.options.multi_scale else [grays[k]] for k in usable]
-        found: list[list[Level]] = [[] for _ in images]
+        levels_of: list[list[Level]] = [[] for _ in images]
         for levels in zip(*of_image, strict=True):
             if min(levels[0].shape) <= 2 * _BORDER_PX:
                 continue
@@ -90,11 +90,11 @@ class AslFeat(LocalNetwork[AslFeatOptions]):
             stacked = torch.from_numpy(np.stack(levels))[:, None].to(device)
             with inference(device, self.options.half_precision):
                 maps = net(stacked)
-            for k, own in zip(usable, maps, strict=True):
-                found[k].append(self._selected(own, images[0].shape))
+            for k, maps_of_image in zip(usable, maps, strict=True):
+                levels_of[k].append(self._selected(maps_of_image, images[0].shape))
         return [
             self._best_of_levels(each or [_NOTHING], mask)
-            for each, mask in zip(found, masks, strict=True)
+            for each, mask in zip(levels_of, masks, strict=True)
         ]
 
     def _selected(self, maps: AslFeatMaps, full_size: Sequence[int]) -> Level:
@@ -174,7 +174,7 @@ class AslFeatNet(nn.Module):
         for name in _DEFORMABLE:
             x = self._deformable(name, x)
         scores = scores + self._scores("conv6", x, (height, width))
-        return [AslFeatMaps(*own) for own in zip(scores, x, strict=True)]
+        return [AslFeatMaps(*maps) for maps in zip(scores, x, strict=True)]
 
     def _deformable(self, name: str, x: torch.Tensor) -> torch.Tensor:
         conv: _Conv = getattr(self, name)
@@ -187,8 +187,10 @@ class AslFeatNet(nn.Module):
     def _scores(self, name: str, features: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
         dilation, weight = _SCORED[name]
         scale = self.get_buffer(f"tower.{name}.instance_max")
-        peaky = (peakiness(own, dilation, scale) for own in features)
-        return torch.stack([weight * resize_as_tensorflow_1(own, size) for own in peaky])
+        peaky = (peakiness(feature_map, dilation, scale) for feature_map in features)
+        return torch.stack(
+            [weight * resize_as_tensorflow_1(feature_map, size) for feature_map in peaky]
+        )
 
 
 class _Norm(nn.Module):

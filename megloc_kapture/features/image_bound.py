@@ -65,7 +65,7 @@ def extract_bounded(extractor: Any, frames: Sequence[Frame]) -> list[LocalFeatur
     bound = max_megapixels_of(extractor)
     small = [_reduced(*frame, bound) for frame in frames]
     several = len(frames) > 1
-    found = (
+    features = (
         extractor.extract_many(*zip(*small, strict=True))
         if several
         else [extractor.extract(*small[0])]
@@ -73,7 +73,7 @@ def extract_bounded(extractor: Any, frames: Sequence[Frame]) -> list[LocalFeatur
     (height, width), (own_height, own_width) = small[0][0].shape[:2], frames[0][0].shape[:2]
     # the first pixel's centre is (0.5, 0.5), so coordinates scale with the size
     ratio = np.array([own_width / width, own_height / height], np.float32)
-    return found if small[0][0] is frames[0][0] else [_scaled(each, ratio) for each in found]
+    return features if small[0][0] is frames[0][0] else [_scaled(each, ratio) for each in features]
 
 
 def _reduced(

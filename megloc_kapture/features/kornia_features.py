@@ -38,9 +38,9 @@ class _KorniaFeatures(LocalNetwork[LocalOptions]):
         require_kornia(self.name)
         super().__init__(options)
 
-    def _of_each(self, found: Any, masks: Masks, offset_px: Any = 0.5) -> list[LocalFeatures]:
+    def _of_each(self, detections: Any, masks: Masks, offset_px: Any = 0.5) -> list[LocalFeatures]:
         features = []
-        for (xy, scores, descriptors), mask in zip(found, masks, strict=True):
+        for (xy, scores, descriptors), mask in zip(detections, masks, strict=True):
             values = scores.float().cpu().numpy()
             # kornia's first pixel centre is (0, 0)
             table = np.column_stack([xy.cpu().numpy() + offset_px, values]).astype(np.float32)
@@ -79,12 +79,17 @@ class XFeat(_KorniaFeatures[XFeatOptions]):
         network, device = make()
         tensors = [image_tensor(image, device) for image in images]
         with inference(device, self.options.half_precision):
-            found = network.detectAndCompute(torch.cat(tensors), _ALL, self.options.threshold)
+            detections = network.detectAndCompute(torch.cat(tensors), _ALL, self.options.threshold)
             if self._descriptor_weights is not None:
                 other, _ = make(file=self._descriptor_weights)
-                for one, tensor in zip(found, tensors, strict=True):
-                    one["descriptors"] = xfeat_descriptors(other, tensor, one["keypoints"])
-        each = ((one["keypoints"], one["scores"], one["descriptors"]) for one in found)
+                for detection, tensor in zip(detections, tensors, strict=True):
+                    detection["descriptors"] = xfeat_descriptors(
+                        other, tensor, detection["keypoints"]
+                    )
+        each = (
+            (detection["keypoints"], detection["scores"], detection["descriptors"])
+            for detection in detections
+        )
         return self._of_each(each, masks, offset_px=xfeat_offset_px(images[0].shape))
 
 
@@ -115,8 +120,11 @@ class Disk(_KorniaFeatures[DiskOptions]):
         network, device = self.network(load_disk)
         batch = torch.cat([image_tensor(image, device) for image in images])
         with inference(device, options.half_precision):
-            found = network(
+            detections = network(
                 batch, None, options.nms_window_px, options.threshold, pad_if_not_divisible=True
             )
-        each = ((one.keypoints, one.detection_scores, one.descriptors) for one in found)
+        each = (
+            (detection.keypoints, detection.detection_scores, detection.descriptors)
+            for detection in detections
+        )
         return self._of_each(each, masks)

@@ -78,7 +78,7 @@ class R2D2(LocalNetwork[R2D2Options]):
         options = self.options
         # twice as fast on a CPU as channels first
         network, device = self.network(load_r2d2, channels_last=True)
-        found: list[list[Level]] = [[] for _ in images]
+        levels_of: list[list[Level]] = [[] for _ in images]
         with inference(device, options.half_precision):
             levels = pyramid_levels(
                 torch.cat([image_tensor(image, device) for image in images]),
@@ -88,8 +88,10 @@ class R2D2(LocalNetwork[R2D2Options]):
             for level in levels:
                 maps = network(in_fast_layout(level))
                 scale = np.float32(_PATCH_PX * max(images[0].shape[:2]) / max(level.shape[-2:]))
-                told = maps.features, maps.reliability[:, 0], maps.repeatability[:, 0]
-                for own, features, reliability, repeatability in zip(found, *told, strict=True):
+                outputs = maps.features, maps.reliability[:, 0], maps.repeatability[:, 0]
+                for of_image, features, reliability, repeatability in zip(
+                    levels_of, *outputs, strict=True
+                ):
                     rows, columns = torch.nonzero(
                         (repeatability == window_maximum(repeatability, 1))
                         & (repeatability >= options.min_repeatability)
@@ -100,9 +102,10 @@ class R2D2(LocalNetwork[R2D2Options]):
                     scores = reliability[rows, columns] * repeatability[rows, columns]
                     descriptors = functional.normalize(features[:, rows, columns].float(), dim=0).T
                     table = np.column_stack([xy_px, np.full(len(xy_px), scale)])
-                    own.append((table, scores.cpu().numpy(), descriptors))
+                    of_image.append((table, scores.cpu().numpy(), descriptors))
         return [
-            self._best_of_levels(levels, mask) for levels, mask in zip(found, masks, strict=True)
+            self._best_of_levels(levels, mask)
+            for levels, mask in zip(levels_of, masks, strict=True)
         ]
 
 

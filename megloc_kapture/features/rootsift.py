@@ -65,8 +65,11 @@ class RootSift:
         keypoints, descriptors = sift.detectAndCompute(gray, None)
         if descriptors is None:
             descriptors = np.zeros((0, self.descriptor_size), np.float32)
-        found = [(*one.pt, one.response, one.size, one.angle) for one in keypoints]
-        x, y, response, size, angle = np.array(found, np.float64).reshape(-1, 5).T
+        rows = [
+            (*keypoint.pt, keypoint.response, keypoint.size, keypoint.angle)
+            for keypoint in keypoints
+        ]
+        x, y, response, size, angle = np.array(rows, np.float64).reshape(-1, 5).T
         # OpenCV's first pixel centre is (0, 0), COLMAP's (0.5, 0.5)
         xy_px = np.stack([x, y], axis=1) + 0.5
         order = np.lexsort((angle, size, x, y, -response))

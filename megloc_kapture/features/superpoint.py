@@ -98,20 +98,20 @@ class SuperPoint(LocalNetwork[SuperPointOptions]):
             scores, descriptors = net(torch.cat([gray_tensor(image, device) for image in images]))
             maxima = suppress_non_maxima(scores, options.nms_radius)
             for k, mask in enumerate(masks):
-                found = select_pixels(
+                keypoints = select_pixels(
                     maxima[k],
                     threshold=options.threshold,
                     border=options.remove_borders,
                     mask=mask,
                     max_keypoints=options.max_keypoints,
                 )
-                sampled = sample_descriptors(descriptors[k], found.xy, sampling).cpu().numpy()
-                values = found.scores.cpu().numpy()
+                sampled = sample_descriptors(descriptors[k], keypoints.xy, sampling).cpu().numpy()
+                values = keypoints.scores.cpu().numpy()
                 # the network's first pixel is (0, 0), COLMAP's (0.5, 0.5)
-                xy = found.xy.cpu().numpy().astype(np.float32) + np.float32(0.5)
+                xy = keypoints.xy.cpu().numpy().astype(np.float32) + np.float32(0.5)
                 table = np.column_stack([xy, values])
                 sampled = np.ascontiguousarray(sampled)
-                features.append(LocalFeatures(table, values, sampled, found.num_masked))
+                features.append(LocalFeatures(table, values, sampled, keypoints.num_masked))
         return features
 
 

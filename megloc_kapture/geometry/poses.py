@@ -218,14 +218,14 @@ def align_to_earth(
     on_earth = np.array([earth_from_enu(*positions[name]).translation for name in names])
     origin = geodetic(np.median(on_earth, axis=0))
     enu = earth_from_enu(*origin).inverse().apply(on_earth)
-    own = np.array([centers[name] for name in names])
+    local = np.array([centers[name] for name in names])
     weights = np.ones(len(names))
     for _ in range(_ALIGNING_ROUNDS):
-        scale, rotation, translation = _similarity(own, enu, weights)
-        apart = np.linalg.norm(scale * own @ rotation.T + translation - enu, axis=1)
+        scale, rotation, translation = _similarity(local, enu, weights)
+        apart = np.linalg.norm(scale * local @ rotation.T + translation - enu, axis=1)
         weights = 1 / (1 + (apart / max(float(np.median(apart)), 1e-9)) ** 2)
     residual_m = float(np.median(apart))
-    spread_m = np.linalg.svd(scale * (own - np.median(own, axis=0)), compute_uv=False)[1]
+    spread_m = np.linalg.svd(scale * (local - np.median(local, axis=0)), compute_uv=False)[1]
     spread_m /= np.sqrt(len(names))
     if spread_m < _MIN_SPREAD * max(residual_m, _MIN_RESIDUAL_M):
         raise DataError(
@@ -265,12 +265,12 @@ def align_poses(
     spread = np.median(np.linalg.norm(centers[1] - np.median(centers[1], axis=0), axis=1))
 
     def fit(rows: NDArray[np.integer[Any]]) -> tuple[float, Floats, Floats]:
-        directions = tuple(one[rows].reshape(-1, 3) for one in axes)
-        a, b = (one[rows] for one in centers)
-        found = _similarity(a, b, np.ones(len(a)), directions)
+        directions = tuple(array[rows].reshape(-1, 3) for array in axes)
+        a, b = (array[rows] for array in centers)
+        similarity = _similarity(a, b, np.ones(len(a)), directions)
         if with_scale:
-            return found
-        return 1.0, found[1], b.mean(axis=0) - found[1] @ a.mean(axis=0)
+            return similarity
+        return 1.0, similarity[1], b.mean(axis=0) - similarity[1] @ a.mean(axis=0)
 
     def agreeing(scale: float, rotation: Floats, translation: Floats) -> NDArray[np.bool_]:
         apart = np.linalg.norm(scale * centers[0] @ rotation.T + translation - centers[1], axis=1)

@@ -297,17 +297,17 @@ def _triangle(px, z, ar, ac, br, bc, cr, cc, inverse, front):
 @compiled_loop
 def _draw(depth, px, z, max_jump, inverse, front):
     rows, columns = depth.shape
-    there = np.zeros((rows, columns), np.bool_)
+    visible = np.zeros((rows, columns), np.bool_)
     for r in range(rows):
         for c in range(columns):
-            there[r, c] = math.isfinite(px[r, c, 0] + px[r, c, 1])
+            visible[r, c] = math.isfinite(px[r, c, 0] + px[r, c, 1])
     for r in range(rows - 1):
         for c in range(columns - 1):
             # use the quad's other diagonal where this one crosses an edge or a hole
             falling = abs(depth[r, c] - depth[r + 1, c + 1])
             rising = abs(depth[r, c + 1] - depth[r + 1, c])
-            whole = there[r, c] and there[r + 1, c + 1]
-            if whole and not (there[r, c + 1] and there[r + 1, c] and rising < falling):
+            whole = visible[r, c] and visible[r + 1, c + 1]
+            if whole and not (visible[r, c + 1] and visible[r + 1, c] and rising < falling):
                 corners = ((0, 0, 0, 1, 1, 1), (0, 0, 1, 1, 1, 0))
             else:
                 corners = ((0, 0, 0, 1, 1, 0), (0, 1, 1, 1, 1, 0))
@@ -316,7 +316,7 @@ def _draw(depth, px, z, max_jump, inverse, front):
                 ar, ac = r + corner[0], c + corner[1]
                 br, bc = r + corner[2], c + corner[3]
                 cr, cc = r + corner[4], c + corner[5]
-                if not (there[ar, ac] and there[br, bc] and there[cr, cc]):
+                if not (visible[ar, ac] and visible[br, bc] and visible[cr, cc]):
                     continue
                 if (
                     _joined(depth[ar, ac], depth[br, bc], max_jump)

@@ -164,8 +164,8 @@ def _remap(array: NDArray[Any], x: NDArray[np.float32], y: NDArray[np.float32]) 
     # OpenCV takes no more than 32767 rows or columns
     missing = -len(x) % _PER_ROW
     x, y = (np.pad(v, (0, missing)).reshape(-1, _PER_ROW) for v in (x, y))
-    found = cv2.remap(array, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found).reshape(-1, *array.shape[2:])[: x.size - missing]
+    remapped = cv2.remap(array, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(remapped).reshape(-1, *array.shape[2:])[: x.size - missing]
 
 
 def _at_resolution(
@@ -186,10 +186,10 @@ def _at_resolution(
 
 def _not_hidden(source: WarpSource, in_camera: Floats, px: Floats) -> NDArray[np.bool_]:
     """Return a mask of the depth sensor's points (N, 3) that the image also sees."""
-    own, _ = _seen_depth(source, source.camera, source.cam_from_world)
+    surface, _ = _seen_depth(source, source.camera, source.cam_from_world)
     inside = in_image(source.camera, px)
     columns, rows = np.floor(np.where(inside[:, None], px, 0)).astype(np.int64).T
-    return inside & (in_camera[:, 2] <= (1.0 + _SAME_SURFACE) * own[rows, columns])
+    return inside & (in_camera[:, 2] <= (1.0 + _SAME_SURFACE) * surface[rows, columns])
 
 
 def _cost(points: Floats, view_centre: Floats, source_centre: Floats) -> Floats:

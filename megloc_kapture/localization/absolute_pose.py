@@ -277,24 +277,24 @@ def _ransac(
         extrinsic.t = np.array(view.cam_from_rig.translation)
         extrinsics.append(extrinsic)
     if len(points_2d) == 1:
-        found, _ = poselib.estimate_absolute_pose(
+        pose, _ = poselib.estimate_absolute_pose(
             points_2d[0], points_3d[0], pinholes[0], options.for_poselib(), bundle
         )
-        return cams_from_rig[0].inverse() @ _rigid_from_poselib(found)
+        return cams_from_rig[0].inverse() @ _rigid_from_poselib(pose)
     # GP3P ignores poselib's seed and uses C's rand(); poselib releases the GIL, so lock out other
     # threads
     with _RAND:
         ctypes.CDLL(None).srand(ctypes.c_uint(options.seed))
-        found, _ = poselib.estimate_generalized_absolute_pose(
+        pose, _ = poselib.estimate_generalized_absolute_pose(
             points_2d, points_3d, extrinsics, pinholes, options.for_poselib(), bundle
         )
-    return _rigid_from_poselib(found)
+    return _rigid_from_poselib(pose)
 
 
-def _rigid_from_poselib(found: Any) -> RigidTransform:
-    quat = np.asarray(found.q, dtype=np.float64)
+def _rigid_from_poselib(pose: Any) -> RigidTransform:
+    quat = np.asarray(pose.q, dtype=np.float64)
     quat = quat / np.linalg.norm(quat)
-    return unstack_poses(quat[None], np.asarray(found.t, dtype=np.float64)[None])[0]
+    return unstack_poses(quat[None], np.asarray(pose.t, dtype=np.float64)[None])[0]
 
 
 def refine_pose(
@@ -329,14 +329,14 @@ def refine_pose(
             num_inliers=len(rows),
         )
     # a left perturbation acts in the camera frame: the offset does not change the covariance
-    found = Pose(
+    refined = Pose(
         cam_from_world=undo_recentring(pose, problem.offset),
         num_matches=count,
         num_inliers=len(rows),
         inliers=inliers,
         covariance=covariance,
     )
-    return check_stable(found, covariance, _median(projected.depths[rows]), options)
+    return check_stable(refined, covariance, _median(projected.depths[rows]), options)
 
 
 def _minimised(

@@ -42,7 +42,7 @@ from megloc_kapture.plugins import HypothesisView, PoseHypothesis, RankingScene
 from megloc_kapture.values import Failure, Options, Pose
 
 Rank = Callable[[Sequence[PoseHypothesis]], NDArray[np.float64]]
-Found = Sequence[Sequence[Correspondences]]
+OfViews = Sequence[Sequence[Correspondences]]
 """2D-3D matches of each view, by keypoints type."""
 
 
@@ -107,7 +107,7 @@ def cluster_candidates(
     """
     clusters: list[list[int]] = []
     for frame in dict.fromkeys(frames):
-        members = [at for at, own in enumerate(frames) if own == frame]
+        members = [at for at, frame_of_image in enumerate(frames) if frame_of_image == frame]
         names = [images[at] for at in members]
         if options.by == "poses" and options.radius is not None:
             labels = cluster_by_centers(np.array([centers[name] for name in names]), options.radius)
@@ -175,8 +175,12 @@ def localize_in_clusters(
     clock.lap("correspondences")
 
     def attempt(cluster: Sequence[str], frame: str) -> _Attempt:
-        found = [[typed.correspondences(cluster) for typed in view.matches] for view in views]
-        problem = PoseProblem.of([view.view(own) for view, own in zip(views, found, strict=True)])
+        correspondences = [
+            [typed.correspondences(cluster) for typed in view.matches] for view in views
+        ]
+        problem = PoseProblem.of(
+            [view.view(of_view) for view, of_view in zip(views, correspondences, strict=True)]
+        )
         clock.lap("correspondences")
         if is_uncertain(problem):
             problem, estimate = estimate_with_intrinsics(problem, options)
@@ -186,7 +190,7 @@ def localize_in_clusters(
         if isinstance(estimate, PoseEstimate):
             hypothesis = _hypothesis(tuple(cluster), views, problem, estimate, options)
         clock.lap("estimation")
-        return _Attempt(tuple(cluster), frame, found, problem, estimate, hypothesis)
+        return _Attempt(tuple(cluster), frame, correspondences, problem, estimate, hypothesis)
 
     attempts = [attempt(clusters[at], frames[at] if frames else "") for at in tried]
     attempts = _join_agreeing(attempts, attempt, rank_of.__getitem__)
@@ -211,10 +215,10 @@ def localize_in_clusters(
             result = refine_pose(problem, estimate, options)
         clock.lap("refinement")
         if min_confidence is not None and isinstance(result, Pose):
-            found = attempts[best].found
-            sources = match_sources(views, found, ranked[best].candidates, centers or {})
+            of_views = attempts[best].correspondences
+            sources = match_sources(views, of_views, ranked[best].candidates, centers or {})
             if scene is not None:
-                seen = partial(displacements_rad, problem, views, found, scene)
+                seen = partial(displacements_rad, problem, views, of_views, scene)
                 sources = replace(sources, displacements_rad=seen)
             known = result.camera is None
             misfit = focal_misfit(problem, result, options) if known else None
@@ -240,7 +244,7 @@ def localize_in_clusters(
 class _Attempt:
     cluster: tuple[str, ...]
     frame: str
-    found: Found
+    correspondences: OfViews
     problem: PoseProblem
     estimate: PoseEstimate | Failure
     hypothesis: PoseHypothesis | None
@@ -273,15 +277,15 @@ def _join_agreeing(
                 break
         else:
             groups.append([each])
-    found: list[_Attempt] = []
+    merged: list[_Attempt] = []
     for group in groups:
         together = group[0]
         if len(group) > 1:
             images = [image for each in group for image in each.cluster]
             together = attempt(sorted(images, key=rank_of), together.frame)
         kept = together.estimate.num_inliers >= max(each.estimate.num_inliers for each in group)
-        found += [together] if kept else group
-    return found
+        merged += [together] if kept else group
+    return merged
 
 
 def _best(clusters: Sequence[Pose | Failure]) -> int:
@@ -351,13 +355,13 @@ def poses_of_cameras(
     for view, inliers in zip(views, problem.split(rig.inliers), strict=True):
         start, end = end, end + int(inliers.sum())
         clusters = tuple(
-            one
-            if one.cam_from_world is None
-            else replace(one, cam_from_world=view.cam_from_rig @ one.cam_from_world)
-            for one in rig.clusters
+            cluster
+            if cluster.cam_from_world is None
+            else replace(cluster, cam_from_world=view.cam_from_rig @ cluster.cam_from_world)
+            for cluster in rig.clusters
         )
         px, points = rig.inlier_points_px, rig.inlier_points_world
-        own = replace(
+        pose = replace(
             rig,
             name=view.name,
             cam_from_world=view.cam_from_rig @ rig.cam_from_world,
@@ -368,9 +372,9 @@ def poses_of_cameras(
             inlier_points_px=None if px is None else px[start:end],
             inlier_points_world=None if points is None else points[start:end],
         )
-        if own.covariance is not None:
-            moved = transform_covariance(own.covariance, view.cam_from_rig)
-            own = replace(own, covariance=moved)
+        if pose.covariance is not None:
+            moved = transform_covariance(pose.covariance, view.cam_from_rig)
+            pose = replace(pose, covariance=moved)
         failure = Failure(
             "no inlier in this camera; others of its rig were localized",
             name=view.name,
@@ -379,5 +383,5 @@ def poses_of_cameras(
             clusters=clusters,
             seconds=rig.seconds,
         )
-        cameras.append(own if start < end else failure)
+        cameras.append(pose if start < end else failure)
     return cameras

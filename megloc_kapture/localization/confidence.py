@@ -295,29 +295,29 @@ def calibrations() -> Mapping[str, Calibration]:
 def calibration_for(local_types: Collection[str]) -> Calibration:
     """Return the calibration shared by all keypoints types."""
     known = calibrations()
-    found = {
-        next((name for name in known if name != OF_ALL and one.startswith(name)), OF_ALL)
-        for one in local_types
+    names = {
+        next((name for name in known if name != OF_ALL and local_type.startswith(name)), OF_ALL)
+        for local_type in local_types
     }
-    return known[found.pop() if len(found) == 1 else OF_ALL]
+    return known[names.pop() if len(names) == 1 else OF_ALL]
 
 
 def match_sources(
     views: Sequence[QueryView],
-    found: Sequence[Sequence[Correspondences]],
+    correspondences: Sequence[Sequence[Correspondences]],
     cluster: Sequence[str],
     centers: Mapping[str, Floats],
 ) -> MatchSources:
     number = {image: at for at, image in enumerate(cluster)}
     center_of = np.array([centers[image] for image in cluster]).reshape(-1, 3)
     support, images, noise, seen = [], [], [], []
-    for view, of_types in zip(views, found, strict=True):
-        for typed, own in zip(view.matches, of_types, strict=True):
+    for view, of_types in zip(views, correspondences, strict=True):
+        for typed, of_type in zip(view.matches, of_types, strict=True):
             rows = np.array([number.get(image, -1) for image, _, _ in typed.matches], np.int64)
-            support.append(own.support)
-            images.append(rows[own.image_rows])
+            support.append(of_type.support)
+            images.append(rows[of_type.image_rows])
             index = typed.index
-            noise.append(np.tile([index.noise_rad, index.noise_px], (len(own.support), 1)))
+            noise.append(np.tile([index.noise_rad, index.noise_px], (len(of_type.support), 1)))
         seen.append(
             np.concatenate([np.zeros((0, 3)), *(m.index.seen_by(cluster) for m in view.matches)])
         )
@@ -329,5 +329,5 @@ def match_sources(
         num_keypoints=sum(len(m.keypoints_px) for view in views for m in view.matches),
         noise=np.concatenate(noise),
         seen=seen,
-        local_types={own.index.local_type for view in views for own in view.matches},
+        local_types={of_type.index.local_type for view in views for of_type in view.matches},
     )

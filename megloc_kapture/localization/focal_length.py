@@ -109,8 +109,8 @@ def focal_misfit(
     if len(problem.views) != 1 or pose.inliers is None or pose.num_inliers < _MIN_INLIERS:
         return None
     given = problem.views[0].camera
-    found = _freed(problem, pose.cam_from_world, pose.inliers, options.max_error_px)
-    if found is None or not found.contradicts(given):
+    fit = _freed(problem, pose.cam_from_world, pose.inliers, options.max_error_px)
+    if fit is None or not fit.contradicts(given):
         return None
     # inliers of a grossly wrong focal length hide the right one
     free = focal_from_matches(
@@ -122,16 +122,16 @@ def focal_misfit(
         if isinstance(estimate, PoseEstimate):
             start = estimate.rig_from_world, estimate.inliers
             second = _freed(other, *start, options.max_error_px)
-            if second is not None and second.cost < found.cost:
-                found = second
-    if not found.contradicts(given):
+            if second is not None and second.cost < fit.cost:
+                fit = second
+    if not fit.contradicts(given):
         return None
-    deviation_px = found.focal_px * found.deviation_from(given)
-    shift = np.linalg.norm(found.rig_from_world.center() - pose.cam_from_world.center())
+    deviation_px = fit.focal_px * fit.deviation_from(given)
+    shift = np.linalg.norm(fit.rig_from_world.center() - pose.cam_from_world.center())
     return FocalMisfit(
-        f"the focal length of {focal_px(given):.0f} px {_DOES_NOT_FIT}: {found.focal_px:.0f} +- "
+        f"the focal length of {focal_px(given):.0f} px {_DOES_NOT_FIT}: {fit.focal_px:.0f} +- "
         f"{deviation_px:.0f} px would",
-        float(shift) / found.distance,
+        float(shift) / fit.distance,
     )
 
 
@@ -229,7 +229,7 @@ def estimate_with_intrinsics(
     Its ``focal_deviation`` is increased if the matches contradict the given focal length.
     """
     given = problem.views[0].camera
-    found = estimate_pose(problem, options)
+    best = estimate_pose(problem, options)
     free = focal_from_matches(
         problem.points_px, problem.points, given, options.max_error_px, options.seed
     )
@@ -238,18 +238,18 @@ def estimate_with_intrinsics(
         of_other = estimate_pose(other, options)
         if (
             isinstance(of_other, PoseEstimate)
-            and of_other.num_inliers > found.num_inliers
+            and of_other.num_inliers > best.num_inliers
             and _is_possible(other, of_other, given)
         ):
-            problem, found = other, of_other
-    if isinstance(found, PoseEstimate):
-        fit = _fit(problem, found.rig_from_world, found.inliers, given)
+            problem, best = other, of_other
+    if isinstance(best, PoseEstimate):
+        fit = _fit(problem, best.rig_from_world, best.inliers, given)
         if fit is not None:
             refined = _with_camera(problem, _changed(problem.views[0].camera, fit.change))
             estimate = estimate_pose(refined, options)
-            if isinstance(estimate, PoseEstimate) and estimate.num_inliers >= found.num_inliers:
+            if isinstance(estimate, PoseEstimate) and estimate.num_inliers >= best.num_inliers:
                 return refined, estimate
-    return problem, found
+    return problem, best
 
 
 def _scaled(given: Camera, focal: float) -> Camera:
@@ -260,15 +260,15 @@ def _scaled(given: Camera, focal: float) -> Camera:
     return camera
 
 
-def _is_possible(problem: PoseProblem, found: PoseEstimate, given: Camera) -> bool:
+def _is_possible(problem: PoseProblem, estimate: PoseEstimate, given: Camera) -> bool:
     """Return True if the prior allows the focal length or the matches contradict it."""
     camera = problem.views[0].camera
     change = math.log(focal_px(camera) / focal_px(given))
     if abs(change) <= _MAX_DEVIATIONS * given.focal_deviation:
         return True
-    if given.focal_deviation < _MIN_DOUBTED or found.num_inliers < _MIN_INLIERS:
+    if given.focal_deviation < _MIN_DOUBTED or estimate.num_inliers < _MIN_INLIERS:
         return False
-    fit = _fit(problem, found.rig_from_world, found.inliers, given)
+    fit = _fit(problem, estimate.rig_from_world, estimate.inliers, given)
     if fit is None:
         return False
     change += float(fit.change[0])
@@ -381,7 +381,7 @@ def _free_camera(
     """
     rotation, translation = np.eye(3), np.zeros(3)
     prior_weight = (correlated / deviations) ** 2
-    own = np.arange(6, 6 + len(change))
+    intrinsics = np.arange(6, 6 + len(change))
     for _ in range(_ROUNDS):
         ahead = points[:, 2] > 0
         if ahead.sum() < 4:
@@ -394,8 +394,8 @@ def _free_camera(
         gradient = np.einsum("nik,n,ni->k", jacobian, weights, residuals)
         # lens model errors do not average out with more matches
         trusted = max(variance, (_MIN_ERROR_PX / focal) ** 2)
-        information[own, own] += trusted * prior_weight
-        gradient[own] += trusted * prior_weight * (change - expected)
+        information[intrinsics, intrinsics] += trusted * prior_weight
+        gradient[intrinsics] += trusted * prior_weight * (change - expected)
         size = np.sqrt(np.diagonal(information)) + 1e-300
         values, vectors = np.linalg.eigh(information / np.outer(size, size))
         if values[0] < 1e-10 * values[-1]:
@@ -451,9 +451,9 @@ def shared_camera(cameras: Sequence[Camera]) -> Camera:
     order = np.argsort(params, axis=0, kind="stable")
     below = np.cumsum(weights[order], axis=0)
     middle = (below < 0.5 * below[-1]).sum(axis=0)
-    found = np.take_along_axis(params, order, axis=0)[middle, np.arange(params.shape[1])]
+    medians = np.take_along_axis(params, order, axis=0)[middle, np.arange(params.shape[1])]
     deviation = _ALIKE / math.sqrt(float(weights.sum()))
-    return replace(cameras[0], params=tuple(found.tolist()), focal_deviation=deviation)
+    return replace(cameras[0], params=tuple(medians.tolist()), focal_deviation=deviation)
 
 
 def solve_with_shared_camera(poses: Sequence[Pose], options: AbsolutePoseOptions) -> list[Pose]:
@@ -490,18 +490,18 @@ def _solved(pose: Pose, shared: Camera, number: int, options: AbsolutePoseOption
     problem = PoseProblem.of([View(shared, RigidTransform.identity(), *inliers)])
     every = np.ones(len(problem.points), bool)
     start = PoseEstimate(pose.cam_from_world, every, every, np.zeros(len(every)))
-    _, found = refine_with_intrinsics(problem, start, options, shared)
-    if not isinstance(found, Pose) or found.camera is None:
+    _, solved = refine_with_intrinsics(problem, start, options, shared)
+    if not isinstance(solved, Pose) or solved.camera is None:
         return pose
-    camera = found.camera
+    camera = solved.camera
     remark = (
         f"focal length estimated of {number} photographs: {focal_px(camera):.0f} +- "
         f"{camera.focal_deviation * focal_px(camera):.0f} px"
     )
     return replace(
         pose,
-        cam_from_world=found.cam_from_world,
-        covariance=found.covariance,
+        cam_from_world=solved.cam_from_world,
+        covariance=solved.covariance,
         camera=camera,
         remarks=(*(r for r in pose.remarks if not r.startswith("focal length estimated")), remark),
     )

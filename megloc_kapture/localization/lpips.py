@@ -43,8 +43,8 @@ class LpipsDistance:
         self._trunk, self._heads = find_all_weights(
             [self.options.trunk or f"lpips-trunk-{net}", self.options.heads or f"lpips-{net}"]
         )
-        own = self.options.trunk or self.options.heads
-        self.name = f"lpips-like-{net}" if own else f"lpips-{net}"
+        weights = self.options.trunk or self.options.heads
+        self.name = f"lpips-like-{net}" if weights else f"lpips-{net}"
 
     def weights(self) -> dict[str, str]:
         """Return the sha256 of trunk and heads by file name."""

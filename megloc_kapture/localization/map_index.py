@@ -280,10 +280,10 @@ class PoseProblem:
         world = _joined([view.points_world for view in views], 3)
         offset = _amid(world)
         given = [view.point_covariances for view in views]
-        known = any(own is not None for own in given)
+        known = any(covariance is not None for covariance in given)
         covariances = [
-            np.zeros((len(view.points_px), 6)) if own is None else own
-            for view, own in zip(views, given, strict=True)
+            np.zeros((len(view.points_px), 6)) if covariance is None else covariance
+            for view, covariance in zip(views, given, strict=True)
             if known
         ]
         return cls(
@@ -328,28 +328,28 @@ class QueryView:
 
     def matched_images(self) -> list[str]:
         """Return the map images with matches, in the given order."""
-        named = (image for own in self.matches for image, pairs, _ in own.matches if len(pairs))
+        named = (image for typed in self.matches for image, pairs, _ in typed.matches if len(pairs))
         return list(dict.fromkeys(named))
 
     def among(self, images: Sequence[str]) -> QueryView:
         """Keep the matches with these map images only."""
         members = set(images)
         kept = (
-            replace(typed, matches=[one for one in typed.matches if one[0] in members])
+            replace(typed, matches=[pair for pair in typed.matches if pair[0] in members])
             for typed in self.matches
         )
         return replace(self, matches=tuple(kept))
 
-    def view(self, found: Sequence[Correspondences]) -> View:
+    def view(self, correspondences: Sequence[Correspondences]) -> View:
         """Return the camera with its 2D-3D matches, all types concatenated."""
         pixels, points, covariances = [np.zeros((0, 2))], [np.zeros((0, 3))], [np.zeros((0, 6))]
-        for typed, own in zip(self.matches, found, strict=True):
-            pixels.append(typed.keypoints_px[own.keypoint_ids, :2].astype(np.float64))
-            points.append(typed.index.xyz[own.point_ids])
+        for typed, of_type in zip(self.matches, correspondences, strict=True):
+            pixels.append(typed.keypoints_px[of_type.keypoint_ids, :2].astype(np.float64))
+            points.append(typed.index.xyz[of_type.point_ids])
             if typed.index.covariances is None:
-                covariances.append(np.full((len(own.point_ids), 6), np.nan))
+                covariances.append(np.full((len(of_type.point_ids), 6), np.nan))
             else:
-                covariances.append(np.asarray(typed.index.covariances[own.point_ids]))
+                covariances.append(np.asarray(typed.index.covariances[of_type.point_ids]))
         known = any(typed.index.covariances is not None for typed in self.matches)
         return View(
             camera=self.camera,

@@ -89,9 +89,9 @@ class DistinctiveInliers:
         return scores
 
 
-def poses_agree(one: PoseHypothesis, other: PoseHypothesis) -> bool:
+def poses_agree(first: PoseHypothesis, second: PoseHypothesis) -> bool:
     """Return True if one pose explains at least half of the other's inliers."""
-    return _explains(one, other) or _explains(other, one)
+    return _explains(first, second) or _explains(second, first)
 
 
 def _explains(this: PoseHypothesis, other: PoseHypothesis) -> bool:
@@ -188,25 +188,25 @@ class PerceptualRanker:
             self._views(each, scene, *read) if count >= enough else None
             for each, count in zip(hypotheses, inliers, strict=True)
         ]
-        own = np.array(
+        distances = np.array(
             [
                 np.inf if v is None else self._mean_distance(v, [a.valid for a in v])
                 for v in compared
             ]
         )
-        told = np.flatnonzero(np.isfinite(own))
-        if not np.isfinite(own[int(np.argmax(otherwise))]):
+        compared_rows = np.flatnonzero(np.isfinite(distances))
+        if not np.isfinite(distances[int(np.argmax(otherwise))]):
             return otherwise
-        by_own = told[np.argsort(own[told], kind="stable")]
-        scores = np.full(len(own), -np.inf)
+        by_own = compared_rows[np.argsort(distances[compared_rows], kind="stable")]
+        scores = np.full(len(distances), -np.inf)
         finalists = by_own[: self.options.finalists]
         scores[finalists] = self._against_each_other(
-            [compared[at] for at in finalists], own, finalists
+            [compared[at] for at in finalists], distances, finalists
         )
         rest = by_own[self.options.finalists :]
-        scores[rest] = scores[finalists].min() - own[rest]
-        untold = ~np.isfinite(own)
-        scores[untold] = scores[told].min() - 1.0 - 1.0 / (1.0 + otherwise[untold])
+        scores[rest] = scores[finalists].min() - distances[rest]
+        untold = ~np.isfinite(distances)
+        scores[untold] = scores[compared_rows].min() - 1.0 - 1.0 / (1.0 + otherwise[untold])
         return scores
 
     def _views(
@@ -229,18 +229,21 @@ class PerceptualRanker:
         return views
 
     def _against_each_other(
-        self, finalists: Sequence[Sequence[_Compared] | None], own: Floats, at: NDArray[np.int64]
+        self,
+        finalists: Sequence[Sequence[_Compared] | None],
+        distances: Floats,
+        at: NDArray[np.int64],
     ) -> Floats:
         """Return how much smaller each distance is than the others', on average."""
         margins = np.zeros(len(finalists))
-        for i, one in enumerate(finalists):
-            for j, other in enumerate(finalists[:i]):
-                if one is None or other is None:
+        for i, first in enumerate(finalists):
+            for j, second in enumerate(finalists[:i]):
+                if first is None or second is None:
                     continue
-                both = [a.valid & b.valid for a, b in zip(one, other, strict=True)]
-                margin = self._mean_distance(other, both) - self._mean_distance(one, both)
+                both = [a.valid & b.valid for a, b in zip(first, second, strict=True)]
+                margin = self._mean_distance(second, both) - self._mean_distance(first, both)
                 if not np.isfinite(margin):  # they show nothing in common
-                    margin = own[at[j]] - own[at[i]]
+                    margin = distances[at[j]] - distances[at[i]]
                 margins[i] += margin
                 margins[j] -= margin
         return margins / max(len(finalists) - 1, 1)

@@ -67,8 +67,8 @@ class StructureDistance:
 
         def blurred(values: Float32) -> Float32:
             # beyond the border nothing is valid
-            found = cv2.GaussianBlur(values, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-            return np.asarray(found, np.float32)
+            smooth = cv2.GaussianBlur(values, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
+            return np.asarray(smooth, np.float32)
 
         filled = blurred(weight)
         used = valid & (filled >= _MIN_FILLED)
@@ -103,7 +103,7 @@ def _grey_levels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def displacements_rad(
     problem: PoseProblem,
     views: Sequence[QueryView],
-    found: Sequence[Sequence[Correspondences]],
+    correspondences: Sequence[Sequence[Correspondences]],
     scene: RankingScene,
     pose: Pose,
 ) -> NDArray[np.float64]:
@@ -117,11 +117,13 @@ def displacements_rad(
     assert pose.inliers is not None  # it was estimated here
     angles = [np.zeros(0)]
     inliers = problem.split(pose.inliers)
-    for query, view, of_types, kept in zip(views, problem.views, found, inliers, strict=True):
+    for query, view, of_types, kept in zip(
+        views, problem.views, correspondences, inliers, strict=True
+    ):
         shown_by = [
             typed.matches[row][0]
-            for typed, own in zip(query.matches, of_types, strict=True)
-            for row in own.image_rows[np.cumsum(own.support) - own.support].tolist()
+            for typed, of_type in zip(query.matches, of_types, strict=True)
+            for row in of_type.image_rows[np.cumsum(of_type.support) - of_type.support].tolist()
         ]
         found_px = _displacements_px(
             query.name,
@@ -147,18 +149,18 @@ def _displacements_px(
     most = [image for image, _ in Counter(shown_by).most_common(_MAX_IMAGES)]
     rows = [row for row, image in enumerate(shown_by) if image in most]
     rows = rows[:: max(1, math.ceil(len(rows) / _MAX_POINTS))]
-    found: list[float] = []
+    displacements: list[float] = []
     try:
         pixels = _grey_levels(scene.query_image(query))
         for image in most:
-            own = points[[row for row in rows if shown_by[row] == image]]
-            found += _found_in(pixels, camera, cam_from_world, own, image, scene)
+            shown = points[[row for row in rows if shown_by[row] == image]]
+            displacements += _displacements_in(pixels, camera, cam_from_world, shown, image, scene)
     except DataError:
         return np.zeros(0)
-    return np.array(found)
+    return np.array(displacements)
 
 
-def _found_in(
+def _displacements_in(
     pixels: NDArray[np.uint8],
     camera: Camera,
     cam_from_world: RigidTransform,
@@ -169,18 +171,21 @@ def _found_in(
     map_camera, map_pose = scene.map_camera(image), scene.map_pose(image)
     shown = _grey_levels(scene.map_image(image))
     with np.errstate(invalid="ignore", divide="ignore"):
-        here, there = project(camera, cam_from_world, points), project(map_camera, map_pose, points)
+        here, in_map = (
+            project(camera, cam_from_world, points),
+            project(map_camera, map_pose, points),
+        )
         z_here, z_there = cam_from_world.apply(points)[:, 2], map_pose.apply(points)[:, 2]
         scales = (focal_px(camera) / z_here) / (focal_px(map_camera) / z_there)
         usable = (scales > 1 / _MAX_SCALE) & (scales < _MAX_SCALE) & (z_here > 0)
-    usable &= np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
+    usable &= np.isfinite(here).all(axis=1) & np.isfinite(in_map).all(axis=1)
     turn = (cam_from_world @ map_pose.inverse()).rotation_matrix()
     angle = math.atan2(turn[1, 0], turn[0, 0])
-    side, found = 2 * _HALF_PATCH_PX + 1, []
+    side, displacements = 2 * _HALF_PATCH_PX + 1, []
     for row in np.flatnonzero(usable):
         cos, sin = math.cos(angle) / scales[row], -math.sin(angle) / scales[row]
         map_from_patch = np.array([[cos, -sin, 0.0], [sin, cos, 0.0]])
-        middle = there[row] - 0.5  # OpenCV counts from the middle of the first pixel
+        middle = in_map[row] - 0.5  # OpenCV counts from the middle of the first pixel
         map_from_patch[:, 2] = middle - map_from_patch[:, :2].sum(axis=1) * _HALF_PATCH_PX
         patch = cv2.warpAffine(
             shown, map_from_patch, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -194,8 +199,8 @@ def _found_in(
         y, x = np.unravel_index(int(np.argmax(likeness)), likeness.shape)
         if likeness[y, x] >= _MIN_CORRELATION:
             at = (_peak(likeness[y], int(x)), _peak(likeness[:, x], int(y)))
-            found.append(math.hypot(at[0] - _SEARCH_PX, at[1] - _SEARCH_PX))
-    return found
+            displacements.append(math.hypot(at[0] - _SEARCH_PX, at[1] - _SEARCH_PX))
+    return displacements
 
 
 def _peak(values: NDArray[Any], at: int) -> float:

@@ -133,13 +133,13 @@ def sample_depth(
     right, bottom = x - left, y - top
     upper, lower = ((1 - right) * side for side in (1 - bottom, bottom))
     weights = np.stack([upper, right * (1 - bottom), lower, right * bottom])
-    there = np.isfinite(corners) & (corners > 0)
+    measured = np.isfinite(corners) & (corners > 0)
     smooth = (weights * corners).sum(axis=0)
-    nearest = np.take_along_axis(corners, np.where(there, weights, -1.0).argmax(0)[None], 0)[0]
-    depth = np.where(there.all(axis=0), smooth, nearest)
-    low = np.where(there, corners, np.inf).min(axis=0)
-    high = np.where(there, corners, -np.inf).max(axis=0)
-    known = there.all(axis=0) if whole else there.any(axis=0)
+    nearest = np.take_along_axis(corners, np.where(measured, weights, -1.0).argmax(0)[None], 0)[0]
+    depth = np.where(measured.all(axis=0), smooth, nearest)
+    low = np.where(measured, corners, np.inf).min(axis=0)
+    high = np.where(measured, corners, -np.inf).max(axis=0)
+    known = measured.all(axis=0) if whole else measured.any(axis=0)
     usable = known & (high - low <= max_jump * low)
     result[inside] = np.where(usable, depth, np.nan)
     return result
@@ -188,9 +188,9 @@ def contradicted_by_depth(
     ``deviations`` (N,) are the points' along the depth camera's axis for a noise of 1 px, NaN if
     unknown. Returns masks (N,) of contradicted points and of points with depth to compare with.
     """
-    own = 0.0 if deviations is None else np.nan_to_num(deviations) * _KEYPOINT_NOISE_PX
+    sigmas = 0.0 if deviations is None else np.nan_to_num(deviations) * _KEYPOINT_NOISE_PX
     before, behind, checked = compare_with_depth(
-        points_in_image, depth_m, depth_camera, image_from_depth, options, own
+        points_in_image, depth_m, depth_camera, image_from_depth, options, sigmas
     )
     return before | behind, checked
 
@@ -226,9 +226,9 @@ def compare_with_depth(
     whole = known.all(axis=1)
     rows, window = rows[whole], window[whole]
     z, low, high = points[rows, 2], window.min(axis=1), window.max(axis=1)
-    own = np.broadcast_to(sigmas, len(points))[rows]
+    keypoint_sigmas = np.broadcast_to(sigmas, len(points))[rows]
     below, above = (
-        options.max_sigmas * np.hypot(depth_noise(depth, options.noise), own)
+        options.max_sigmas * np.hypot(depth_noise(depth, options.noise), keypoint_sigmas)
         for depth in (low, high)
     )
     checked[rows] = True

@@ -46,9 +46,9 @@ def most_shared(
     for image in range(first, last):
         count = 0
         for k in range(starts[image], starts[image + 1]):
-            own = of_image[k]
-            begin = max(track_starts[track[own]], own - window)
-            end = min(track_starts[track[own] + 1], own + window + 1)
+            observation = of_image[k]
+            begin = max(track_starts[track[observation]], observation - window)
+            end = min(track_starts[track[observation] + 1], observation + window + 1)
             for i in range(begin, end):
                 other = images[i]
                 if shared[other] == 0:

@@ -70,7 +70,7 @@ def pairs_by_poses(
     axes = np.array([pose.rotation_matrix()[2] for pose in cams_from_world])
     min_cosine = np.cos(np.radians(options.max_angle_deg))
     tree = cKDTree(centers)
-    found = [np.zeros((0, 2), dtype=np.int64)]
+    parts = [np.zeros((0, 2), dtype=np.int64)]
     waiting = np.arange(count)
     # an image is its own nearest centre
     largest = min(count, max(_MAX_SEARCHED, options.num_neighbours) + 1)
@@ -89,11 +89,11 @@ def pairs_by_poses(
             done = (rank[:, -1] >= options.num_neighbours) | (size >= largest)
             take = good & (rank <= options.num_neighbours) & done[:, None]
             rows, columns = np.nonzero(take)
-            found.append(np.stack([part[rows], index[rows, columns]], axis=1))
+            parts.append(np.stack([part[rows], index[rows, columns]], axis=1))
             unfinished.append(part[~done])
         waiting = np.concatenate(unfinished)
         size = min(largest, 2 * size)
-    return unique_pairs(np.concatenate(found))
+    return unique_pairs(np.concatenate(parts))
 
 
 # points both images observe: as many as the matches of a verified pair
@@ -152,14 +152,14 @@ def pairs_by_sequence(
     sequences: dict[str, list[int]] = {}
     for image in sorted(range(len(cameras)), key=lambda image: timestamps[image]):
         sequences.setdefault(cameras[image], []).append(image)
-    found = [np.zeros((0, 2), dtype=np.int64)]
+    parts = [np.zeros((0, 2), dtype=np.int64)]
     for sequence in sequences.values():
         images = np.array(sequence, dtype=np.int64)
         for step in range(1, min(options.window, len(images) - 1) + 1):
-            found.append(np.stack([images[:-step], images[step:]], axis=1))
+            parts.append(np.stack([images[:-step], images[step:]], axis=1))
             if options.loop:
-                found.append(np.stack([images[-step:], images[:step]], axis=1))
-    return unique_pairs(np.concatenate(found))
+                parts.append(np.stack([images[-step:], images[:step]], axis=1))
+    return unique_pairs(np.concatenate(parts))
 
 
 def views_can_overlap(

@@ -270,7 +270,7 @@ def extract_variants(
     like : features of the image itself, which define the number of columns.
     """
     height, width = image.shape[:2]
-    found, skipped = [], {}
+    extracted, skipped = [], {}
     for variant in variants:
         try:
             features = extract(
@@ -292,11 +292,11 @@ def extract_variants(
                 f"descriptor, the extractor's {px.shape[1]} and {features.descriptors.shape[1]}"
             )
         size = variant.size(width, height)
-        own = ImageFeatures(px[:, :columns], features.descriptors, *size)
+        in_variant = ImageFeatures(px[:, :columns], features.descriptors, *size)
         original_px = px[:, :columns].copy()
         original_px[:, :2] = variant.px_in_original(px[:, :2], width, height)
-        found.append(VariantFeatures(variant, own, original_px))
-    return found, skipped
+        extracted.append(VariantFeatures(variant, in_variant, original_px))
+    return extracted, skipped
 
 
 def match_variants(
@@ -306,10 +306,10 @@ def match_variants(
     judgements: Sequence[PairVerifier],
 ) -> list[list[VariantMatches]]:
     """Match an image's variants with several other images, each with its verifier."""
-    found: list[list[VariantMatches]] = [[] for _ in others]
+    matches_of: list[list[VariantMatches]] = [[] for _ in others]
     for variant in variants:
         matched = match(variant.features, others)
-        for into, judgement, (matches, scores) in zip(found, judgements, matched, strict=True):
+        for into, judgement, (matches, scores) in zip(matches_of, judgements, matched, strict=True):
             if len(matches) == 0:
                 continue
             verify = partial(judgement.verify, variant)
@@ -325,4 +325,6 @@ def match_variants(
                         np.asarray(scores[good], dtype=np.float32),
                     )
                 )
-    return [judgement.agree(matches) for judgement, matches in zip(judgements, found, strict=True)]
+    return [
+        judgement.agree(matches) for judgement, matches in zip(judgements, matches_of, strict=True)
+    ]

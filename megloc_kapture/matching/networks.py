@@ -44,12 +44,12 @@ class PairNetwork(Checkpointed[PairOptions], ABC):
 
 
 def _matched(
-    num_others: int, rows: Sequence[int], found: Iterable[tuple[torch.Tensor, torch.Tensor]]
+    num_others: int, rows: Sequence[int], matched: Iterable[tuple[torch.Tensor, torch.Tensor]]
 ) -> list[Matches]:
     matches: list[Matches] = [
         (np.zeros((0, 2), np.int64), np.zeros(0, np.float32)) for _ in range(num_others)
     ]
-    for row, (pairs, scores) in zip(rows, found, strict=True):
+    for row, (pairs, scores) in zip(rows, matched, strict=True):
         matches[row] = pairs.cpu().numpy(), scores.cpu().numpy()
     return matches
 
@@ -81,8 +81,10 @@ class SuperGlue(PairNetwork[SuperGlueOptions]):
             rows = [k for k, b in enumerate(sides) if len(side.scores) and len(b.scores)]
             pairs = [(side, sides[k]) for k in rows]
             assignments = net(pairs, options.sinkhorn_iterations) if pairs else ()
-            found = [mutual_matches(one, options.match_threshold) for one in assignments]
-            return _matched(len(others), rows, found)
+            matched = [
+                mutual_matches(assignment, options.match_threshold) for assignment in assignments
+            ]
+            return _matched(len(others), rows, matched)
 
 
 def network_input(
@@ -153,15 +155,15 @@ class LightGlue(PairNetwork[LightGlueOptions]):
         for image in (a, *others):
             _check(image, network.conf.input_dim, self._weights)
         rows = [at for at, b in enumerate(others) if len(a.keypoints_px) and len(b.keypoints_px)]
-        found = []
+        matched = []
         with inference(device):
             side = _kornia_input(a, device)
             for row in rows:
                 result = network({"image0": side, "image1": _kornia_input(others[row], device)})
                 pairs, scores = result["matches"][0], result["scores"][0]
                 order = torch.argsort(pairs[:, 0])
-                found.append((pairs[order], scores[order].float()))
-        return _matched(len(others), rows, found)
+                matched.append((pairs[order], scores[order].float()))
+        return _matched(len(others), rows, matched)
 
 
 def _check(image: ImageFeatures, expected: int, file: WeightsFile) -> None:

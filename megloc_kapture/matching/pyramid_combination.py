@@ -91,28 +91,28 @@ class _Combination:
 
     def take(self, number: int, tried: TriedVariant) -> None:
         """Add the matches of a variant between unused keypoints."""
-        side, found = tried
+        side, matched = tried
         union = self._keypoints[side]
         if union is None:
             raise ValueError("a variant of an image whose keypoints are not given")
-        known = union.find(found.keypoints_px)
+        known = union.find(matched.keypoints_px)
         used, used_other = self._used[side], self._used[1 - side]
-        for k in np.argsort(-found.scores, kind="stable").tolist():
-            other = int(found.other_rows[k])
+        for k in np.argsort(-matched.scores, kind="stable").tolist():
+            other = int(matched.other_rows[k])
             if other in used_other:
                 continue
             row = int(known[k])
             if row < 0:  # may have been appended in this loop
-                row = union.find_added(found.keypoints_px[k])
+                row = union.find_added(matched.keypoints_px[k])
             if row < 0:
-                row = union.append(found.keypoints_px[k])
+                row = union.append(matched.keypoints_px[k])
                 self._added[side].append((number, k))
             elif row in used:
                 continue
             used.add(row)
             used_other.add(other)
             self.matches.append((row, other) if side == 0 else (other, row))
-            self._scores.append(float(found.scores[k]))
+            self._scores.append(float(matched.scores[k]))
 
     def result(self, best: int | None) -> Combined:
         first, second = (np.array(added, dtype=np.int64).reshape(-1, 2) for added in self._added)
@@ -143,17 +143,17 @@ class KeypointUnion:
 
     def find(self, keypoints_px: Float32) -> NDArray[np.int64]:
         """Return the rows (K,) of the identical keypoints, -1 if missing."""
-        found = np.full(len(keypoints_px), -1, dtype=np.int64)
+        rows_of = np.full(len(keypoints_px), -1, dtype=np.int64)
         if self._tree is not None and len(keypoints_px):
             near = self._tree.query_ball_point(
                 keypoints_px[:, :2], SAME_KEYPOINT_PX, return_sorted=True
             )
             for k, rows in enumerate(near):
                 if rows:
-                    found[k] = self._nearest(keypoints_px[k], rows)
-        for k in np.flatnonzero(found < 0).tolist():
-            found[k] = self.find_added(keypoints_px[k])
-        return found
+                    rows_of[k] = self._nearest(keypoints_px[k], rows)
+        for k in np.flatnonzero(rows_of < 0).tolist():
+            rows_of[k] = self.find_added(keypoints_px[k])
+        return rows_of
 
     def find_added(self, keypoint_px: Float32) -> int:
         """Find one keypoint (C,) among the added ones, see :meth:`find`."""
@@ -189,8 +189,8 @@ class KeypointUnion:
 
     def _distance(self, keypoint_px: Float32, row: int) -> float:
         n = len(self._base)
-        there = self._base[row] if row < n else self._added[row - n]
-        dx, dy = (float(keypoint_px[k]) - float(there[k]) for k in (0, 1))
+        position = self._base[row] if row < n else self._added[row - n]
+        dx, dy = (float(keypoint_px[k]) - float(position[k]) for k in (0, 1))
         return float(np.hypot(dx, dy))
 
 

@@ -192,21 +192,24 @@ def two_view_of_variants(
     focal, other_focal = focal_px(camera), focal_px(other_camera)
     pairs = image_px[base_matches[:, 0], :2], other_px[base_matches[:, 1], :2]
 
-    def verify(found: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def verify(features: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
         # poselib's errors are at the mean focal length; a variant's are larger by its scale
-        coarser = (focal + other_focal) / (_precision(found.variant) * focal + other_focal)
+        coarser = (focal + other_focal) / (_precision(features.variant) * focal + other_focal)
         return verify_two_view(
-            found.keypoints_px[matches[:, 0], :2],
+            features.keypoints_px[matches[:, 0], :2],
             camera,
             other_px[matches[:, 1], :2],
             other_camera,
             options.model_copy(update={"max_error_px": options.max_error_px * coarser}),
         )
 
-    def agree(found: list[VariantMatches]) -> list[VariantMatches]:
-        if not found:
-            return found
-        sets = [pairs, *((one.keypoints_px, other_px[one.other_rows]) for one in found)]
+    def agree(matched: list[VariantMatches]) -> list[VariantMatches]:
+        if not matched:
+            return matched
+        sets = [
+            pairs,
+            *((each.keypoints_px, other_px[each.other_rows]) for each in matched),
+        ]
         richest = max(range(len(sets)), key=lambda at: len(sets[at][0]))
         other_from_image = relative_pose(
             bearing_rays(camera, sets[richest][0][:, :2]),
@@ -215,17 +218,17 @@ def two_view_of_variants(
             options,
         )
         if other_from_image is None:
-            return found
+            return matched
         other_rays = bearing_rays(other_camera, other_px[:, :2])
         other_slopes = ray_slopes(other_camera, other_px[:, :2], other_rays)
         exact = KnownPoseOptions(max_error_px=options.max_error_px)
         kept = []
-        for one in found:
-            px = one.keypoints_px[:, :2]
+        for each in matched:
+            px = each.keypoints_px[:, :2]
             rays = bearing_rays(camera, px)
             # pixels of a smaller image are larger angles
-            slopes = ray_slopes(camera, px, rays) / _precision(one.variant)
-            others = one.other_rows
+            slopes = ray_slopes(camera, px, rays) / _precision(each.variant)
+            others = each.other_rows
             good = verify_with_poses(
                 rays,
                 slopes,
@@ -236,7 +239,7 @@ def two_view_of_variants(
                 min_matches=0,
             )
             if good.sum() >= _MIN_AGREEING * len(good):
-                kept.append(one.only(good))
+                kept.append(each.only(good))
         return kept
 
     return PairVerifier(verify, agree)
@@ -253,8 +256,8 @@ def known_pose_of_variants(
     given.
     """
 
-    def verify(found: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
-        px, others = found.keypoints_px[matches[:, 0], :2], matches[:, 1]
+    def verify(features: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
+        px, others = features.keypoints_px[matches[:, 0], :2], matches[:, 1]
         rays = bearing_rays(camera, px)
         slopes = ray_slopes(camera, px, rays)
         return verify_with_poses(

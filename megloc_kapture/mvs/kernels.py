@@ -54,18 +54,18 @@ def correlate(reference, warped, radius, costs):
     num_sources = len(warped)
     area = np.float32((2 * radius + 1) ** 2)
     columns, sums = np.empty((3, width), np.float32), np.empty((3, width), np.float32)
-    own = np.empty((3, width), np.float32)
+    reference_sums = np.empty((3, width), np.float32)
     first, second = np.empty(width, np.float32), np.empty(width, np.float32)
     for y in range(height):
-        window_sums(reference, reference, radius, y, columns, own)
+        window_sums(reference, reference, radius, y, columns, reference_sums)
         for x in range(width):
             first[x] = second[x] = np.float32(-2)
         for s in range(num_sources):
             window_sums(warped[s], reference, radius, y, columns, sums)
             for x in range(width):
-                above = sums[2, x] - sums[0, x] * own[0, x] / area
+                above = sums[2, x] - sums[0, x] * reference_sums[0, x] / area
                 spread = (sums[1, x] - sums[0, x] * sums[0, x] / area) * (
-                    own[1, x] - own[0, x] * own[0, x] / area
+                    reference_sums[1, x] - reference_sums[0, x] * reference_sums[0, x] / area
                 )
                 score = above / np.float32(math.sqrt(max(spread, _FLAT)))
                 score = score if score == score else np.float32(-2)
@@ -170,26 +170,26 @@ def count_agreeing(
             column, row = int(math.floor(u + 0.5)), int(math.floor(v + 0.5))
             if column < 0 or row < 0 or column >= columns or row >= rows:
                 continue
-            there = float(other[row, column])
-            if there <= 0.0:
+            other_depth = float(other[row, column])
+            if other_depth <= 0.0:
                 continue
             # the other's depth, extrapolated to the projection along the tangent of 1 / depth
             if 0 < column < columns - 1 and 0 < row < rows - 1:
                 left, right = other[row, column - 1], other[row, column + 1]
                 top, bottom = other[row - 1, column], other[row + 1, column]
                 across, down = 0.5 * (right - left), 0.5 * (bottom - top)
-                limit = 0.05 * there
+                limit = 0.05 * other_depth
                 if left > 0 and right > 0 and abs(across) < limit:
-                    there += across * (u - column)
+                    other_depth += across * (u - column)
                 if top > 0 and bottom > 0 and abs(down) < limit:
-                    there += down * (v - row)
-            qz = g[2, 0] * u + g[2, 1] * v + g[2, 2] + c[2] * there
+                    other_depth += down * (v - row)
+            qz = g[2, 0] * u + g[2, 1] * v + g[2, 2] + c[2] * other_depth
             if qz <= 1e-9:
                 continue
-            back_x = (g[0, 0] * u + g[0, 1] * v + g[0, 2] + c[0] * there) / qz
-            back_y = (g[1, 0] * u + g[1, 1] * v + g[1, 2] + c[1] * there) / qz
+            back_x = (g[0, 0] * u + g[0, 1] * v + g[0, 2] + c[0] * other_depth) / qz
+            back_y = (g[1, 0] * u + g[1, 1] * v + g[1, 2] + c[1] * other_depth) / qz
             # depth in this view: q = K (R p z' + t), its third coordinate over 1 / z'
-            depth = qz / there
+            depth = qz / other_depth
             if (back_x - x) ** 2 + (back_y - y) ** 2 > max_px * max_px:
                 continue
             if abs(depth * w - 1.0) <= max_share:

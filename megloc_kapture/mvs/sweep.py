@@ -142,7 +142,7 @@ def as_estimate(camera: Camera, planes: Floats, deviations: NDArray[np.floating]
     normals = -covector @ pinhole_matrix(camera)
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
     sigma, normals = deviations * depth**2, np.where(known[..., None], normals, 0.0)
-    return DepthEstimate(*(one.astype(np.float32) for one in (depth, sigma, normals)))
+    return DepthEstimate(*(array.astype(np.float32) for array in (depth, sigma, normals)))
 
 
 def planes_of(camera: Camera, depth_m: NDArray[Any], normals: NDArray[Any]) -> Floats:
@@ -185,7 +185,7 @@ def sweep(
     wanted = int(np.ceil((limits[1] - limits[0]) / step)) + 1
     planes = np.linspace(limits[0], limits[1], int(np.clip(wanted, _MIN_PLANES, max_planes)))
     grey = stereo_image(reference)
-    volume = cost_volume(grey, [stereo_image(one) for one in sources], projections, planes)
+    volume = cost_volume(grey, [stereo_image(image) for image in sources], projections, planes)
     step = float(planes[1] - planes[0])
     return (planes[0] + step * semi_global(volume, grey)).astype(np.float32), step
 
@@ -265,10 +265,10 @@ def matching_deviations(
     from megloc_kapture.mvs.plane_kernels import plane_deviations
 
     grey = stereo_image(reference)
-    found = np.empty(grey.shape, np.float32)
+    deviations = np.empty(grey.shape, np.float32)
     views = _compared(reference, sources)
-    plane_deviations(grey, *views, planes, _REACH, _TONE, calibration, found)
-    return found
+    plane_deviations(grey, *views, planes, _REACH, _TONE, calibration, deviations)
+    return deviations
 
 
 def _compared(reference: StereoView, sources: Sequence[StereoView]) -> tuple[Image, Floats, Floats]:

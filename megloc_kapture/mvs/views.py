@@ -192,8 +192,10 @@ def with_pose_errors(
     paths = [relative_projection(view, source) for source in sources]
     # any of the sources may have decided
     step = np.sqrt(np.mean([pixel_step([path], view.camera, limits) ** 2 for path in paths]))
-    own = (error_px * step * np.square(estimate.depth_m.astype(np.float64))).astype(np.float32)
-    return replace(estimate, sigma_m=np.hypot(estimate.sigma_m, own))
+    pose_sigma = (error_px * step * np.square(estimate.depth_m.astype(np.float64))).astype(
+        np.float32
+    )
+    return replace(estimate, sigma_m=np.hypot(estimate.sigma_m, pose_sigma))
 
 
 def confirmed(

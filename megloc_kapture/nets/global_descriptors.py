@@ -97,8 +97,8 @@ class VggNetVlad(nn.Module):
     def features(self, image: torch.Tensor) -> torch.Tensor:
         """Return features (B, 512, H // 16, W // 16) of RGB images (B, 3, H, W) in [0, 1]."""
         mean = image.new_tensor(self.mean_rgb)[:, None, None]
-        found: torch.Tensor = self.base_model["base"](255.0 * image - mean)
-        return found
+        activations: torch.Tensor = self.base_model["base"](255.0 * image - mean)
+        return activations
 
     def vectors(self, features: torch.Tensor) -> torch.Tensor:
         # a convolution would first reorder half a gigabyte of weights

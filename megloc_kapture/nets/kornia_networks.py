@@ -148,7 +148,7 @@ def _in_half_precision(forward: Callable[..., Any]) -> Callable[..., Any]:
     def run(x: torch.Tensor, *others: Any, **named: Any) -> Any:
         half = torch.float16 if x.device.type == "cuda" else torch.bfloat16
         with torch.autocast(x.device.type, dtype=half):
-            return tuple(found.float() for found in forward(x, *others, **named))
+            return tuple(output.float() for output in forward(x, *others, **named))
 
     return run
 

@@ -107,21 +107,21 @@ class Lpips(nn.Module):
         """Return unit features of the valid pixels, per layer (B, C, h, w); see :meth:`forward`."""
         # channels last: the same convolutions and lengths, faster on a CPU
         x = in_fast_layout(self._normalised(image) * valid)
-        found = []
+        normalised = []
         for number, layer in enumerate(self.features):
             x = layer(x)
             if number in self.taps:
                 features = x.to(image.dtype)
                 length = (features * features).sum(dim=1, keepdim=True).sqrt()
-                found.append(features / (length + _MIN_LENGTH))
-        return found
+                normalised.append(features / (length + _MIN_LENGTH))
+        return normalised
 
     def between(
-        self, one: Sequence[torch.Tensor], other: Sequence[torch.Tensor], valid: torch.Tensor
+        self, first: Sequence[torch.Tensor], second: Sequence[torch.Tensor], valid: torch.Tensor
     ) -> torch.Tensor:
         """Return distances (B,) between results of :meth:`described` with the same valid pixels."""
         total = torch.zeros(len(valid), dtype=valid.dtype, device=valid.device)
-        for layer, (a, b) in enumerate(zip(one, other, strict=True)):
+        for layer, (a, b) in enumerate(zip(first, second, strict=True)):
             different = self.get_submodule(f"lin{layer}")((a - b) ** 2)
             weight = F.interpolate(valid, size=different.shape[-2:], mode="area")
             total = total + (different * weight).sum(dim=(1, 2, 3)) / weight.sum(dim=(1, 2, 3))

@@ -309,8 +309,8 @@ class TriPlane(nn.Module):
             .prod(0)
             for plane in self.planes
         ]
-        found = self.geometry(torch.cat(features).T).reshape(*points.shape[:2], -1)
-        return torch.exp(found[..., 0].clamp(max=_MAX_LOG_DENSITY)), found[..., 1:]
+        outputs = self.geometry(torch.cat(features).T).reshape(*points.shape[:2], -1)
+        return torch.exp(outputs[..., 0].clamp(max=_MAX_LOG_DENSITY)), outputs[..., 1:]
 
     def render(self, rays: Rays, generator: torch.Generator | None = None) -> Rendered:
         t = self._where(rays, generator)
@@ -337,10 +337,10 @@ class TriPlane(nn.Module):
     def _where(self, rays: Rays, generator: torch.Generator | None) -> torch.Tensor:
         depth = rays.depth
         spread = stratified(rays, _SPREAD, generator)
-        there = spread.new_zeros(len(spread), _THERE)
+        near_surface = spread.new_zeros(len(spread), _THERE)
         unknown = torch.arange(len(spread), device=spread.device)
         if depth is not None:
-            there = about_depth(depth, there, generator)
+            near_surface = about_depth(depth, near_surface, generator)
             unknown = torch.nonzero(depth <= 0)[:, 0]
         if len(unknown):
             some = Rays(rays.origins[unknown], rays.directions[unknown], rays.near, rays.far)
@@ -348,8 +348,8 @@ class TriPlane(nn.Module):
             sigma = self.density(some.points(t))[0]
             passed = torch.cumsum(sigma * spacings(t, some), dim=1)
             left = torch.exp(-torch.cat([torch.zeros_like(passed[:, :1]), passed], dim=1))
-            there[unknown] = importance(t, left[:, :-1] - left[:, 1:], _THERE, generator)
-        return torch.sort(torch.cat([spread, there], dim=1), dim=1).values
+            near_surface[unknown] = importance(t, left[:, :-1] - left[:, 1:], _THERE, generator)
+        return torch.sort(torch.cat([spread, near_surface], dim=1), dim=1).values
 
 
 def _mlp(entering: int, leaving: int) -> nn.Sequential:

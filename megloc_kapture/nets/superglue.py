@@ -73,12 +73,12 @@ class SuperGlueNet(nn.Module):
             scores = torch.cat([image.scores for image in images])
             located = torch.column_stack([torch.cat([image.xy for image in images]), scores])
             tokens = torch.cat([image.descriptors for image in images]) + self.kenc.encoder(located)
-        found = [self._assigned(tokens, lengths, iterations)] if 0 in after else []
+        assigned = [self._assigned(tokens, lengths, iterations)] if 0 in after else []
         for number, layer in enumerate(self.gnn.layers, start=1):
             tokens = tokens + layer(tokens, lengths, cross=number % 2 == 0)
             if number in after:
-                found.append(self._assigned(tokens, lengths, iterations))
-        return found
+                assigned.append(self._assigned(tokens, lengths, iterations))
+        return assigned
 
     def _assigned(
         self, tokens: torch.Tensor, lengths: list[int], iterations: int
@@ -168,12 +168,12 @@ def superglue(tensors: Mapping[str, torch.Tensor], where: str) -> SuperGlueNet:
 
 
 def _numbered(tensors: Mapping[str, torch.Tensor], pattern: str, *, dimensions: int) -> list[int]:
-    found = {}
+    sizes = {}
     for key, value in tensors.items():
         matched = re.fullmatch(pattern, key)
         if matched and value.ndim == dimensions:
-            found[int(matched[1])] = value.shape[0]
-    return [found[number] for number in sorted(found)]
+            sizes[int(matched[1])] = value.shape[0]
+    return [sizes[number] for number in sorted(sizes)]
 
 
 def normalise_keypoints(xy: torch.Tensor, width: int, height: int) -> torch.Tensor:

@@ -242,9 +242,9 @@ def most_likely(logits: torch.Tensor, height: int, width: int) -> torch.Tensor:
     """Return the argmax uint8 (height, width) of upscaled logits (C, h, w), one class at a time."""
     best = logits.new_full((height, width), -torch.inf)
     label = torch.zeros((height, width), dtype=torch.uint8, device=logits.device)
-    for number, one in enumerate(logits):
+    for number, channel in enumerate(logits):
         scaled = F.interpolate(
-            one[None, None], size=(height, width), mode="bilinear", align_corners=False
+            channel[None, None], size=(height, width), mode="bilinear", align_corners=False
         )[0, 0]
         better = scaled > best
         label[better] = number

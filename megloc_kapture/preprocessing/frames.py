@@ -109,9 +109,11 @@ def _reaches(
     plan: FramePlan, x: NDArray[np.floating[Any]], y: NDArray[np.floating[Any]]
 ) -> NDArray[np.bool_]:
     rays = bearing_rays(plan.processed, _grid(x, y))
-    found = px_from_cam(plan.original, rays)
-    inside = ((found >= 0) & (found <= [plan.original.width, plan.original.height])).all(axis=1)
-    return np.asarray((inside & sees(plan.original, rays, found)).reshape(len(y), len(x)))
+    original_px = px_from_cam(plan.original, rays)
+    inside = (
+        (original_px >= 0) & (original_px <= [plan.original.width, plan.original.height])
+    ).all(axis=1)
+    return np.asarray((inside & sees(plan.original, rays, original_px)).reshape(len(y), len(x)))
 
 
 def _grid(x: NDArray[np.floating[Any]], y: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
@@ -128,16 +130,16 @@ def _sampled_at(plan: FramePlan, samples: int) -> tuple[Float32, Float32]:
     square = max(1, round(_INTERPOLATED_PX / max(plan.shrink, 1.0)))
     columns, rows = -(-width // square) + 2, -(-height // square) + 2
     x, y = ((np.arange(number) - 0.5) * square for number in (columns, rows))
-    found = px_from_cam(plan.original, bearing_rays(plan.processed, _grid(x, y))) - 0.5
-    found = found.reshape(rows, columns, 2).astype(np.float32)
+    original_px = px_from_cam(plan.original, bearing_rays(plan.processed, _grid(x, y))) - 0.5
+    original_px = original_px.reshape(rows, columns, 2).astype(np.float32)
     margin = square * samples
     if margin > 1:
         size = (margin * columns, margin * rows)
-        found = np.asarray(cv2.resize(found, size, interpolation=cv2.INTER_LINEAR))
-    found = found[margin:, margin:][: samples * height, : samples * width]
-    maps = tuple(np.ascontiguousarray(found[..., k], np.float32) for k in (0, 1))
-    for one in maps:
-        one.setflags(write=False)
+        original_px = np.asarray(cv2.resize(original_px, size, interpolation=cv2.INTER_LINEAR))
+    original_px = original_px[margin:, margin:][: samples * height, : samples * width]
+    maps = tuple(np.ascontiguousarray(original_px[..., k], np.float32) for k in (0, 1))
+    for coordinates in maps:
+        coordinates.setflags(write=False)
     return maps[0], maps[1]
 
 
@@ -184,11 +186,11 @@ class FramePlan:
             return estimated
         px = focal_px(self.original) / focal_px(self.processed)
         shift = np.subtract(principal_point_px(estimated), principal_point_px(self.processed)) * px
-        found = shift_principal_point(self.original, *shift.tolist())
-        found = scale_focal(found, focal_px(estimated) / focal_px(self.processed))
-        if found.model in RADIAL_MODELS and estimated.model in RADIAL_MODELS:
-            found = with_distortion(found, radial_distortion(estimated))
-        return replace(found, focal_deviation=estimated.focal_deviation)
+        camera = shift_principal_point(self.original, *shift.tolist())
+        camera = scale_focal(camera, focal_px(estimated) / focal_px(self.processed))
+        if camera.model in RADIAL_MODELS and estimated.model in RADIAL_MODELS:
+            camera = with_distortion(camera, radial_distortion(estimated))
+        return replace(camera, focal_deviation=estimated.focal_deviation)
 
 
 def plan_frame(camera: Camera, options: FrameOptions) -> FramePlan:
@@ -218,14 +220,14 @@ def carry_points(source: Camera, target: Camera, points_px: NDArray[np.floating[
     points = np.asarray(points_px, np.float64).reshape(-1, 2)
     if same_lens(source, target):
         a, b = (np.array(with_two_focals(camera).params[:4]) for camera in (source, target))
-        found = (points - a[2:]) * (b[:2] / a[:2]) + b[2:]
+        moved = (points - a[2:]) * (b[:2] / a[:2]) + b[2:]
     else:
         rays = bearing_rays(source, points)
-        found = px_from_cam(target, rays)
-        found[~(sees(source, rays, points) & sees(target, rays, found))] = np.nan
+        moved = px_from_cam(target, rays)
+        moved[~(sees(source, rays, points) & sees(target, rays, moved))] = np.nan
     limit = np.array([target.width, target.height]) + _ROUNDING_PX
-    found[~((found >= -_ROUNDING_PX) & (found <= limit)).all(axis=1)] = np.nan
-    return found
+    moved[~((moved >= -_ROUNDING_PX) & (moved <= limit)).all(axis=1)] = np.nan
+    return moved
 
 
 def sees(camera: Camera, rays: Floats, points_px: Floats) -> NDArray[np.bool_]:

@@ -99,13 +99,13 @@ class Candidate:
 
 def accept_or_keep(
     start: RigidTransform,
-    found: Candidate,
+    candidate: Candidate,
     overlaps: tuple[float, float],
     options: RenderingOptions,
 ) -> PoseRefinement:
     """Return the new pose with its covariance, or the old one and the reason."""
-    pose = found.alignment.cam_from_world
-    comparison = compare_poses(found.problem, start, pose)
+    pose = candidate.alignment.cam_from_world
+    comparison = compare_poses(candidate.problem, start, pose)
     moved_m, turned_deg = movement(start, pose)
     measures = {
         "cost_before": comparison.before.cost,
@@ -117,11 +117,11 @@ def accept_or_keep(
         "overlap_after": overlaps[1],
         "moved_m": moved_m,
         "turned_deg": turned_deg,
-        "moved_px": _moved_px(found.problem, start, pose),
+        "moved_px": _moved_px(candidate.problem, start, pose),
         "points": float(comparison.after.count),
-        "references": float(len(np.unique(found.problem.chosen.groups))),
+        "references": float(len(np.unique(candidate.problem.chosen.groups))),
     }
-    uncertainty = covariance(found.free, found.alignment)
+    uncertainty = covariance(candidate.free, candidate.alignment)
     if uncertainty is not None:
         measures["claimed_m"] = float(np.sqrt(np.trace(uncertainty[3:, 3:])))
         measures["claimed_deg"] = float(np.degrees(np.sqrt(np.trace(uncertainty[:3, :3]))))
@@ -279,8 +279,8 @@ def _scatter(
     rows, groups = rows[seen], problem.chosen.groups[seen]
     weight = (1.0 + np.square(rows[..., 0]).mean(1) / squared_scale) ** -2 / rows.shape[1]
     # total derivative by the pose: gain and bias follow it
-    own = np.stack([rows[..., 7], np.ones(rows.shape[:2])], axis=-1)
-    derivative = rows[..., 1:7] - np.einsum("ncpi,nci->ncp", projection[groups], own)
+    nuisance = np.stack([rows[..., 7], np.ones(rows.shape[:2])], axis=-1)
+    derivative = rows[..., 1:7] - np.einsum("ncpi,nci->ncp", projection[groups], nuisance)
     score = np.einsum("n,nc,ncp->np", weight, rows[..., 0], derivative)
     cells = problem.cells(at.cam_from_world, seen)
     sums = np.zeros((int(cells.max()) + 1, 6))
@@ -292,10 +292,10 @@ def _scatter(
 def _inverse_curvature(
     problem: LevelProblem, at: Alignment, squared_scale: float, system: NormalEquations
 ) -> Float64 | None:
-    found = whitened_directions(problem, system)
-    if found is None:
+    whitened = whitened_directions(problem, system)
+    if whitened is None:
         return None
-    steps, change = found
+    steps, change = whitened
     weights = float(system.own[..., 2].sum())
     nearer = min(1.0, (_CHANGE * at.deviation) ** 2 * weights / change)
     steps, change = steps * np.sqrt(nearer), change * nearer
@@ -340,10 +340,10 @@ def whitened_directions(
 def perturbed_starts(problem: LevelProblem, at: Alignment) -> list[Alignment]:
     """Return alignments perturbed along the two least determined directions, best first."""
     scale2 = at.squared_scale
-    found = whitened_directions(problem, problem.system_at(at, scale2)) if scale2 > 0 else None
-    if found is None:
+    whitened = whitened_directions(problem, problem.system_at(at, scale2)) if scale2 > 0 else None
+    if whitened is None:
         return []
-    first, second = found[0][:, 0], found[0][:, 1]
+    first, second = whitened[0][:, 0], whitened[0][:, 1]
     steps = [a * first + b * second for a in _BESIDE for b in _BESIDE if a or b]
     others = [replace(at, cam_from_world=perturbed(at.cam_from_world, step)) for step in steps]
     costs = [problem.system_at(each, scale2).mean_cost for each in others]

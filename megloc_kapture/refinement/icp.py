@@ -219,17 +219,17 @@ def _fit_levels(
 ) -> tuple[RigidTransform, str]:
     moved = start
     for level in levels:
-        found = fit_to_surface(level.surface, level.points, moved, level.max_distance_m)
-        if found is None:
+        fitted = fit_to_surface(level.surface, level.points, moved, level.max_distance_m)
+        if fitted is None:
             return start, "no point of the map is near the query's"
-        moved = found
+        moved = fitted
         if reason := _reason_too_far(start, moved, options):
             return start, reason
     finest, noise = levels[-1], depth_noise(pixels[:, 2], options.noise)
-    found = fit_weighted(finest.surface, pixels, noise, moved, finest.max_distance_m)
-    if found is None:
+    fitted = fit_weighted(finest.surface, pixels, noise, moved, finest.max_distance_m)
+    if fitted is None:
         return start, "the surfaces do not determine the pose"
-    return found, _reason_too_far(start, found, options)
+    return fitted, _reason_too_far(start, fitted, options)
 
 
 def _movement(start: RigidTransform, end: RigidTransform) -> tuple[float, float]:
@@ -324,7 +324,7 @@ def _overlaps(
     scene: RankingScene,
     options: IcpOptions,
 ) -> list[tuple[str, float]]:
-    found = []
+    shares = []
     depth_from_world = query_depth.image_from_depth.inverse() @ cam_from_world
     for name in references:
         view = scene.map_depth(name)
@@ -333,8 +333,8 @@ def _overlaps(
         points = depth_cloud(view, options.depth, step_px=_OVERLAP_STEP_PX)
         seen = (depth_from_world @ scene.map_pose(name).inverse()).apply(points)
         agrees = _agrees(query_depth, seen, options.max_distances_m[0])
-        found.append((name, float(agrees.mean()) if len(agrees) else 0.0))
-    return sorted(found, key=lambda each: -each[1])
+        shares.append((name, float(agrees.mean()) if len(agrees) else 0.0))
+    return sorted(shares, key=lambda each: -each[1])
 
 
 def _different_views(

@@ -50,8 +50,8 @@ class FieldView:
     def as_source(self) -> WarpSource:
         assert self.depth is not None
         depth, pose = self.depth, self.cam_from_world
-        own = depth.depth_m, depth.camera, depth.image_from_depth
-        return WarpSource(self.image, self.camera, pose, *own, self.mask)
+        measured = depth.depth_m, depth.camera, depth.image_from_depth
+        return WarpSource(self.image, self.camera, pose, *measured, self.mask)
 
 
 class FieldFrame(Options):
@@ -105,8 +105,8 @@ class NeuralField:
         """Return rays (H * W,) through the pixel centres of a view, by rows."""
         directions = pixel_rays(camera) @ cam_from_world.rotation_matrix()
         origin = (cam_from_world.center() - self.frame.centre) / self.frame.scale
-        there = self._tensor(directions / self.frame.scale)
-        return Rays(self._tensor(origin).expand_as(there), there, self.frame.near, self.frame.far)
+        along = self._tensor(directions / self.frame.scale)
+        return Rays(self._tensor(origin).expand_as(along), along, self.frame.near, self.frame.far)
 
     def appearance_of(self, image: str) -> torch.Tensor | None:
         """Return the appearance embedding (A,) of a training image; None without embeddings."""
@@ -143,7 +143,9 @@ class NeuralField:
             with self._rendering:
                 parts.append(self.module.render(part))
         names = ("rgb", "depth", "opacity", "beta", "weights")
-        joined = {name: torch.cat([getattr(one, name) for one in parts]) for name in names}
+        joined = {
+            name: torch.cat([getattr(rendered, name) for rendered in parts]) for name in names
+        }
         return replace(parts[0], coarse_rgb=None, **joined)
 
     def fit_appearance(
@@ -195,8 +197,8 @@ class NeuralField:
             return float("nan")
         appearance = self.fit_appearance(select(rays, ours), seen[ours])
         with torch.no_grad():
-            found = self.render_rays(select(rays, judged), appearance).rgb
-        error = torch.square(found.clamp(0, 1) - seen[judged]).mean()
+            rendered = self.render_rays(select(rays, judged), appearance).rgb
+        error = torch.square(rendered.clamp(0, 1) - seen[judged]).mean()
         return float(-10 * torch.log10(error.clamp_min(1e-10)))
 
     def _tensor(self, values: NDArray[np.floating]) -> torch.Tensor:

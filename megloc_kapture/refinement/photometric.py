@@ -131,8 +131,8 @@ class LevelProblem:
         for _ in range(_NUISANCE_STEPS):
             steps = few.system_of(rows, at.squared_scale).nuisance_step()
             at = at.moved(cam_from_world, *steps)
-            found = at.gains[groups] * rows[..., 7] + at.biases[groups] - values
-            rows[..., 0] = np.where(seen, found, np.nan)
+            residuals = at.gains[groups] * rows[..., 7] + at.biases[groups] - values
+            rows[..., 0] = np.where(seen, residuals, np.nan)
             at = replace(at, deviation=_deviation(rows))
         return at
 
@@ -298,8 +298,8 @@ def unoccluded_points(problem: LevelProblem, at: Alignment) -> NDArray[np.bool_]
     theirs = theirs - (summed(theirs) / filled)[cells]
     product = summed(ours**2).sum(1) * summed(theirs**2).sum(1)
     correlation = summed(ours * theirs).sum(1) / np.sqrt(np.maximum(product, 1e-30))
-    told = count >= _CELL_POINTS
-    if told.sum() > 0:
-        limit = _AGREES * float(np.percentile(correlation[told], 75))
-        keep[seen] = ~told[cells] | (correlation[cells] >= limit)
+    judged = count >= _CELL_POINTS
+    if judged.sum() > 0:
+        limit = _AGREES * float(np.percentile(correlation[judged], 75))
+        keep[seen] = ~judged[cells] | (correlation[cells] >= limit)
     return keep

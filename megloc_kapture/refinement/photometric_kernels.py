@@ -90,11 +90,11 @@ def _read(values, row, column, a, b, c):
 
 
 @compiled_loop
-def read_values(values, valid, x, y, out, found):
-    """Interpolate values (N, C) at N pixels bilinearly; ``found`` (N,) marks valid ones."""
+def read_values(values, valid, x, y, out, readable):
+    """Interpolate values (N, C) at N pixels bilinearly; ``readable`` (N,) marks valid ones."""
     for k in range(len(x)):
         row, column, a, b = _corner(valid, x[k], y[k])
-        found[k] = row >= 0
+        readable[k] = row >= 0
         if row < 0:
             continue
         for c in range(values.shape[2]):

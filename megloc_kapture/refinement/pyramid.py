@@ -255,9 +255,9 @@ def choose_points(
         x, y = reference.px[:, 0] * level.scale_x, reference.px[:, 1] * level.scale_y
         strongest_per_cell(x, y, level.gradient_energy, ours, cell_px, best)
         rows = best[best >= 0]
-        read, found = np.empty((len(rows), level.values.shape[2])), np.empty(len(rows), np.bool_)
-        read_values(level.values, level.valid, x[rows] - 0.5, y[rows] - 0.5, read, found)
-        points.append(reference.points[rows[found]])
-        values.append(read[found])
-        groups.append(np.full(int(found.sum()), group, np.int64))
+        read, readable = np.empty((len(rows), level.values.shape[2])), np.empty(len(rows), np.bool_)
+        read_values(level.values, level.valid, x[rows] - 0.5, y[rows] - 0.5, read, readable)
+        points.append(reference.points[rows[readable]])
+        values.append(read[readable])
+        groups.append(np.full(int(readable.sum()), group, np.int64))
     return ChosenPoints(np.concatenate(points), np.concatenate(values), np.concatenate(groups))

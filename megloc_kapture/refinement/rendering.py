@@ -74,7 +74,7 @@ def judge_by_rendering(
     query: RenderingQuery,
     references: Sequence[RenderingReference],
     start: RigidTransform,
-    found: RigidTransform,
+    refined: RigidTransform,
     options: RenderingOptions,
     *,
     judged: NDArray[np.bool_] | None = None,
@@ -83,7 +83,7 @@ def judge_by_rendering(
 
     ``judged``: bool (H, W), pixels of the query for acceptance, all by default.
     """
-    return _Refining(query, references, options).judge(start, found, judged)
+    return _Refining(query, references, options).judge(start, refined, judged)
 
 
 def displacement_by_rendering(

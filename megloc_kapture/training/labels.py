@@ -116,8 +116,8 @@ def labels_of_homography(
     def side(px: NDArray[np.floating[Any]], matrix: Floats, size: tuple[int, int]) -> _Side:
         moved = np.column_stack([px, np.ones(len(px))]) @ matrix.T
         with np.errstate(divide="ignore", invalid="ignore"):
-            there = np.where(moved[:, 2:] > 0, moved[:, :2] / moved[:, 2:], np.nan)
-        return px, there, np.ones(len(px), bool), _inside(there, *size)
+            moved_px = np.where(moved[:, 2:] > 0, moved[:, :2] / moved[:, 2:], np.nan)
+        return px, moved_px, np.ones(len(px), bool), _inside(moved_px, *size)
 
     a_from_b = np.asarray(np.linalg.inv(b_from_a), np.float64)
     a, b = side(px_a, b_from_a, size_b), side(px_b, a_from_b, size_a)
@@ -136,24 +136,24 @@ def reproject(
         px, a.depth.depth_m, a.camera, a.depth.camera, a.depth.image_from_depth
     )
     in_b = (b.cam_from_world @ a.cam_from_world.inverse()).apply(points)
-    there = px_from_cam(b.camera, in_b)
+    px_in_b = px_from_cam(b.camera, in_b)
     in_depth = b.depth.image_from_depth.inverse().apply(in_b)
     measured = sample_depth(b.depth.depth_m, px_from_cam(b.depth.camera, in_depth), MAX_DEPTH_JUMP)
     with np.errstate(invalid="ignore"):
         seen = np.abs(measured - in_depth[:, 2]) <= options.max_depth_error * in_depth[:, 2]
-    return there, known, known & seen & _inside(there, b.camera.width, b.camera.height)
+    return px_in_b, known, known & seen & _inside(px_in_b, b.camera.width, b.camera.height)
 
 
 def overlap(a: PosedView, b: PosedView, options: LabelOptions | None = None) -> float:
     """Return the share of pixels with depth visible in the other image, the smaller of two."""
     shares = []
-    for one, other in ((a, b), (b, a)):
-        size = one.camera.width, one.camera.height
+    for view, other in ((a, b), (b, a)):
+        size = view.camera.width, view.camera.height
         x, y = np.meshgrid(
             *((np.arange(n) + 0.5) * side / n for n, side in zip(_GRID, size, strict=True))
         )
         grid = np.stack([x.ravel(), y.ravel()], axis=1)
-        _, known, visible = reproject(grid, one, other, options)
+        _, known, visible = reproject(grid, view, other, options)
         shares.append(visible.sum() / known.sum() if known.any() else 0.0)
     return float(min(shares))
 
@@ -182,8 +182,8 @@ def _labels(a: _Side, b: _Side, options: LabelOptions) -> Labels:
 def _distances(
     first: NDArray[np.floating[Any]], second: NDArray[np.floating[Any]]
 ) -> NDArray[np.float64]:
-    found = np.linalg.norm(first[:, None].astype(np.float64) - second[None], axis=2)
-    return np.where(np.isfinite(found), found, np.inf)
+    distances = np.linalg.norm(first[:, None].astype(np.float64) - second[None], axis=2)
+    return np.where(np.isfinite(distances), distances, np.inf)
 
 
 def _inside(px: Floats, width: int, height: int) -> NDArray[np.bool_]:

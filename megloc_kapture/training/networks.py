@@ -60,7 +60,7 @@ class PreparedPair:
 
     @property
     def usable(self) -> bool:
-        return all(len(one.keypoints_px) > 0 for one in self.features)
+        return all(len(image.keypoints_px) > 0 for image in self.features)
 
 
 class FrozenFeatures:
@@ -79,9 +79,11 @@ class FrozenFeatures:
     def _of(self, image: Image, key: str | None) -> ImageFeatures:
         if key is not None and key in self._kept:
             return self._kept[key]
-        found, best = self.extractor.extract(image), slice(self._max_keypoints)
+        extracted, best = self.extractor.extract(image), slice(self._max_keypoints)
         height, width = image.shape[:2]
-        features = ImageFeatures(found.keypoints_px[best], found.descriptors[best], width, height)
+        features = ImageFeatures(
+            extracted.keypoints_px[best], extracted.descriptors[best], width, height
+        )
         if key is not None and len(self._kept) < _FEATURES_KEPT:
             self._kept[key] = features
         return features
@@ -204,11 +206,11 @@ class PairModel(nn.Module):
 
     def forward(self, pairs: Sequence[PreparedPair]) -> torch.Tensor:
         """Return the mean loss (), 0 without keypoints."""
-        usable = [one for one in pairs if one.usable]
+        usable = [pair for pair in pairs if pair.usable]
         losses = [
-            transport_loss(assignment, one.labels)
+            transport_loss(assignment, pair.labels)
             for depth in self._assignments(usable)
-            for one, assignment in zip(usable, depth, strict=True)
+            for pair, assignment in zip(usable, depth, strict=True)
         ]
         if not losses:
             return 0.0 * next(self.head.parameters()).sum()
@@ -225,7 +227,7 @@ class PairModel(nn.Module):
         return matches.cpu().numpy(), float(transport_loss(assignment, pair.labels))
 
     def _assignments(self, pairs: Sequence[PreparedPair]) -> list[list[torch.Tensor]]:
-        sides = [(self._side(one, 0), self._side(one, 1)) for one in pairs]
+        sides = [(self._side(pair, 0), self._side(pair, 1)) for pair in pairs]
         if not sides:
             return []
         if isinstance(self.head, SuperGlueNet):
@@ -235,11 +237,11 @@ class PairModel(nn.Module):
     def _side(self, prepared: PreparedPair, side: int) -> ImageKeypoints:
         features = prepared.features[side]
         device = next(self.head.parameters()).device
-        found = network_input(features, features.descriptors.shape[1], "SuperGlue", device)
+        keypoints = network_input(features, features.descriptors.shape[1], "SuperGlue", device)
         if self.describer is None:
-            return found
+            return keypoints
         xy_px = torch.from_numpy(features.keypoints_px[:, :2].copy()).to(device)
-        return replace(found, descriptors=self.describer(prepared.pair.images[side], xy_px))
+        return replace(keypoints, descriptors=self.describer(prepared.pair.images[side], xy_px))
 
 
 def transport_loss(log_assignment: torch.Tensor, labels: Labels) -> torch.Tensor:
@@ -268,18 +270,18 @@ class HeldOutResult:
 
 
 def held_out_result(model: PairModel, pairs: Sequence[PreparedPair]) -> HeldOutResult:
-    right = told = labelled = 0
+    right = judged_count = labelled = 0
     losses, errors = [], []
     for pair in pairs:
         matches, loss = model.match(pair)
         good, known = judged(matches, pair.labels)
-        right, told = right + int(good.sum()), told + int(known.sum())
+        right, judged_count = right + int(good.sum()), judged_count + int(known.sum())
         labelled += len(pair.labels.matches())
         losses.append(loss)
         if pair.pair.views is not None:
             errors.append(pose_error_deg(pair, matches))
     loss = float(np.mean(losses)) if losses else 0.0
-    precision, recall = right / max(told, 1), right / max(labelled, 1)
+    precision, recall = right / max(judged_count, 1), right / max(labelled, 1)
     return HeldOutResult(len(pairs), loss, precision, recall, pose_auc(errors))
 
 
@@ -306,13 +308,13 @@ def pose_error_deg(pair: PreparedPair, matches: NDArray[np.int64]) -> float:
     ]
     usable = np.isfinite(rays[0]).all(axis=1) & np.isfinite(rays[1]).all(axis=1)
     focal = 0.5 * (focal_px(views[0].camera) + focal_px(views[1].camera))
-    found = relative_pose(rays[0][usable], rays[1][usable], focal, _TWO_VIEWS, min_matches=6)
-    return np.inf if found is None else relative_pose_error_deg(found, truth)
+    estimate = relative_pose(rays[0][usable], rays[1][usable], focal, _TWO_VIEWS, min_matches=6)
+    return np.inf if estimate is None else relative_pose_error_deg(estimate, truth)
 
 
-def relative_pose_error_deg(found: RigidTransform, truth: RigidTransform) -> float:
-    rotation = rotation_angles_deg(np.array(found.quat_wxyz), np.array(truth.quat_wxyz))
-    a, b = np.array(found.translation), np.array(truth.translation)
+def relative_pose_error_deg(estimate: RigidTransform, truth: RigidTransform) -> float:
+    rotation = rotation_angles_deg(np.array(estimate.quat_wxyz), np.array(truth.quat_wxyz))
+    a, b = np.array(estimate.translation), np.array(truth.translation)
     lengths = np.linalg.norm(a) * np.linalg.norm(b)
     if np.linalg.norm(b) < _SAME_CENTRE or lengths == 0:
         return float(rotation)

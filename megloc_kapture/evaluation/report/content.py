@@ -168,10 +168,10 @@ def format_movement(metres: float, degrees: float) -> str:
     return f"{format_metres(metres)} m, {format_degrees(degrees)} deg"
 
 
-def agreement_sentence(row: AgreementRow, found: WithoutTruth) -> str:
+def agreement_sentence(row: AgreementRow, results: WithoutTruth) -> str:
     if not row.num_only_first and not row.num_only_second:
         return "The same queries have a pose in both."
-    first, second = found.evaluations[row.first].label, found.evaluations[row.second].label
+    first, second = results.evaluations[row.first].label, results.evaluations[row.second].label
     return (
         f"Only {first} has a pose for {counted(row.num_only_first, 'query')}, "
         f"only {second} for {row.num_only_second}."
@@ -312,12 +312,12 @@ def result_table(evaluation: Evaluation) -> DataFrame:
     )
 
 
-def agreement_table(found: WithoutTruth, rows: Iterable[AgreementRow]) -> DataFrame:
+def agreement_table(results: WithoutTruth, rows: Iterable[AgreementRow]) -> DataFrame:
     """Return the share of queries whose poses in two results agree."""
     return _frame(
         {
-            "first": _shortened(found.evaluations[row.first].label),
-            "second": _shortened(found.evaluations[row.second].label),
+            "first": _shortened(results.evaluations[row.first].label),
+            "second": _shortened(results.evaluations[row.second].label),
             **_condition(row.name),
             "queries": row.num_queries,
             "both have a pose": row.num_both,
