@@ -197,11 +197,8 @@ def choose_dataset(
     return choice
 
 
-def with_model(choice: DatasetChoice, *, features: bool = False) -> DatasetChoice | None:
-    """Return the dataset with import of its point model, or None if it has no model.
-
-    With ``features`` a twin's model features are rendered too, as localization needs them.
-    """
+def with_model(choice: DatasetChoice) -> DatasetChoice | None:
+    """Return the dataset with import of its point model, or None if it has no model."""
     if choice.adapter is None:
         return None
     layout = choice.name.removeprefix(TWIN_PREFIX)
@@ -210,10 +207,7 @@ def with_model(choice: DatasetChoice, *, features: bool = False) -> DatasetChoic
         adapter: DatasetAdapter = load_plugin(DATASETS, layout, options)
     except PluginError:
         return None
-    twin = choice.twin
-    if twin is not None and features:
-        twin = twin_of(layout, **{**twin.options.model_dump(), "model_features": True})
-    return replace(choice, adapter=adapter, import_options=options, twin=twin)
+    return replace(choice, adapter=adapter, import_options=options)
 
 
 def has_model(choice: DatasetChoice) -> bool:

@@ -33,12 +33,12 @@ from megloc_kapture.pipeline.presets import assigned, check_weights, options_of_
 from megloc_kapture.pipeline.submission import write_submission
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import STAGES
+from megloc_kapture.stages.guided_pyramid import PyramidQueries
 from megloc_kapture.stages.image_pairs import PairQueries, RerankQueries
 from megloc_kapture.stages.localized_folder import set_aside_unreadable
 from megloc_kapture.stages.matches import MatchQueries
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import RefinePoses
-from megloc_kapture.stages.pyramid_mapping import PyramidQueries
 from megloc_kapture.stages.query_poses import LocalizeQueries
 from megloc_kapture.stages.stage import (
     EVALUATION,
@@ -191,18 +191,12 @@ PIPELINE: tuple[type[PipelineStage], ...] = (
 def plan_evaluation(run: Run) -> list[Stage]:
     """Return the stages of a run, in order, without writing anything."""
     options = run.options
-    given = options.uses_given_map()
-    if given or options.pairs_by_points():
-        run = replace(run, source=_with_model(run, given))
+    if options.pairs_by_points():
+        run = replace(run, source=_with_model(run))
     run.source.check()
     check_weights(options)
     options.reranking.counted_types(options.local_types())
     options.retrieval()
-    if given and options.changes_frames():
-        raise OptionError(
-            f"map = {options.map}: the given map's keypoints are in the original images; "
-            "pre-processing may mask them, but not resize or undistort"
-        )
     stages: list[Stage] = [Render(run)] if run.source.twin is not None else []
     stages.append(Import(run))
     stages += wanted_stages(PIPELINE, options)
@@ -244,17 +238,13 @@ def _insert(stages: list[Stage], stage: Stage) -> None:
     stages.insert(max(places, default=len(stages) - 1) + 1, stage)
 
 
-def _with_model(run: Run, given: bool) -> DatasetChoice:
-    found = with_model(run.source, features=given)
+def _with_model(run: Run) -> DatasetChoice:
+    found = with_model(run.source)
     if found is None:
-        wanted = (
-            f"map = {run.options.map} localizes in that model (megloc localize takes any kapture "
-            "map)"
-            if given
-            else "mapping_pairs by covisibility or overlap need its points; "
-            '--set \'mapping_pairs.by=["poses", "retrieval"]\' does without them'
+        raise OptionError(
+            f"dataset {run.dataset} comes with no model: mapping_pairs by covisibility needs its "
+            'points; --set \'mapping_pairs.by=["poses", "retrieval"]\' does without them'
         )
-        raise OptionError(f"dataset {run.dataset} comes with no model: {wanted}")
     return found
 
 

@@ -90,9 +90,7 @@ class MapMatching:
         options = self.options.query_pairs
         if options.by == "exhaustive" or not permitted:
             return permitted
-        all_taken = len(permitted) <= options.top_k
-        in_order = self.options.localization.sure_confidence is not None
-        if all_taken and not in_order and not self.is_at_hand(query.global_features):
+        if len(permitted) <= options.top_k and not self.is_at_hand(query.global_features):
             return permitted
         return self.rank(image, features, permitted)
 
@@ -325,48 +323,25 @@ def _unit(rows: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 class LiveSource:
-    """Matches of one camera, computed with as many candidates as are asked for.
-
-    Reranking, a second matcher and guided pyramids need the matches with all candidates first.
-    """
+    """Candidates and matches of one camera, computed from its image."""
 
     def __init__(
         self, matching: MapMatching, image: QueryImage, cam_from_rig: RigidTransform
     ) -> None:
         self.image, self.clock = image, Clock()
         self.remarks: list[str] = []
-        self._matching, self._cam_from_rig = matching, cam_from_rig
-        self._features = matching.features(image)
+        features = matching.features(image)
         self.clock.lap("extraction")
-        self._ranked = self.candidates = matching.candidates(image, self._features)
+        ranked = matching.candidates(image, features)
         self.clock.lap("retrieval")
-        self._matches: list[list[VerifiedMatches]] = [[] for _ in matching.types]
-        options = matching.options
-        self._needs_all = options.reranking.reranks() or options.matches_again()
-        if self._needs_all:
-            self._view = self._match(len(self._ranked))
-
-    def view(self, count: int) -> QueryView:
-        view = self._view if self._needs_all else self._match(count)
-        return view.among(self.candidates[:count])
-
-    def _match(self, count: int) -> QueryView:
-        """Match the first ``count`` ranked images, as far as they are not matched yet."""
-        self.clock.start()
-        images, types = self._ranked[:count], self._matching.types
-        num_matched = min(map(len, self._matches), default=0)
-        new = self._matching.match(self._features, images[num_matched:])
-        for matches, added in zip(self._matches, new, strict=True):
-            matches += added
-        kept = self._matching.rerank(self._matches)
-        typed, self.remarks = [], []
-        for local, features, matches in zip(types, self._features, self._matches, strict=True):
-            pairs = {images[row]: matches[row] for row in kept}
-            keypoints_px, named, remark = local.match_again(features, pairs, self.image)
+        matches = matching.match(features, ranked)
+        kept = matching.rerank(matches)
+        self.candidates = [ranked[row] for row in kept]
+        typed = []
+        for local, of_query, of_type in zip(matching.types, features, matches, strict=True):
+            pairs = {ranked[row]: of_type[row] for row in kept}
+            keypoints_px, named, remark = local.match_again(of_query, pairs, image)
             self.remarks += [remark] if remark else []
             typed.append(TypedMatches(local.points.index, keypoints_px, named))
-        if self._needs_all:
-            self.candidates = [images[row] for row in kept]
         self.clock.lap("matching")
-        image = self.image
-        return QueryView(image.query.name, image.camera, tuple(typed), self._cam_from_rig)
+        self.view = QueryView(image.query.name, image.camera, tuple(typed), cam_from_rig)

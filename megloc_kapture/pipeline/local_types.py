@@ -14,7 +14,6 @@ from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.localization.map_index import ImageMatches
 from megloc_kapture.matching.guided_pyramid import base_type, equivalent_types
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, plain_name
-from megloc_kapture.pipeline.presets import feature_choices
 from megloc_kapture.pipeline.queries import QueryImage
 from megloc_kapture.plugin_loading import load_chosen, plugin_names
 from megloc_kapture.plugins import (
@@ -24,14 +23,13 @@ from megloc_kapture.plugins import (
     Matcher,
     PluginChoice,
 )
-from megloc_kapture.stages.given_map import rows_found_again
 from megloc_kapture.stages.guided_pyramid import PyramidMethod, retry_query
 from megloc_kapture.stages.local_features import extract_all, read_frame
+from megloc_kapture.stages.map_features import rows_found_again
 from megloc_kapture.stages.matches import (
     FeatureCache,
     Features,
     VerifiedMatches,
-    best_pairs,
     match_all,
     verification_of,
     verified,
@@ -81,10 +79,6 @@ class LocalType:
         return found
 
     @cached_property
-    def second_matcher(self) -> Matcher | None:
-        return self._options.make_second_matcher()
-
-    @cached_property
     def extractor(self) -> LocalFeatureExtractor:
         found = self.brought()
         if found is None:
@@ -119,16 +113,14 @@ class LocalType:
         """Return descriptors (N, D) of a map image."""
         return self.first.descriptors(image) if self._again is None else self._again[image]
 
-    def match(
-        self, query: Features, images: Sequence[str], matcher: Matcher | None = None
-    ) -> list[VerifiedMatches]:
+    def match(self, query: Features, images: Sequence[str]) -> list[VerifiedMatches]:
         found = dict.fromkeys(images, _NO_MATCHES)
         verify = verification_of(self._options.verify_queries())
         # limits the features in memory
         for names in batched((image for image in images if image in self.first), BATCH):
             others = [self._map_features(self.first, name) for name in names]
             labels = [f"pair with {name}" for name in names]
-            pairs = match_all(matcher or self.matcher, query, others, labels)
+            pairs = match_all(self.matcher, query, others, labels)
             for name, other, pair in zip(names, others, pairs, strict=True):
                 found[name] = verified(query, other, pair, verify)
         return [found[image] for image in images]
@@ -136,19 +128,12 @@ class LocalType:
     def match_again(
         self, query: Features, pairs: Mapping[str, VerifiedMatches], image: QueryImage
     ) -> tuple[NDArray[np.float32], list[ImageMatches], str]:
-        """Match the best map images with the second matcher, and those with few matches by guided
-        pyramid matching, as far as these are enabled.
+        """Match map images with few matches by guided pyramid matching, if enabled.
 
         Returns query keypoints with added ones last, matches in the order of ``pairs``, and the
         reason if the pyramid was skipped, else "".
         """
         options = self._options
-        if self.second_matcher is not None:
-            verified = {("", name): len(pair.matches) for name, pair in pairs.items()}
-            best = best_pairs(verified, options.second_matching.pairs, of_both=False)
-            names = [name for _, name in best]
-            again = self.match(query, names, self.second_matcher)
-            pairs = {**pairs, **dict(zip(names, again, strict=True))}
         is_hard = options.guided_pyramid.is_hard
         matches = [(name, pair.matches, pair.scores) for name, pair in pairs.items()]
         if not any(is_hard(pair.num_found, len(pair.matches)) for pair in pairs.values()):
@@ -167,7 +152,7 @@ class LocalType:
             num_found={name: pair.num_found for name, pair in pairs.items()},
             name=image.query.name,
         )
-        skipped = next((row[-1] for row in found.rows), "")
+        skipped = next((one.skipped for one in found.tried), "")
         remark = f"guided pyramid matching: skipped {skipped}" if skipped else ""
         return np.concatenate([query.keypoints_px, found.added_px]), found.matches, remark
 
@@ -200,7 +185,7 @@ def local_types_of(
 
     Types in the options without map points only help to rank candidates.
     """
-    choices = feature_choices(options)
+    choices = options.local_features
     by_base = {base_type(name): keypoints for name, keypoints in kapture_map.keypoints.items()}
     for stored in kapture_map.stored_types():
         named = _rank(stored, choices) < len(choices)

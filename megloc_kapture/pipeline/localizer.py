@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.localization.cluster_poses import interleave
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.live_source import LiveSource, MapMatching
@@ -146,7 +147,8 @@ class Localizer:
             ]
             scene = KaptureScene(self.map.folder, QueryImages(images), map_camera=self.map.camera)
             results = localize_query(
-                sources,
+                [source.view for source in sources],
+                interleave([source.candidates for source in sources]),
                 self.options.localization,
                 frame_of=self.map.restrictions.frame,
                 centers=self._centers,

@@ -62,15 +62,15 @@ from megloc_kapture.pipeline.presets import (
 from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.stages.densifying import Densify
 from megloc_kapture.stages.global_features import ExtractGlobalFeatures
+from megloc_kapture.stages.guided_pyramid import PyramidMapping
 from megloc_kapture.stages.image_pairs import PairMapping
 from megloc_kapture.stages.local_features import ExtractLocalFeatures
 from megloc_kapture.stages.localized_folder import set_aside_unreadable
-from megloc_kapture.stages.map_points import GivenMap, LiftPoints, TriangulatePoints
+from megloc_kapture.stages.map_points import LiftPoints, TriangulatePoints
 from megloc_kapture.stages.map_refinement import RefineMap
 from megloc_kapture.stages.matches import MatchMapping
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.preprocessing import Preprocess
-from megloc_kapture.stages.pyramid_mapping import PyramidMapping
 from megloc_kapture.stages.stage import (
     MAP,
     MAPPING,
@@ -98,7 +98,6 @@ MAP_STAGES: tuple[type[PipelineStage], ...] = (
     PyramidMapping,
     TriangulatePoints,
     LiftPoints,
-    GivenMap,
     RefineMap,
     Densify,
 )
@@ -120,8 +119,8 @@ _WITH_POSES: tuple[type[PipelineStage], ...] = (
 def plan_map(mapping: KaptureFolder, options: PipelineOptions) -> list[Stage]:
     check_weights(options)
     options.retrieval()
-    if options.uses_given_map() or options.pairs_by_points():
-        raise OptionError("images with poses come with no model: map, mapping_pairs.by")
+    if options.pairs_by_points():
+        raise OptionError("images with poses come with no model: mapping_pairs.by covisibility")
     return [ImportMapping(mapping), *wanted_stages(MAP_STAGES, options)]
 
 

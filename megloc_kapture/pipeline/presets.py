@@ -267,22 +267,13 @@ def check_weights(options: PipelineOptions) -> None:
     raise error
 
 
-def feature_choices(options: PipelineOptions) -> list[LocalFeaturesChoice]:
-    """Return the local features of the options, those of a given map last."""
-    choices = list(options.local_features) if options.makes_points() else []
-    if options.uses_given_map():
-        given = options.given_features
-        choices.append(LocalFeaturesChoice(name=given.name, options=given.options))
-    return choices
-
-
 def _missing(options: PipelineOptions) -> MissingWeightsError | None:
-    features = feature_choices(options)
+    features = options.local_features
     matchers = [choice.matching or options.matching for choice in features]
     chosen: list[tuple[str, PluginChoice | None]] = [
         (SEGMENTERS, options.preprocessing.masks.segmenter),
         *((LOCAL_FEATURES, one) for one in features),
-        *((MATCHERS, one) for one in (*matchers, options.second_matching.matcher)),
+        *((MATCHERS, one) for one in matchers),
         (POSE_RANKERS, options.localization.rank),
         *((POSE_REFINERS, one) for one in options.pose_refinement.by),
     ]

@@ -41,8 +41,8 @@ from megloc_kapture.plugins import (
     StereoView,
 )
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.given_map import copy_features
 from megloc_kapture.stages.local_features import read_frame
+from megloc_kapture.stages.map_features import copy_features
 from megloc_kapture.stages.scene import (
     check_points,
     depth_records,

@@ -33,14 +33,13 @@ from megloc_kapture.plugin_loading import (
 )
 from megloc_kapture.plugins import GLOBAL_FEATURES as PLUGINS
 from megloc_kapture.plugins import GlobalFeatureExtractor, PluginChoice
-from megloc_kapture.stages.given_map import (
+from megloc_kapture.stages.local_features import images_of, read_image_of
+from megloc_kapture.stages.map_features import (
     MEAN_FILE,
     PROJECTION_FILE,
     SETTINGS_FILE,
     VOCABULARY_FILE,
-    described_images,
 )
-from megloc_kapture.stages.local_features import images_of, read_image_of
 from megloc_kapture.stages.scene import write_array
 from megloc_kapture.stages.stage import (
     FEATURES,
@@ -313,7 +312,7 @@ class ExtractGlobalFeatures(PipelineStage):
     @property
     def reads(self) -> Sequence[str]:  # type: ignore[override]
         images = (self.layout.mapping(), self.layout.query())
-        return (*images, *self.layout.reference(), LOCAL_FEATURES) if self._trains() else images
+        return (*images, LOCAL_FEATURES) if self._trains() else images
 
     def _trains(self) -> bool:
         return any(chosen.is_vlad for chosen in self.options.global_features)
@@ -331,16 +330,15 @@ class ExtractGlobalFeatures(PipelineStage):
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         queries, counts = work.folders((self.layout.query(),), FEATURES), {}
+        mapping = work.folder(self.layout.mapping(), FEATURES)
         for chosen in self.options.global_features:
             if chosen.is_vlad:
                 vlad = chosen.vlad_options()
                 name = vlad.local_type or self.options.main_type()
-                mapping = described_images(work, self, name)
                 folders = [mapping, *queries]
                 found = extract_vlad(mapping, folders, name, work.out, vlad.of_vlad(), work=work)
             else:
-                folders = [work.folder(self.layout.mapping()), *queries]
                 extractor = chosen.make(work.placement)
-                found = extract_global_features(folders, extractor, work.out, work=work)
+                found = extract_global_features([mapping, *queries], extractor, work.out, work=work)
             counts[f"images_with_{chosen.name}"] = found["images"]
         return counts

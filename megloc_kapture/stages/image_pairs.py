@@ -35,7 +35,6 @@ from megloc_kapture.stages.candidates import (
     Retrieval,
     vectors_of,
 )
-from megloc_kapture.stages.given_map import described_images
 from megloc_kapture.stages.matches import VerifiedMatches, iterate_candidates
 from megloc_kapture.stages.scene import check_points
 from megloc_kapture.stages.stage import (
@@ -241,7 +240,7 @@ class PairQueries(PipelineStage):
     version = 3
     uses = ("query_pairs", *RETRIEVAL_OPTIONS)
     explained_by = ("query_pairs.by", "query_pairs.top_k")
-    inputs = (Layout.mapping, Layout.query, SIDE_TABLES, GLOBAL_FEATURES, Layout.reference)
+    inputs = (Layout.mapping, Layout.query, SIDE_TABLES, GLOBAL_FEATURES)
     outputs = (Layout.candidates,)
 
     @property
@@ -250,7 +249,7 @@ class PairQueries(PipelineStage):
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         pairs = pair_queries(
-            described_images(work, self, self.options.main_type()),
+            work.folder(self.layout.mapping(), FEATURES),
             work.folder(self.layout.query(), FEATURES),
             self.options.query_pairs,
             retrieval=self.options.retrieval(),

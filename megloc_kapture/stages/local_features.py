@@ -27,11 +27,9 @@ from megloc_kapture.io.tables import append_mask_count, read_mask_counts, write_
 from megloc_kapture.plugin_loading import checked_array
 from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.preprocessing.masks import with_margin
-from megloc_kapture.stages.given_map import check_given_type, has_descriptors
 from megloc_kapture.stages.stage import (
     LOCAL_FEATURES,
     LOCAL_TYPES,
-    REFERENCE,
     Layout,
     PipelineStage,
     StageWork,
@@ -207,28 +205,23 @@ def _checked(extractor: LocalFeatureExtractor, features: Any, image: str) -> Loc
 
 
 class ExtractLocalFeatures(PipelineStage):
-    """Extract local features of all images; of a given map's, where it brings none."""
+    """Extract local features of all images."""
 
     name = "local_features"
     resumes = True
     uses = ("mask_margin_px", *LOCAL_TYPES)
     explained_by = ("local_features",)
-    inputs = (Layout.mapping, Layout.query, Layout.reference)
+    inputs = (Layout.mapping, Layout.query)
     outputs = (LOCAL_FEATURES,)
 
     def plugins(self) -> Sequence[object]:
-        return self.options.query_extractors()
+        return self.options.make_extractors()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        everything = work.folders((self.layout.mapping(), self.layout.query()))
-        todo = [(extractor, everything) for extractor in self.options.own_extractors()]
-        if self.options.uses_given_map():
-            extractor, reference = self.options.make_given_extractor(), work.folder(REFERENCE)
-            check_given_type(reference, extractor.name)
-            todo.append((extractor, everything[1:] if has_descriptors(reference) else everything))
+        folders = work.folders((self.layout.mapping(), self.layout.query()))
         counts: Counter[str] = Counter()
-        margin_px = self.options.mask_margin_px
-        for extractor, folders in todo:
+        for extractor in self.options.make_extractors():
+            margin_px = self.options.mask_margin_px
             found = extract_local_features(
                 folders, extractor, work.out, mask_margin_px=margin_px, work=work
             )

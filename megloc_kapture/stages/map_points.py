@@ -1,4 +1,4 @@
-"""Stages: map points, triangulated, lifted through depth, or from a prebuilt model."""
+"""Stages: map points, triangulated or lifted through depth."""
 
 from __future__ import annotations
 
@@ -23,14 +23,13 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.io.kapture.matches import MatchesReader
 from megloc_kapture.mapping.depth import lift_keypoints
 from megloc_kapture.matching.guided_pyramid import base_type
-from megloc_kapture.stages.given_map import check_given_type, copy_features, given_map
+from megloc_kapture.stages.map_features import copy_features
 from megloc_kapture.stages.scene import DepthRecord, depth_records, read_depth
 from megloc_kapture.stages.stage import (
     FEATURES,
     GLOBAL_FEATURES,
     LOCAL_FEATURES,
     LOCAL_TYPES,
-    REFERENCE,
     UNREFINED,
     Layout,
     PipelineStage,
@@ -222,25 +221,6 @@ def _lift(
     return points[valid], np.flatnonzero(valid).astype(np.int32)
 
 
-class GivenMap(PipelineStage):
-    """Use the points of the dataset's model."""
-
-    name = "points"
-    uses = ("map", "given_features")
-    explained_by = ("map",)
-    inputs = (REFERENCE, Layout.mapping, LOCAL_FEATURES, GLOBAL_FEATURES)
-    outputs = (UNREFINED,)
-
-    def is_wanted(self) -> bool:
-        return self.options.map == "given"
-
-    def run(self, work: StageWork) -> Mapping[str, float]:
-        reference = work.folder(REFERENCE)
-        check_given_type(reference, self.options.make_given_extractor().name)
-        mapping = work.folder(self.layout.mapping(), FEATURES)
-        return given_map(reference, mapping, work.out / UNREFINED)
-
-
 class LiftPoints(PipelineStage):
     """Lift the map's points from keypoints through depth."""
 
@@ -254,7 +234,7 @@ class LiftPoints(PipelineStage):
         return self.options.map == "lift"
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping, types = work.folder(self.layout.mapping(), FEATURES), self.options.own_types()
+        mapping, types = work.folder(self.layout.mapping(), FEATURES), self.options.local_types()
         return lift_map(mapping, types, work.out / UNREFINED, work=work)
 
 

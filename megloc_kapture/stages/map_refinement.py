@@ -47,7 +47,7 @@ from megloc_kapture.mapping.uncertainty import (
     track_lengths,
 )
 from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.given_map import copy_features
+from megloc_kapture.stages.map_features import copy_features
 from megloc_kapture.stages.scene import DepthRecord, check_points, depth_records, read_depth
 from megloc_kapture.stages.stage import UNREFINED, Layout, PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, FolderSpec, Work

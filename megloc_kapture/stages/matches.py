@@ -16,7 +16,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from megloc_kapture.errors import DataError, PluginError
 from megloc_kapture.geometry.cameras import bearing_rays
@@ -38,8 +37,7 @@ from megloc_kapture.matching.verification import (
     verify_with_poses,
 )
 from megloc_kapture.plugin_loading import checked_array
-from megloc_kapture.plugins import Matcher, PluginChoice
-from megloc_kapture.stages.given_map import matched_images
+from megloc_kapture.plugins import Matcher
 from megloc_kapture.stages.local_features import check_lengths
 from megloc_kapture.stages.stage import (
     FEATURES,
@@ -78,20 +76,6 @@ class NoVerification(Options):
 
 
 Verification = KnownPoseOptions | TwoViewOptions | NoVerification
-
-
-class SecondMatchingOptions(Options):
-    """Options of a second pass of matching: the best pairs again, with another matcher."""
-
-    matcher: PluginChoice | None = Field(
-        default=None,
-        description="matcher whose matches replace those of the best pairs; none: no second pass",
-    )
-    pairs: int = Field(
-        default=5,
-        gt=0,
-        description="pairs of each query and each map image, those with most verified matches",
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,23 +165,6 @@ def match_pairs(
         "pairs_with_matches": sum(row.verified > 0 for row in rows),
         "matches": sum(row.verified for row in rows),
     }
-
-
-def best_pairs(
-    verified: Mapping[tuple[str, str], int], number: int, *, of_both: bool
-) -> list[tuple[str, str]]:
-    """Return the ``number`` pairs with most verified matches of each first image, sorted.
-
-    With ``of_both`` also those of each second image. Ties are in order of the names.
-    """
-    chosen: set[tuple[str, str]] = set()
-    taken: Counter[str] = Counter()
-    for pair in sorted(verified, key=lambda pair: (-verified[pair], pair)):
-        for image in pair if of_both else pair[:1]:
-            taken[image] += 1
-            if taken[image] <= number:
-                chosen.add(pair)
-    return sorted(chosen)
 
 
 def check_given_poses(
@@ -425,7 +392,7 @@ def iterate_candidates(pairs: Sequence[ImagePair]) -> Iterator[tuple[str, list[s
 
 
 # options that determine the local feature types and their matching
-MATCHING_OPTIONS = ("map", "local_features", "given_features", "matching", "verification")
+MATCHING_OPTIONS = ("local_features", "matching", "verification")
 
 
 def mapping_pairs(work: StageWork, mapping: KaptureFolder) -> list[ImagePair]:
@@ -458,7 +425,7 @@ class MatchMapping(_MatchStage):
         return self.options.triangulates()
 
     def plugins(self) -> Sequence[object]:
-        return [self.options.make_matcher(name) for name in self.options.own_types()]
+        return [self.options.make_matcher(name) for name in self.options.local_types()]
 
     def verification(self) -> Verification:
         return self.options.verify_mapping()
@@ -468,10 +435,10 @@ class MatchMapping(_MatchStage):
         pairs, out = mapping_pairs(work, mapping), work.out / self.writes[0]
         # poses of photographs are estimated from matches, so they cannot contradict them
         if isinstance(self.verification(), KnownPoseOptions) and not self.layout.posed:
-            name = self.options.own_types()[0]
+            name = self.options.main_type()
             check_given_poses(mapping, pairs, name, self.options.make_matcher(name), work)
         counts: Counter[str] = Counter()
-        for name in self.options.own_types():
+        for name in self.options.local_types():
             matcher, how = self.options.make_matcher(name), self.verification()
             counts.update(match_pairs(mapping, mapping, pairs, name, matcher, how, out, work=work))
         return counts
@@ -483,7 +450,7 @@ class MatchQueries(_MatchStage):
     name = "query_matches"
     version = 4
     uses = (*MATCHING_OPTIONS, "query_verification")
-    inputs = (Layout.mapping, Layout.query, LOCAL_FEATURES, Layout.candidates, Layout.given_map)
+    inputs = (Layout.mapping, Layout.query, LOCAL_FEATURES, Layout.candidates)
     outputs = (QUERY_MATCHES,)
 
     def plugins(self) -> Sequence[object]:
@@ -491,12 +458,10 @@ class MatchQueries(_MatchStage):
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         query = work.folder(self.layout.query(), FEATURES)
+        mapping = work.folder(self.layout.mapping(), FEATURES)
         pairs, out = read_pairs(work.path(self.layout.candidates())), work.out / QUERY_MATCHES
         counts: Counter[str] = Counter()
         for name in self.options.local_types():
-            mapping = matched_images(work, self, name)
-            described = mapping.descriptors(name)
-            some = [pair for pair in pairs if pair.map in described]
             matcher, how = self.options.make_matcher(name), self.options.verify_queries()
-            counts.update(match_pairs(query, mapping, some, name, matcher, how, out, work=work))
+            counts.update(match_pairs(query, mapping, pairs, name, matcher, how, out, work=work))
         return counts

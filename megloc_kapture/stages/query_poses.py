@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,11 +73,6 @@ from megloc_kapture.values import (
     RigidTransform,
 )
 
-_FIRST_TURN = 5
-# below this even the right pose can be decimetres off, which more candidates improve
-# (docs/performance.md)
-_SURE_INLIERS = 30
-
 
 class LocalizationOptions(Options):
     clusters: ClusterOptions = ClusterOptions()
@@ -93,13 +87,6 @@ class LocalizationOptions(Options):
         le=1,
         description="poses with a lower confidence are rejected; 0 (as in benchmarks) keeps all",
     )
-    sure_confidence: float | None = Field(
-        default=None,
-        gt=0,
-        le=1,
-        description="match candidates in turn, best first, until the pose has "
-        f"{_SURE_INLIERS} inliers and this confidence; none: match all candidates",
-    )
     rigs: bool = Field(default=False, description="localize all cameras of a rig jointly")
     fallback: Fallback = Field(
         default="none",
@@ -112,29 +99,31 @@ class LocalizationOptions(Options):
         return ranker
 
 
-def localize_unit(
+def localize_query(
     views: Sequence[QueryView],
     candidates: Sequence[str],
-    frames: Sequence[str],
     options: LocalizationOptions,
     *,
+    frame_of: Callable[[str], str],
     centers: Mapping[str, NDArray[np.float64]],
     ranker: PoseRanker,
     scene: RankingScene,
 ) -> list[Pose | Failure]:
-    """Localize one query, or the cameras of a rig together; return a result per camera.
+    """Localize a query, or the cameras of a rig together; return a result per camera.
 
+    ``megloc eval``, ``megloc localize``, ``Localizer`` and the HTTP service all call this function.
     A rig without a joint pose is localized camera by camera.
 
     Parameters
     ----------
-    candidates : map images, best first, with a coordinate frame each in ``frames``.
+    views : matches of each camera, computed live or read from kapture folders.
+    candidates : map images, best first.
+    frame_of : names the coordinate frame of a map image.
     centers : camera centres (3,) of the candidates in the world.
     """
 
     def localize(together: Sequence[QueryView]) -> tuple[Pose | Failure, PoseProblem | None]:
         matched = {image for view in together for image in view.matched_images()}
-        frame_of = dict(zip(candidates, frames, strict=True))
         images = [image for image in candidates if image in matched]
         if not images:
             reason = "no map image matches" if candidates else "no map image is a candidate"
@@ -143,7 +132,7 @@ def localize_unit(
         indices = {id(typed.index): typed.index for view in together for typed in view.matches}
         clusters = cluster_candidates(
             images,
-            [frame_of[image] for image in images],
+            list(map(frame_of, images)),
             options.clusters,
             centers=centers,
             indices=list(indices.values()),
@@ -154,7 +143,7 @@ def localize_unit(
             clusters,
             options.pose,
             rank=lambda hypotheses: ranker.score(hypotheses, scene),
-            frames=[frame_of[cluster[0]] for cluster in clusters],
+            frames=[frame_of(cluster[0]) for cluster in clusters],
             centers=centers,
             min_confidence=options.min_confidence,
             scene=scene,
@@ -167,77 +156,6 @@ def localize_unit(
             return poses_of_cameras(views, result, problem)
     results = [localize([QueryView(v.name, v.camera, v.matches)])[0] for v in views]
     return [replace(result, name=v.name) for v, result in zip(views, results, strict=True)]
-
-
-def in_turn(
-    solve: Callable[[int], list[Pose | Failure]], num_candidates: int, options: LocalizationOptions
-) -> list[Pose | Failure]:
-    """Localize with the first few candidates, and with more until the result is certain."""
-    sure, few = options.sure_confidence, _FIRST_TURN
-    while sure is not None and few < num_candidates:
-        solved = solve(few)
-        if all(
-            isinstance(r, Pose) and (r.confidence or 0.0) >= sure and r.num_inliers >= _SURE_INLIERS
-            for r in solved
-        ):
-            return solved
-        few *= 2
-    return solve(num_candidates)
-
-
-class QuerySource(Protocol):
-    """A camera of a query, whose matches are computed live or read from kapture folders."""
-
-    @property
-    def candidates(self) -> Sequence[str]:
-        """Map images, best first."""
-        ...
-
-    def view(self, count: int) -> QueryView:
-        """Return the matches with the first ``count`` candidates."""
-        ...
-
-
-def localize_query(
-    sources: Sequence[QuerySource],
-    options: LocalizationOptions,
-    *,
-    frame_of: Callable[[str], str],
-    centers: Mapping[str, NDArray[np.float64]],
-    ranker: PoseRanker,
-    scene: RankingScene,
-) -> list[Pose | Failure]:
-    """Localize a query, or the cameras of a rig; return a result per camera.
-
-    ``megloc eval``, ``megloc localize``, ``Localizer`` and the HTTP service all call this function.
-    ``frame_of`` names the coordinate frame of a map image; see :func:`localize_unit`.
-    """
-
-    def solve(count: int) -> list[Pose | Failure]:
-        views = [source.view(count) for source in sources]
-        candidates = interleave([source.candidates[:count] for source in sources])
-        return localize_unit(
-            views,
-            candidates,
-            [frame_of(image) for image in candidates],
-            options,
-            centers=centers,
-            ranker=ranker,
-            scene=scene,
-        )
-
-    return in_turn(solve, max((len(source.candidates) for source in sources), default=0), options)
-
-
-@dataclass(frozen=True)
-class StoredSource:
-    """Matches that were read from kapture folders."""
-
-    stored: QueryView
-    candidates: Sequence[str]
-
-    def view(self, count: int) -> QueryView:
-        return self.stored.among(self.candidates[:count])
 
 
 # a unit, the candidates of each image, and their coordinate frames
@@ -264,13 +182,12 @@ class _StoredQueries:
             for image in interleave(candidate_lists)
             if (pose := mapping.read().cam_from_world(image)) is not None
         }
-        sources = [
-            StoredSource(self._read(*camera, images), [name for name in images if name in centers])
-            for camera, images in zip(unit, candidate_lists, strict=True)
-        ]
-        reading_s = (time.perf_counter() - started) / len(sources)
+        usable = [[name for name in images if name in centers] for images in candidate_lists]
+        views = [self._read(*camera, some) for camera, some in zip(unit, usable, strict=True)]
+        reading_s = (time.perf_counter() - started) / len(views)
         results = localize_query(
-            sources,
+            views,
+            interleave(usable),
             self.options,
             frame_of=frame_of.__getitem__,
             centers=centers,

@@ -29,9 +29,8 @@ from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.query_poses import (
     LocalizationOptions,
-    in_turn,
     localize_from_matches,
-    localize_unit,
+    localize_query,
 )
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import Work
@@ -96,26 +95,6 @@ def test_an_unknown_ranker_is_refused_before_the_first_query(world: Any) -> None
         world.localized(rank=PluginChoice(name="no-such"))
 
 
-def test_candidates_are_taken_in_turn_until_the_pose_is_sure_and_well_supported() -> None:
-    asked: list[int] = []
-
-    def solve(count: int) -> list[Pose | Failure]:
-        asked.append(count)
-        confidence, inliers = {5: (0.99, 29), 10: (0.89, 30), 20: (0.9, 30)}.get(count, (1.0, 99))
-        return [Pose(RigidTransform.identity(), 100, inliers, confidence=confidence)]
-
-    def turns(count: int, options: LocalizationOptions, *also: Failure) -> list[int]:
-        asked.clear()
-        in_turn(lambda few: [*solve(few), *also], count, options)
-        return asked.copy()
-
-    options = LocalizationOptions(sure_confidence=0.9)
-    assert turns(50, options) == [5, 10, 20]
-    assert turns(15, options) == [5, 10, 15]  # all of them where no turn is sure
-    assert turns(50, options, Failure("none")) == [5, 10, 20, 40, 50]  # a rig's other camera
-    assert turns(50, LocalizationOptions()) == [50]
-
-
 def test_map_points_are_those_that_an_image_observes(world: Any) -> None:
     folder = world.map()
     scene, xyz = KaptureScene(folder), folder.points3d()[:, :3]
@@ -166,11 +145,11 @@ def test_every_cluster_gives_a_pose_whichever_retrieval_ranks_first(first: str) 
         for name, count in zip(names, (80, 90, 60, 50), strict=True)
     ]
     seen = project(camera, truth, place).astype(np.float32)
-    (found,) = localize_unit(
+    (found,) = localize_query(
         [QueryView("q", camera, (TypedMatches(index, seen, matches),))],
         sorted(names, key=lambda name: not name.startswith(first)),
-        [""] * 4,
         LocalizationOptions(),
+        frame_of=lambda _: "",
         centers={
             name: np.array([0.0 if name.startswith("right") else 50.0, 0.0, 0.0]) for name in names
         },
@@ -193,11 +172,11 @@ def test_places_whose_poses_agree_are_one_but_in_two_frames(
     halves = zip("ab", np.split(rows, 2), strict=True)
     matches = [(name, np.stack([own] * 2, axis=1), np.full(50, 0.9)) for name, own in halves]
     seen = project(camera, truth, points).astype(np.float32)
-    (found,) = localize_unit(
+    (found,) = localize_query(
         [QueryView("q", camera, (TypedMatches(index, seen, matches),))],
         ["a", "b"],
-        frames,
         LocalizationOptions(clusters=ClusterOptions(by="poses", radius=1.0)),
+        frame_of=dict(zip("ab", frames, strict=True)).__getitem__,
         centers={"a": np.zeros(3), "b": np.full(3, 9.0)},
         ranker=load_plugin(POSE_RANKERS, "inliers"),
         scene=cast(RankingScene, None),

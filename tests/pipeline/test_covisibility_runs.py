@@ -1,8 +1,7 @@
-"""Runs that localize in the model a dataset comes with."""
+"""Pairs by co-visibility in the model that a dataset comes with."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from megloc_kapture.pipeline.datasets import DatasetChoice, choose_dataset, twin
 from megloc_kapture.pipeline.evaluation_plan import Run, plan_evaluation
 from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
-from tests.pipeline.runs import evaluated, recall, run_in
+from tests.pipeline.runs import evaluated, run_in
 
 pytestmark = pytest.mark.slow
 
@@ -37,29 +36,6 @@ def twin() -> DatasetChoice:
     return replace(source, twin=twin_of("aachen", **SMALL))
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Workspace]:
-    """Runs the twin with some options in one workspace; renders once."""
-    workspace = Workspace(tmp_path_factory.mktemp("given") / "workspace")
-
-    def run_with(*assignments: str) -> Workspace:
-        options = options_of_preset(changes=[CHEAP], assignments=assignments)
-        run_in(workspace, twin(), options, workers=2)
-        return workspace
-
-    return run_with
-
-
-def test_the_model_alone(run: Callable[..., Workspace]) -> None:
-    workspace = run("map=given")
-    assert recall(workspace, "day")[1] == 1.0
-    assert not workspace.path("matches/mapping").exists()  # nothing of our own was matched
-    found = workspace.folder("map")
-    assert list(found.observations()) == ["sift"]
-    assert workspace.folder("query", "").types("keypoints") == ["sift"]
-    assert len(found.points3d()) == len(workspace.folder("reference").points3d())
-
-
 def covisible_pairs(workspace: Workspace) -> int:
     """How many pairs there are; every pair sees points of the model in common."""
     seen = KaptureFolder(workspace.path("reference")).observations()["sift"]
@@ -78,14 +54,6 @@ COVISIBLE = 'mapping_pairs.by=["covisibility"]'
 @pytest.mark.parametrize(
     ("name", "assignments", "words"),
     [
-        ("synthetic", ["map=given"], "map = given"),
-        ("synthetic-inloc", ["map=given"], "map = given"),
-        ("kapture", ["map=given"], "map = given"),
-        (
-            "synthetic-aachen",
-            ["map=given", "preprocessing.max_size_px=320"],
-            "keypoints are in the original images",
-        ),
         ("synthetic", [COVISIBLE], "synthetic comes with no model: .*by covisibility"),
         ("synthetic-4seasons", [COVISIBLE], "4seasons comes with no model: .*by covisibility"),
     ],
