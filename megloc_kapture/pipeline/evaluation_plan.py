@@ -211,7 +211,7 @@ def explain(options: PipelineOptions) -> list[dict[str, Any]]:
     rows: dict[str, dict[str, Any]] = {}
     for stage in (kind(options) for kind in PIPELINE):
         on = stage.is_wanted()
-        if on or stage.name not in rows:  # alternative stages share a name
+        if on or stage.name not in rows:  # reranking shares a name with what it replaces
             rows[stage.name] = {"name": stage.name, "on": on, "why": stage.explain()}
     return list(rows.values())
 

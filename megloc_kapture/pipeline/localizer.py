@@ -15,12 +15,10 @@ from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.localization.cluster_poses import interleave
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
-from megloc_kapture.pipeline.live_source import LiveSource, MapMatching
-from megloc_kapture.pipeline.local_types import local_types_of
+from megloc_kapture.pipeline.live_source import LiveSource, MapMatching, local_types_of
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.queries import Preprocessor, Query, QueryImages, Unit
 from megloc_kapture.stages.localized_folder import unreadable_image
-from megloc_kapture.stages.matches import FeatureCache
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import MapRefiners
 from megloc_kapture.stages.query_poses import localize_query
@@ -68,7 +66,7 @@ class Localizer:
             self.options.pose_refinement,
             self.options.placement,
         )
-        self.types = local_types_of(kapture_map, self.options, FeatureCache())
+        self.types = local_types_of(kapture_map, self.options)
         for local in self.types:
             local.prepare()
         self.matching = MapMatching(kapture_map, self.options, self.types, self._preprocessor)

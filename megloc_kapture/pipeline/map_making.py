@@ -66,7 +66,7 @@ from megloc_kapture.stages.guided_pyramid import PyramidMapping
 from megloc_kapture.stages.image_pairs import PairMapping
 from megloc_kapture.stages.local_features import ExtractLocalFeatures
 from megloc_kapture.stages.localized_folder import set_aside_unreadable
-from megloc_kapture.stages.map_points import LiftPoints, TriangulatePoints
+from megloc_kapture.stages.map_points import MakePoints
 from megloc_kapture.stages.map_refinement import RefineMap
 from megloc_kapture.stages.matches import MatchMapping
 from megloc_kapture.stages.options import PipelineOptions
@@ -96,8 +96,7 @@ MAP_STAGES: tuple[type[PipelineStage], ...] = (
     PairMapping,
     MatchMapping,
     PyramidMapping,
-    TriangulatePoints,
-    LiftPoints,
+    MakePoints,
     RefineMap,
     Densify,
 )
@@ -111,7 +110,7 @@ _WITHOUT_POSES: tuple[type[PipelineStage], ...] = (
 _WITH_POSES: tuple[type[PipelineStage], ...] = (
     MatchMapping,
     PyramidMapping,
-    TriangulatePoints,
+    MakePoints,
     RefineMap,
 )
 

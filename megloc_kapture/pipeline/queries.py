@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.images import read_image_rgb, turned_upright
 from megloc_kapture.localization.focal_length import estimate_remark
-from megloc_kapture.plugin_loading import load_chosen
 from megloc_kapture.plugins import (
-    SEGMENTERS,
     DepthView,
     GlobalFeatureExtractor,
     LocalFeatureExtractor,
@@ -24,9 +22,9 @@ from megloc_kapture.plugins import (
 from megloc_kapture.preprocessing.frames import FrameOptions, FramePlan, carry_points, plan_frame
 from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages.global_features import describe_images
-from megloc_kapture.stages.image_masks import ClassMasks, MaskOptions, ProcessedFrame
 from megloc_kapture.stages.local_features import check_size, extract_all, read_mask
 from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.stages.preprocessing import ClassMasks, MaskOptions, ProcessedFrame
 from megloc_kapture.values import Camera, LocalFeatures, Pose, RigidTransform
 
 
@@ -121,11 +119,7 @@ class Preprocessor:
 
     @cached_property
     def classes(self) -> ClassMasks | None:
-        masks = self._options.preprocessing.masks
-        if masks.segmenter is None:
-            return None
-        segmenter = load_chosen(SEGMENTERS, masks.segmenter, self._options.placement)
-        return ClassMasks.of(segmenter, masks.dynamic)
+        return self._options.preprocessing.masks.make_classes(self._options.placement)
 
 
 class QueryImage:
@@ -179,7 +173,7 @@ class QueryImage:
 
 
 class QueryImages:
-    """Images by name, as a :class:`~megloc_kapture.stages.scene.QueryScene`."""
+    """Images by name, for :class:`~megloc_kapture.stages.scene.KaptureScene`."""
 
     def __init__(self, images: Iterable[QueryImage]) -> None:
         self._images = {image.query.name: image for image in images}

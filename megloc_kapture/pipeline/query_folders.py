@@ -42,11 +42,17 @@ from megloc_kapture.io.images import (
     turned_upright,
     write_image,
 )
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, writable_name
+from megloc_kapture.io.kapture import (
+    FeatureReader,
+    KaptureData,
+    KaptureFolder,
+    Sensor,
+    writable_name,
+)
 from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.output_folders import MARKER
-from megloc_kapture.matching.guided_pyramid import equivalent_types
-from megloc_kapture.pipeline.kapture_map import KaptureMap, plain_name
+from megloc_kapture.matching.guided_pyramid import base_type
+from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, plain_name
 from megloc_kapture.pipeline.queries import Query, Unit
 from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.stages import scene
@@ -105,6 +111,24 @@ class Queries(ABC):
         """Write the images into a kapture folder, as links if unchanged."""
 
 
+@dataclass(frozen=True)
+class _StoredType:
+    """Stored features of queries; the keypoints follow the convention of ``like``."""
+
+    keypoints: FeatureReader
+    descriptors: FeatureReader
+    like: MapKeypoints
+
+    def __contains__(self, image: str) -> bool:
+        return image in self.keypoints
+
+    def read(self, image: str) -> LocalFeatures:
+        check_lengths(self.keypoints, self.descriptors, image)
+        stored = self.keypoints.read(image)
+        scores = np.zeros(len(stored), np.float32)
+        return LocalFeatures(self.like.to_colmap(stored), scores, self.descriptors.read(image))
+
+
 class KaptureQueries(Queries):
     """Queries of a kapture folder, with its features if it has any.
 
@@ -116,25 +140,21 @@ class KaptureQueries(Queries):
         super().__init__()
         self._folder, self._map = folder, kapture_map
         self.names = folder.read().image_names()
-        self._stored = stored = kapture_map.stored_types()
-        wanted = {other for name in stored for other in equivalent_types(name)}
         brought = set(folder.types("keypoints")).intersection(folder.types("descriptors"))
-        plain = {plain_name(name): name for name in sorted(brought)}
-        sources = {
-            name: name if name in brought else plain.get(plain_name(name)) for name in wanted
-        }
-        self._local = {
-            name: (folder.keypoints(source), folder.descriptors(source))
-            for name, source in sorted(sources.items())
-            if source is not None
-        }
+        self._local: dict[str, _StoredType] = {}
+        for stored in kapture_map.stored_types():
+            base = base_type(stored)
+            plain = plain_name(base)
+            serving = [name for name in brought if plain_name(base_type(name)) == plain]
+            if serving and base not in self._local:
+                # a type serves its guided pyramid, and the other way round
+                name = min(serving, key=lambda name: (name != base, name != base_type(name), name))
+                self._local[base] = _StoredType(
+                    folder.keypoints(name),
+                    folder.descriptors(name),
+                    kapture_map.keypoints_of(stored),
+                )
         self._data = folder.read() if self._local else with_cameras_of_images(folder)
-        self._like = {
-            name: kapture_map.keypoints_of(
-                next(other for other in equivalent_types(name) if other in stored)
-            )
-            for name in self._local
-        }
         self._globals = {
             name: folder.global_features(name)
             for name in kapture_map.global_types()
@@ -142,10 +162,8 @@ class KaptureQueries(Queries):
         }
 
     def lacking(self, local_type: str) -> str | None:
-        types = [name for name in equivalent_types(local_type) if name in self._local]
-        return next(
-            (name for name in self.names if not any(name in self._local[t][0] for t in types)), None
-        )
+        local = self._local.get(base_type(local_type))
+        return next((name for name in self.names if local is None or name not in local), None)
 
     def check(self) -> None:
         self._map.folder.check_features_apart(self._folder)
@@ -154,7 +172,7 @@ class KaptureQueries(Queries):
         self._check_widths()
         errors = []
         for name in self.names:
-            if any(name in keypoints for keypoints, _ in self._local.values()):
+            if any(name in local for local in self._local.values()):
                 continue
             try:
                 if self._is_unknown(name):
@@ -196,7 +214,7 @@ class KaptureQueries(Queries):
             return guessed_camera(width, height)
         # keypoints are in pixels of the sensor's image size
         is_other = min(width, height) > 0 and (width, height) != (found.width, found.height)
-        brings = any(name in keypoints for keypoints, _ in self._local.values())
+        brings = any(name in local for local in self._local.values())
         return scaled_camera(found, width, height) if is_other and brings else found
 
     def write_images(self, output: Path) -> None:
@@ -207,11 +225,11 @@ class KaptureQueries(Queries):
             (vectors, self._map.folder.global_features(name))
             for name, vectors in self._globals.items()
         ]
-        for name, (_, descriptors) in self._local.items():
-            described = self._map.folder.types("descriptors")
-            theirs = next((other for other in equivalent_types(name) if other in described), None)
-            if theirs is not None:
-                pairs.append((descriptors, self._map.folder.descriptors(theirs)))
+        pairs += [
+            (local.descriptors, local.like.folder.descriptors(local.like.name))
+            for local in self._local.values()
+            if local.like.name in self._map.folder.types("descriptors")
+        ]
         for own, other in pairs:
             if own.config.dsize != other.config.dsize:
                 raise DataError(
@@ -260,30 +278,16 @@ class KaptureQueries(Queries):
         return found
 
     def _features(self, name: str) -> dict[str, LocalFeatures]:
-        found = {}
-        for needed in self._stored:
-            serving = (one for one in equivalent_types(needed) if one in self._local)
-            local_type = next((one for one in serving if name in self._local[one][0]), None)
-            if local_type is None or local_type in found:
-                continue
-            keypoints, descriptors = self._local[local_type]
-            check_lengths(keypoints, descriptors, name)
-            stored = keypoints.read(name)
-            found[local_type] = LocalFeatures(
-                self._like[local_type].to_colmap(stored),
-                np.zeros(len(stored), np.float32),
-                descriptors.read(name),
-            )
-        return found
+        return {base: one.read(name) for base, one in self._local.items() if name in one}
 
     def _no_features(self) -> dict[str, LocalFeatures]:
         return {
-            local_type: LocalFeatures(
+            base: LocalFeatures(
                 np.zeros((0, 2), np.float32),
                 np.zeros(0, np.float32),
-                np.zeros((0, descriptors.config.dsize), descriptors.config.dtype),
+                np.zeros((0, local.descriptors.config.dsize), local.descriptors.config.dtype),
             )
-            for local_type, (_, descriptors) in self._local.items()
+            for base, local in self._local.items()
         }
 
 

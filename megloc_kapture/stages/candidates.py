@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -140,29 +140,19 @@ def vectors_of(readers: Sequence[FeatureReader], images: Sequence[str]) -> list[
     return [KaptureVectors(reader, images) for reader in readers]
 
 
-class Candidates:
-    """Retrieval of map images; ``database`` returns vectors by image index, for each type."""
+def most_similar(
+    queries: Sequence[Vectors],
+    database: Sequence[Vectors],
+    permitted: NDArray[np.int64],
+    retrieval: Retrieval,
+    top_k: int,
+) -> Found:
+    """Return indices of the most similar images, best first, and scores: (Q, K), -1 for none.
 
-    def __init__(
-        self,
-        database: Callable[[NDArray[np.int64]], Sequence[Vectors]],
-        retrieval: Retrieval,
-    ) -> None:
-        self._database, self._retrieval = database, retrieval
-
-    def of(
-        self,
-        queries: Sequence[Vectors],
-        permitted: NDArray[np.int64],
-        options: QueryPairsOptions,
-    ) -> Found:
-        """Return indices of the most similar images, best first, and scores: (Q, K), -1 for none.
-
-        Parameters
-        ----------
-        queries : vectors (Q, D) by type, unit rows.
-        permitted : sorted indices of the permitted images.
-        """
-        database = self._database(permitted)
-        index, scores = self._retrieval.rank(queries, database, options.top_k)
-        return np.where(index >= 0, permitted[np.maximum(index, 0)], -1), scores
+    Parameters
+    ----------
+    queries, database : unit vectors (Q, D) and (M, D) by type.
+    permitted : indices (M,) of the database's images.
+    """
+    index, scores = retrieval.rank(queries, database, top_k)
+    return np.where(index >= 0, permitted[np.maximum(index, 0)], -1), scores

@@ -29,10 +29,10 @@ from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.retrieval.search import greedy_coverage
 from megloc_kapture.stages.candidates import (
     UNRESTRICTED,
-    Candidates,
     QueryPairsOptions,
     Restrictions,
     Retrieval,
+    most_similar,
     vectors_of,
 )
 from megloc_kapture.stages.matches import VerifiedMatches, iterate_candidates
@@ -189,13 +189,10 @@ def pair_queries(
     if retrieval is None:
         raise DataError("retrieval needs global features of map and queries")
     database, described = retrieval.readers(mapping), retrieval.readers(query)
-    candidates = Candidates(
-        lambda members: vectors_of(database, [images[member] for member in members.tolist()]),
-        retrieval,
-    )
     for positions, permitted in pools:
         asked = vectors_of(described, [queries[at] for at in positions])
-        index, scores = candidates.of(asked, permitted, options)
+        vectors = vectors_of(database, [images[member] for member in permitted.tolist()])
+        index, scores = most_similar(asked, vectors, permitted, retrieval, options.top_k)
         for at, row, row_scores in zip(positions, index.tolist(), scores.tolist(), strict=True):
             of_query[at] = [
                 ImagePair(queries[at], images[i], score)

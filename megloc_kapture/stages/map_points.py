@@ -92,14 +92,7 @@ def triangulate_map(
             "(cam_from_world) and cameras are right",
             path=mapping.root,
         )
-    write_sensors(output, data)
-    link_images(mapping.root, output)
-    # keep a pyramid's base type, as queries are first matched with that
-    there = mapping.types("keypoints")
-    copy_features(mapping, output, {*types, *map(base_type, types)}.intersection(there))
-    # kapture stores a colour per point; black means unknown
-    write_points3d(output, np.concatenate([xyz, np.zeros_like(xyz)], axis=1))
-    write_observations(output, observations)
+    _write_map(mapping, output, xyz, observations)
     num_observations = sum(map(len, observations.values()))
     return {
         "images": len(images),
@@ -197,11 +190,7 @@ def lift_map(
         )
         total += len(keypoints)
     xyz = np.concatenate(points)
-    write_sensors(output, data)
-    link_images(mapping.root, output)
-    copy_features(mapping, output, local_types)
-    write_points3d(output, np.concatenate([xyz, np.zeros_like(xyz)], axis=1))
-    write_observations(output, seen)
+    _write_map(mapping, output, xyz, seen)
     return {"images": len(images), "images_with_depth": len(with_depth), "points": len(xyz)}
 
 
@@ -221,48 +210,37 @@ def _lift(
     return points[valid], np.flatnonzero(valid).astype(np.int32)
 
 
-class LiftPoints(PipelineStage):
-    """Lift the map's points from keypoints through depth."""
+def _write_map(
+    mapping: KaptureFolder,
+    output: Path,
+    xyz: NDArray[np.float64],
+    observations: Mapping[str, Observations],
+) -> None:
+    write_sensors(output, mapping.read())
+    link_images(mapping.root, output)
+    # keep a pyramid's base type, as queries are first matched with that
+    copy_features(mapping, output, {*observations, *map(base_type, observations)})
+    # kapture stores a colour per point; black means unknown
+    write_points3d(output, np.concatenate([xyz, np.zeros_like(xyz)], axis=1))
+    write_observations(output, observations)
+
+
+class MakePoints(PipelineStage):
+    """Triangulate the map's points, or lift them from keypoints through depth."""
 
     name = "points"
-    uses = ("map", "local_features.name", "local_features.options")
+    version = 3
+    uses = ("map", "triangulation", "guided_pyramid.mode", *LOCAL_TYPES)
     explained_by = ("map",)
-    inputs = (Layout.mapping, LOCAL_FEATURES, GLOBAL_FEATURES)
+    inputs = (Layout.mapping, LOCAL_FEATURES, GLOBAL_FEATURES, Layout.mapping_matches)
     outputs = (UNREFINED,)
 
-    def is_wanted(self) -> bool:
-        return self.options.map == "lift"
-
     def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping, types = work.folder(self.layout.mapping(), FEATURES), self.options.local_types()
-        return lift_map(mapping, types, work.out / UNREFINED, work=work)
-
-
-class TriangulatePoints(PipelineStage):
-    """Triangulate the map's points."""
-
-    name = "points"
-    version = 2
-    uses = ("triangulation", "guided_pyramid.mode", *LOCAL_TYPES)
-    explained_by = ("map",)
-    inputs = (
-        Layout.mapping,
-        LOCAL_FEATURES,
-        GLOBAL_FEATURES,
-        Layout.mapping_matches,
-    )
-    outputs = (UNREFINED,)
-
-    def is_wanted(self) -> bool:
-        return self.options.triangulates()
-
-    def run(self, work: StageWork) -> Mapping[str, float]:
+        options, out = self.options, work.out / UNREFINED
         mapping = work.folder(self.layout.mapping(), FEATURES, *self.layout.mapping_matches())
+        if not options.triangulates():
+            return lift_map(mapping, options.local_types(), out, work=work)
+        types, threads = options.point_types(), work.num_threads
         return triangulate_map(
-            mapping,
-            mapping,
-            self.options.point_types(),
-            work.out / UNREFINED,
-            self.options.triangulation,
-            num_threads=work.num_threads,
+            mapping, mapping, types, out, options.triangulation, num_threads=threads
         )

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
-from collections import Counter, OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from itertools import combinations, groupby
 from operator import itemgetter
 from pathlib import Path
@@ -56,13 +55,14 @@ from megloc_kapture.stages.work import (
     Work,
     batched,
     in_batches,
+    open_folder,
     resumed_label,
 )
 from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
 
 _log = logging.getLogger(__name__)
 
-_CACHE_BYTES = 256 << 20  # per process: the descriptors of about a hundred images
+CACHED_IMAGES = 80  # per process: about 250 MB of RootSIFT
 _PAIRS_PER_ITEM = 32  # share an image, whose features are read once
 # image groups in which the given poses are checked against the matches
 _CHECKED_GROUPS = 6
@@ -337,48 +337,17 @@ def verification_of(
     return verify
 
 
-class FeatureCache:
-    """Thread-safe LRU cache of image features, bounded in bytes."""
-
-    def __init__(self, max_bytes: int = _CACHE_BYTES) -> None:
-        self._items: OrderedDict[Hashable, Features] = OrderedDict()
-        self._bytes = 0
-        self._max_bytes = max_bytes
-        self._lock = threading.Lock()
-
-    def get(self, key: Hashable, load: Callable[[], Features]) -> Features:
-        with self._lock:
-            if key in self._items:
-                self._items.move_to_end(key)
-                return self._items[key]
-        features = load()
-        with self._lock:
-            if key not in self._items:
-                self._items[key] = features
-                self._bytes += _size(features)
-            while self._bytes > self._max_bytes and len(self._items) > 1:
-                _, old = self._items.popitem(last=False)
-                self._bytes -= _size(old)
-        return features
-
-
-def _size(features: Features) -> int:
-    rays_and_slopes = (3 + 4) * 8 * len(features.keypoints_px)  # counted even if not computed yet
-    return features.descriptors.nbytes + features.keypoints_px.nbytes + rays_and_slopes
-
-
-_cache = FeatureCache()
-
-
 def cached_features(spec: FolderSpec, local_type: str, image: str) -> Features:
-    def read() -> Features:
-        folder = spec.open()
-        keypoints, descriptors = folder.keypoints(local_type), folder.descriptors(local_type)
-        check_lengths(keypoints, descriptors, image)
-        camera = folder.read().camera_of(image)
-        return Features.of(camera, keypoints.read(image), descriptors.read(image))
+    return _features(spec.key, local_type, image)
 
-    return _cache.get((*spec.key, local_type, image), read)
+
+@lru_cache(maxsize=CACHED_IMAGES)
+def _features(key: tuple[Any, ...], local_type: str, image: str) -> Features:
+    folder = open_folder(*key)
+    keypoints, descriptors = folder.keypoints(local_type), folder.descriptors(local_type)
+    check_lengths(keypoints, descriptors, image)
+    camera = folder.read().camera_of(image)
+    return Features.of(camera, keypoints.read(image), descriptors.read(image))
 
 
 def iterate_candidates(pairs: Sequence[ImagePair]) -> Iterator[tuple[str, list[str]]]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -326,22 +326,6 @@ def _images_of(folder: KaptureFolder) -> _Images:
     return _Images(folder)
 
 
-class QueryScene(Protocol):
-    """Pixels, mask and depth of query images; see :class:`KaptureScene`."""
-
-    def image(self, name: str) -> NDArray[np.uint8]:
-        """RGB pixels (H, W, 3)."""
-        ...
-
-    def mask(self, name: str) -> NDArray[np.bool_] | None:
-        """Mask (H, W), True = use, or None."""
-        ...
-
-    def depth(self, name: str) -> DepthView | None:
-        """Depth taken with the image, or None."""
-        ...
-
-
 def depth_of(folder: KaptureFolder, name: str) -> DepthView | None:
     """Return the depth taken with an image, or None."""
     return _images_of(folder).depth(name)
@@ -350,49 +334,28 @@ def depth_of(folder: KaptureFolder, name: str) -> DepthView | None:
 class KaptureScene:
     """:class:`~megloc_kapture.plugins.RankingScene` of a map folder and its queries.
 
+    ``query`` is a folder, or an object with ``image``, ``mask`` and ``depth`` by name.
     ``map_camera`` returns the camera of a map image by name, by default the stored one.
     """
 
     def __init__(
         self,
         mapping: KaptureFolder,
-        query: KaptureFolder | QueryScene | None = None,
+        query: Any = None,
         *,
         map_camera: Callable[[str], Camera] | None = None,
     ) -> None:
         self._map = _images_of(mapping)
-        known = _images_of(query) if isinstance(query, KaptureFolder) else query
-        self._query: QueryScene | None = known
-        self._map_camera = map_camera or self._map.camera
-
-    def query_image(self, name: str) -> NDArray[np.uint8]:
-        if self._query is None:
-            raise DataError(f"the pixels of query {name} are not known")
-        return self._query.image(name)
-
-    def query_mask(self, name: str) -> NDArray[np.bool_] | None:
-        return None if self._query is None else self._query.mask(name)
-
-    def query_depth(self, name: str) -> DepthView | None:
-        return None if self._query is None else self._query.depth(name)
-
-    def map_image(self, name: str) -> NDArray[np.uint8]:
-        return self._map.image(name)
-
-    def map_mask(self, name: str) -> NDArray[np.bool_] | None:
-        return self._map.mask(name)
-
-    def map_depth(self, name: str) -> DepthView | None:
-        return self._map.depth(name)
-
-    def map_points(self, name: str) -> NDArray[np.float64]:
-        return self._map.points(name)
-
-    def map_camera(self, name: str) -> Camera:
-        return self._map_camera(name)
+        queries = _images_of(query) if isinstance(query, KaptureFolder) else query
+        if queries is not None:
+            self.query_image = queries.image
+            self.query_mask = queries.mask
+            self.query_depth = queries.depth
+        self.map_image = self._map.image
+        self.map_mask = self._map.mask
+        self.map_depth = self._map.depth
+        self.map_points = self._map.points
+        self.map_camera = map_camera or self._map.camera
 
     def map_pose(self, name: str) -> RigidTransform:
-        pose = self._map.folder.read().cam_from_world(name)
-        if pose is None:
-            raise DataError(f"map image {name} has no pose", path=self._map.folder.root)
-        return pose
+        return self._map.folder.read().poses()[name]

@@ -20,8 +20,6 @@ from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import (
-    FeatureCache,
-    Features,
     NoVerification,
     check_given_poses,
     iterate_candidates,
@@ -161,35 +159,6 @@ def test_what_has_no_features_is_named(world: Any, tmp_path: Path) -> None:
         match("left/1.png", "r2d2")
     with pytest.raises(DataError, match=r"nowhere\.png"):
         match("nowhere.png", "rootsift")
-
-
-def test_the_cache_is_bounded_and_forgets_what_was_used_longest_ago() -> None:
-    def features() -> Features:
-        return Features.of(CAMERA, np.zeros((100, 2), np.float32), np.zeros((100, 4), np.float32))
-
-    one = features()
-    # rays and their slopes are made when they are needed, and counted from the start
-    slopes = 100 * 2 * 2 * 8
-    size = one.descriptors.nbytes + one.keypoints_px.nbytes + one.rays.nbytes + slopes
-    cache = FeatureCache(max_bytes=3 * size)
-    loaded: list[str] = []
-
-    def get(key: str) -> None:
-        def load() -> Features:
-            loaded.append(key)
-            return features()
-
-        cache.get(key, load)
-
-    for key in "abcab":
-        get(key)
-    assert loaded == ["a", "b", "c"]
-    get("d")  # c was used longest ago
-    for key in "abd":
-        get(key)
-    assert loaded == ["a", "b", "c", "d"]
-    get("c")
-    assert loaded == ["a", "b", "c", "d", "c"]
 
 
 def test_candidates_come_best_first_and_ties_by_name() -> None:
