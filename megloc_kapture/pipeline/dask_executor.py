@@ -19,7 +19,7 @@ from typing import Any
 
 from distributed import Client, KilledWorker, LocalCluster, Worker, WorkerPlugin
 
-from megloc_kapture.errors import MeglocError, OptionError
+from megloc_kapture.errors import MeglocError, OptionError, check_option
 from megloc_kapture.evaluation.pose_files import installed_version
 from megloc_kapture.pipeline.executors import enter_single_threaded
 
@@ -46,8 +46,7 @@ def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator
     with dask.config.set(settings), ExitStack() as stack:
         client = _client(stack, workers, scheduler)
         threads = sum(worker["nthreads"] for worker in _workers(client))
-        if not threads:
-            raise OptionError(f"the scheduler {scheduler} has no workers: start some (dask worker)")
+        check_option(threads, f"the scheduler {scheduler} has no workers: start some (dask worker)")
         try:
             shared.mkdir(parents=True, exist_ok=True)
             client.register_plugin(_Preparation(_environment(), Path.cwd(), shared.absolute()))

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import OptionError, check_option, require
 from megloc_kapture.evaluation.evaluate import evaluate, results_without_truth
 from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.evaluation.protocols import benchmark_of
@@ -139,8 +139,10 @@ def choose_run(
     benchmark = find_benchmark(dataset)
     if config:
         benchmark = read_benchmark(config)
-        if benchmark.dataset != dataset:
-            raise OptionError(f"{config} is for dataset {benchmark.dataset}, not {dataset}")
+        check_option(
+            benchmark.dataset == dataset,
+            f"{config} is for dataset {benchmark.dataset}, not {dataset}",
+        )
     preset = preset or benchmark.preset
     source = choose_dataset(
         dataset,
@@ -225,11 +227,15 @@ def explained(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def _insert(stages: list[Stage], stage: Stage) -> None:
     """Insert a plugin stage after the last stage that writes one of its inputs."""
-    if any(stage.name == one.name for one in stages):
-        raise OptionError(f"stages.{stage.name}: there is a stage of this name")
+    check_option(
+        not any(stage.name == one.name for one in stages),
+        f"stages.{stage.name}: there is a stage of this name",
+    )
     for path in stage.reads:
-        if not any(is_below(path, written) for one in stages for written in one.writes):
-            raise OptionError(f"stages.{stage.name} reads {path}, which no stage of the run writes")
+        check_option(
+            any(is_below(path, written) for one in stages for written in one.writes),
+            f"stages.{stage.name} reads {path}, which no stage of the run writes",
+        )
     places = [
         number
         for number, one in enumerate(stages)
@@ -308,8 +314,7 @@ class Import(_RunStage):
         source = self._run.source
         root = work.path(WORLD) if source.root is None else source.root.resolve()
         counts = source.import_to(root, work.out, self._change)
-        if not counts["queries"]:
-            raise DataError("no query image is left to localize", path=root)
+        require(counts["queries"], "no query image is left to localize", path=root)
         unreadable = set_aside_unreadable(work.out / QUERY, work.out / SIDE_TABLES, work)
         return counts | ({"unreadable_queries": len(unreadable)} if unreadable else {})
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.features.vlad import Vocabulary, aggregate, train_vlad
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.localization.cluster_poses import Clock
@@ -221,12 +221,12 @@ def extract_again(
     kapture_map: KaptureMap, keypoints: MapKeypoints, extractor: LocalFeatureExtractor
 ) -> dict[str, NDArray[Any]]:
     """Extract descriptors of all stored map keypoints; zero for keypoints not detected again."""
-    if not kapture_map.has_images():
-        raise DataError(
-            f"the map has no descriptors of type {keypoints.name!r}, and no images to extract "
-            "them from again",
-            path=kapture_map.folder.root,
-        )
+    require(
+        kapture_map.has_images(),
+        f"the map has no descriptors of type {keypoints.name!r}, and no images to extract "
+        "them from again",
+        path=kapture_map.folder.root,
+    )
     found: dict[str, NDArray[Any]] = {}
     again = observed = 0
     for image in kapture_map.images:
@@ -243,12 +243,12 @@ def extract_again(
         seen, _ = keypoints.index.observed(image)
         again += int(hit[seen].sum())
         observed += len(seen)
-    if again < _MIN_FOUND_AGAIN * observed:
-        raise DataError(
-            f"the map has no descriptors, and extracting {extractor.name} again finds only "
-            f"{again} of {observed} observed keypoints: it was made with other options",
-            path=kapture_map.folder.root,
-        )
+    require(
+        again >= _MIN_FOUND_AGAIN * observed,
+        f"the map has no descriptors, and extracting {extractor.name} again finds only "
+        f"{again} of {observed} observed keypoints: it was made with other options",
+        path=kapture_map.folder.root,
+    )
     return found
 
 
@@ -477,11 +477,11 @@ class MapMatching:
                     for name in images
                 ]
             )
-        if not self._map.has_images():
-            raise DataError(
-                f"the map has no global features {one.name!r}, and no images to describe",
-                path=self._map.folder.root,
-            )
+        require(
+            self._map.has_images(),
+            f"the map has no global features {one.name!r}, and no images to describe",
+            path=self._map.folder.root,
+        )
         extractor = one.extractor or one.choice.make(self.options.placement)
         return np.stack([self._map_image(name).describe(extractor) for name in images])
 

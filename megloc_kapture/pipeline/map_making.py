@@ -27,7 +27,7 @@ from megloc_kapture.datasets.colmap_map import (
     is_colmap,
 )
 from megloc_kapture.datasets.kapture_folders import import_mapping, mapping_files
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.io.colmap_mapping import MIN_IMAGES, Mapper
 from megloc_kapture.io.dataset_tables import (
     METRES,
@@ -118,8 +118,10 @@ _WITH_POSES: tuple[type[PipelineStage], ...] = (
 def plan_map(mapping: KaptureFolder, options: PipelineOptions) -> list[Stage]:
     check_weights(options)
     options.retrieval()
-    if options.pairs_by_points():
-        raise OptionError("images with poses come with no model: mapping_pairs.by covisibility")
+    check_option(
+        not options.pairs_by_points(),
+        "images with poses come with no model: mapping_pairs.by covisibility",
+    )
     return [ImportMapping(mapping), *wanted_stages(MAP_STAGES, options)]
 
 
@@ -200,13 +202,14 @@ def options_of_photographs(
     options = options_of_preset(preset, changes=changes, assignments=assignments)
     if without := sorted(_BY_POSES.intersection(options.mapping_pairs.by)):
         raise OptionError(f"mapping_pairs.by {without[0]}: photographs have no poses yet")
-    if options.preprocessing.undistort:
-        raise OptionError(
-            "preprocessing.undistort: the distortion of photographs is unknown; it is estimated "
-            "with the map's cameras"
-        )
-    if options.map != "triangulate":
-        raise OptionError(f"map = {options.map}: points of photographs are triangulated")
+    check_option(
+        not options.preprocessing.undistort,
+        "preprocessing.undistort: the distortion of photographs is unknown; it is estimated "
+        "with the map's cameras",
+    )
+    check_option(
+        options.map == "triangulate", f"map = {options.map}: points of photographs are triangulated"
+    )
     return options
 
 
@@ -217,11 +220,11 @@ def structure_options(
     gps, distance = None, None
     if tuple(scale) == (GPS,):
         gps = photographs.gps()
-        if len(gps) < MIN_IMAGES:
-            raise DataError(
-                f"--scale gps: {len(gps)} photographs have a GPS position, at least {MIN_IMAGES} "
-                "are needed"
-            )
+        require(
+            len(gps) >= MIN_IMAGES,
+            f"--scale gps: {len(gps)} photographs have a GPS position, at least {MIN_IMAGES} "
+            "are needed",
+        )
     elif len(scale) == 3:
         try:
             distance = scale[0], scale[1], float(scale[2])
@@ -232,8 +235,7 @@ def structure_options(
                 f"--scale {' '.join(scale)}: {scale[2]!r} is not a distance in metres"
             )
         for name in scale[:2]:
-            if name not in photographs.names:
-                raise DataError(f"--scale: there is no photograph {name!r}")
+            require(name in photographs.names, f"--scale: there is no photograph {name!r}")
     elif scale:
         raise OptionError(
             f"--scale takes {GPS}, or two photographs and the metres between them, got "

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from megloc_kapture.errors import OptionError, suggestion
+from megloc_kapture.errors import OptionError, check_option, suggestion
 from megloc_kapture.io.weights import MissingWeightsError, all_missing, lookup
 from megloc_kapture.mapping.pairs import PairsByPosesOptions
 from megloc_kapture.mapping.uncertainty import UncertaintyOptions
@@ -166,8 +166,7 @@ def assigned(
 
 def _typed(assignment: str, flag: str) -> tuple[str, Any]:
     key, equals, text = assignment.partition("=")
-    if not equals or not key:
-        raise OptionError(f"{flag} takes key=value, got {assignment!r}")
+    check_option(equals and key, f"{flag} takes key=value, got {assignment!r}")
     key, text = key.strip(), text.strip()
     if text in ("None", "null"):  # Options parses "none", which is also a choice of some options
         return key, None
@@ -235,8 +234,10 @@ def _merged_choices(
     named = {one.get("name"): one for one in merged}
     if set(changes) <= set(named):
         for name, change in changes.items():
-            if not isinstance(change, dict):
-                raise OptionError(f"option {key}.{name}: a table is expected, got {change!r}")
+            check_option(
+                isinstance(change, dict),
+                f"option {key}.{name}: a table is expected, got {change!r}",
+            )
             _merge(named[name], change)
     elif len(merged) == 1:
         _merge(merged[0], changes)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, check_option, require
 from megloc_kapture.io.images import read_image_rgb, turned_upright
 from megloc_kapture.localization.focal_length import estimate_remark
 from megloc_kapture.plugins import (
@@ -62,10 +62,10 @@ class Query:
         if self.mask is None:
             return None
         mask = np.asarray(self.mask)
-        if mask.dtype != np.bool_ or mask.shape != shape:
-            raise DataError(
-                f"query {self.name}: a mask is bool {shape}, got {mask.dtype} {mask.shape}"
-            )
+        require(
+            mask.dtype == np.bool_ and mask.shape == shape,
+            f"query {self.name}: a mask is bool {shape}, got {mask.dtype} {mask.shape}",
+        )
         return mask
 
     def read_depth(self) -> DepthView | None:
@@ -91,11 +91,11 @@ class Query:
             return image
         image = np.asarray(self.image)
         shape = (self.camera.height, self.camera.width, 3)
-        if image.dtype != np.uint8 or image.shape != shape:
-            raise DataError(
-                f"query {self.name}: an image of its camera is uint8 {shape}, got {image.dtype} "
-                f"{image.shape}"
-            )
+        require(
+            image.dtype == np.uint8 and image.shape == shape,
+            f"query {self.name}: an image of its camera is uint8 {shape}, got {image.dtype} "
+            f"{image.shape}",
+        )
         return image
 
 
@@ -106,11 +106,11 @@ class Preprocessor:
         self._options = options
         self.mask_margin_px = options.mask_margin_px
         masks = options.preprocessing.masks
-        if masks != MaskOptions(segmenter=masks.segmenter, dynamic=masks.dynamic):
-            raise OptionError(
-                "preprocessing.masks.fixed, unchanging and user_masks are for folders of images: "
-                "make one with `megloc preprocess`; a query brings its own mask: Query(mask=...)"
-            )
+        check_option(
+            masks == MaskOptions(segmenter=masks.segmenter, dynamic=masks.dynamic),
+            "preprocessing.masks.fixed, unchanging and user_masks are for folders of images: "
+            "make one with `megloc preprocess`; a query brings its own mask: Query(mask=...)",
+        )
 
     def of(self, query: Query) -> QueryImage:
         """Prepare a query lazily; images with local features stay as they are."""

@@ -20,7 +20,7 @@ from megloc_kapture.datasets.kapture_folders import (
     warn_of_scaled,
     with_cameras_of_images,
 )
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.io.camera_list import CameraList
 from megloc_kapture.io.files import (
     check_relative,
@@ -167,8 +167,7 @@ class KaptureQueries(Queries):
 
     def check(self) -> None:
         self._map.folder.check_features_apart(self._folder)
-        if not self.names:
-            raise DataError("there are no query images", path=self._folder.root)
+        require(self.names, "there are no query images", path=self._folder.root)
         self._check_widths()
         errors = []
         for name in self.names:
@@ -231,12 +230,12 @@ class KaptureQueries(Queries):
             if local.like.name in self._map.folder.types("descriptors")
         ]
         for own, other in pairs:
-            if own.config.dsize != other.config.dsize:
-                raise DataError(
-                    f"{own.kind} of type {own.type_name!r} have {own.config.dsize} values, "
-                    f"the map's {other.config.dsize}",
-                    path=self._folder.root,
-                )
+            require(
+                own.config.dsize == other.config.dsize,
+                f"{own.kind} of type {own.type_name!r} have {own.config.dsize} values, "
+                f"the map's {other.config.dsize}",
+                path=self._folder.root,
+            )
 
     def types_of_all(self) -> list[str]:
         return [
@@ -465,11 +464,13 @@ def _named_files(paths: Sequence[Path]) -> tuple[dict[str, Path], list[str]]:
             wanted, passed_over = _images_below(path)
             files = {str(file.relative_to(path)): file for file in wanted}
             others += [str(file.relative_to(path)) for file in passed_over]
-            if not files:
-                raise DataError("no image or video in this folder", path=path)
+            require(files, "no image or video in this folder", path=path)
         elif path.exists():
-            if path.suffix.lower() in _LIST_SUFFIXES:
-                raise DataError("not an image; a list of cameras is given by --camera", path=path)
+            require(
+                path.suffix.lower() not in _LIST_SUFFIXES,
+                "not an image; a list of cameras is given by --camera",
+                path=path,
+            )
             files = {path.name: path}
         else:
             raise DataError("no such file or folder", path=path)
@@ -487,12 +488,12 @@ def _named_files(paths: Sequence[Path]) -> tuple[dict[str, Path], list[str]]:
 
 def _images_of_kapture(folder: KaptureFolder) -> dict[str, Path]:
     data = folder.read()
-    if data.poses():
-        raise DataError(
-            "a kapture folder of images with poses: `megloc triangulate` makes a map of them, "
-            "`megloc localize --query` localizes them",
-            path=folder.root,
-        )
+    require(
+        not data.poses(),
+        "a kapture folder of images with poses: `megloc triangulate` makes a map of them, "
+        "`megloc localize --query` localizes them",
+        path=folder.root,
+    )
     return {name: folder.image_path(name) for name in data.image_names()}
 
 
@@ -519,9 +520,9 @@ def _check_name(name: str, path: Path) -> None:
         check_relative(name)
     except DataError as error:
         raise DataError(f"{error.message}; rename the file", path=path) from error
-    if name != writable_name(name):
-        raise DataError(
-            f"kapture's tables cannot hold the name {name!r} (a comma, a space at an end, or # at "
-            "its beginning); rename the file",
-            path=path,
-        )
+    require(
+        name == writable_name(name),
+        f"kapture's tables cannot hold the name {name!r} (a comma, a space at an end, or # at "
+        "its beginning); rename the file",
+        path=path,
+    )

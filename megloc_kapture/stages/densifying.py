@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.errors import DataError, MeglocError
+from megloc_kapture.errors import DataError, MeglocError, require
 from megloc_kapture.geometry.cameras import focal_px
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.files import link_images, link_records, remove, safe_join
@@ -198,8 +198,7 @@ def fuse_depth(
     A pixel is skipped if an earlier source of its image, by name, has the same surface.
     """
     path = densified.root / DEPTH_FILE
-    if not path.is_file():
-        raise DataError("no densified map: reconstruction/depth.csv is missing", path=path)
+    require(path.is_file(), "no densified map: reconstruction/depth.csv is missing", path=path)
     images = stereo_images(densified)
     jobs = [
         (image, [other for other in own if other < image and other in images])
@@ -256,8 +255,6 @@ _ERROR_PX, _DIFFERENCE, _DEVIATION = 0.5, 5.0, 2 / 1.1774
 
 # map images an image is compared with; more where poses are not exact
 _NUM_SOURCES, _MAX_SOURCES = 4, 16
-
-Floats = NDArray[np.float64]
 
 
 class DensifyOptions(Options):
@@ -359,10 +356,16 @@ def densify_map(
 
 def _check(source: KaptureFolder, data: KaptureData) -> None:
     check_points(source, "densify")
-    if (source.root / "sensors" / "records_data" / FOLDER).exists():
-        raise DataError(f"has images or depth maps in records_data/{FOLDER}", path=source.root)
-    if any(f"{sensor}_mvs" in data.sensors for sensor in data.sensors):
-        raise DataError("has a sensor CAMERA_mvs: densified already?", path=source.root)
+    require(
+        not (source.root / "sensors" / "records_data" / FOLDER).exists(),
+        f"has images or depth maps in records_data/{FOLDER}",
+        path=source.root,
+    )
+    require(
+        not any(f"{sensor}_mvs" in data.sensors for sensor in data.sensors),
+        "has a sensor CAMERA_mvs: densified already?",
+        path=source.root,
+    )
 
 
 # ------------------------------------------------------------------------------------ planning

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
-from megloc_kapture.errors import DataError, OptionError, PluginError, suggestion
+from megloc_kapture.errors import DataError, OptionError, PluginError, require, suggestion
 from megloc_kapture.features.image_bound import bounded_image
 from megloc_kapture.features.vlad import (
     PcaWhitening,
@@ -81,8 +81,11 @@ def train_on_map(
 ) -> Vocabulary:
     images = mapping.read().image_names()
     descriptors = mapping.descriptors(local_type)
-    if not any(descriptors.length(image) for image in images):
-        raise DataError(f"the map has no descriptors of type {local_type}", path=mapping.root)
+    require(
+        any(descriptors.length(image) for image in images),
+        f"the map has no descriptors of type {local_type}",
+        path=mapping.root,
+    )
     read = partial(_descriptors, FolderSpec(mapping), local_type)
     each = partial(ordered_map, executor=work.executor)
     return train_vlad(images, descriptors.length, read, options, each=each)
@@ -165,8 +168,11 @@ def _read_array(path: Path, what: str) -> NDArray[np.float32]:
         array = np.load(path, allow_pickle=False)
     except (ValueError, OSError, EOFError) as error:
         raise DataError(f"not a {what}: {error}", path=path) from error
-    if array.dtype != np.float32 or not np.isfinite(array).all():
-        raise DataError(f"not a {what}: {array.dtype} {array.shape}", path=path)
+    require(
+        array.dtype == np.float32 and np.isfinite(array).all(),
+        f"not a {what}: {array.dtype} {array.shape}",
+        path=path,
+    )
     return array
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.errors import DataError, OptionError, suggestion
+from megloc_kapture.errors import DataError, OptionError, require, suggestion
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
 from megloc_kapture.io.kapture.features import KaptureVectors
@@ -84,8 +84,7 @@ def _seen_points(
         points.append(observations.point_ids[image_ids >= 0])
         seeing.append(image_ids[image_ids >= 0])
     point_ids = np.concatenate(points)
-    if len(point_ids) == 0:
-        raise DataError("no image to be paired observes its points", path=folder.root)
+    require(len(point_ids) != 0, "no image to be paired observes its points", path=folder.root)
     return point_ids, np.concatenate(seeing)
 
 

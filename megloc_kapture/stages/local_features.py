@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, PluginError
+from megloc_kapture.errors import DataError, PluginError, require
 from megloc_kapture.features.image_bound import (
     Frame,
     bounded_size,
@@ -96,10 +96,8 @@ def images_of(folders: Sequence[KaptureFolder], purpose: str) -> dict[str, Kaptu
     named = [(image, folder) for folder in folders for image in folder.read().image_names()]
     named.sort(key=itemgetter(0))
     for (image, _), (other, _) in pairwise(named):
-        if image == other:
-            raise DataError(f"image {image} is in two kapture folders")
-    if not named:
-        raise DataError(f"there are no images to {purpose}")
+        require(image != other, f"image {image} is in two kapture folders")
+    require(named, f"there are no images to {purpose}")
     return dict(named)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import require
 from megloc_kapture.io.files import hard_link, link_images
 from megloc_kapture.io.kapture import (
     FeatureReader,
@@ -43,13 +43,13 @@ def move_points(
     """
     seen = model.observations()[local_type]
     moved, rows_of, num_found = _moved(model, mapping, seen)
-    if num_found < _MIN_FOUND_AGAIN * len(seen):
-        raise DataError(
-            f"the model has no descriptors, and of its {len(seen)} observations only "
-            f"{num_found / len(seen):.0%} have a keypoint that extracting {local_type} again "
-            "finds: it was made with another detector, other options or other images",
-            path=model.root,
-        )
+    require(
+        num_found >= _MIN_FOUND_AGAIN * len(seen),
+        f"the model has no descriptors, and of its {len(seen)} observations only "
+        f"{num_found / len(seen):.0%} have a keypoint that extracting {local_type} again "
+        "finds: it was made with another detector, other options or other images",
+        path=model.root,
+    )
     none = np.zeros(0, np.int64)
     for reader in (mapping.keypoints(local_type), mapping.descriptors(local_type)):
         with FeatureWriter(output, reader.kind, local_type, reader.config) as writer:

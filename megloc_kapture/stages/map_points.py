@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap import MapImage, TriangulatedPoints, TriangulationOptions, triangulate
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import (
@@ -62,8 +62,7 @@ def triangulate_map(
     types = tuple(dict.fromkeys([local_types] if isinstance(local_types, str) else local_types))
     data = mapping.read()
     images = sorted(data.poses())
-    if not images:
-        raise DataError("no mapping image has a pose", path=mapping.root)
+    require(images, "no mapping image has a pose", path=mapping.root)
     asked = None if pairs is None else {tuple(sorted((pair.query, pair.map))) for pair in pairs}
     of_type = {name: matched_pairs(matches.matches(name), images, asked) for name in types}
     for name in types:
@@ -160,12 +159,12 @@ def lift_map(
     records = depth_records(data)
     images = sorted(poses)
     with_depth = [image for image in images if image in records]
-    if not with_depth:
-        raise DataError(
-            "no mapping image has a pose and a depth map of its moment (records_depth.txt, a "
-            "rig with camera and depth sensor)",
-            path=mapping.root,
-        )
+    require(
+        with_depth,
+        "no mapping image has a pose and a depth map of its moment (records_depth.txt, a "
+        "rig with camera and depth sensor)",
+        path=mapping.root,
+    )
     spec, row_of = FolderSpec(mapping), {image: row for row, image in enumerate(images)}
     jobs = [(image, records[image]) for image in with_depth]
     points: list[NDArray[np.float64]] = []

@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, PluginError
+from megloc_kapture.errors import PluginError, require
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, MatchesWriter, read_pairs
 from megloc_kapture.io.tables import (
@@ -190,8 +190,7 @@ def check_given_poses(
     if contradiction is None:
         return
     message, most = contradiction
-    if most and not work.force:
-        raise DataError(f"{message} (--force continues anyway)", path=mapping.root)
+    require(not most or work.force, f"{message} (--force continues anyway)", path=mapping.root)
     _log.warning("%s", message)
 
 

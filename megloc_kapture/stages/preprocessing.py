@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.errors import DataError, OptionError, OutputError, PluginError
+from megloc_kapture.errors import DataError, OptionError, OutputError, PluginError, require
 from megloc_kapture.io.files import (
     link_file,
     link_records,
@@ -448,8 +448,7 @@ def _link_records(folder: KaptureFolder, output: Path, plans: Mapping[str, Frame
         return True
     for name in sorted(folder.read().records_depth.values()):
         source = folder.depth_path(name)
-        if not source.is_file():
-            raise DataError("no such depth map", path=source)
+        require(source.is_file(), "no such depth map", path=source)
         link_file(source, output / "sensors" / "records_data" / name)
     return False
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import require
 from megloc_kapture.geometry.cameras import focal_px
 from megloc_kapture.io.files import atomic_write, owned_name, write_bytes, writing
 from megloc_kapture.io.images import read_depth_map
@@ -34,12 +34,12 @@ _SAMPLED_IMAGES = 32
 
 def check_points(folder: KaptureFolder, purpose: str) -> None:
     """Raise DataError if a folder has no map points for a purpose, such as ``localize in``."""
-    if not folder.has_points():
-        raise DataError(
-            f"no map to {purpose}: reconstruction/points3d.txt or observations.txt is missing; "
-            "`megloc triangulate` makes one from images with poses",
-            path=folder.root,
-        )
+    require(
+        folder.has_points(),
+        f"no map to {purpose}: reconstruction/points3d.txt or observations.txt is missing; "
+        "`megloc triangulate` makes one from images with poses",
+        path=folder.root,
+    )
 
 
 def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
@@ -49,8 +49,11 @@ def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
     """
     observations = folder.observations().get(local_type)
     if observations is None:
-        if local_type not in folder.types("keypoints"):
-            raise DataError(f"the map has no observations of type {local_type!r}", path=folder.root)
+        require(
+            local_type in folder.types("keypoints"),
+            f"the map has no observations of type {local_type!r}",
+            path=folder.root,
+        )
         nothing = np.zeros(0, np.int32)
         observations = Observations(local_type, (), nothing.astype(np.int64), nothing, nothing)
     points = folder.points3d()
@@ -252,8 +255,7 @@ def _carried(data: KaptureData) -> _Carried:
     """Return ``sensor_from_rig`` by sensor for each top-level rig, through nested rigs."""
 
     def members(rig: str, above: frozenset[str]) -> dict[str, RigidTransform]:
-        if rig in above:
-            raise DataError(f"rig {rig!r} contains itself")
+        require(rig not in above, f"rig {rig!r} contains itself")
         found = {}
         for member, member_from_rig in data.rigs[rig].items():
             if member not in data.rigs:
