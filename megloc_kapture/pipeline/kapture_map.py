@@ -22,7 +22,7 @@ from megloc_kapture.mapping.map_check import Origin, PixelOrigin, find_pixel_ori
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice
-from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.local_features import check_lengths
 from megloc_kapture.stages.map_refinement import REPORT_FILE
 from megloc_kapture.stages.scene import check_points, index_map, observed_keypoints, with_noise

@@ -65,12 +65,12 @@ from megloc_kapture.stages.global_features import ExtractGlobalFeatures
 from megloc_kapture.stages.guided_pyramid import PyramidMapping
 from megloc_kapture.stages.image_pairs import PairMapping
 from megloc_kapture.stages.local_features import ExtractLocalFeatures
-from megloc_kapture.stages.localized_folder import set_aside_unreadable
 from megloc_kapture.stages.map_points import MakePoints
 from megloc_kapture.stages.map_refinement import RefineMap
 from megloc_kapture.stages.matches import MatchMapping
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.preprocessing import Preprocess
+from megloc_kapture.stages.query_poses import set_aside_unreadable
 from megloc_kapture.stages.stage import (
     MAP,
     MAPPING,

@@ -26,12 +26,14 @@ from megloc_kapture.plugins import (
     SEGMENTERS,
     PluginChoice,
 )
-from megloc_kapture.stages.candidates import QueryPairsOptions
 from megloc_kapture.stages.global_features import GlobalFeaturesChoice
-from megloc_kapture.stages.image_pairs import MappingPairsOptions, RerankingOptions
+from megloc_kapture.stages.image_pairs import (
+    MappingPairsOptions,
+    QueryPairsOptions,
+    RerankingOptions,
+)
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
 from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
-from megloc_kapture.stages.pose_refinement import PoseRefinementOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.query_poses import LocalizationOptions
 from megloc_kapture.values import Options
@@ -62,7 +64,6 @@ _MEGLOC = PipelineOptions(
     guided_pyramid=GuidedPyramidOptions(mode="all", count="matches"),
     refinement=MapRefinementOptions(uncertainty=UncertaintyOptions(max_robust_sigmas=2.5)),
     localization=LocalizationOptions(rank=PluginChoice(name="inliers")),
-    pose_refinement=PoseRefinementOptions(references="cluster"),
 )
 # weights with a free licence: docs/experiments/presets.md
 _MODERN = PipelineOptions(

@@ -329,7 +329,7 @@ class Photographs(Queries):
         if every is not None and every < 1:
             raise OptionError(f"every {every}th frame cannot be taken; give 1 or more")
         roots = [Path(path) for path in paths]
-        files, self.passed_over = _named_files(roots)
+        files = _named_files(roots)
         self.root = roots[0] if roots[0].is_dir() else roots[0].parent
         self.without_row: list[str] = []
         self._calibrated = {k: v for root in roots for k, v in _calibrated(root).items()}
@@ -357,11 +357,8 @@ class Photographs(Queries):
         return all(image.camera.focal_deviation == 0 for image in self._images.values())
 
     def describe(self) -> list[str]:
-        """Describe skipped files and images missing from the camera list."""
+        """Describe images that are missing from the camera list."""
         lines = []
-        if self.passed_over:
-            said = f"{len(self.passed_over)} files that are no images are left out"
-            lines.append(f"{said}: {_first(self.passed_over)}")
         if self.without_row:
             said = f"{len(self.without_row)} images are not in the list of cameras"
             lines.append(f"{said}, their cameras are estimated: {_first(self.without_row)}")
@@ -454,16 +451,13 @@ def _calibrated(root: Path) -> dict[str, Camera]:
     return found
 
 
-def _named_files(paths: Sequence[Path]) -> tuple[dict[str, Path], list[str]]:
+def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
     found: dict[str, Path] = {}
-    others: list[str] = []
     for path in paths:
         if is_kapture(path):
             files = _images_of_kapture(KaptureFolder(path))
         elif path.is_dir():
-            wanted, passed_over = _images_below(path)
-            files = {str(file.relative_to(path)): file for file in wanted}
-            others += [str(file.relative_to(path)) for file in passed_over]
+            files = {str(file.relative_to(path)): file for file in _images_below(path)}
             require(files, "no image or video in this folder", path=path)
         elif path.exists():
             require(
@@ -483,7 +477,7 @@ def _named_files(paths: Sequence[Path]) -> tuple[dict[str, Path], list[str]]:
                 )
             _check_name(name, file)
             found[name] = file
-    return dict(sorted(found.items())), others
+    return dict(sorted(found.items()))
 
 
 def _images_of_kapture(folder: KaptureFolder) -> dict[str, Path]:
@@ -497,7 +491,7 @@ def _images_of_kapture(folder: KaptureFolder) -> dict[str, Path]:
     return {name: folder.image_path(name) for name in data.image_names()}
 
 
-def _images_below(folder: Path) -> tuple[list[Path], list[Path]]:
+def _images_below(folder: Path) -> list[Path]:
     found, seen = list[Path](), set[str]()
     for place, folders, files in os.walk(folder, followlinks=True):
         here, real = Path(place), os.path.realpath(place)
@@ -511,8 +505,7 @@ def _images_below(folder: Path) -> tuple[list[Path], list[Path]]:
         folders[:] = sorted(shown, key=lambda name: ((here / name).is_symlink(), name))
         found += [here / name for name in files if not name.startswith(".")]
     named = {*WRITABLE_SUFFIXES, *UNREAD_SUFFIXES, *VIDEO_SUFFIXES}
-    wanted = {path for path in found if path.suffix.lower() in named or is_image(path)}
-    return sorted(wanted), sorted(set(found) - wanted)
+    return sorted(path for path in found if path.suffix.lower() in named or is_image(path))
 
 
 def _check_name(name: str, path: Path) -> None:

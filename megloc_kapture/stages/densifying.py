@@ -57,7 +57,7 @@ from megloc_kapture.plugins import (
     PluginChoice,
     StereoView,
 )
-from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.local_features import read_frame, read_image_of
 from megloc_kapture.stages.map_features import copy_features
 from megloc_kapture.stages.scene import (

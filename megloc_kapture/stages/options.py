@@ -21,10 +21,14 @@ from megloc_kapture.plugins import (
     PluginChoice,
 )
 from megloc_kapture.retrieval.search import FusionOptions
-from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
 from megloc_kapture.stages.densifying import DensifyOptions
 from megloc_kapture.stages.global_features import GlobalFeaturesChoice
-from megloc_kapture.stages.image_pairs import MappingPairsOptions, RerankingOptions
+from megloc_kapture.stages.image_pairs import (
+    MappingPairsOptions,
+    QueryPairsOptions,
+    RerankingOptions,
+    Retrieval,
+)
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
 from megloc_kapture.stages.matches import NoVerification, Verification
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions

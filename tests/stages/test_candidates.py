@@ -17,13 +17,13 @@ from megloc_kapture.io.kapture import (
     write_sensors,
 )
 from megloc_kapture.retrieval.search import FusionOptions, fuse
-from megloc_kapture.stages.candidates import (
+from megloc_kapture.stages.image_pairs import (
     UNRESTRICTED,
     QueryPairsOptions,
     Restrictions,
     Retrieval,
+    pair_queries,
 )
-from megloc_kapture.stages.image_pairs import pair_queries
 
 Folders = tuple[KaptureFolder, KaptureFolder]
 SIZES = {"short": 3, "long": 8}
