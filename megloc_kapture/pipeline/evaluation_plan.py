@@ -361,18 +361,14 @@ class Evaluate(_RunStage):
         provenance = self.settings() | {"versions": package_versions()}
         del provenance[PROTOCOL]  # the report shows the protocol as text
         output = work.out / EVALUATION
-        context = context_of(localized)
+        context, label = context_of(localized), self._run.label
         if not truth.is_dir():
-            found = results_without_truth(
-                [localized], benchmark_of(tables), labels=[self._run.label]
-            )
-            single = replace(found.evaluations[0], context=context)
-            found = replace(found, evaluations=(single,))
+            found = results_without_truth([localized], benchmark_of(tables), labels=[label])
+            found = replace(found, evaluations=(replace(found.evaluations[0], context=context),))
             write_report(output, found, map_poses=map_poses, provenance=provenance)
             return {"queries_with_truth": 0}
-        evaluation = evaluate(
-            localized, truth, side_tables=tables, label=self._run.label, mapping=work.path(MAPPING)
-        )
+        mapping = work.path(MAPPING)
+        evaluation = evaluate(localized, truth, side_tables=tables, label=label, mapping=mapping)
         evaluation = replace(evaluation, context=context)
         write_report(output, evaluation, map_poses=map_poses, provenance=provenance)
         row = evaluation.row()

@@ -23,7 +23,6 @@ from megloc_kapture.features.image_bound import (
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import FeatureConfig, FeatureReader, FeatureWriter, KaptureFolder
 from megloc_kapture.io.kapture.features import feature_folder, has_features
-from megloc_kapture.io.tables import append_mask_count, read_mask_counts, write_mask_counts
 from megloc_kapture.plugin_loading import checked_array
 from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.preprocessing.masks import with_margin
@@ -71,12 +70,12 @@ def extract_local_features(
         _SIZE,
     )
     writers: tuple[FeatureWriter, FeatureWriter] | None = None
+    masked = 0
     label = resumed_label(f"{extractor.name} features", len(jobs), len(todo))
     results = work.map(steps, todo, label)
     for job, features in zip(todo, results, strict=True):
         writers = writers or _writers(output, extractor, features)
-        if job.has_mask:
-            append_mask_count(output, extractor.name, job.image, features.num_masked)
+        masked += features.num_masked
         writers[0].write(job.image, features.keypoints_px)
         writers[1].write(job.image, features.descriptors)  # last: it marks the image as finished
     place = feature_folder(output, "keypoints", extractor.name, orphan=True)
@@ -85,10 +84,8 @@ def extract_local_features(
     bound = max_megapixels_of(extractor)
     if reduced := sum(bounded_size(*job.size, bound) != job.size for job in jobs):
         counts["images_reduced"] = reduced
-    if any(job.has_mask for job in jobs):
-        masked = read_mask_counts(output, extractor.name)
-        write_mask_counts(output, extractor.name, masked)
-        counts |= {"images_with_mask": len(masked), "keypoints_masked": sum(masked.values())}
+    if with_mask := sum(job.has_mask for job in jobs):
+        counts |= {"images_with_mask": with_mask, "keypoints_masked": masked}
     return counts
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from operator import itemgetter
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import require
 from megloc_kapture.geometry.cameras import focal_px
-from megloc_kapture.io.files import atomic_write, owned_name, write_bytes, writing
+from megloc_kapture.io.files import atomic_write, owned_name, write_bytes
 from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Observations
 from megloc_kapture.io.kapture.points import read_point_covariances
@@ -137,16 +137,10 @@ def shared_index(
     indices: Mapping[str, MapIndex], scratch: Path | None = None
 ) -> Iterator[dict[str, Path]]:
     """Share indices by keypoints type as temporary folders; open indices stay valid afterwards."""
-    where = tempfile.gettempdir() if scratch is None else scratch
-    with writing(where):
-        place = tempfile.TemporaryDirectory(
-            prefix=f".{owned_name()}", dir=where, ignore_cleanup_errors=True
-        )
-    with place as name:
-        folders = {}
-        for number, (keypoints_type, index) in enumerate(indices.items()):
-            folders[keypoints_type] = Path(name) / str(number)
-            write_index(index, folders[keypoints_type])
+    with TemporaryDirectory(prefix=f".{owned_name()}", dir=scratch) as place:
+        folders = {name: Path(place) / str(at) for at, name in enumerate(indices)}
+        for name, folder in folders.items():
+            write_index(indices[name], folder)
         yield folders
 
 
