@@ -17,7 +17,7 @@ from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.live_source import LiveSource, MapMatching, local_types_of
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.queries import Preprocessor, Query, QueryImages, Unit
+from megloc_kapture.pipeline.queries import Preprocessor, Query, Unit
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import MapRefiners
 from megloc_kapture.stages.query_poses import localize_query, unreadable_image
@@ -142,7 +142,8 @@ class Localizer:
                 LiveSource(self.matching, image, cam_from_rig)
                 for image, (_, cam_from_rig) in zip(images, unit, strict=True)
             ]
-            scene = KaptureScene(self.map.folder, QueryImages(images), map_camera=self.map.camera)
+            by_name = {image.query.name: image for image in images}
+            scene = KaptureScene(self.map.folder, by_name, map_camera=self.map.camera)
             results = localize_query(
                 [source.view for source in sources],
                 interleave([source.candidates for source in sources]),

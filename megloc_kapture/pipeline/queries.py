@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -160,6 +160,10 @@ class QueryImage:
         return self._frame.mask
 
     @property
+    def depth(self) -> DepthView | None:
+        return self.query.read_depth()
+
+    @property
     def feature_mask(self) -> NDArray[np.bool_] | None:
         mask = self.mask
         return None if mask is None else with_margin(mask, self._preprocessor.mask_margin_px)
@@ -170,22 +174,6 @@ class QueryImage:
     def describe(self, extractor: GlobalFeatureExtractor) -> NDArray[np.float32]:
         """Return the global feature, float32 (D,)."""
         return describe_images(extractor, [self.pixels], [self.query.name])[0]
-
-
-class QueryImages:
-    """Images by name, for :class:`~megloc_kapture.stages.scene.KaptureScene`."""
-
-    def __init__(self, images: Iterable[QueryImage]) -> None:
-        self._images = {image.query.name: image for image in images}
-
-    def image(self, name: str) -> NDArray[np.uint8]:
-        return self._images[name].pixels
-
-    def mask(self, name: str) -> NDArray[np.bool_] | None:
-        return self._images[name].mask
-
-    def depth(self, name: str) -> DepthView | None:
-        return self._images[name].query.read_depth()
 
 
 Unit = tuple[tuple[Query, RigidTransform], ...]

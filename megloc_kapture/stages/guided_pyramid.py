@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from operator import itemgetter
@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from megloc_kapture.io.files import hard_link
 from megloc_kapture.io.kapture import (
-    FeatureReader,
     FeatureWriter,
     ImagePair,
     KaptureFolder,
@@ -54,7 +53,6 @@ from megloc_kapture.stages.local_features import check_lengths, extract_all, rea
 from megloc_kapture.stages.matches import (
     MATCHING_OPTIONS,
     Features,
-    NoVerification,
     Verification,
     cached_features,
     mapping_pairs,
@@ -257,7 +255,7 @@ def retry_query(
     assert not isinstance(verification, KnownPoseOptions)
 
     def judge(other: str, features: Features) -> PairVerifier:
-        if isinstance(verification, NoVerification):
+        if verification is None:
             return UNVERIFIED
         return two_view_of_variants(
             query.camera, query.keypoints_px, features.camera, features.keypoints_px, base[other],
@@ -312,7 +310,7 @@ def pyramid_mapping(
     stored, keypoints = mapping.matches(local_type), mapping.keypoints(local_type)
     counts = {pair: len(stored.read(*pair)[0]) for pair in named}
     found = num_found or {}
-    is_hard = method.options.is_hard
+    is_hard, mode = method.options.is_hard, method.options.mode
     hard = [p for p in named if is_hard(found.get(p, counts[p]), counts[p]) and can_gain(*p)]
     others: dict[str, tuple[list[str], list[str]]] = defaultdict(lambda: ([], []))
     for a, b in hard:
@@ -325,21 +323,34 @@ def pyramid_mapping(
     jobs = [(image, *others[image]) for image in sorted(others)]
     plugins = method.extractor, method.matcher
     results = work.map(again, jobs, "guided pyramid", plugins=plugins)
-    variants = _VariantsOfMap(keypoints)
-    for (image, *names), matched in zip(jobs, results, strict=True):
-        variants.put(image, list(chain(*names)), matched)
+    matched_of: dict[_Pair, tuple[list[VariantMatches], str]] = {}
+    for (image, *names), (of_pairs, skipped) in zip(jobs, results, strict=True):
+        for other, of_pair in zip(chain(*names), of_pairs, strict=True):
+            matched_of[image, other] = of_pair, skipped
+    unions: dict[str, KeypointUnion] = {}
+    added: dict[str, list[NDArray[Any]]] = defaultdict(list)  # descriptors
     tried, hard_pairs = [], set(hard)
     with MatchesWriter(output, pyramid_type(local_type), orphan=True) as writer:
         for pair in named:
             matches, scores = stored.read(*pair)
-            if pair in hard_pairs:
-                combined, one = variants.combine(pair, (matches, scores), method)
-                tried.append(one)
+            if pair in hard_pairs and mode != "off":
+                directed = matched_of[pair], matched_of[pair[::-1]]
+                variants = [
+                    (at, one) for at, (of_pair, _) in enumerate(directed) for one in of_pair
+                ]
+                for image in set(pair) - unions.keys():
+                    unions[image] = KeypointUnion(keypoints.read(image))
+                both = unions[pair[0]], unions[pair[1]]
+                combined = combine((matches, scores), variants, mode, both)
+                for image, new in zip(pair, combined.added, strict=True):
+                    added[image] += [variants[at][1].descriptors[row] for at, row in new.tolist()]
+                skipped = " | ".join(reason for _, reason in directed if reason)
+                tried.append(_tried(pair, len(matches), combined, skipped))
                 matches, scores = combined.matches, combined.scores
             writer.write(*pair, matches, scores)
-    extended = {image: own for image, own in sorted(variants.added.items()) if own.descriptors}
-    for image, own in extended.items():
-        features.write(image, own.keypoints_px, np.stack(own.descriptors))
+    extended = sorted(image for image, descriptors in added.items() if descriptors)
+    for image in extended:
+        features.write(image, unions[image].added(), np.stack(added[image]))
     features.write_rest()
     return {
         "images_extracted_again": len(jobs),
@@ -360,7 +371,7 @@ def _match_again(
     itself = cached_features(mapping, local_type, image)
 
     def judge(other: str, features: Features) -> PairVerifier:
-        if isinstance(verification, NoVerification):
+        if verification is None:
             return UNVERIFIED
         image_from_world = folder.read().cam_from_world(image)
         other_from_world = folder.read().cam_from_world(other)
@@ -381,50 +392,6 @@ def _match_again(
         only_scaled=only_scaled,
         name=image,
     )
-
-
-@dataclass(eq=False)
-class _Added:
-    """Keypoints (A, C) added to an image, and their descriptors (D,)."""
-
-    keypoints_px: NDArray[np.float32]
-    descriptors: list[NDArray[Any]] = field(default_factory=list)
-
-
-class _VariantsOfMap:
-    def __init__(self, keypoints: FeatureReader) -> None:
-        self._keypoints = keypoints
-        # matches by variant, and reasons of skipped ones
-        self._found: dict[_Pair, tuple[list[VariantMatches], str]] = {}
-        self.added: dict[str, _Added] = {}
-
-    def put(
-        self, image: str, others: Sequence[str], matched: tuple[list[list[VariantMatches]], str]
-    ) -> None:
-        found, skipped = matched
-        for other, of_pair in zip(others, found, strict=True):
-            self._found[image, other] = of_pair, skipped
-
-    def combine(
-        self, pair: _Pair, base: tuple[NDArray[np.int64], NDArray[Any]], method: PyramidMethod
-    ) -> tuple[Combined, TriedPair]:
-        """Combine a pair's matches with its variant matches."""
-        assert method.options.mode != "off"
-        directed = self._found[pair], self._found[pair[::-1]]
-        tried = [(side, one) for side, (found, _) in enumerate(directed) for one in found]
-        unions = []
-        for image in pair:
-            stored = self._keypoints.read(image)
-            if image not in self.added:
-                self.added[image] = _Added(stored[:0])
-            unions.append(KeypointUnion(stored, self.added[image].keypoints_px))
-        combined = combine(base, tried, method.options.mode, (unions[0], unions[1]))
-        for image, union, new in zip(pair, unions, combined.added, strict=True):
-            added = self.added[image]
-            added.keypoints_px = union.added()
-            added.descriptors += [tried[number][1].descriptors[row] for number, row in new.tolist()]
-        skipped = " | ".join(why for _, why in directed if why)
-        return combined, _tried(pair, len(base[0]), combined, skipped)
 
 
 def pyramid_queries(

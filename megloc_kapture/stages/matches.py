@@ -11,7 +11,7 @@ from functools import cached_property, lru_cache, partial
 from itertools import combinations, groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +57,7 @@ from megloc_kapture.stages.work import (
     open_folder,
     resumed_label,
 )
-from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
+from megloc_kapture.values import Camera, ImageFeatures, RigidTransform
 
 _log = logging.getLogger(__name__)
 
@@ -68,13 +68,8 @@ _CHECKED_GROUPS = 6
 _RANKS = (0, 1, 3, 7, 15)  # ranks of the other group members among the images paired with the first
 
 
-class NoVerification(Options):
-    """Keep every match."""
-
-    kind: Literal["none"] = "none"
-
-
-Verification = KnownPoseOptions | TwoViewOptions | NoVerification
+Verification = KnownPoseOptions | TwoViewOptions | None
+"""Options of a verification by known poses or by a two-view model; None keeps every match."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,7 +299,7 @@ def verification_of(
 
     def verify(a: Features, b: Features, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
         rows_a, rows_b = matches.T
-        if isinstance(options, NoVerification):
+        if options is None:
             return np.ones(len(matches), dtype=bool)
         if isinstance(options, TwoViewOptions):
             points_px = a.keypoints_px[rows_a, :2], b.keypoints_px[rows_b, :2]
@@ -344,6 +339,7 @@ def iterate_candidates(pairs: Sequence[ImagePair]) -> Iterator[tuple[str, list[s
 
 # options that determine the local feature types and their matching
 MATCHING_OPTIONS = ("local_features", "matching", "verification")
+EXPLAINED = ("map", *MATCHING_OPTIONS)
 
 
 def mapping_pairs(work: StageWork, mapping: KaptureFolder) -> list[ImagePair]:
@@ -352,22 +348,13 @@ def mapping_pairs(work: StageWork, mapping: KaptureFolder) -> list[ImagePair]:
     return [p for p in read_pairs(work.path(MAPPING_PAIRS)) if {p.query, p.map} <= names]
 
 
-class _MatchStage(PipelineStage):
-    resumes = True
-
-    def explain(self) -> str:
-        options = self.options
-        matched = (
-            f"{o.name} by {(o.matching or options.matching).name}" for o in options.local_features
-        )
-        return f"map = {options.map}, {', '.join(matched)}, verification = {options.verification}"
-
-
-class MatchMapping(_MatchStage):
+class MatchMapping(PipelineStage):
     """Match and verify pairs of map images."""
 
     name = "mapping_matches"
     version = 3
+    resumes = True
+    explained_by = EXPLAINED
     uses = (*MATCHING_OPTIONS, "mapping_verification")
     inputs = (Layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS)
     outputs = (MAPPING_MATCHES,)
@@ -395,11 +382,13 @@ class MatchMapping(_MatchStage):
         return counts
 
 
-class MatchQueries(_MatchStage):
+class MatchQueries(PipelineStage):
     """Match and verify queries with their candidates, before reranking with all of them."""
 
     name = "query_matches"
     version = 4
+    resumes = True
+    explained_by = EXPLAINED
     uses = (*MATCHING_OPTIONS, "query_verification")
     inputs = (Layout.mapping, Layout.query, LOCAL_FEATURES, Layout.candidates)
     outputs = (QUERY_MATCHES,)

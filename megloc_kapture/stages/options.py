@@ -30,7 +30,7 @@ from megloc_kapture.stages.image_pairs import (
     Retrieval,
 )
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
-from megloc_kapture.stages.matches import NoVerification, Verification
+from megloc_kapture.stages.matches import Verification
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.query_poses import LocalizationOptions
@@ -169,10 +169,10 @@ class PipelineOptions(Options):
         return matcher
 
     def verify_mapping(self) -> Verification:
-        return NoVerification() if self.verification == "none" else self.mapping_verification
+        return None if self.verification == "none" else self.mapping_verification
 
     def verify_photographs(self) -> Verification:
-        return NoVerification() if self.verification == "none" else self.query_verification
+        return None if self.verification == "none" else self.query_verification
 
     def verify_queries(self) -> Verification:
-        return self.query_verification if self.verification == "geometric" else NoVerification()
+        return self.query_verification if self.verification == "geometric" else None

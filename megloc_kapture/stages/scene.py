@@ -330,23 +330,26 @@ def depth_of(folder: KaptureFolder, name: str) -> DepthView | None:
 class KaptureScene:
     """:class:`~megloc_kapture.plugins.RankingScene` of a map folder and its queries.
 
-    ``query`` is a folder, or an object with ``image``, ``mask`` and ``depth`` by name.
+    ``query`` is a folder, or images by name with ``pixels``, ``mask`` and ``depth``.
     ``map_camera`` returns the camera of a map image by name, by default the stored one.
     """
 
     def __init__(
         self,
         mapping: KaptureFolder,
-        query: Any = None,
+        query: KaptureFolder | Mapping[str, Any] | None = None,
         *,
         map_camera: Callable[[str], Camera] | None = None,
     ) -> None:
         self._map = _images_of(mapping)
-        queries = _images_of(query) if isinstance(query, KaptureFolder) else query
-        if queries is not None:
-            self.query_image = queries.image
-            self.query_mask = queries.mask
+        if isinstance(query, KaptureFolder):
+            queries = _images_of(query)
+            self.query_image, self.query_mask = queries.image, queries.mask
             self.query_depth = queries.depth
+        elif query is not None:
+            self.query_image = lambda name: query[name].pixels
+            self.query_mask = lambda name: query[name].mask
+            self.query_depth = lambda name: query[name].depth
         self.map_image = self._map.image
         self.map_mask = self._map.mask
         self.map_depth = self._map.depth

@@ -30,10 +30,6 @@ BATCH = 8  # for batch plugins without a device option
 MOST_AT_ONCE = {"cpu": 1, "cuda": 16}
 
 
-class DeviceMemoryError(MeglocError):
-    """Out of memory for a single image or pair."""
-
-
 def on_gpu(plugin: object) -> bool:
     return _device_of(plugin) not in (None, "cpu")
 
@@ -69,7 +65,7 @@ def in_batches(
 ) -> list[Result]:
     """Run a plugin on items in batches, halved when memory runs out.
 
-    Raise DeviceMemoryError if one item does not fit.
+    Raise MeglocError if one item does not fit.
     """
     key = type(plugin).__qualname__, many, repr(getattr(plugin, "options", None))
     found: list[Result] = []
@@ -83,7 +79,7 @@ def in_batches(
             if not is_out_of_memory(error):
                 raise
             if len(batch) == 1:
-                raise DeviceMemoryError(
+                raise MeglocError(
                     f"{name(len(found))}: there is not enough memory for it alone; make images "
                     "smaller (max_megapixels, preprocessing.max_size_px), keep fewer keypoints, or "
                     "compute on another device (--device)"

@@ -41,7 +41,7 @@ def test_each_stage_says_whether_it_is_on_and_why() -> None:
     off = {name for name, line in lines.items() if not line["on"]}
     assert off == {"densify", "refine_poses"}
     assert lines["local_features"]["why"] == "local_features = superpoint + aslfeat"
-    assert "superpoint by superglue, aslfeat by nn" in lines["query_matches"]["why"]
+    assert "local_features = superpoint + aslfeat" in lines["query_matches"]["why"]
     assert lines["mapping_pairs"]["why"].endswith("by = poses + covisibility + retrieval")
     assert lines["query_pairs"]["why"] == (
         "reranking.by = verified, reranking.keep = 20, reranking.local_type = superpoint"

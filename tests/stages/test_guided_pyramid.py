@@ -35,7 +35,7 @@ from megloc_kapture.stages.guided_pyramid import (
 )
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.map_points import triangulate_map
-from megloc_kapture.stages.matches import Features, NoVerification, match_pairs
+from megloc_kapture.stages.matches import Features, match_pairs
 from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera, ImageFeatures, LocalFeatures, Pose, RigidTransform
@@ -415,7 +415,7 @@ def test_without_verification_every_match_of_a_variant_is_kept(
     scene: Scene, tmp_path: Path, kind: str
 ) -> None:
     one_turn = GuidedPyramidOptions(mode="max", scales=(1.0,), rotations_deg=(270,))
-    none = {"verification": NoVerification()}
+    none = {"verification": None}
     unverified = scene.retry(kind, tmp_path / "none", options=one_turn, **none)
     verified = scene.retry(kind, tmp_path / "verified", options=one_turn)
     assert unverified["pairs_tried"] == verified["pairs_tried"] > 0

@@ -20,7 +20,6 @@ from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import (
-    NoVerification,
     check_given_poses,
     iterate_candidates,
     match_all,
@@ -50,7 +49,7 @@ def run(world: Any, kind: str, verification: Any, output: Path, **more: Any) -> 
 def test_all_of_the_matchers_matches_are_kept_or_those_that_are_verified(
     world: Any, tmp_path: Path
 ) -> None:
-    run(world, "query", NoVerification(), tmp_path / "all")
+    run(world, "query", None, tmp_path / "all")
     run(world, "query", TwoViewOptions(), tmp_path / "verified")
     everything, verified = (
         world.mapping().with_features([tmp_path / name]).matches("rootsift")
@@ -93,8 +92,8 @@ def test_a_pair_without_matches_is_known_and_one_asked_for_twice_matched_once(
     matcher = NearestNeighbours()
     for pairs, how, name, counts in (
         (asked, KnownPoseOptions(), "none verified", (2, 0, 0)),
-        (asked, NoVerification(), "all", (2, 1, 4)),
-        ([], NoVerification(), "no pairs", (0, 0, 0)),
+        (asked, None, "all", (2, 1, 4)),
+        ([], None, "no pairs", (0, 0, 0)),
     ):
         output = tmp_path / name
         found = match_pairs(folder, folder, pairs, "toy", matcher, how, output)
@@ -152,7 +151,7 @@ def test_what_has_no_features_is_named(world: Any, tmp_path: Path) -> None:
     def match(image: str, local_type: str) -> None:
         match_pairs(
             world.mapping(), world.mapping(), [ImagePair("left/0.png", image, 1.0)], local_type,
-            NearestNeighbours(), NoVerification(), tmp_path,
+            NearestNeighbours(), None, tmp_path,
         )  # fmt: skip
 
     with pytest.raises(DataError, match="no keypoints of type 'r2d2' .* there are: rootsift"):
