@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.errors import DataError, MeglocError, require
+from megloc_kapture.errors import MeglocError, require
 from megloc_kapture.geometry.cameras import focal_px
 from megloc_kapture.io.dataset_tables import SIDE_TABLES
 from megloc_kapture.io.files import link_images, link_records, remove, safe_join
@@ -110,10 +110,7 @@ def read_beside(
     path = side_file(root, image, kind)
     if not path.is_file():
         return None
-    try:
-        found = np.load(path, allow_pickle=False).astype(np.float32)
-    except (OSError, ValueError) as error:
-        raise DataError(f"no array of numpy: {error}", path=path) from error
+    found = np.load(path).astype(np.float32)
     return np.asarray(found / np.float32(127) if kind == "normals" else found)
 
 
