@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -330,6 +330,15 @@ class QueryView:
         """Return the map images with matches, in the given order."""
         named = (image for own in self.matches for image, pairs, _ in own.matches if len(pairs))
         return list(dict.fromkeys(named))
+
+    def among(self, images: Sequence[str]) -> QueryView:
+        """Keep the matches with these map images only."""
+        members = set(images)
+        kept = (
+            replace(typed, matches=[pair for pair in typed.matches if pair[0] in members])
+            for typed in self.matches
+        )
+        return replace(self, matches=tuple(kept))
 
     def view(self, found: Sequence[Correspondences]) -> View:
         """Return the camera with its 2D-3D matches, all types concatenated."""

@@ -42,6 +42,7 @@ from megloc_kapture.stages.matches import (
     CACHED_IMAGES,
     Features,
     VerifiedMatches,
+    best_pairs,
     match_all,
     verification_of,
     verified,
@@ -92,6 +93,10 @@ class LocalType:
         return found
 
     @cached_property
+    def second_matcher(self) -> Matcher | None:
+        return self._options.make_second_matcher()
+
+    @cached_property
     def extractor(self) -> LocalFeatureExtractor:
         found = self.brought()
         if found is None:
@@ -126,14 +131,16 @@ class LocalType:
         """Return descriptors (N, D) of a map image."""
         return self.first.descriptors(image) if self._again is None else self._again[image]
 
-    def match(self, query: Features, images: Sequence[str]) -> list[VerifiedMatches]:
+    def match(
+        self, query: Features, images: Sequence[str], matcher: Matcher | None = None
+    ) -> list[VerifiedMatches]:
         found = dict.fromkeys(images, _NO_MATCHES)
         verify = verification_of(self._options.verify_queries())
         # limits the features in memory
         for names in batched((image for image in images if image in self.first), BATCH):
             others = [self._map_features(self.first, name) for name in names]
             labels = [f"pair with {name}" for name in names]
-            pairs = match_all(self.matcher, query, others, labels)
+            pairs = match_all(matcher or self.matcher, query, others, labels)
             for name, other, pair in zip(names, others, pairs, strict=True):
                 found[name] = verified(query, other, pair, verify)
         return [found[image] for image in images]
@@ -141,12 +148,19 @@ class LocalType:
     def match_again(
         self, query: Features, pairs: Mapping[str, VerifiedMatches], image: QueryImage
     ) -> tuple[NDArray[np.float32], list[ImageMatches], str]:
-        """Match map images with few matches by guided pyramid matching, if enabled.
+        """Match the best map images with the second matcher, and those with few matches by guided
+        pyramid matching, as far as these are enabled.
 
         Returns query keypoints with added ones last, matches in the order of ``pairs``, and the
         reason if the pyramid was skipped, else "".
         """
         options = self._options
+        if self.second_matcher is not None:
+            verified = {("", name): len(pair.matches) for name, pair in pairs.items()}
+            best = best_pairs(verified, options.second_matching.pairs, of_both=False)
+            names = [name for _, name in best]
+            again = self.match(query, names, self.second_matcher)
+            pairs = {**pairs, **dict(zip(names, again, strict=True))}
         is_hard = options.guided_pyramid.is_hard
         matches = [(name, pair.matches, pair.scores) for name, pair in pairs.items()]
         if not any(is_hard(pair.num_found, len(pair.matches)) for pair in pairs.values()):
@@ -306,7 +320,9 @@ class MapMatching:
         options = self.options.query_pairs
         if options.by == "exhaustive" or not permitted:
             return permitted
-        if len(permitted) <= options.top_k and not self.is_at_hand(query.global_features):
+        all_taken = len(permitted) <= options.top_k
+        in_order = self.options.localization.sure_confidence is not None
+        if all_taken and not in_order and not self.is_at_hand(query.global_features):
             return permitted
         return self.rank(image, features, permitted)
 
@@ -527,25 +543,48 @@ def _unit(rows: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 class LiveSource:
-    """Candidates and matches of one camera, computed from its image."""
+    """Matches of one camera, computed with as many candidates as are asked for.
+
+    Reranking, a second matcher and guided pyramids need the matches with all candidates first.
+    """
 
     def __init__(
         self, matching: MapMatching, image: QueryImage, cam_from_rig: RigidTransform
     ) -> None:
         self.image, self.clock = image, Clock()
         self.remarks: list[str] = []
-        features = matching.features(image)
+        self._matching, self._cam_from_rig = matching, cam_from_rig
+        self._features = matching.features(image)
         self.clock.lap("extraction")
-        ranked = matching.candidates(image, features)
+        self._ranked = self.candidates = matching.candidates(image, self._features)
         self.clock.lap("retrieval")
-        matches = matching.match(features, ranked)
-        kept = matching.rerank(matches)
-        self.candidates = [ranked[row] for row in kept]
-        typed = []
-        for local, of_query, of_type in zip(matching.types, features, matches, strict=True):
-            pairs = {ranked[row]: of_type[row] for row in kept}
-            keypoints_px, named, remark = local.match_again(of_query, pairs, image)
+        self._matches: list[list[VerifiedMatches]] = [[] for _ in matching.types]
+        options = matching.options
+        self._needs_all = options.reranking.reranks() or options.matches_again()
+        if self._needs_all:
+            self._view = self._match(len(self._ranked))
+
+    def view(self, count: int) -> QueryView:
+        view = self._view if self._needs_all else self._match(count)
+        return view.among(self.candidates[:count])
+
+    def _match(self, count: int) -> QueryView:
+        """Match the first ``count`` ranked images, as far as they are not matched yet."""
+        self.clock.start()
+        images, types = self._ranked[:count], self._matching.types
+        num_matched = min(map(len, self._matches), default=0)
+        new = self._matching.match(self._features, images[num_matched:])
+        for matches, added in zip(self._matches, new, strict=True):
+            matches += added
+        kept = self._matching.rerank(self._matches)
+        typed, self.remarks = [], []
+        for local, features, matches in zip(types, self._features, self._matches, strict=True):
+            pairs = {images[row]: matches[row] for row in kept}
+            keypoints_px, named, remark = local.match_again(features, pairs, self.image)
             self.remarks += [remark] if remark else []
             typed.append(TypedMatches(local.points.index, keypoints_px, named))
+        if self._needs_all:
+            self.candidates = [images[row] for row in kept]
         self.clock.lap("matching")
-        self.view = QueryView(image.query.name, image.camera, tuple(typed), cam_from_rig)
+        image = self.image
+        return QueryView(image.query.name, image.camera, tuple(typed), self._cam_from_rig)

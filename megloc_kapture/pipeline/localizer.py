@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.localization.cluster_poses import interleave
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
 from megloc_kapture.pipeline.live_source import LiveSource, MapMatching, local_types_of
@@ -145,8 +144,7 @@ class Localizer:
             by_name = {image.query.name: image for image in images}
             scene = KaptureScene(self.map.folder, by_name, map_camera=self.map.camera)
             results = localize_query(
-                [source.view for source in sources],
-                interleave([source.candidates for source in sources]),
+                sources,
                 self.options.localization,
                 frame_of=self.map.restrictions.frame,
                 centers=self._centers,

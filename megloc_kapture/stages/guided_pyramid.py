@@ -1,4 +1,7 @@
-"""Guided pyramid matching (MegLoc): poor pairs matched again at other scales and rotations.
+"""Pairs matched again by stronger means: a second matcher, then guided pyramids (MegLoc).
+
+The second matcher matches the best pairs of each image; guided pyramids match poor pairs at other
+scales and rotations.
 
 The result is a keypoints type ``T-pyramid``: the keypoints of T, unchanged, followed by the added
 ones, with the matches of all pairs. Indices into T are therefore valid in T-pyramid. All variants
@@ -30,7 +33,7 @@ from megloc_kapture.io.kapture import (
     read_pairs,
 )
 from megloc_kapture.io.kapture.features import SUFFIX, feature_folder
-from megloc_kapture.io.tables import read_match_counts
+from megloc_kapture.io.tables import PairCount, read_match_counts
 from megloc_kapture.localization.map_index import ImageMatches
 from megloc_kapture.mapping.pairs import views_can_overlap
 from megloc_kapture.matching.guided_pyramid import (
@@ -54,9 +57,11 @@ from megloc_kapture.stages.matches import (
     MATCHING_OPTIONS,
     Features,
     Verification,
+    best_pairs,
     cached_features,
     mapping_pairs,
     match_all,
+    match_pairs,
 )
 from megloc_kapture.stages.stage import (
     FEATURES,
@@ -464,48 +469,89 @@ def _retry(
     )
 
 
-class _PyramidStage(PipelineStage):
+class _AgainStage(PipelineStage):
+    """Match the best pairs again with a second matcher, and poor pairs in guided pyramids."""
+
     version = 4
     matches: ClassVar[str]
     explained_by = (
         "guided_pyramid.mode",
         "guided_pyramid.min_matches",
         "guided_pyramid.count",
+        "second_matching.matcher",
+        "second_matching.pairs",
     )
 
     def is_wanted(self) -> bool:
-        return self.options.uses_pyramid()
+        return self.options.matches_again()
 
     def plugins(self) -> Sequence[object]:
-        extractors = self.options.make_extractors()
-        return [*extractors, *(self.options.make_matcher(one.name) for one in extractors)]
+        extractors, second = self.options.make_extractors(), self.options.make_second_matcher()
+        matchers = [self.options.make_matcher(extractor.name) for extractor in extractors]
+        return [*extractors, *matchers, *(() if second is None else (second,))]
 
-    def _retry(self, work: StageWork, verification: Verification, retry: Any) -> dict[str, float]:
-        """Call ``retry(local_type, method, output, num_found=, work=)`` for each type."""
+    def _match_again(
+        self,
+        work: StageWork,
+        first: KaptureFolder,
+        second: KaptureFolder,
+        pairs: Sequence[ImagePair],
+        verification: Verification,
+    ) -> dict[str, float]:
         options, out = self.options, work.out / self.writes[0]
+        second_matcher, within_one = options.make_second_matcher(), first.root == second.root
         counts: dict[str, float] = {}
         for extractor in options.make_extractors():
             name = extractor.name
-            method = PyramidMethod(
-                extractor,
-                options.make_matcher(name),
-                verification,
-                options.guided_pyramid,
-                options.mask_margin_px,
-            )
-            rows = read_match_counts(work.path(self.matches), name)
-            num_found = {(row.image, row.other): row.matches for row in rows}
-            found = retry(name, method, out, num_found=num_found, work=work)
-            counts |= {f"{name} {key}": count for key, count in found.items()}
+            rows = _match_counts(work.path(self.matches), name)
+            if second_matcher is not None:
+                best = best_pairs(
+                    {pair: rows[pair].verified for pair in _named(pairs) & rows.keys()},
+                    options.second_matching.pairs,
+                    of_both=within_one,
+                )
+                again = [ImagePair(*pair, 1.0) for pair in best]
+                matched = match_pairs(
+                    first, second, again, name, second_matcher, verification, out, work=work
+                )
+                rows |= _match_counts(out, name)
+                counts |= {f"{name} second {key}": count for key, count in matched.items()}
+            if options.uses_pyramid():
+                matcher, margin_px = options.make_matcher(name), options.mask_margin_px
+                method = PyramidMethod(
+                    extractor, matcher, verification, options.guided_pyramid, margin_px
+                )
+                folder = first.with_features([out, *first.features_dirs])
+                retry = partial(pyramid_queries, folder, second)
+                if within_one:
+                    retry = partial(pyramid_mapping, folder)
+                num_found = {pair: row.matches for pair, row in rows.items()}
+                retried = retry(pairs, name, method, out, num_found=num_found, work=work)
+                counts |= {f"{name} {key}": count for key, count in retried.items()}
         return counts
 
 
-class PyramidMapping(_PyramidStage):
-    """Match pairs of map images again, at other scales and rotations."""
+def _match_counts(features_dir: Path, local_type: str) -> dict[_Pair, PairCount]:
+    return {(row.image, row.other): row for row in read_match_counts(features_dir, local_type)}
+
+
+def _named(pairs: Sequence[ImagePair]) -> set[_Pair]:
+    """Return the names of the pairs in both orders, as map pairs are stored in one."""
+    return {names for p in pairs for names in ((p.query, p.map), (p.map, p.query))}
+
+
+class PyramidMapping(_AgainStage):
+    """Match pairs of map images again: with a second matcher, at other scales and rotations."""
 
     name = "mapping_pyramid"
     matches = MAPPING_MATCHES
-    uses = (*MATCHING_OPTIONS, "mapping_verification", "guided_pyramid", "mask_margin_px")
+    uses = (
+        *MATCHING_OPTIONS,
+        "mapping_verification",
+        "second_matching",
+        "guided_pyramid",
+        "mask_margin_px",
+    )
     inputs = (Layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS, MAPPING_MATCHES)
     outputs = (MAPPING_PYRAMID,)
 
@@ -514,16 +560,23 @@ class PyramidMapping(_PyramidStage):
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         mapping = work.folder(self.layout.mapping(), FEATURES, MAPPING_MATCHES)
-        retry = partial(pyramid_mapping, mapping, mapping_pairs(work, mapping))
-        return self._retry(work, self.options.verify_mapping(), retry)
+        pairs = mapping_pairs(work, mapping)
+        return self._match_again(work, mapping, mapping, pairs, self.options.verify_mapping())
 
 
-class PyramidQueries(_PyramidStage):
+class PyramidQueries(_AgainStage):
     """Match queries with candidates again; see :class:`PyramidMapping`."""
 
     name = "query_pyramid"
     matches = QUERY_MATCHES
-    uses = (*MATCHING_OPTIONS, "map", "query_verification", "guided_pyramid", "mask_margin_px")
+    uses = (
+        *MATCHING_OPTIONS,
+        "map",
+        "query_verification",
+        "second_matching",
+        "guided_pyramid",
+        "mask_margin_px",
+    )
     inputs = (
         Layout.mapping,
         Layout.query,
@@ -537,5 +590,5 @@ class PyramidQueries(_PyramidStage):
     def run(self, work: StageWork) -> Mapping[str, float]:
         query = work.folder(self.layout.query(), FEATURES, QUERY_MATCHES)
         mapping = work.folder(self.layout.mapping(), FEATURES, *self.layout.mapping_matches())
-        retry = partial(pyramid_queries, query, mapping, read_pairs(work.path(QUERY_PAIRS)))
-        return self._retry(work, self.options.verify_queries(), retry)
+        pairs = read_pairs(work.path(QUERY_PAIRS))
+        return self._match_again(work, query, mapping, pairs, self.options.verify_queries())

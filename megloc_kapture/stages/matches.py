@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from megloc_kapture.errors import PluginError, require
 from megloc_kapture.geometry.cameras import bearing_rays
@@ -36,7 +37,7 @@ from megloc_kapture.matching.verification import (
     verify_with_poses,
 )
 from megloc_kapture.plugin_loading import checked_array
-from megloc_kapture.plugins import Matcher
+from megloc_kapture.plugins import Matcher, PluginChoice
 from megloc_kapture.stages.local_features import check_lengths
 from megloc_kapture.stages.stage import (
     FEATURES,
@@ -57,7 +58,7 @@ from megloc_kapture.stages.work import (
     open_folder,
     resumed_label,
 )
-from megloc_kapture.values import Camera, ImageFeatures, RigidTransform
+from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
 
 _log = logging.getLogger(__name__)
 
@@ -70,6 +71,20 @@ _RANKS = (0, 1, 3, 7, 15)  # ranks of the other group members among the images p
 
 Verification = KnownPoseOptions | TwoViewOptions | None
 """Options of a verification by known poses or by a two-view model; None keeps every match."""
+
+
+class SecondMatchingOptions(Options):
+    """Second pass of matching: the best pairs again, with another matcher."""
+
+    matcher: PluginChoice | None = Field(
+        default=None,
+        description="matcher whose matches replace those of the best pairs; none: no second pass",
+    )
+    pairs: int = Field(
+        default=5,
+        gt=0,
+        description="pairs of each query and each map image, those with most verified matches",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +170,23 @@ def match_pairs(
         "pairs_with_matches": sum(row.verified > 0 for row in rows),
         "matches": sum(row.verified for row in rows),
     }
+
+
+def best_pairs(
+    verified: Mapping[tuple[str, str], int], number: int, *, of_both: bool
+) -> list[tuple[str, str]]:
+    """Return the ``number`` pairs with most verified matches of each first image, sorted.
+
+    With ``of_both`` also those of each second image. Ties are in order of the names.
+    """
+    chosen: set[tuple[str, str]] = set()
+    taken: Counter[str] = Counter()
+    for pair in sorted(verified, key=lambda pair: (-verified[pair], pair)):
+        for image in pair if of_both else pair[:1]:
+            taken[image] += 1
+            if taken[image] <= number:
+                chosen.add(pair)
+    return sorted(chosen)
 
 
 def check_given_poses(

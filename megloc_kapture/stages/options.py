@@ -30,7 +30,7 @@ from megloc_kapture.stages.image_pairs import (
     Retrieval,
 )
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
-from megloc_kapture.stages.matches import Verification
+from megloc_kapture.stages.matches import SecondMatchingOptions, Verification
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.query_poses import LocalizationOptions
@@ -88,6 +88,7 @@ class PipelineOptions(Options):
     )
     mapping_verification: KnownPoseOptions = KnownPoseOptions()
     query_verification: TwoViewOptions = TwoViewOptions()
+    second_matching: SecondMatchingOptions = SecondMatchingOptions()
     guided_pyramid: GuidedPyramidOptions = GuidedPyramidOptions()
     map: Literal["triangulate", "lift"] = Field(
         default="triangulate",
@@ -119,6 +120,10 @@ class PipelineOptions(Options):
     def uses_pyramid(self) -> bool:
         """Return whether guided pyramid matching is enabled."""
         return self.guided_pyramid.mode != "off"
+
+    def matches_again(self) -> bool:
+        """Return whether some pairs are matched again, by a second matcher or guided pyramids."""
+        return self.uses_pyramid() or self.second_matching.matcher is not None
 
     def triangulates(self) -> bool:
         return self.map == "triangulate"
@@ -167,6 +172,11 @@ class PipelineOptions(Options):
     def make_matcher(self, local_type: str) -> Matcher:
         matcher: Matcher = load_chosen(MATCHERS, self.matching_of(local_type), self.placement)
         return matcher
+
+    def make_second_matcher(self) -> Matcher | None:
+        """Create the matcher of the second pass, or None."""
+        chosen = self.second_matching.matcher
+        return None if chosen is None else load_chosen(MATCHERS, chosen, self.placement)
 
     def verify_mapping(self) -> Verification:
         return None if self.verification == "none" else self.mapping_verification

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -223,6 +224,12 @@ def _fault(spec: FolderSpec, name: str) -> str:
     return ""
 
 
+_FIRST_TURN = 5
+# below this even the right pose can be decimetres off, which more candidates improve
+# (docs/performance.md)
+_SURE_INLIERS = 30
+
+
 class LocalizationOptions(Options):
     clusters: ClusterOptions = ClusterOptions()
     rank: PluginChoice = Field(
@@ -236,6 +243,13 @@ class LocalizationOptions(Options):
         le=1,
         description="poses with a lower confidence are rejected; 0 (as in benchmarks) keeps all",
     )
+    sure_confidence: float | None = Field(
+        default=None,
+        gt=0,
+        le=1,
+        description="match candidates in turn, best first, until the pose has "
+        f"{_SURE_INLIERS} inliers and this confidence; none: match all candidates",
+    )
     rigs: bool = Field(default=False, description="localize all cameras of a rig jointly")
     fallback: Fallback = Field(
         default="none",
@@ -248,7 +262,7 @@ class LocalizationOptions(Options):
         return ranker
 
 
-def localize_query(
+def localize_unit(
     views: Sequence[QueryView],
     candidates: Sequence[str],
     options: LocalizationOptions,
@@ -258,14 +272,12 @@ def localize_query(
     ranker: PoseRanker,
     scene: RankingScene,
 ) -> list[Pose | Failure]:
-    """Localize a query, or the cameras of a rig together; return a result per camera.
+    """Localize one query, or the cameras of a rig together; return a result per camera.
 
-    ``megloc eval``, ``megloc localize``, ``Localizer`` and the HTTP service all call this function.
     A rig without a joint pose is localized camera by camera.
 
     Parameters
     ----------
-    views : matches of each camera, computed live or read from kapture folders.
     candidates : map images, best first.
     frame_of : names the coordinate frame of a map image.
     centers : camera centres (3,) of the candidates in the world.
@@ -307,6 +319,70 @@ def localize_query(
     return [replace(result, name=v.name) for v, result in zip(views, results, strict=True)]
 
 
+class QuerySource(Protocol):
+    """A camera of a query, whose matches are computed live or read from kapture folders."""
+
+    @property
+    def candidates(self) -> Sequence[str]:
+        """Map images, best first."""
+        ...
+
+    def view(self, count: int) -> QueryView:
+        """Return the matches with the first ``count`` candidates."""
+        ...
+
+
+@dataclass(frozen=True)
+class StoredSource:
+    """Matches that were read from kapture folders."""
+
+    stored: QueryView
+    candidates: Sequence[str]
+
+    def view(self, count: int) -> QueryView:
+        return self.stored.among(self.candidates[:count])
+
+
+def localize_query(
+    sources: Sequence[QuerySource],
+    options: LocalizationOptions,
+    *,
+    frame_of: Callable[[str], str],
+    centers: Mapping[str, NDArray[np.float64]],
+    ranker: PoseRanker,
+    scene: RankingScene,
+) -> list[Pose | Failure]:
+    """Localize a query, or the cameras of a rig; return a result per camera.
+
+    ``megloc eval``, ``megloc localize``, ``Localizer`` and the HTTP service all call this function.
+    With ``sure_confidence``, candidates are taken in turn until the pose is certain. See
+    :func:`localize_unit`.
+    """
+
+    def solve(count: int) -> list[Pose | Failure]:
+        return localize_unit(
+            [source.view(count) for source in sources],
+            interleave([source.candidates[:count] for source in sources]),
+            options,
+            frame_of=frame_of,
+            centers=centers,
+            ranker=ranker,
+            scene=scene,
+        )
+
+    num_candidates = max((len(source.candidates) for source in sources), default=0)
+    sure, count = options.sure_confidence, _FIRST_TURN
+    while sure is not None and count < num_candidates:
+        results = solve(count)
+        if all(
+            isinstance(r, Pose) and (r.confidence or 0.0) >= sure and r.num_inliers >= _SURE_INLIERS
+            for r in results
+        ):
+            return results
+        count *= 2
+    return solve(num_candidates)
+
+
 # a unit, the candidates of each image, and their coordinate frames
 _Job = tuple[Unit, Sequence[Sequence[str]], Mapping[str, str]]
 
@@ -331,12 +407,13 @@ class _StoredQueries:
             for image in interleave(candidate_lists)
             if (pose := mapping.read().cam_from_world(image)) is not None
         }
-        usable = [[name for name in images if name in centers] for images in candidate_lists]
-        views = [self._read(*camera, some) for camera, some in zip(unit, usable, strict=True)]
-        reading_s = (time.perf_counter() - started) / len(views)
+        sources = [
+            StoredSource(self._read(*camera, images), [name for name in images if name in centers])
+            for camera, images in zip(unit, candidate_lists, strict=True)
+        ]
+        reading_s = (time.perf_counter() - started) / len(sources)
         results = localize_query(
-            views,
-            interleave(usable),
+            sources,
             self.options,
             frame_of=frame_of.__getitem__,
             centers=centers,

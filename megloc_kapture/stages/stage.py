@@ -105,11 +105,11 @@ class Layout:
         if not self.options.triangulates():
             return ()
         # the first folder that has a pair counts
-        again = self.options.uses_pyramid()
+        again = self.options.matches_again()
         return (MAPPING_PYRAMID, MAPPING_MATCHES) if again else (MAPPING_MATCHES,)
 
     def query_matches(self) -> tuple[str, ...]:
-        again = self.options.uses_pyramid()
+        again = self.options.matches_again()
         return (QUERY_PYRAMID, QUERY_MATCHES) if again else (QUERY_MATCHES,)
 
     def sparse_map(self) -> str:

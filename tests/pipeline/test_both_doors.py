@@ -20,6 +20,7 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.tables import (
     CONSISTENCY_FILE,
+    read_match_counts,
     read_refinement,
     read_status,
 )
@@ -27,6 +28,7 @@ from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.stages.matches import iterate_candidates
+from megloc_kapture.stages.stage import MAPPING_MATCHES, QUERY_MATCHES, Layout
 from megloc_kapture.values import RigidTransform
 from tests.pipeline.runs import evaluated
 
@@ -35,6 +37,11 @@ FEW = ("local_features.rootsift.options.max_keypoints=300",)
 TWO_TYPES = (
     *('local_features=["rootsift","sift"]', "local_features.sift.options.first_octave=0"),
     *FEW,
+)
+SECOND = (
+    "second_matching.matcher.name=nn",
+    "second_matching.matcher.options.max_ratio=0.9",
+    "second_matching.pairs=2",
 )
 
 
@@ -96,10 +103,13 @@ def with_rig(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         pytest.param(FEW, id="classic"),
         pytest.param((*TWO_TYPES, "reranking.by=coverage", "reranking.keep=4"), id="coverage"),
+        pytest.param((*FEW, *SECOND), id="second matcher"),
         *(
             pytest.param((*FEW, *more), id=name, marks=pytest.mark.slow)
             for name, more in {
                 "retrieval": ["query_pairs.top_k=4"],
+                "in turn": ["localization.sure_confidence=0.5"],
+                "turns of all": ["localization.sure_confidence=1.0", "reranking.by=matches"],
                 "resized": ["preprocessing.max_size_px=240", "query_pairs.top_k=4"],
                 "matches": [*TWO_TYPES, "reranking.by=matches", "reranking.keep=3"],
                 "pyramid": [
@@ -114,6 +124,12 @@ def with_rig(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
                     "guided_pyramid.scales=[0.5,1.0]",
                     "guided_pyramid.min_matches=100",
                 ],
+                "second matcher, then pyramid": [
+                    *SECOND,
+                    "guided_pyramid.mode=all",
+                    "guided_pyramid.scales=[0.5,1.0]",
+                    "guided_pyramid.min_matches=100",
+                ],
                 "unverified": ["verification=none", "localization.clusters.by=none"],
             }.items()
         ),
@@ -121,6 +137,33 @@ def with_rig(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_the_same_poses(scene: Path, tmp_path: Path, assignments: tuple[str, ...]) -> None:
     assert len(same_poses(*both(scene, tmp_path / "workspace", *assignments))) == 4
+
+
+def test_the_second_matchers_matches_replace_those_of_the_best_pairs(
+    scene: Path, tmp_path: Path
+) -> None:
+    options = options_of_preset(assignments=[*FEW, *SECOND])
+    workspace = evaluated(tmp_path, scene, options, last="localization")
+    for kind, part in (("query", QUERY_MATCHES), ("mapping", MAPPING_MATCHES)):
+        again = workspace.path(f"pyramid/{kind}")
+        first = {
+            (row.image, row.other): row for row in read_match_counts(workspace.path(part), TYPE)
+        }
+        second = {(row.image, row.other): row for row in read_match_counts(again, TYPE)}
+        by_image: dict[str, list[tuple[int, tuple[str, str]]]] = {}
+        for pair, row in first.items():
+            for image in pair if kind == "mapping" else pair[:1]:
+                by_image.setdefault(image, []).append((-row.verified, pair))
+        best = {pair for pairs in by_image.values() for _, pair in sorted(pairs)[:2]}
+        assert set(second) == best and len(best) < len(first)
+        # the ratio test leaves fewer
+        assert all(row.matches < first[pair].matches for pair, row in second.items())
+        layout = Layout(options)
+        folders = layout.query_matches() if kind == "query" else layout.mapping_matches()
+        stored = workspace.folder(kind, *folders).matches(TYPE)
+        for pair, row in {**first, **second}.items():
+            assert stored.length(*pair) == row.verified
+    assert workspace.folder("map").types("keypoints") == [TYPE]
 
 
 def test_a_fallback_is_the_pose_of_the_first_candidate_after_reranking(

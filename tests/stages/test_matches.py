@@ -20,6 +20,7 @@ from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import (
+    best_pairs,
     check_given_poses,
     iterate_candidates,
     match_all,
@@ -101,6 +102,14 @@ def test_a_pair_without_matches_is_known_and_one_asked_for_twice_matched_once(
         reader = folder.with_features([output]).matches("toy")
         assert reader.pairs == [empty, full][: counts[0]]
         assert sum(len(reader.read(*pair)[0]) for pair in reader.pairs) == counts[2]
+
+
+def test_the_best_pairs_are_those_with_most_verified_matches() -> None:
+    verified = {("a", "b"): 5, ("a", "c"): 9, ("a", "d"): 5, ("b", "c"): 1, ("c", "d"): 0}
+    of_first = [("a", "b"), ("a", "c"), ("b", "c"), ("c", "d")]
+    assert best_pairs(verified, 2, of_both=False) == of_first
+    assert best_pairs(verified, 1, of_both=True) == [("a", "b"), ("a", "c"), ("a", "d")]
+    assert best_pairs({}, 1, of_both=True) == []
 
 
 @pytest.mark.parametrize("kind", ["mapping", "query"])

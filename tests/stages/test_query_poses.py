@@ -31,6 +31,7 @@ from megloc_kapture.stages.query_poses import (
     LocalizationOptions,
     localize_from_matches,
     localize_query,
+    localize_unit,
 )
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import Work
@@ -95,6 +96,50 @@ def test_an_unknown_ranker_is_refused_before_the_first_query(world: Any) -> None
         world.localized(rank=PluginChoice(name="no-such"))
 
 
+class _Turns:
+    """A query whose pose gets surer with more candidates, and the counts that were asked for."""
+
+    def __init__(self, count: int) -> None:
+        self.candidates = [str(number) for number in range(count)]
+        self.asked: list[int] = []
+
+    def view(self, count: int) -> QueryView:
+        self.asked.append(count)
+        return QueryView("q", cast(Camera, None), ())
+
+
+@pytest.mark.parametrize(
+    ("count", "sure", "expected"),
+    [
+        (50, 0.9, [5, 10, 20]),
+        (15, 0.9, [5, 10, 15]),
+        (50, 1.0, [5, 10, 20, 40, 50]),
+        (50, None, [50]),
+    ],
+)
+def test_candidates_are_taken_in_turn_until_the_pose_is_sure_and_well_supported(
+    count: int, sure: float | None, expected: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = _Turns(count)
+
+    def solve(*_: Any, **__: Any) -> list[Pose]:
+        turns = {5: (0.99, 29), 10: (0.89, 30), 20: (0.9, 30)}
+        confidence, inliers = turns.get(source.asked[-1], (0.95, 99))
+        return [Pose(RigidTransform.identity(), 100, inliers, confidence=confidence)]
+
+    monkeypatch.setattr("megloc_kapture.stages.query_poses.localize_unit", solve)
+    nothing: Any = None
+    localize_query(
+        [source],
+        LocalizationOptions(sure_confidence=sure),
+        frame_of=lambda _: "",
+        centers={},
+        ranker=nothing,
+        scene=nothing,
+    )
+    assert source.asked == expected
+
+
 def test_map_points_are_those_that_an_image_observes(world: Any) -> None:
     folder = world.map()
     scene, xyz = KaptureScene(folder), folder.points3d()[:, :3]
@@ -145,7 +190,7 @@ def test_every_cluster_gives_a_pose_whichever_retrieval_ranks_first(first: str) 
         for name, count in zip(names, (80, 90, 60, 50), strict=True)
     ]
     seen = project(camera, truth, place).astype(np.float32)
-    (found,) = localize_query(
+    (found,) = localize_unit(
         [QueryView("q", camera, (TypedMatches(index, seen, matches),))],
         sorted(names, key=lambda name: not name.startswith(first)),
         LocalizationOptions(),
@@ -172,7 +217,7 @@ def test_places_whose_poses_agree_are_one_but_in_two_frames(
     halves = zip("ab", np.split(rows, 2), strict=True)
     matches = [(name, np.stack([own] * 2, axis=1), np.full(50, 0.9)) for name, own in halves]
     seen = project(camera, truth, points).astype(np.float32)
-    (found,) = localize_query(
+    (found,) = localize_unit(
         [QueryView("q", camera, (TypedMatches(index, seen, matches),))],
         ["a", "b"],
         LocalizationOptions(clusters=ClusterOptions(by="poses", radius=1.0)),
