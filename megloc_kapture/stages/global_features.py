@@ -51,6 +51,7 @@ from megloc_kapture.stages.stage import (
 )
 from megloc_kapture.stages.work import (
     HERE,
+    Batched,
     FolderSpec,
     Work,
     in_batches,
@@ -224,11 +225,11 @@ def extract_global_features(
     ]
     jobs.sort(key=_size)  # images of equal size can share a batch
     describe = partial(_describe, extractor)
-    writer: FeatureWriter | None = None
-    label = resumed_label(extractor.name, len(folder_of), len(jobs))
-    results = work.map_batches(
-        describe, jobs, label, plugin=extractor, many="describe_many", alike=_size
+    steps: Batched[_Job, NDArray[np.float32]] = Batched(
+        _read, describe, extractor, "describe_many", _size
     )
+    writer: FeatureWriter | None = None
+    results = work.map(steps, jobs, resumed_label(extractor.name, len(folder_of), len(jobs)))
     for (image, *_), vector in zip(jobs, results, strict=True):
         if writer is None:
             kind = np.dtype(np.float32)
@@ -273,10 +274,13 @@ def _size(job: _Job) -> tuple[int, int]:
     return job[2].width, job[2].height
 
 
+def _read(job: _Job) -> NDArray[np.uint8]:
+    return read_image_of(*job[1:])
+
+
 def _describe(
-    extractor: GlobalFeatureExtractor, jobs: Sequence[_Job]
-) -> Sequence[NDArray[np.float32]]:
-    images = [read_image_of(path, camera) for _, path, camera in jobs]
+    extractor: GlobalFeatureExtractor, jobs: Sequence[_Job], images: Sequence[NDArray[np.uint8]]
+) -> Sequence[Any]:
     return list(describe_images(extractor, images, [name for name, *_ in jobs]))
 
 

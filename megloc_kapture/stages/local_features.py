@@ -33,7 +33,7 @@ from megloc_kapture.stages.stage import (
     PipelineStage,
     StageWork,
 )
-from megloc_kapture.stages.work import HERE, FolderSpec, Work, in_batches, resumed_label
+from megloc_kapture.stages.work import HERE, Batched, FolderSpec, Work, in_batches, resumed_label
 from megloc_kapture.values import Camera, LocalFeatures
 
 _SIZE = attrgetter("size")
@@ -62,13 +62,17 @@ def extract_local_features(
     is_written = partial(has_features, output, "descriptors", extractor.name)
     todo = work.unfinished(jobs, lambda job: is_written(job.image))
     todo.sort(key=_SIZE)  # images of equal size can share a batch
-    extract = partial(_extract, extractor, mask_margin_px)
+    steps: Batched[_Job, LocalFeatures] = Batched(
+        partial(_read, mask_margin_px),
+        partial(_extract, extractor),
+        extractor,
+        "extract_many",
+        _SIZE,
+    )
     writers: tuple[FeatureWriter, FeatureWriter] | None = None
     masked = 0
     label = resumed_label(f"{extractor.name} features", len(jobs), len(todo))
-    results = work.map_batches(
-        extract, todo, label, plugin=extractor, many="extract_many", alike=_SIZE
-    )
+    results = work.map(steps, todo, label)
     for job, features in zip(todo, results, strict=True):
         writers = writers or _writers(output, extractor, features)
         masked += features.num_masked
@@ -109,10 +113,13 @@ def _writers(
     )
 
 
+def _read(margin_px: float, job: _Job) -> Frame:
+    return read_frame(job.folder.open(), job.image, margin_px=margin_px)
+
+
 def _extract(
-    extractor: LocalFeatureExtractor, margin_px: float, jobs: Sequence[_Job]
+    extractor: LocalFeatureExtractor, jobs: Sequence[_Job], frames: Sequence[Frame]
 ) -> list[LocalFeatures]:
-    frames = [read_frame(job.folder.open(), job.image, margin_px=margin_px) for job in jobs]
     return extract_all(extractor, frames, [job.image for job in jobs])
 
 

@@ -51,6 +51,7 @@ from megloc_kapture.stages.stage import (
 )
 from megloc_kapture.stages.work import (
     HERE,
+    Batched,
     FolderSpec,
     Work,
     batched,
@@ -154,9 +155,13 @@ def match_pairs(
     for image, group in groupby(todo, key=itemgetter(0)):
         jobs += [(image, some) for some in batched((b for _, b in group), _PAIRS_PER_ITEM)]
     specs = FolderSpec(first), FolderSpec(second)
-    match = partial(_match_and_verify, specs, local_type, matcher, verification)
-    label = resumed_label("matching", len(ordered), len(todo))
-    results = work.map(match, jobs, label, plugins=(matcher,))
+    read = partial(_read, specs, local_type)
+    verify = partial(_verify, specs, local_type, verification)
+    match: Any = partial(_match, matcher)
+    steps: Batched[_Job, list[VerifiedMatches]] = Batched(
+        read, match, matcher, "match_many", None, verify
+    )
+    results = work.map(steps, jobs, resumed_label("matching", len(ordered), len(todo)))
     for (image, others), found in zip(jobs, results, strict=True):
         for other, pair in zip(others, found, strict=True):
             count = PairCount(image, other, pair.num_found, len(pair.matches))
@@ -201,9 +206,13 @@ def check_given_poses(
     Log a warning if some poses contradict the matches. If most do, raise DataError unless
     ``work.force``.
     """
-    evidence = partial(_evidence, FolderSpec(mapping), local_type, matcher)
-    jobs = _sampled(pairs)
-    found = work.map(evidence, jobs, "checking the given poses", plugins=(matcher,))
+    specs = FolderSpec(mapping), FolderSpec(mapping)
+    read, finish = partial(_read, specs, local_type), partial(_evidence, specs, local_type)
+    match: Any = partial(_match, matcher)
+    steps: Batched[_Job, list[PairEvidence]] = Batched(
+        read, match, matcher, "match_many", None, finish
+    )
+    found = work.map(steps, _sampled(pairs), "checking the given poses")
     contradiction = pose_contradiction([pair for of_image in found for pair in of_image])
     if contradiction is None:
         return
@@ -228,11 +237,15 @@ def _sampled(pairs: Sequence[ImagePair]) -> list[_Job]:
     return [(image, sorted(others)) for image, others in chosen.items()]
 
 
-def _evidence(spec: FolderSpec, local_type: str, matcher: Matcher, job: _Job) -> list[PairEvidence]:
+def _evidence(
+    specs: tuple[FolderSpec, FolderSpec],
+    local_type: str,
+    found: tuple[_Job, Sequence[_PairMatches]],
+) -> list[PairEvidence]:
     """Return the pairs of an image that a two-view model explains better than chance."""
-    image, others = job
-    data, options = spec.open().read(), TwoViewOptions()
-    a, read, matched = _matched((spec, spec), local_type, matcher, job)
+    (image, others), matched = found
+    data, options = specs[0].open().read(), TwoViewOptions()
+    a, *read = _read(specs, local_type, (image, others))
     evidence = []
     for other, b, pair in zip(others, read, matched, strict=True):
         poses = data.cam_from_world(image), data.cam_from_world(other)
@@ -257,24 +270,28 @@ def _one_way(pair: ImagePair) -> tuple[str, str]:
     return min(pair.query, pair.map), max(pair.query, pair.map)
 
 
-def _matched(
-    specs: tuple[FolderSpec, FolderSpec], local_type: str, matcher: Matcher, job: _Job
-) -> tuple[Features, list[Features], list[_PairMatches]]:
-    """Return the features of an image and of the others, and the matches with each."""
+def _read(specs: tuple[FolderSpec, FolderSpec], local_type: str, job: _Job) -> list[Features]:
     image, others = job
-    a = cached_features(specs[0], local_type, image)
-    read = [cached_features(specs[1], local_type, other) for other in others]
-    return a, read, match_all(matcher, a, read, [f"pair {image}, {other}" for other in others])
+    others_read = [cached_features(specs[1], local_type, other) for other in others]
+    return [cached_features(specs[0], local_type, image), *others_read]
 
 
-def _match_and_verify(
+def _match(
+    matcher: Matcher, jobs: Sequence[_Job], features: Sequence[Sequence[Features]]
+) -> list[list[_PairMatches]]:
+    return [
+        match_all(matcher, a, read, [f"pair {image}, {other}" for other in others])
+        for (image, others), (a, *read) in zip(jobs, features, strict=True)
+    ]
+
+
+def _verify(
     specs: tuple[FolderSpec, FolderSpec],
     local_type: str,
-    matcher: Matcher,
     verification: Verification,
-    job: _Job,
+    found: tuple[_Job, Sequence[_PairMatches]],
 ) -> list[VerifiedMatches]:
-    image, others = job
+    (image, others), matched = found
     first, second = (spec.open().read() for spec in specs)
 
     def relative(other: str) -> RigidTransform | None:
@@ -283,7 +300,7 @@ def _match_and_verify(
             return None
         return b_from_world @ a_from_world.inverse()
 
-    a, read, matched = _matched(specs, local_type, matcher, job)
+    a, *read = _read(specs, local_type, (image, others))
     return [
         verified(a, b, pair, verification_of(verification, partial(relative, other)))
         for other, b, pair in zip(others, read, matched, strict=True)

@@ -1,13 +1,13 @@
 """Context of a run: ordered work with bounded memory and a progress bar, batches of networks.
 
-Work runs on an executor with one core per process. Networks on a GPU of this machine run in threads
-of this process only, one batch at a time.
+Work runs on an executor with one core per process. Networks on a GPU of this machine run in this
+process only: threads read ahead, one thread computes batches, and the executor does the rest.
 """
 
 from __future__ import annotations
 
+import os
 import sys
-import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain, groupby, islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 from uuid import uuid4
 
 from megloc_kapture.errors import MeglocError, PluginError
@@ -73,8 +73,7 @@ def in_batches(
         most = min(most_at_once(plugin, many), _limits.get(key, sys.maxsize))
         batch = items[len(found) :][:most]
         try:
-            with _gpu if on_gpu(plugin) else nullcontext():
-                results = run(batch)
+            results = run(batch)
         except RuntimeError as error:
             if not is_out_of_memory(error):
                 raise
@@ -113,8 +112,9 @@ def is_out_of_memory(error: BaseException) -> bool:
     )
 
 
-_THREADS = 4  # that share a plugin on a GPU
-_gpu = threading.Lock()  # as one batch may fill the memory
+# threads that read ahead for a GPU, and threads that share a plugin on one
+_READERS = min(os.cpu_count() or 1, 16)
+_THREADS = 4
 
 
 Track = Callable[[Iterable[Any], int, str], Iterator[Any]]
@@ -159,6 +159,35 @@ def batched(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
 
 
 @dataclass(frozen=True)
+class Batched(Generic[Item, Result]):
+    """A function of several items, in module-level steps, so that plugins get batches.
+
+    Attributes
+    ----------
+    read : reads the arrays of an item.
+    compute : a result per item, by ``plugin``, whose batch method is ``many``.
+    alike : consecutive items with equal keys share a batch; None means single items.
+    finish : optional last step for an item and its result; needs no device.
+    """
+
+    read: Callable[[Item], Any]
+    compute: Callable[[Sequence[Item], Sequence[Any]], Sequence[Any]]
+    plugin: object
+    many: str
+    alike: Callable[[Item], object] | None
+    finish: Callable[[tuple[Item, Any]], Result] | None = None
+
+    def __call__(self, items: Sequence[Item]) -> Sequence[Result]:
+        found = self.computed([(item, self.read(item)) for item in items])
+        return found if self.finish is None else list(map(self.finish, found))
+
+    def computed(self, batch: Sequence[tuple[Item, Any]]) -> list[Any]:
+        items, arrays = zip(*batch, strict=True)
+        found = self.compute(items, arrays)
+        return list(found if self.finish is None else zip(items, found, strict=True))
+
+
+@dataclass(frozen=True)
 class Work:
     """Execution context of a stage.
 
@@ -180,7 +209,7 @@ class Work:
 
     def map(
         self,
-        function: Callable[[Item], Result],
+        function: Callable[[Item], Result] | Batched[Item, Result],
         items: Iterable[Item],
         label: str,
         total: int | None = None,
@@ -195,39 +224,39 @@ class Work:
         if total is None:
             items = items if isinstance(items, Sequence) else list(items)
             total = len(items)
-        return self.track(self._results(function, items, plugins), total, label)
+        if isinstance(function, Batched):
+            results = self._in_batches(function, items)
+        else:
+            results = self._one_by_one(function, items, self._has_gpu(plugins))
+        return self.track(results, total, label)
 
-    def map_batches(
-        self,
-        function: Callable[[Sequence[Item]], Sequence[Result]],
-        items: Sequence[Item],
-        label: str,
-        *,
-        plugin: object,
-        many: str,
-        alike: Callable[[Item], object],
+    def _one_by_one(
+        self, function: Callable[[Item], Result], items: Iterable[Item], in_threads: bool
     ) -> Iterator[Result]:
-        """Yield the results of a function of several items, as :meth:`map` does.
-
-        ``many`` is the batch method of the plugin; consecutive items with equal keys ``alike`` can
-        share a batch.
-        """
-        most = most_at_once(plugin, many)
-        groups = (group for _, group in groupby(items, key=alike))
-        batches = (some for group in groups for some in batched(group, most))
-        results = self._results(function, batches, (plugin,))
-        return self.track(chain.from_iterable(results), len(items), label)
-
-    def _results(
-        self,
-        function: Callable[[Item], Result],
-        items: Iterable[Item],
-        plugins: Sequence[object],
-    ) -> Iterator[Result]:
-        # cluster machines have separate GPUs
-        in_threads = not getattr(self.executor, "is_elsewhere", False) and any(map(on_gpu, plugins))
         with ThreadPoolExecutor(_THREADS) if in_threads else nullcontext(self.executor) as executor:
             yield from ordered_map(function, items, executor)
+
+    def _has_gpu(self, plugins: Sequence[object]) -> bool:
+        # cluster machines have separate GPUs
+        return not getattr(self.executor, "is_elsewhere", False) and any(map(on_gpu, plugins))
+
+    def _in_batches(self, steps: Batched[Item, Result], items: Iterable[Item]) -> Iterator[Result]:
+        alike = steps.alike or (lambda _: None)
+        most = 1 if steps.alike is None else most_at_once(steps.plugin, steps.many)
+        if not self._has_gpu([steps.plugin]):
+            batches = _alike(items, most, alike)
+            yield from chain.from_iterable(ordered_map(steps, batches, self.executor))
+            return
+        # reading ahead and finishing overlap with computing
+        with ThreadPoolExecutor(_READERS) as readers, ThreadPoolExecutor(1) as computing:
+            ahead = most + _READERS
+            read = ordered_map(lambda one: (one, steps.read(one)), items, readers, window=ahead)
+            ready = _alike(read, most, lambda pair: alike(pair[0]))
+            found = chain.from_iterable(ordered_map(steps.computed, ready, computing, window=2))
+            if steps.finish is None:
+                yield from found
+            else:
+                yield from ordered_map(steps.finish, found, self.executor)
 
     def unfinished(self, items: Iterable[Item], is_written: Callable[[Item], bool]) -> list[Item]:
         """Return the items that an interrupted run of the stage has not written."""
@@ -236,6 +265,13 @@ class Work:
 
 def resumed_label(text: str, total: int, todo: int) -> str:
     return f"{text}, {total - todo} kept" if todo < total else text
+
+
+def _alike(
+    items: Iterable[Item], size: int, alike: Callable[[Item], object]
+) -> Iterator[list[Item]]:
+    for _, group in groupby(items, key=alike):
+        yield from batched(group, size)
 
 
 HERE = Work()
