@@ -29,6 +29,7 @@ from safetensors.torch import load_file
 from whole_preset_weights import _WRITERS, FREE_NETWORKS, Sizes, write_random_weights
 
 from megloc_kapture import KaptureMap, Localizer
+from megloc_kapture.errors import MeglocError
 from megloc_kapture.features import global_networks
 from megloc_kapture.features.aliked import Aliked
 from megloc_kapture.features.aslfeat import AslFeat
@@ -41,7 +42,7 @@ from megloc_kapture.localization.lpips import LpipsDistance
 from megloc_kapture.matching.networks import LightGlue, SuperGlue
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.preprocessing.deeplab import DeepLab
-from megloc_kapture.stages.work import DeviceMemoryError, Work, in_batches
+from megloc_kapture.stages.work import Work, in_batches
 from megloc_kapture.training.train import TrainingData, TrainingOptions, train
 from megloc_kapture.values import ImageFeatures, LocalFeatures
 
@@ -235,7 +236,7 @@ def memory(device: str, _: Path) -> None:
 
     try:
         in_batches(plugin, "extract_many", run, images, name=str)
-    except DeviceMemoryError as error:
+    except MeglocError as error:
         expect("not enough memory" in str(error), str(error))
     else:
         raise Failed("no error without memory")

@@ -213,8 +213,9 @@ def test_refused(built: megloc.Map, scene: Path, tmp_path: Path) -> None:
             scene / "query"
         )
     with pytest.raises(megloc.OptionError, match="come with no model"):
-        megloc.build_map(scene / "mapping", set={"map": "given"}, workspace=tmp_path / "given")
-    assert not (tmp_path / "given").exists()
+        by = {"mapping_pairs.by": ["covisibility"]}
+        megloc.build_map(scene / "mapping", set=by, workspace=tmp_path / "refused")
+    assert not (tmp_path / "refused").exists()
 
 
 def test_importing_the_package_loads_no_network_and_no_solver() -> None:

@@ -46,7 +46,7 @@ from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS
 from megloc_kapture.stages import work as devices
 from megloc_kapture.stages.local_features import extract_local_features
-from megloc_kapture.stages.matches import NoVerification, match_pairs
+from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.values import ImageFeatures, LocalFeatures
 
 sys.path.append(str(Path(__file__).resolve().parent))
@@ -256,8 +256,7 @@ def throughput(scene: Path, names: list[str], device: str) -> list[tuple[str, ..
                 described: KaptureFolder = described,
             ) -> None:  # fmt: skip
                 if batch:
-                    none = NoVerification()
-                    match_pairs(described, described, pairs, name, matcher, none, out)
+                    match_pairs(described, described, pairs, name, matcher, None, out)
                 else:
                     matching_loop(described, matcher, name, pairs, out)
 

@@ -24,8 +24,7 @@ from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.mapping.uncertainty import point_deviations
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, PixelOriginChoice
-from megloc_kapture.pipeline.live_source import MapMatching
-from megloc_kapture.pipeline.local_types import local_types_of
+from megloc_kapture.pipeline.live_source import MapMatching, local_types_of
 from megloc_kapture.pipeline.presets import (
     BASIC_OPTIONS,
     DEFAULT_PRESET,
@@ -46,7 +45,6 @@ from megloc_kapture.plugins import (
     PluginChoice,
 )
 from megloc_kapture.stages.global_features import VLAD
-from megloc_kapture.stages.matches import FeatureCache
 from megloc_kapture.stages.scene import depth_records
 from megloc_kapture.values import Options
 
@@ -192,7 +190,7 @@ def describe_retrieval(console: Console, opened: KaptureMap) -> None:
             line(console, "retrieval", "not possible without the map's descriptors")
             return
     options = options_of_preset(DEFAULT_PRESET)
-    types = local_types_of(opened, options, FeatureCache())
+    types = local_types_of(opened, options)
     retrieval = MapMatching(opened, options, types, Preprocessor(options))
     line(console, "retrieval", retrieval.describe_candidates(()))
     if brought := opened.global_types():

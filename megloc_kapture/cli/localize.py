@@ -36,7 +36,7 @@ from megloc_kapture.io.tables import STATUS_FILE
 from megloc_kapture.localization.focal_length import misfits_text
 from megloc_kapture.pipeline.executors import available_cores
 from megloc_kapture.pipeline.kapture_map import KaptureMap, PixelOriginChoice
-from megloc_kapture.pipeline.local_types import LocalType
+from megloc_kapture.pipeline.live_source import LocalType
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.presets import DEFAULT_PRESET, options_of_preset
 from megloc_kapture.pipeline.query_folders import Photographs

@@ -13,11 +13,11 @@ from megloc_kapture.errors import OptionError, check_option
 from megloc_kapture.io.kapture import KaptureFolder, write_pairs
 from megloc_kapture.pipeline.kapture_map import restrictions_beside
 from megloc_kapture.retrieval.search import FusionMethod
-from megloc_kapture.stages.candidates import Retrieval
 from megloc_kapture.stages.global_features import extract_global_features, extract_vlad, vlad_type
 from megloc_kapture.stages.image_pairs import (
     PairingMethod,
     RerankingOptions,
+    Retrieval,
     pair_map_images,
     pair_queries,
     reranked,

@@ -34,8 +34,8 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES
-from megloc_kapture.stages.given_map import given_map
 from megloc_kapture.stages.local_features import extract_local_features
+from megloc_kapture.stages.map_features import move_points
 from megloc_kapture.stages.work import HERE, Work
 from megloc_kapture.values import Camera
 
@@ -217,12 +217,11 @@ class ColmapReconstruction:
             extractor = load_plugin(LOCAL_FEATURES, _SIFT)
             extract_local_features([mapping], extractor, sift, work=work)
             try:
-                counts = given_map(KaptureFolder(reference), mapping, output)
+                counts = move_points(KaptureFolder(reference), mapping, _SIFT, output)
             except DataError as error:
                 if error.path != reference:
                     raise
-                message = error.message.replace("the given map", "the model")
-                raise OtherFeaturesError(message, path=self.source.model) from None
+                raise OtherFeaturesError(error.message, path=self.source.model) from None
         self.link_images(output)  # links pointed to the scratch folder
         return counts
 

@@ -150,7 +150,7 @@ class ReferenceModel:
             return []
         return [
             "The reference model comes without descriptors: its database is not there. "
-            "With map = given they are extracted again from the images."
+            "`megloc localize` extracts them again from the images."
         ]
 
 

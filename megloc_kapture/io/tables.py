@@ -8,7 +8,6 @@ refinement.csv       outcome of refining each query's pose, step by step
 map_consistency.csv  displacement of a map's own images by refinement, by coordinate frame
 depth.csv            stereo depth of the map's images
 match_counts.csv     matches and verified matches of each pair, with the matches of a type
-masked.csv           keypoints removed by masks, by image, with the features of a type
 ==================== =============================================================================
 
 Readers and writers take the file itself and keep its order, unless they say otherwise.
@@ -301,23 +300,3 @@ def append_match_count(features_dir: Path, type_name: str, count: PairCount) -> 
 
 def write_match_counts(features_dir: Path, type_name: str, counts: Iterable[PairCount]) -> None:
     _MATCH_COUNTS.write(match_counts_path(features_dir, type_name), counts)
-
-
-def mask_counts_path(features_dir: Path, type_name: str) -> Path:
-    return features_dir / "local_features" / type_name / "masked.csv"
-
-
-_MASK_COUNTS: Table[Any] = Table({"image": str, "num_masked": int})
-
-
-def read_mask_counts(features_dir: Path, type_name: str) -> dict[str, int]:
-    return dict(_MASK_COUNTS.read(mask_counts_path(features_dir, type_name)))
-
-
-def append_mask_count(features_dir: Path, type_name: str, image: str, count: int) -> None:
-    _MASK_COUNTS.append(mask_counts_path(features_dir, type_name), (image, count))
-
-
-def write_mask_counts(features_dir: Path, type_name: str, counts: Mapping[str, int]) -> None:
-    """Write ``masked.csv``: image with a mask -> removed keypoints."""
-    _MASK_COUNTS.write(mask_counts_path(features_dir, type_name), sorted(counts.items()))

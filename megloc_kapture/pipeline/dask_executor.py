@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import os
-import sys
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import Executor
@@ -19,14 +18,14 @@ from typing import Any
 
 from distributed import Client, KilledWorker, LocalCluster, Worker, WorkerPlugin
 
-from megloc_kapture.errors import MeglocError, OptionError
-from megloc_kapture.evaluation.pose_files import installed_version
+from megloc_kapture.errors import MeglocError, OptionError, check_option
 from megloc_kapture.pipeline.executors import enter_single_threaded
 
 _CONNECT_S = 10.0
 # tolerates dead workers, but not an item that kills ten of them
 _ALLOWED_FAILURES = 10
 _ITEMS_PER_WORKER = 4
+_PACKAGES = ["megloc_kapture", "numpy", "torch"]
 
 
 @contextmanager
@@ -46,11 +45,14 @@ def dask_executor(workers: int, scheduler: str | None, shared: Path) -> Iterator
     with dask.config.set(settings), ExitStack() as stack:
         client = _client(stack, workers, scheduler)
         threads = sum(worker["nthreads"] for worker in _workers(client))
-        if not threads:
-            raise OptionError(f"the scheduler {scheduler} has no workers: start some (dask worker)")
+        check_option(threads, f"the scheduler {scheduler} has no workers: start some (dask worker)")
+        try:
+            client.get_versions(check=True, packages=_PACKAGES)
+        except ValueError as error:
+            raise MeglocError(f"the cluster has other versions of packages: {error}") from error
         try:
             shared.mkdir(parents=True, exist_ok=True)
-            client.register_plugin(_Preparation(_environment(), Path.cwd(), shared.absolute()))
+            client.register_plugin(_Preparation(Path.cwd(), shared.absolute()))
             executor: Any = client.get_executor(pure=False)
             executor.window = _ITEMS_PER_WORKER * threads
             executor.is_elsewhere = scheduler is not None  # remote machines may have GPUs
@@ -93,18 +95,11 @@ def _workers(client: Client) -> list[dict[str, Any]]:
 
 @dataclass
 class _Preparation(WorkerPlugin):
-    environment: dict[str, str]
     folder: Path  # current folder, base of relative paths
     shared: Path
     name = "megloc"
 
     def setup(self, worker: Worker) -> None:
-        for name, version in _environment().items():
-            if version != self.environment[name]:
-                raise MeglocError(
-                    f"worker {worker.address} has {name} {version}, this process "
-                    f"{self.environment[name]}"
-                )
         try:
             self.shared.stat()
             os.chdir(self.folder)
@@ -114,9 +109,3 @@ class _Preparation(WorkerPlugin):
                 "system that all machines share, at the same path"
             ) from error
         enter_single_threaded()
-
-
-def _environment() -> dict[str, str]:
-    names = ("megloc-kapture", "numpy", "torch")
-    versions = {name: installed_version(name) or "none" for name in names}
-    return {"Python": sys.version.split()[0], **versions}

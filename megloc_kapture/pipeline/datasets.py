@@ -28,7 +28,14 @@ from megloc_kapture.datasets.kapture_folders import (
     input_files,
 )
 from megloc_kapture.datasets.official import OfficialDataset, check_official, write_official
-from megloc_kapture.errors import DataError, MeglocError, OptionError, PluginError, suggestion
+from megloc_kapture.errors import (
+    DataError,
+    MeglocError,
+    OptionError,
+    PluginError,
+    check_option,
+    suggestion,
+)
 from megloc_kapture.evaluation.protocols import TWIN_PREFIX as TWIN_PREFIX
 from megloc_kapture.io.dataset_tables import SIDE_TABLES, Protocol
 from megloc_kapture.io.files import write_bytes
@@ -183,8 +190,7 @@ def choose_dataset(
     adapter: DatasetAdapter | None = None
     if layout not in (KAPTURE, SYNTHETIC):
         adapter = load_plugin(DATASETS, layout, dict(import_options or {}))
-        if query_prefix:
-            raise OptionError("--query-prefix is for datasets of kapture folders")
+        check_option(not query_prefix, "--query-prefix is for datasets of kapture folders")
     elif import_options:
         raise OptionError(f"dataset {name} has no import options: {', '.join(import_options)}")
     choice = DatasetChoice(
@@ -197,11 +203,8 @@ def choose_dataset(
     return choice
 
 
-def with_model(choice: DatasetChoice, *, features: bool = False) -> DatasetChoice | None:
-    """Return the dataset with import of its point model, or None if it has no model.
-
-    With ``features`` a twin's model features are rendered too, as localization needs them.
-    """
+def with_model(choice: DatasetChoice) -> DatasetChoice | None:
+    """Return the dataset with import of its point model, or None if it has no model."""
     if choice.adapter is None:
         return None
     layout = choice.name.removeprefix(TWIN_PREFIX)
@@ -210,10 +213,7 @@ def with_model(choice: DatasetChoice, *, features: bool = False) -> DatasetChoic
         adapter: DatasetAdapter = load_plugin(DATASETS, layout, options)
     except PluginError:
         return None
-    twin = choice.twin
-    if twin is not None and features:
-        twin = twin_of(layout, **{**twin.options.model_dump(), "model_features": True})
-    return replace(choice, adapter=adapter, import_options=options, twin=twin)
+    return replace(choice, adapter=adapter, import_options=options)
 
 
 def has_model(choice: DatasetChoice) -> bool:
@@ -252,11 +252,11 @@ def _root_in_environment(name: str, adapter: DatasetAdapter | None) -> Path:
 
 def twin_of(layout: str, **options: Any) -> RenderedDataset:
     known = plugin_names(RENDERED_DATASETS)
-    if not known:
-        raise OptionError(
-            "rendered datasets (synthetic, synthetic-aachen ...) need a separate package: "
-            "pip install megloc-twins"
-        )
+    check_option(
+        known,
+        "rendered datasets (synthetic, synthetic-aachen ...) need a separate package: "
+        "pip install megloc-twins",
+    )
     if layout not in known:
         raise OptionError(f"nothing renders {layout!r}; known: {', '.join(known)}")
     twin: RenderedDataset = load_plugin(RENDERED_DATASETS, layout, options)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import OptionError, check_option, require
 from megloc_kapture.evaluation.evaluate import evaluate, results_without_truth
 from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.evaluation.protocols import benchmark_of
@@ -33,13 +33,12 @@ from megloc_kapture.pipeline.presets import assigned, check_weights, options_of_
 from megloc_kapture.pipeline.submission import write_submission
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import STAGES
+from megloc_kapture.stages.guided_pyramid import PyramidQueries
 from megloc_kapture.stages.image_pairs import PairQueries, RerankQueries
-from megloc_kapture.stages.localized_folder import set_aside_unreadable
 from megloc_kapture.stages.matches import MatchQueries
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import RefinePoses
-from megloc_kapture.stages.pyramid_mapping import PyramidQueries
-from megloc_kapture.stages.query_poses import LocalizeQueries
+from megloc_kapture.stages.query_poses import LocalizeQueries, set_aside_unreadable
 from megloc_kapture.stages.stage import (
     EVALUATION,
     LOCALIZED,
@@ -139,8 +138,10 @@ def choose_run(
     benchmark = find_benchmark(dataset)
     if config:
         benchmark = read_benchmark(config)
-        if benchmark.dataset != dataset:
-            raise OptionError(f"{config} is for dataset {benchmark.dataset}, not {dataset}")
+        check_option(
+            benchmark.dataset == dataset,
+            f"{config} is for dataset {benchmark.dataset}, not {dataset}",
+        )
     preset = preset or benchmark.preset
     source = choose_dataset(
         dataset,
@@ -191,18 +192,12 @@ PIPELINE: tuple[type[PipelineStage], ...] = (
 def plan_evaluation(run: Run) -> list[Stage]:
     """Return the stages of a run, in order, without writing anything."""
     options = run.options
-    given = options.uses_given_map()
-    if given or options.pairs_by_points():
-        run = replace(run, source=_with_model(run, given))
+    if options.pairs_by_points():
+        run = replace(run, source=_with_model(run))
     run.source.check()
     check_weights(options)
     options.reranking.counted_types(options.local_types())
     options.retrieval()
-    if given and options.changes_frames():
-        raise OptionError(
-            f"map = {options.map}: the given map's keypoints are in the original images; "
-            "pre-processing may mask them, but not resize or undistort"
-        )
     stages: list[Stage] = [Render(run)] if run.source.twin is not None else []
     stages.append(Import(run))
     stages += wanted_stages(PIPELINE, options)
@@ -217,7 +212,7 @@ def explain(options: PipelineOptions) -> list[dict[str, Any]]:
     rows: dict[str, dict[str, Any]] = {}
     for stage in (kind(options) for kind in PIPELINE):
         on = stage.is_wanted()
-        if on or stage.name not in rows:  # alternative stages share a name
+        if on or stage.name not in rows:  # reranking shares a name with what it replaces
             rows[stage.name] = {"name": stage.name, "on": on, "why": stage.explain()}
     return list(rows.values())
 
@@ -231,11 +226,15 @@ def explained(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def _insert(stages: list[Stage], stage: Stage) -> None:
     """Insert a plugin stage after the last stage that writes one of its inputs."""
-    if any(stage.name == one.name for one in stages):
-        raise OptionError(f"stages.{stage.name}: there is a stage of this name")
+    check_option(
+        not any(stage.name == one.name for one in stages),
+        f"stages.{stage.name}: there is a stage of this name",
+    )
     for path in stage.reads:
-        if not any(is_below(path, written) for one in stages for written in one.writes):
-            raise OptionError(f"stages.{stage.name} reads {path}, which no stage of the run writes")
+        check_option(
+            any(is_below(path, written) for one in stages for written in one.writes),
+            f"stages.{stage.name} reads {path}, which no stage of the run writes",
+        )
     places = [
         number
         for number, one in enumerate(stages)
@@ -244,17 +243,13 @@ def _insert(stages: list[Stage], stage: Stage) -> None:
     stages.insert(max(places, default=len(stages) - 1) + 1, stage)
 
 
-def _with_model(run: Run, given: bool) -> DatasetChoice:
-    found = with_model(run.source, features=given)
+def _with_model(run: Run) -> DatasetChoice:
+    found = with_model(run.source)
     if found is None:
-        wanted = (
-            f"map = {run.options.map} localizes in that model (megloc localize takes any kapture "
-            "map)"
-            if given
-            else "mapping_pairs by covisibility or overlap need its points; "
-            '--set \'mapping_pairs.by=["poses", "retrieval"]\' does without them'
+        raise OptionError(
+            f"dataset {run.dataset} comes with no model: mapping_pairs by covisibility needs its "
+            'points; --set \'mapping_pairs.by=["poses", "retrieval"]\' does without them'
         )
-        raise OptionError(f"dataset {run.dataset} comes with no model: {wanted}")
     return found
 
 
@@ -318,8 +313,7 @@ class Import(_RunStage):
         source = self._run.source
         root = work.path(WORLD) if source.root is None else source.root.resolve()
         counts = source.import_to(root, work.out, self._change)
-        if not counts["queries"]:
-            raise DataError("no query image is left to localize", path=root)
+        require(counts["queries"], "no query image is left to localize", path=root)
         unreadable = set_aside_unreadable(work.out / QUERY, work.out / SIDE_TABLES, work)
         return counts | ({"unreadable_queries": len(unreadable)} if unreadable else {})
 
@@ -367,18 +361,14 @@ class Evaluate(_RunStage):
         provenance = self.settings() | {"versions": package_versions()}
         del provenance[PROTOCOL]  # the report shows the protocol as text
         output = work.out / EVALUATION
-        context = context_of(localized)
+        context, label = context_of(localized), self._run.label
         if not truth.is_dir():
-            found = results_without_truth(
-                [localized], benchmark_of(tables), labels=[self._run.label]
-            )
-            single = replace(found.evaluations[0], context=context)
-            found = replace(found, evaluations=(single,))
+            found = results_without_truth([localized], benchmark_of(tables), labels=[label])
+            found = replace(found, evaluations=(replace(found.evaluations[0], context=context),))
             write_report(output, found, map_poses=map_poses, provenance=provenance)
             return {"queries_with_truth": 0}
-        evaluation = evaluate(
-            localized, truth, side_tables=tables, label=self._run.label, mapping=work.path(MAPPING)
-        )
+        mapping = work.path(MAPPING)
+        evaluation = evaluate(localized, truth, side_tables=tables, label=label, mapping=mapping)
         evaluation = replace(evaluation, context=context)
         write_report(output, evaluation, map_poses=map_poses, provenance=provenance)
         row = evaluation.row()

@@ -16,7 +16,7 @@ from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, Literal
 
-from megloc_kapture.errors import MeglocError, OptionError
+from megloc_kapture.errors import MeglocError, OptionError, check_option
 from megloc_kapture.io.files import clear_leftovers, output_error, owned_name
 
 ExecutorKind = Literal["inline", "processes", "dask"]
@@ -108,8 +108,7 @@ def open_executor(
     that all workers must see, the current one by default.
     """
     count = available_cores() if workers is None else workers
-    if count < 1:
-        raise OptionError(f"{count} workers cannot work; give 1 or more")
+    check_option(count >= 1, f"{count} workers cannot work; give 1 or more")
     if scheduler is not None and kind != "dask":
         raise OptionError("--scheduler needs --executor dask")
     if kind == "dask":

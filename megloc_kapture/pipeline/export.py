@@ -25,7 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.datasets.kapture_folders import cameras_of_folder, warn_of_scaled
-from megloc_kapture.errors import DataError, OptionError, OutputError, suggestion
+from megloc_kapture.errors import (
+    DataError,
+    OptionError,
+    OutputError,
+    check_option,
+    require,
+    suggestion,
+)
 from megloc_kapture.evaluation.view import corner_rays
 from megloc_kapture.geometry.cameras import principal_point_px
 from megloc_kapture.io.colmap import MapImage, undistort_model, write_model
@@ -191,11 +198,11 @@ def frustum(camera: Camera, cam_from_world: RigidTransform, depth: float) -> NDA
 
 
 def _nerfstudio_camera(camera: Camera) -> Mapping[str, Any]:
-    if camera.model not in _NERFSTUDIO:
-        raise DataError(
-            f"nerfstudio has no camera model {camera.model}; undistort first: it also reads what "
-            "`megloc export colmap --undistort` writes"
-        )
+    require(
+        camera.model in _NERFSTUDIO,
+        f"nerfstudio has no camera model {camera.model}; undistort first: it also reads what "
+        "`megloc export colmap --undistort` writes",
+    )
     model, names = _NERFSTUDIO[camera.model]
     cx, cy = principal_point_px(camera)
     fx, fy = camera.params[0], camera.params[0 if camera.model in ONE_FOCAL_MODELS else 1]
@@ -243,11 +250,11 @@ def export(
         raise OptionError(f"unknown format {name!r}; {suggestion(name, get_args(ExportFormat))}")
     if map is None and query is None:
         raise OptionError("nothing to export: give a map, or localized queries")
-    if undistort and name != "colmap":
-        raise OptionError(f"--undistort is an option of colmap, not of {name}")
+    check_option(
+        not undistort or name == "colmap", f"--undistort is an option of colmap, not of {name}"
+    )
     scene = _scene(map, query, sensor, trajectory=name == "tum")
-    if not scene.images:
-        raise DataError("no image has a pose" + (f" of camera {sensor!r}" if sensor else ""))
+    require(scene.images, "no image has a pose" + (f" of camera {sensor!r}" if sensor else ""))
     output = Path(output)
     if name in ("colmap", "nerfstudio"):
         with staged_output(output, kind=_KIND, force=force) as out:

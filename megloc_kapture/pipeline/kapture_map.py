@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.geometry.cameras import shift_principal_point
 from megloc_kapture.io.dataset_tables import tables_of, unit_of
 from megloc_kapture.io.kapture import FeatureReader, KaptureFolder
@@ -22,7 +22,7 @@ from megloc_kapture.mapping.map_check import Origin, PixelOrigin, find_pixel_ori
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import LOCAL_FEATURES, PluginChoice
-from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
 from megloc_kapture.stages.local_features import check_lengths
 from megloc_kapture.stages.map_refinement import REPORT_FILE
 from megloc_kapture.stages.scene import check_points, index_map, observed_keypoints, with_noise
@@ -130,8 +130,10 @@ class KaptureMap:
         pixel_origin : origin of the map's intrinsics; "auto" estimates it (see ``.pixel_origin``).
         allow_links_below : folders that links in the map may lead to.
         """
-        if pixel_origin not in ("auto", "corner", "centre"):
-            raise OptionError(f"pixel_origin is {pixel_origin!r}; give auto, corner or centre")
+        check_option(
+            pixel_origin in ("auto", "corner", "centre"),
+            f"pixel_origin is {pixel_origin!r}; give auto, corner or centre",
+        )
         folder = KaptureFolder(
             path, features_dirs=features_dirs, allow_links_below=allow_links_below
         )
@@ -265,8 +267,7 @@ def _extractor_named(name: str) -> PluginChoice | None:
 
 def _read_indices(folder: KaptureFolder, keypoints_types: Sequence[str]) -> dict[str, MapIndex]:
     present = sorted(t for t, seen in folder.observations().items() if len(seen.point_ids))
-    if not present:
-        raise DataError("the map's points have no observations", path=folder.root)
+    require(present, "the map's points have no observations", path=folder.root)
     absent = [name for name in keypoints_types if name not in present]
     if absent:
         raise OptionError(
@@ -314,11 +315,11 @@ def _find_origin(folder: KaptureFolder, local_type: str, index: MapIndex) -> Pix
     images = [image for image in sorted(index.row_of_image) if image in poses]
     keypoints = folder.keypoints(local_type)
     for image in images:
-        if image not in keypoints:
-            raise DataError(
-                f"points are observed in {image!r}, which has no keypoints of type {local_type!r}",
-                path=folder.root / "reconstruction" / "observations.txt",
-            )
+        require(
+            image in keypoints,
+            f"points are observed in {image!r}, which has no keypoints of type {local_type!r}",
+            path=folder.root / "reconstruction" / "observations.txt",
+        )
     step = max(1, len(images) // _SAMPLED_IMAGES)
     sample = observed_keypoints(folder, index, images[::step])
     known: Origin | None = "corner" if _is_ours(folder, local_type) else None

@@ -1,37 +1,268 @@
-"""Candidates and matches of a query, computed when they are needed."""
+"""Features, candidates and matches of a query, computed when they are needed."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.features.vlad import Vocabulary, aggregate, train_vlad
 from megloc_kapture.io.weights import MissingWeightsError
 from megloc_kapture.localization.cluster_poses import Clock
-from megloc_kapture.localization.map_index import QueryView, TypedMatches
-from megloc_kapture.matching.guided_pyramid import base_type
-from megloc_kapture.pipeline.kapture_map import KaptureMap
-from megloc_kapture.pipeline.local_types import LocalType
+from megloc_kapture.localization.map_index import ImageMatches, QueryView, TypedMatches
+from megloc_kapture.matching.guided_pyramid import base_type, equivalent_types
+from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, plain_name
 from megloc_kapture.pipeline.queries import Preprocessor, Query, QueryImage
-from megloc_kapture.plugins import GlobalFeatureExtractor
-from megloc_kapture.stages.candidates import Candidates, Retrieval, vectors_of
+from megloc_kapture.plugin_loading import load_chosen, plugin_names
+from megloc_kapture.plugins import (
+    LOCAL_FEATURES,
+    MATCHERS,
+    GlobalFeatureExtractor,
+    LocalFeatureExtractor,
+    Matcher,
+    PluginChoice,
+)
 from megloc_kapture.stages.global_features import (
     GlobalFeaturesChoice,
     VladSettings,
     read_vocabulary,
     vlad_type,
 )
-from megloc_kapture.stages.image_pairs import counted, rerank
-from megloc_kapture.stages.local_features import read_image_of
-from megloc_kapture.stages.matches import Features, VerifiedMatches
-from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.stages.guided_pyramid import PyramidMethod, retry_query
+from megloc_kapture.stages.image_pairs import Retrieval, counted, most_similar, rerank, vectors_of
+from megloc_kapture.stages.local_features import extract_all, read_frame, read_image_of
+from megloc_kapture.stages.map_features import rows_found_again
+from megloc_kapture.stages.matches import (
+    CACHED_IMAGES,
+    Features,
+    VerifiedMatches,
+    best_pairs,
+    match_all,
+    verification_of,
+    verified,
+)
+from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
+from megloc_kapture.stages.work import BATCH, batched
 from megloc_kapture.values import RigidTransform
+
+_MIN_FOUND_AGAIN = 0.5
+_NO_MATCHES = VerifiedMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32), 0)
+
+
+class LocalType:
+    """A keypoints type of the map with its query extraction and matching; plugins load lazily.
+
+    ``points`` observe the map's points; ``first`` is matched first and differs from ``points`` in
+    guided pyramids. ``cache`` holds map features, shared with other types.
+    """
+
+    def __init__(
+        self,
+        kapture_map: KaptureMap,
+        points: MapKeypoints,
+        first: MapKeypoints,
+        choice: LocalFeaturesChoice | None,
+        options: PipelineOptions,
+    ) -> None:
+        self.points, self.first = points, first
+        self.choice = choice
+        self._map, self._options = kapture_map, options
+        self._map_features = lru_cache(maxsize=CACHED_IMAGES)(self._load)
+        self._again: dict[str, NDArray[Any]] | None = None
+
+    def prepare(self) -> None:
+        """Extract missing map descriptors again; call this before matching."""
+        if not self.first.has_descriptors(self._map.images):
+            self._again = extract_again(self._map, self.first, self.extractor)
+
+    @property
+    def name(self) -> str:
+        return self.first.name
+
+    @cached_property
+    def matcher(self) -> Matcher:
+        own = None if self.choice is None else self.choice.matching
+        chosen = own or self._options.matching
+        found: Matcher = load_chosen(MATCHERS, chosen, self._options.placement)
+        return found
+
+    @cached_property
+    def second_matcher(self) -> Matcher | None:
+        return self._options.make_second_matcher()
+
+    @cached_property
+    def extractor(self) -> LocalFeatureExtractor:
+        found = self.brought()
+        if found is None:
+            raise DataError(
+                f"features of type {self.name!r} are missing and no extractor for them is "
+                f"installed (known: {', '.join(plugin_names(LOCAL_FEATURES))}); give them with "
+                "--features-dir, or in the kapture folder; or, if one of the known ones made "
+                f"them, write its name first into {self.name}/keypoints.txt",
+                path=self._map.folder.root,
+            )
+        extractor: LocalFeatureExtractor = load_chosen(
+            LOCAL_FEATURES, found, self._options.placement
+        )
+        return extractor
+
+    def brought(self) -> PluginChoice | None:
+        found = self.first.extractor()
+        if self.choice is None or (found is not None and found.name != self.choice.name):
+            return found
+        known = {} if found is None else found.options
+        return PluginChoice(name=self.choice.name, options={**self.choice.options, **known})
+
+    def of_query(self, image: QueryImage) -> Features:
+        """Return the query's own features, or extract them."""
+        brought = image.query.features
+        local = next((brought[n] for n in equivalent_types(self.name) if n in brought), None)
+        if local is None:
+            local = image.extract(self.extractor)
+        return Features.of(image.camera, local.keypoints_px, local.descriptors)
+
+    def descriptors(self, image: str) -> NDArray[Any]:
+        """Return descriptors (N, D) of a map image."""
+        return self.first.descriptors(image) if self._again is None else self._again[image]
+
+    def match(
+        self, query: Features, images: Sequence[str], matcher: Matcher | None = None
+    ) -> list[VerifiedMatches]:
+        found = dict.fromkeys(images, _NO_MATCHES)
+        verify = verification_of(self._options.verify_queries())
+        # limits the features in memory
+        for names in batched((image for image in images if image in self.first), BATCH):
+            others = [self._map_features(self.first, name) for name in names]
+            labels = [f"pair with {name}" for name in names]
+            pairs = match_all(matcher or self.matcher, query, others, labels)
+            for name, other, pair in zip(names, others, pairs, strict=True):
+                found[name] = verified(query, other, pair, verify)
+        return [found[image] for image in images]
+
+    def match_again(
+        self, query: Features, pairs: Mapping[str, VerifiedMatches], image: QueryImage
+    ) -> tuple[NDArray[np.float32], list[ImageMatches], str]:
+        """Match the best map images with the second matcher, and those with few matches by guided
+        pyramid matching, as far as these are enabled.
+
+        Returns query keypoints with added ones last, matches in the order of ``pairs``, and the
+        reason if the pyramid was skipped, else "".
+        """
+        options = self._options
+        if self.second_matcher is not None:
+            verified = {("", name): len(pair.matches) for name, pair in pairs.items()}
+            best = best_pairs(verified, options.second_matching.pairs, of_both=False)
+            names = [name for _, name in best]
+            again = self.match(query, names, self.second_matcher)
+            pairs = {**pairs, **dict(zip(names, again, strict=True))}
+        is_hard = options.guided_pyramid.is_hard
+        matches = [(name, pair.matches, pair.scores) for name, pair in pairs.items()]
+        if not any(is_hard(pair.num_found, len(pair.matches)) for pair in pairs.values()):
+            return query.keypoints_px, matches, ""
+        if reason := self.pyramid_obstacle or ("" if image.query.has_image() else "no image"):
+            return query.keypoints_px, matches, f"guided pyramid matching: {reason}"
+        method = PyramidMethod(
+            self.extractor, self.matcher, options.verify_queries(), options.guided_pyramid
+        )
+        found = retry_query(
+            query,
+            [each for each in matches if each[0] in self.first],
+            lambda name: self._map_features(self.points, name),
+            method,
+            lambda: (image.pixels, image.feature_mask),
+            num_found={name: pair.num_found for name, pair in pairs.items()},
+            name=image.query.name,
+        )
+        skipped = next((one.skipped for one in found.tried), "")
+        remark = f"guided pyramid matching: skipped {skipped}" if skipped else ""
+        return np.concatenate([query.keypoints_px, found.added_px]), found.matches, remark
+
+    @cached_property
+    def pyramid_obstacle(self) -> str:
+        """Return the reason why guided pyramid matching cannot extract this type, or ""."""
+        try:
+            _ = self.extractor
+        except MissingWeightsError:
+            return f"the weights that extract {self.name} are missing (megloc weights list)"
+        except DataError as error:
+            return error.message
+        return ""
+
+    def _load(self, keypoints: MapKeypoints, image: str) -> Features:
+        stored = keypoints.keypoints_px(image)
+        source = self if keypoints is self.first else keypoints
+        descriptors = source.descriptors(image)
+        # keypoints without a point help no pose, but reject wrong matches in the mutual check
+        return Features.of(self._map.camera(image), stored, descriptors)
+
+
+def local_types_of(kapture_map: KaptureMap, options: PipelineOptions) -> list[LocalType]:
+    """Return the types for localization, in the options' order, then others by name.
+
+    Types in the options without map points only help to rank candidates.
+    """
+    choices = options.local_features
+    by_base = {base_type(name): keypoints for name, keypoints in kapture_map.keypoints.items()}
+    for stored in kapture_map.stored_types():
+        named = _rank(stored, choices) < len(choices)
+        if named and base_type(stored) not in by_base:
+            by_base[base_type(stored)] = kapture_map.keypoints_of(stored)
+    found = []
+    for base in sorted(by_base, key=lambda name: (_rank(name, choices), name)):
+        points = by_base[base]
+        first, rank = points, _rank(base, choices)
+        if options.uses_pyramid() and base in kapture_map.stored_types():
+            first = kapture_map.keypoints_of(base)
+        choice = choices[rank] if rank < len(choices) else None
+        found.append(LocalType(kapture_map, points, first, choice, options))
+    return found
+
+
+def _rank(local_type: str, choices: Sequence[LocalFeaturesChoice]) -> int:
+    plain = plain_name(base_type(local_type))
+    fitting = (rank for rank, one in enumerate(choices) if plain.startswith(plain_name(one.name)))
+    return next(fitting, len(choices))
+
+
+def extract_again(
+    kapture_map: KaptureMap, keypoints: MapKeypoints, extractor: LocalFeatureExtractor
+) -> dict[str, NDArray[Any]]:
+    """Extract descriptors of all stored map keypoints; zero for keypoints not detected again."""
+    require(
+        kapture_map.has_images(),
+        f"the map has no descriptors of type {keypoints.name!r}, and no images to extract "
+        "them from again",
+        path=kapture_map.folder.root,
+    )
+    found: dict[str, NDArray[Any]] = {}
+    again = observed = 0
+    for image in kapture_map.images:
+        if image not in keypoints:
+            continue
+        frame = read_frame(kapture_map.folder, image)
+        features = extract_all(extractor, [frame], [image])[0]
+        stored = keypoints.keypoints_px(image)
+        rows = rows_found_again(stored[:, :2], features.keypoints_px[:, :2])
+        descriptors = np.zeros((len(stored), features.descriptors.shape[1]), np.float32)
+        hit = rows >= 0
+        descriptors[hit] = features.descriptors[rows[hit]]
+        found[image] = descriptors
+        seen, _ = keypoints.index.observed(image)
+        again += int(hit[seen].sum())
+        observed += len(seen)
+    require(
+        again >= _MIN_FOUND_AGAIN * observed,
+        f"the map has no descriptors, and extracting {extractor.name} again finds only "
+        f"{again} of {observed} observed keypoints: it was made with other options",
+        path=kapture_map.folder.root,
+    )
+    return found
 
 
 @dataclass(frozen=True)
@@ -73,7 +304,6 @@ class MapMatching:
         self._map, self.options, self.types = kapture_map, options, types
         self._preprocessor = preprocessor
         self._vectors: dict[str, NDArray[np.float32]] = {}
-        self._candidates: dict[tuple[str, ...], Candidates] = {}
         self._vocabularies: dict[str, tuple[Vocabulary, VladSettings]] = {}
         self._lock = threading.RLock()
 
@@ -157,8 +387,12 @@ class MapMatching:
         vectors = [self._of_query(one, image, features) for one in compared]
         rows = [_unit(np.asarray(v, np.float32).reshape(1, -1)) for v in vectors]
         members = np.array(sorted({self._positions[name] for name in permitted}), np.int64)
-        candidates = self._candidates_by(compared)
-        index, _ = candidates.of(rows, members, self.options.query_pairs)
+        # do not copy the whole map, the usual pool
+        whole = len(members) == len(self._map.images)
+        databases = [of_map if whole else of_map[members] for of_map in map(self._of_map, compared)]
+        names, weights = zip(*((one.name, one.weight) for one in compared), strict=True)
+        retrieval = Retrieval(names, weights, self.options.fusion)
+        index, _ = most_similar(rows, databases, members, retrieval, self.options.query_pairs.top_k)
         return [self._map.images[i] for i in index[0] if i >= 0]
 
     def is_at_hand(self, brought: Collection[str]) -> bool:
@@ -204,12 +438,10 @@ class MapMatching:
         return _GlobalType(extractor.name, choice.weight, stored, choice, extractor)
 
     def _vlad_name(self, choice: GlobalFeaturesChoice) -> str:
-        """Return the map's VLAD type made with these options, or a new name."""
+        """Return the map's VLAD type of the chosen local features, or a new name."""
         local_type = choice.vlad_options().local_type
-        asked = {key: value for key, value in choice.options.items() if key != "local_type"}
         for name, (_, settings) in sorted(self._stored_vocabularies.items()):
-            same = settings.options.model_copy(update=asked) == settings.options
-            if same and local_type in (None, settings.local_type):
+            if local_type in (None, settings.local_type):
                 return name
         name = vlad_type(local_type or base_type(self.types[0].name))
         return name if name not in self._map.global_types() else f"{name}, trained anew"
@@ -228,20 +460,6 @@ class MapMatching:
                 if stored[1].local_type in known:
                     found.setdefault(name, stored)
         return found
-
-    def _candidates_by(self, compared: Sequence[_GlobalType]) -> Candidates:
-        databases = [self._of_map(one) for one in compared]
-        names, weights = zip(*((one.name, one.weight) for one in compared), strict=True)
-        if names not in self._candidates:
-            self._candidates[names] = Candidates(
-                lambda positions: [
-                    # do not copy the whole map, the usual pool
-                    database if len(positions) == len(database) else database[positions]
-                    for database in databases
-                ],
-                Retrieval(names, weights, self.options.fusion),
-            )
-        return self._candidates[names]
 
     def _of_query(
         self, one: _GlobalType, image: QueryImage, features: Sequence[Features]
@@ -274,11 +492,11 @@ class MapMatching:
                     for name in images
                 ]
             )
-        if not self._map.has_images():
-            raise DataError(
-                f"the map has no global features {one.name!r}, and no images to describe",
-                path=self._map.folder.root,
-            )
+        require(
+            self._map.has_images(),
+            f"the map has no global features {one.name!r}, and no images to describe",
+            path=self._map.folder.root,
+        )
         extractor = one.extractor or one.choice.make(self.options.placement)
         return np.stack([self._map_image(name).describe(extractor) for name in images])
 

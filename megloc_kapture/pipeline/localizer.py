@@ -14,15 +14,12 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.kapture_map import KaptureMap
-from megloc_kapture.pipeline.live_source import LiveSource, MapMatching
-from megloc_kapture.pipeline.local_types import local_types_of
+from megloc_kapture.pipeline.live_source import LiveSource, MapMatching, local_types_of
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.pipeline.queries import Preprocessor, Query, QueryImages, Unit
-from megloc_kapture.stages.localized_folder import unreadable_image
-from megloc_kapture.stages.matches import FeatureCache
+from megloc_kapture.pipeline.queries import Preprocessor, Query, Unit
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.pose_refinement import MapRefiners
-from megloc_kapture.stages.query_poses import localize_query
+from megloc_kapture.stages.query_poses import localize_query, unreadable_image
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.work import ordered_map
 from megloc_kapture.values import Camera, Device, Failure, Pose, Precision, RigidTransform
@@ -67,7 +64,7 @@ class Localizer:
             self.options.pose_refinement,
             self.options.placement,
         )
-        self.types = local_types_of(kapture_map, self.options, FeatureCache())
+        self.types = local_types_of(kapture_map, self.options)
         for local in self.types:
             local.prepare()
         self.matching = MapMatching(kapture_map, self.options, self.types, self._preprocessor)
@@ -144,7 +141,8 @@ class Localizer:
                 LiveSource(self.matching, image, cam_from_rig)
                 for image, (_, cam_from_rig) in zip(images, unit, strict=True)
             ]
-            scene = KaptureScene(self.map.folder, QueryImages(images), map_camera=self.map.camera)
+            by_name = {image.query.name: image for image in images}
+            scene = KaptureScene(self.map.folder, by_name, map_camera=self.map.camera)
             results = localize_query(
                 sources,
                 self.options.localization,

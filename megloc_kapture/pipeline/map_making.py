@@ -27,7 +27,7 @@ from megloc_kapture.datasets.colmap_map import (
     is_colmap,
 )
 from megloc_kapture.datasets.kapture_folders import import_mapping, mapping_files
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.io.colmap_mapping import MIN_IMAGES, Mapper
 from megloc_kapture.io.dataset_tables import (
     METRES,
@@ -62,15 +62,15 @@ from megloc_kapture.pipeline.presets import (
 from megloc_kapture.pipeline.query_folders import Photographs
 from megloc_kapture.stages.densifying import Densify
 from megloc_kapture.stages.global_features import ExtractGlobalFeatures
+from megloc_kapture.stages.guided_pyramid import PyramidMapping
 from megloc_kapture.stages.image_pairs import PairMapping
 from megloc_kapture.stages.local_features import ExtractLocalFeatures
-from megloc_kapture.stages.localized_folder import set_aside_unreadable
-from megloc_kapture.stages.map_points import GivenMap, LiftPoints, TriangulatePoints
+from megloc_kapture.stages.map_points import MakePoints
 from megloc_kapture.stages.map_refinement import RefineMap
 from megloc_kapture.stages.matches import MatchMapping
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.stages.preprocessing import Preprocess
-from megloc_kapture.stages.pyramid_mapping import PyramidMapping
+from megloc_kapture.stages.query_poses import set_aside_unreadable
 from megloc_kapture.stages.stage import (
     MAP,
     MAPPING,
@@ -96,9 +96,7 @@ MAP_STAGES: tuple[type[PipelineStage], ...] = (
     PairMapping,
     MatchMapping,
     PyramidMapping,
-    TriangulatePoints,
-    LiftPoints,
-    GivenMap,
+    MakePoints,
     RefineMap,
     Densify,
 )
@@ -112,7 +110,7 @@ _WITHOUT_POSES: tuple[type[PipelineStage], ...] = (
 _WITH_POSES: tuple[type[PipelineStage], ...] = (
     MatchMapping,
     PyramidMapping,
-    TriangulatePoints,
+    MakePoints,
     RefineMap,
 )
 
@@ -120,8 +118,10 @@ _WITH_POSES: tuple[type[PipelineStage], ...] = (
 def plan_map(mapping: KaptureFolder, options: PipelineOptions) -> list[Stage]:
     check_weights(options)
     options.retrieval()
-    if options.uses_given_map() or options.pairs_by_points():
-        raise OptionError("images with poses come with no model: map, mapping_pairs.by")
+    check_option(
+        not options.pairs_by_points(),
+        "images with poses come with no model: mapping_pairs.by covisibility",
+    )
     return [ImportMapping(mapping), *wanted_stages(MAP_STAGES, options)]
 
 
@@ -202,13 +202,14 @@ def options_of_photographs(
     options = options_of_preset(preset, changes=changes, assignments=assignments)
     if without := sorted(_BY_POSES.intersection(options.mapping_pairs.by)):
         raise OptionError(f"mapping_pairs.by {without[0]}: photographs have no poses yet")
-    if options.preprocessing.undistort:
-        raise OptionError(
-            "preprocessing.undistort: the distortion of photographs is unknown; it is estimated "
-            "with the map's cameras"
-        )
-    if options.map != "triangulate":
-        raise OptionError(f"map = {options.map}: points of photographs are triangulated")
+    check_option(
+        not options.preprocessing.undistort,
+        "preprocessing.undistort: the distortion of photographs is unknown; it is estimated "
+        "with the map's cameras",
+    )
+    check_option(
+        options.map == "triangulate", f"map = {options.map}: points of photographs are triangulated"
+    )
     return options
 
 
@@ -219,11 +220,11 @@ def structure_options(
     gps, distance = None, None
     if tuple(scale) == (GPS,):
         gps = photographs.gps()
-        if len(gps) < MIN_IMAGES:
-            raise DataError(
-                f"--scale gps: {len(gps)} photographs have a GPS position, at least {MIN_IMAGES} "
-                "are needed"
-            )
+        require(
+            len(gps) >= MIN_IMAGES,
+            f"--scale gps: {len(gps)} photographs have a GPS position, at least {MIN_IMAGES} "
+            "are needed",
+        )
     elif len(scale) == 3:
         try:
             distance = scale[0], scale[1], float(scale[2])
@@ -234,8 +235,7 @@ def structure_options(
                 f"--scale {' '.join(scale)}: {scale[2]!r} is not a distance in metres"
             )
         for name in scale[:2]:
-            if name not in photographs.names:
-                raise DataError(f"--scale: there is no photograph {name!r}")
+            require(name in photographs.names, f"--scale: there is no photograph {name!r}")
     elif scale:
         raise OptionError(
             f"--scale takes {GPS}, or two photographs and the metres between them, got "

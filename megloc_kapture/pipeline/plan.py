@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from megloc_kapture.errors import DataError, OptionError, OutputError, suggestion
+from megloc_kapture.errors import DataError, OptionError, OutputError, check_option, suggestion
 from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.io.files import (
     clear_leftovers,
@@ -243,8 +243,7 @@ def run_plan(
             raise OptionError(f"no stage {name!r}; {suggestion(name, names, listed='stages: ')}")
     start = names.index(first) if first else 0
     stop = names.index(last) + 1 if last else len(names)
-    if stop <= start:
-        raise OptionError(f"--until {last} comes before --from {first}")
+    check_option(stop > start, f"--until {last} comes before --from {first}")
     asked = _with_followers(stages, first) if first else {}
     for name in names[:start]:
         if workspace.manifest(name) is None:
@@ -345,10 +344,9 @@ def _there(stages: Sequence[Stage], stage: Stage, workspace: Workspace) -> dict[
     found = {}
     for path in missing:
         made = [m for m in manifests if any(is_below(path, output) for output in m.outputs)]
-        if not made:
-            raise OptionError(
-                f"stage {stage.name} reads {path}, which no stage has written in {workspace.root}"
-            )
+        check_option(
+            made, f"stage {stage.name} reads {path}, which no stage has written in {workspace.root}"
+        )
         found.update({manifest.stage: manifest.output for manifest in made})
     return found
 

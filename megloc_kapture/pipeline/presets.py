@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from megloc_kapture.errors import OptionError, suggestion
+from megloc_kapture.errors import OptionError, check_option, suggestion
 from megloc_kapture.io.weights import MissingWeightsError, all_missing, lookup
 from megloc_kapture.mapping.pairs import PairsByPosesOptions
 from megloc_kapture.mapping.uncertainty import UncertaintyOptions
@@ -26,12 +26,14 @@ from megloc_kapture.plugins import (
     SEGMENTERS,
     PluginChoice,
 )
-from megloc_kapture.stages.candidates import QueryPairsOptions
 from megloc_kapture.stages.global_features import GlobalFeaturesChoice
-from megloc_kapture.stages.image_pairs import MappingPairsOptions, RerankingOptions
+from megloc_kapture.stages.image_pairs import (
+    MappingPairsOptions,
+    QueryPairsOptions,
+    RerankingOptions,
+)
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
 from megloc_kapture.stages.options import LocalFeaturesChoice, PipelineOptions
-from megloc_kapture.stages.pose_refinement import PoseRefinementOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.query_poses import LocalizationOptions
 from megloc_kapture.values import Options
@@ -62,7 +64,6 @@ _MEGLOC = PipelineOptions(
     guided_pyramid=GuidedPyramidOptions(mode="all", count="matches"),
     refinement=MapRefinementOptions(uncertainty=UncertaintyOptions(max_robust_sigmas=2.5)),
     localization=LocalizationOptions(rank=PluginChoice(name="inliers")),
-    pose_refinement=PoseRefinementOptions(references="cluster"),
 )
 # weights with a free licence: docs/experiments/presets.md
 _MODERN = PipelineOptions(
@@ -166,8 +167,7 @@ def assigned(
 
 def _typed(assignment: str, flag: str) -> tuple[str, Any]:
     key, equals, text = assignment.partition("=")
-    if not equals or not key:
-        raise OptionError(f"{flag} takes key=value, got {assignment!r}")
+    check_option(equals and key, f"{flag} takes key=value, got {assignment!r}")
     key, text = key.strip(), text.strip()
     if text in ("None", "null"):  # Options parses "none", which is also a choice of some options
         return key, None
@@ -235,8 +235,10 @@ def _merged_choices(
     named = {one.get("name"): one for one in merged}
     if set(changes) <= set(named):
         for name, change in changes.items():
-            if not isinstance(change, dict):
-                raise OptionError(f"option {key}.{name}: a table is expected, got {change!r}")
+            check_option(
+                isinstance(change, dict),
+                f"option {key}.{name}: a table is expected, got {change!r}",
+            )
             _merge(named[name], change)
     elif len(merged) == 1:
         _merge(merged[0], changes)
@@ -267,22 +269,13 @@ def check_weights(options: PipelineOptions) -> None:
     raise error
 
 
-def feature_choices(options: PipelineOptions) -> list[LocalFeaturesChoice]:
-    """Return the local features of the options, those of a given map last."""
-    choices = list(options.local_features) if options.makes_points() else []
-    if options.uses_given_map():
-        given = options.given_features
-        choices.append(LocalFeaturesChoice(name=given.name, options=given.options))
-    return choices
-
-
 def _missing(options: PipelineOptions) -> MissingWeightsError | None:
-    features = feature_choices(options)
+    features = options.local_features
     matchers = [choice.matching or options.matching for choice in features]
     chosen: list[tuple[str, PluginChoice | None]] = [
         (SEGMENTERS, options.preprocessing.masks.segmenter),
         *((LOCAL_FEATURES, one) for one in features),
-        *((MATCHERS, one) for one in (*matchers, options.second_matching.matcher)),
+        *((MATCHERS, one) for one in matchers),
         (POSE_RANKERS, options.localization.rank),
         *((POSE_REFINERS, one) for one in options.pose_refinement.by),
     ]

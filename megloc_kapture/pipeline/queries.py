@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, check_option, require
 from megloc_kapture.io.images import read_image_rgb, turned_upright
 from megloc_kapture.localization.focal_length import estimate_remark
-from megloc_kapture.plugin_loading import load_chosen
 from megloc_kapture.plugins import (
-    SEGMENTERS,
     DepthView,
     GlobalFeatureExtractor,
     LocalFeatureExtractor,
@@ -24,9 +22,9 @@ from megloc_kapture.plugins import (
 from megloc_kapture.preprocessing.frames import FrameOptions, FramePlan, carry_points, plan_frame
 from megloc_kapture.preprocessing.masks import with_margin
 from megloc_kapture.stages.global_features import describe_images
-from megloc_kapture.stages.image_masks import ClassMasks, MaskOptions, ProcessedFrame
 from megloc_kapture.stages.local_features import check_size, extract_all, read_mask
 from megloc_kapture.stages.options import PipelineOptions
+from megloc_kapture.stages.preprocessing import ClassMasks, MaskOptions, ProcessedFrame
 from megloc_kapture.values import Camera, LocalFeatures, Pose, RigidTransform
 
 
@@ -64,10 +62,10 @@ class Query:
         if self.mask is None:
             return None
         mask = np.asarray(self.mask)
-        if mask.dtype != np.bool_ or mask.shape != shape:
-            raise DataError(
-                f"query {self.name}: a mask is bool {shape}, got {mask.dtype} {mask.shape}"
-            )
+        require(
+            mask.dtype == np.bool_ and mask.shape == shape,
+            f"query {self.name}: a mask is bool {shape}, got {mask.dtype} {mask.shape}",
+        )
         return mask
 
     def read_depth(self) -> DepthView | None:
@@ -93,11 +91,11 @@ class Query:
             return image
         image = np.asarray(self.image)
         shape = (self.camera.height, self.camera.width, 3)
-        if image.dtype != np.uint8 or image.shape != shape:
-            raise DataError(
-                f"query {self.name}: an image of its camera is uint8 {shape}, got {image.dtype} "
-                f"{image.shape}"
-            )
+        require(
+            image.dtype == np.uint8 and image.shape == shape,
+            f"query {self.name}: an image of its camera is uint8 {shape}, got {image.dtype} "
+            f"{image.shape}",
+        )
         return image
 
 
@@ -108,11 +106,11 @@ class Preprocessor:
         self._options = options
         self.mask_margin_px = options.mask_margin_px
         masks = options.preprocessing.masks
-        if masks != MaskOptions(segmenter=masks.segmenter, dynamic=masks.dynamic):
-            raise OptionError(
-                "preprocessing.masks.fixed, unchanging and user_masks are for folders of images: "
-                "make one with `megloc preprocess`; a query brings its own mask: Query(mask=...)"
-            )
+        check_option(
+            masks == MaskOptions(segmenter=masks.segmenter, dynamic=masks.dynamic),
+            "preprocessing.masks.fixed, unchanging and user_masks are for folders of images: "
+            "make one with `megloc preprocess`; a query brings its own mask: Query(mask=...)",
+        )
 
     def of(self, query: Query) -> QueryImage:
         """Prepare a query lazily; images with local features stay as they are."""
@@ -121,11 +119,7 @@ class Preprocessor:
 
     @cached_property
     def classes(self) -> ClassMasks | None:
-        masks = self._options.preprocessing.masks
-        if masks.segmenter is None:
-            return None
-        segmenter = load_chosen(SEGMENTERS, masks.segmenter, self._options.placement)
-        return ClassMasks.of(segmenter, masks.dynamic)
+        return self._options.preprocessing.masks.make_classes(self._options.placement)
 
 
 class QueryImage:
@@ -166,6 +160,10 @@ class QueryImage:
         return self._frame.mask
 
     @property
+    def depth(self) -> DepthView | None:
+        return self.query.read_depth()
+
+    @property
     def feature_mask(self) -> NDArray[np.bool_] | None:
         mask = self.mask
         return None if mask is None else with_margin(mask, self._preprocessor.mask_margin_px)
@@ -176,22 +174,6 @@ class QueryImage:
     def describe(self, extractor: GlobalFeatureExtractor) -> NDArray[np.float32]:
         """Return the global feature, float32 (D,)."""
         return describe_images(extractor, [self.pixels], [self.query.name])[0]
-
-
-class QueryImages:
-    """Images by name, as a :class:`~megloc_kapture.stages.scene.QueryScene`."""
-
-    def __init__(self, images: Iterable[QueryImage]) -> None:
-        self._images = {image.query.name: image for image in images}
-
-    def image(self, name: str) -> NDArray[np.uint8]:
-        return self._images[name].pixels
-
-    def mask(self, name: str) -> NDArray[np.bool_] | None:
-        return self._images[name].mask
-
-    def depth(self, name: str) -> DepthView | None:
-        return self._images[name].query.read_depth()
 
 
 Unit = tuple[tuple[Query, RigidTransform], ...]

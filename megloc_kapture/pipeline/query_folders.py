@@ -20,7 +20,7 @@ from megloc_kapture.datasets.kapture_folders import (
     warn_of_scaled,
     with_cameras_of_images,
 )
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.io.camera_list import CameraList
 from megloc_kapture.io.files import (
     check_relative,
@@ -42,11 +42,17 @@ from megloc_kapture.io.images import (
     turned_upright,
     write_image,
 )
-from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, writable_name
+from megloc_kapture.io.kapture import (
+    FeatureReader,
+    KaptureData,
+    KaptureFolder,
+    Sensor,
+    writable_name,
+)
 from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.output_folders import MARKER
-from megloc_kapture.matching.guided_pyramid import equivalent_types
-from megloc_kapture.pipeline.kapture_map import KaptureMap, plain_name
+from megloc_kapture.matching.guided_pyramid import base_type
+from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, plain_name
 from megloc_kapture.pipeline.queries import Query, Unit
 from megloc_kapture.preprocessing.frames import scaled_camera
 from megloc_kapture.stages import scene
@@ -105,6 +111,24 @@ class Queries(ABC):
         """Write the images into a kapture folder, as links if unchanged."""
 
 
+@dataclass(frozen=True)
+class _StoredType:
+    """Stored features of queries; the keypoints follow the convention of ``like``."""
+
+    keypoints: FeatureReader
+    descriptors: FeatureReader
+    like: MapKeypoints
+
+    def __contains__(self, image: str) -> bool:
+        return image in self.keypoints
+
+    def read(self, image: str) -> LocalFeatures:
+        check_lengths(self.keypoints, self.descriptors, image)
+        stored = self.keypoints.read(image)
+        scores = np.zeros(len(stored), np.float32)
+        return LocalFeatures(self.like.to_colmap(stored), scores, self.descriptors.read(image))
+
+
 class KaptureQueries(Queries):
     """Queries of a kapture folder, with its features if it has any.
 
@@ -116,25 +140,21 @@ class KaptureQueries(Queries):
         super().__init__()
         self._folder, self._map = folder, kapture_map
         self.names = folder.read().image_names()
-        self._stored = stored = kapture_map.stored_types()
-        wanted = {other for name in stored for other in equivalent_types(name)}
         brought = set(folder.types("keypoints")).intersection(folder.types("descriptors"))
-        plain = {plain_name(name): name for name in sorted(brought)}
-        sources = {
-            name: name if name in brought else plain.get(plain_name(name)) for name in wanted
-        }
-        self._local = {
-            name: (folder.keypoints(source), folder.descriptors(source))
-            for name, source in sorted(sources.items())
-            if source is not None
-        }
+        self._local: dict[str, _StoredType] = {}
+        for stored in kapture_map.stored_types():
+            base = base_type(stored)
+            plain = plain_name(base)
+            serving = [name for name in brought if plain_name(base_type(name)) == plain]
+            if serving and base not in self._local:
+                # a type serves its guided pyramid, and the other way round
+                name = min(serving, key=lambda name: (name != base, name != base_type(name), name))
+                self._local[base] = _StoredType(
+                    folder.keypoints(name),
+                    folder.descriptors(name),
+                    kapture_map.keypoints_of(stored),
+                )
         self._data = folder.read() if self._local else with_cameras_of_images(folder)
-        self._like = {
-            name: kapture_map.keypoints_of(
-                next(other for other in equivalent_types(name) if other in stored)
-            )
-            for name in self._local
-        }
         self._globals = {
             name: folder.global_features(name)
             for name in kapture_map.global_types()
@@ -142,19 +162,16 @@ class KaptureQueries(Queries):
         }
 
     def lacking(self, local_type: str) -> str | None:
-        types = [name for name in equivalent_types(local_type) if name in self._local]
-        return next(
-            (name for name in self.names if not any(name in self._local[t][0] for t in types)), None
-        )
+        local = self._local.get(base_type(local_type))
+        return next((name for name in self.names if local is None or name not in local), None)
 
     def check(self) -> None:
         self._map.folder.check_features_apart(self._folder)
-        if not self.names:
-            raise DataError("there are no query images", path=self._folder.root)
+        require(self.names, "there are no query images", path=self._folder.root)
         self._check_widths()
         errors = []
         for name in self.names:
-            if any(name in keypoints for keypoints, _ in self._local.values()):
+            if any(name in local for local in self._local.values()):
                 continue
             try:
                 if self._is_unknown(name):
@@ -196,7 +213,7 @@ class KaptureQueries(Queries):
             return guessed_camera(width, height)
         # keypoints are in pixels of the sensor's image size
         is_other = min(width, height) > 0 and (width, height) != (found.width, found.height)
-        brings = any(name in keypoints for keypoints, _ in self._local.values())
+        brings = any(name in local for local in self._local.values())
         return scaled_camera(found, width, height) if is_other and brings else found
 
     def write_images(self, output: Path) -> None:
@@ -207,18 +224,18 @@ class KaptureQueries(Queries):
             (vectors, self._map.folder.global_features(name))
             for name, vectors in self._globals.items()
         ]
-        for name, (_, descriptors) in self._local.items():
-            described = self._map.folder.types("descriptors")
-            theirs = next((other for other in equivalent_types(name) if other in described), None)
-            if theirs is not None:
-                pairs.append((descriptors, self._map.folder.descriptors(theirs)))
+        pairs += [
+            (local.descriptors, local.like.folder.descriptors(local.like.name))
+            for local in self._local.values()
+            if local.like.name in self._map.folder.types("descriptors")
+        ]
         for own, other in pairs:
-            if own.config.dsize != other.config.dsize:
-                raise DataError(
-                    f"{own.kind} of type {own.type_name!r} have {own.config.dsize} values, "
-                    f"the map's {other.config.dsize}",
-                    path=self._folder.root,
-                )
+            require(
+                own.config.dsize == other.config.dsize,
+                f"{own.kind} of type {own.type_name!r} have {own.config.dsize} values, "
+                f"the map's {other.config.dsize}",
+                path=self._folder.root,
+            )
 
     def types_of_all(self) -> list[str]:
         return [
@@ -260,30 +277,16 @@ class KaptureQueries(Queries):
         return found
 
     def _features(self, name: str) -> dict[str, LocalFeatures]:
-        found = {}
-        for needed in self._stored:
-            serving = (one for one in equivalent_types(needed) if one in self._local)
-            local_type = next((one for one in serving if name in self._local[one][0]), None)
-            if local_type is None or local_type in found:
-                continue
-            keypoints, descriptors = self._local[local_type]
-            check_lengths(keypoints, descriptors, name)
-            stored = keypoints.read(name)
-            found[local_type] = LocalFeatures(
-                self._like[local_type].to_colmap(stored),
-                np.zeros(len(stored), np.float32),
-                descriptors.read(name),
-            )
-        return found
+        return {base: one.read(name) for base, one in self._local.items() if name in one}
 
     def _no_features(self) -> dict[str, LocalFeatures]:
         return {
-            local_type: LocalFeatures(
+            base: LocalFeatures(
                 np.zeros((0, 2), np.float32),
                 np.zeros(0, np.float32),
-                np.zeros((0, descriptors.config.dsize), descriptors.config.dtype),
+                np.zeros((0, local.descriptors.config.dsize), local.descriptors.config.dtype),
             )
-            for local_type, (_, descriptors) in self._local.items()
+            for base, local in self._local.items()
         }
 
 
@@ -326,7 +329,7 @@ class Photographs(Queries):
         if every is not None and every < 1:
             raise OptionError(f"every {every}th frame cannot be taken; give 1 or more")
         roots = [Path(path) for path in paths]
-        files, self.passed_over = _named_files(roots)
+        files = _named_files(roots)
         self.root = roots[0] if roots[0].is_dir() else roots[0].parent
         self.without_row: list[str] = []
         self._calibrated = {k: v for root in roots for k, v in _calibrated(root).items()}
@@ -354,11 +357,8 @@ class Photographs(Queries):
         return all(image.camera.focal_deviation == 0 for image in self._images.values())
 
     def describe(self) -> list[str]:
-        """Describe skipped files and images missing from the camera list."""
+        """Describe images that are missing from the camera list."""
         lines = []
-        if self.passed_over:
-            said = f"{len(self.passed_over)} files that are no images are left out"
-            lines.append(f"{said}: {_first(self.passed_over)}")
         if self.without_row:
             said = f"{len(self.without_row)} images are not in the list of cameras"
             lines.append(f"{said}, their cameras are estimated: {_first(self.without_row)}")
@@ -451,21 +451,20 @@ def _calibrated(root: Path) -> dict[str, Camera]:
     return found
 
 
-def _named_files(paths: Sequence[Path]) -> tuple[dict[str, Path], list[str]]:
+def _named_files(paths: Sequence[Path]) -> dict[str, Path]:
     found: dict[str, Path] = {}
-    others: list[str] = []
     for path in paths:
         if is_kapture(path):
             files = _images_of_kapture(KaptureFolder(path))
         elif path.is_dir():
-            wanted, passed_over = _images_below(path)
-            files = {str(file.relative_to(path)): file for file in wanted}
-            others += [str(file.relative_to(path)) for file in passed_over]
-            if not files:
-                raise DataError("no image or video in this folder", path=path)
+            files = {str(file.relative_to(path)): file for file in _images_below(path)}
+            require(files, "no image or video in this folder", path=path)
         elif path.exists():
-            if path.suffix.lower() in _LIST_SUFFIXES:
-                raise DataError("not an image; a list of cameras is given by --camera", path=path)
+            require(
+                path.suffix.lower() not in _LIST_SUFFIXES,
+                "not an image; a list of cameras is given by --camera",
+                path=path,
+            )
             files = {path.name: path}
         else:
             raise DataError("no such file or folder", path=path)
@@ -478,21 +477,21 @@ def _named_files(paths: Sequence[Path]) -> tuple[dict[str, Path], list[str]]:
                 )
             _check_name(name, file)
             found[name] = file
-    return dict(sorted(found.items())), others
+    return dict(sorted(found.items()))
 
 
 def _images_of_kapture(folder: KaptureFolder) -> dict[str, Path]:
     data = folder.read()
-    if data.poses():
-        raise DataError(
-            "a kapture folder of images with poses: `megloc triangulate` makes a map of them, "
-            "`megloc localize --query` localizes them",
-            path=folder.root,
-        )
+    require(
+        not data.poses(),
+        "a kapture folder of images with poses: `megloc triangulate` makes a map of them, "
+        "`megloc localize --query` localizes them",
+        path=folder.root,
+    )
     return {name: folder.image_path(name) for name in data.image_names()}
 
 
-def _images_below(folder: Path) -> tuple[list[Path], list[Path]]:
+def _images_below(folder: Path) -> list[Path]:
     found, seen = list[Path](), set[str]()
     for place, folders, files in os.walk(folder, followlinks=True):
         here, real = Path(place), os.path.realpath(place)
@@ -506,8 +505,7 @@ def _images_below(folder: Path) -> tuple[list[Path], list[Path]]:
         folders[:] = sorted(shown, key=lambda name: ((here / name).is_symlink(), name))
         found += [here / name for name in files if not name.startswith(".")]
     named = {*WRITABLE_SUFFIXES, *UNREAD_SUFFIXES, *VIDEO_SUFFIXES}
-    wanted = {path for path in found if path.suffix.lower() in named or is_image(path)}
-    return sorted(wanted), sorted(set(found) - wanted)
+    return sorted(path for path in found if path.suffix.lower() in named or is_image(path))
 
 
 def _check_name(name: str, path: Path) -> None:
@@ -515,9 +513,9 @@ def _check_name(name: str, path: Path) -> None:
         check_relative(name)
     except DataError as error:
         raise DataError(f"{error.message}; rename the file", path=path) from error
-    if name != writable_name(name):
-        raise DataError(
-            f"kapture's tables cannot hold the name {name!r} (a comma, a space at an end, or # at "
-            "its beginning); rename the file",
-            path=path,
-        )
+    require(
+        name == writable_name(name),
+        f"kapture's tables cannot hold the name {name!r} (a comma, a space at an end, or # at "
+        "its beginning); rename the file",
+        path=path,
+    )

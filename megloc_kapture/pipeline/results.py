@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, check_option
 from megloc_kapture.io.dataset_tables import METRES, write_unit
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
@@ -18,7 +18,7 @@ from megloc_kapture.io.tables import CONSISTENCY_FILE, status_row, write_consist
 from megloc_kapture.localization.focal_length import solve_with_shared_camera
 from megloc_kapture.pipeline.localizer import Localizer
 from megloc_kapture.pipeline.query_folders import KaptureQueries, Photographs, Queries
-from megloc_kapture.stages.localized_folder import unreadable_image, write_localized
+from megloc_kapture.stages.query_poses import unreadable_image, write_localized
 from megloc_kapture.stages.stage import LOCALIZED
 from megloc_kapture.stages.work import Track, untracked
 from megloc_kapture.values import Failure, Pose, RigidTransform
@@ -46,8 +46,7 @@ class Results(Mapping[str, Pose | Failure]):
         candidates: Candidates | None = None,
         track: Track = untracked,
     ) -> None:
-        if workers < 1:
-            raise OptionError(f"{workers} workers cannot work; give 1 or more")
+        check_option(workers >= 1, f"{workers} workers cannot work; give 1 or more")
         self.localizer = localizer
         self.queries: Queries
         if isinstance(folder, Photographs):

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from megloc_kapture.datasets.kapture_folders import MAPPING, QUERY
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, OptionError, check_option, require
 from megloc_kapture.evaluation.pose_files import (
     RelativePose,
     format_mlad_file,
@@ -70,11 +70,11 @@ def check_dataset(dataset: str, protocol: Protocol, *, tables: Path | None) -> N
             "here; give it to submit with --side-tables, to check with --data"
         )
     official = {name for name in dataset_names() if name not in plain}
-    if wanted != given and (wanted not in plain or given in official):
-        raise OptionError(
-            f"dataset {dataset} is asked for, and {(tables or Path()) / PROTOCOL_FILE} is of "
-            f"dataset {protocol.dataset}"
-        )
+    check_option(
+        wanted == given or wanted in plain and given not in official,
+        f"dataset {dataset} is asked for, and {(tables or Path()) / PROTOCOL_FILE} is of "
+        f"dataset {protocol.dataset}",
+    )
 
 
 def write_submission(
@@ -162,11 +162,11 @@ def _read_results(localized: Path, beside: Path | None, *, from_rig: bool) -> _R
         for name in data.image_names()
     }
     if from_rig:
-        if not data.rigs:
-            raise DataError(
-                "no pose can come from the rig: neither the queries nor the result have a rigs.txt",
-                path=localized,
-            )
+        require(
+            data.rigs,
+            "no pose can come from the rig: neither the queries nor the result have a rigs.txt",
+            path=localized,
+        )
         # from the camera with the most inliers; fallback poses are replaced, never propagated
         known = {
             image: Pose(pose, num_inliers=results[image].num_inliers or 0)
@@ -215,12 +215,12 @@ def _ltvl(
 def _mlad(results: _Results, tables: Path) -> _Content:
     """Return texts by file name, (row, image) with a pose, and those without."""
     pairs = read_relocalization(tables)
-    if not pairs:
-        raise DataError(
-            "no pairs, and an MLAD challenge is about pairs: was the dataset imported with its "
-            "relocalization files?",
-            path=tables / RELOCALIZATION_FILE,
-        )
+    require(
+        pairs,
+        "no pairs, and an MLAD challenge is about pairs: was the dataset imported with its "
+        "relocalization files?",
+        path=tables / RELOCALIZATION_FILE,
+    )
     poses = _posed(results)
     scale = read_world(tables).official_from_local.scale
     references = KaptureFolder(tables.parent / MAPPING).read().poses()
@@ -296,8 +296,7 @@ def keep_submission(place: Path, folder: Path) -> Path:
     Identical content is not copied again; a name conflict gets a number, ``..._METHOD-2.txt``.
     """
     for path in (place, provenance_path(place)):
-        if not path.exists():
-            raise DataError("no such file; --from submission writes it again", path=path)
+        require(path.exists(), "no such file; --from submission writes it again", path=path)
     provenance = json.loads(read_text(provenance_path(place)))
     # a dot in a folder's name starts no suffix
     suffix = place.suffix if place.is_file() else ""

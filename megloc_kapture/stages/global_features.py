@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
-from megloc_kapture.errors import DataError, OptionError, PluginError, suggestion
+from megloc_kapture.errors import OptionError, PluginError, require, suggestion
 from megloc_kapture.features.image_bound import bounded_image
 from megloc_kapture.features.vlad import (
     PcaWhitening,
@@ -33,14 +33,13 @@ from megloc_kapture.plugin_loading import (
 )
 from megloc_kapture.plugins import GLOBAL_FEATURES as PLUGINS
 from megloc_kapture.plugins import GlobalFeatureExtractor, PluginChoice
-from megloc_kapture.stages.given_map import (
+from megloc_kapture.stages.local_features import images_of, read_image_of
+from megloc_kapture.stages.map_features import (
     MEAN_FILE,
     PROJECTION_FILE,
     SETTINGS_FILE,
     VOCABULARY_FILE,
-    described_images,
 )
-from megloc_kapture.stages.local_features import images_of, read_image_of
 from megloc_kapture.stages.scene import write_array
 from megloc_kapture.stages.stage import (
     FEATURES,
@@ -82,8 +81,11 @@ def train_on_map(
 ) -> Vocabulary:
     images = mapping.read().image_names()
     descriptors = mapping.descriptors(local_type)
-    if not any(descriptors.length(image) for image in images):
-        raise DataError(f"the map has no descriptors of type {local_type}", path=mapping.root)
+    require(
+        any(descriptors.length(image) for image in images),
+        f"the map has no descriptors of type {local_type}",
+        path=mapping.root,
+    )
     read = partial(_descriptors, FolderSpec(mapping), local_type)
     each = partial(ordered_map, executor=work.executor)
     return train_vlad(images, descriptors.length, read, options, each=each)
@@ -149,26 +151,14 @@ def write_vocabulary(
 
 def read_vocabulary(folder: Path) -> tuple[Vocabulary, VladSettings] | None:
     """Read the vocabulary of a global feature type, or None."""
-    path = folder / VOCABULARY_FILE
     if not (folder / SETTINGS_FILE).is_file():
         return None
     settings = read_json_model(folder / SETTINGS_FILE, VladSettings)
-    centres = _read_array(path, "vocabulary")
+    centres = np.load(folder / VOCABULARY_FILE)
     if settings.options.dimensions is None:
         return Vocabulary(centres), settings
-    mean = _read_array(folder / MEAN_FILE, "whitening")
-    projection = _read_array(folder / PROJECTION_FILE, "whitening")
+    mean, projection = (np.load(folder / name) for name in (MEAN_FILE, PROJECTION_FILE))
     return Vocabulary(centres, PcaWhitening(mean, projection)), settings
-
-
-def _read_array(path: Path, what: str) -> NDArray[np.float32]:
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise DataError(f"not a {what}: {error}", path=path) from error
-    if array.dtype != np.float32 or not np.isfinite(array).all():
-        raise DataError(f"not a {what}: {array.dtype} {array.shape}", path=path)
-    return array
 
 
 VLAD = "vlad"
@@ -239,18 +229,12 @@ def extract_global_features(
         _read, describe, extractor, "describe_many", _size
     )
     writer: FeatureWriter | None = None
-    size = 0
     results = work.map(steps, jobs, resumed_label(extractor.name, len(folder_of), len(jobs)))
     for (image, *_), vector in zip(jobs, results, strict=True):
         if writer is None:
-            size = len(vector)
-            config = FeatureConfig(extractor.name, np.dtype(np.float32), size, metric_type="L2")
+            kind = np.dtype(np.float32)
+            config = FeatureConfig(extractor.name, kind, len(vector), metric_type="L2")
             writer = FeatureWriter(output, "global_features", extractor.name, config, orphan=True)
-        if len(vector) != size:
-            raise PluginError(
-                f"plugin {extractor.name!r} on image {image}: {len(vector)} "
-                f"values, {size} of the images before"
-            )
         writer.write(image, vector)
     return {"images": len(folder_of)}
 
@@ -313,7 +297,7 @@ class ExtractGlobalFeatures(PipelineStage):
     @property
     def reads(self) -> Sequence[str]:  # type: ignore[override]
         images = (self.layout.mapping(), self.layout.query())
-        return (*images, *self.layout.reference(), LOCAL_FEATURES) if self._trains() else images
+        return (*images, LOCAL_FEATURES) if self._trains() else images
 
     def _trains(self) -> bool:
         return any(chosen.is_vlad for chosen in self.options.global_features)
@@ -331,16 +315,15 @@ class ExtractGlobalFeatures(PipelineStage):
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         queries, counts = work.folders((self.layout.query(),), FEATURES), {}
+        mapping = work.folder(self.layout.mapping(), FEATURES)
         for chosen in self.options.global_features:
             if chosen.is_vlad:
                 vlad = chosen.vlad_options()
                 name = vlad.local_type or self.options.main_type()
-                mapping = described_images(work, self, name)
                 folders = [mapping, *queries]
                 found = extract_vlad(mapping, folders, name, work.out, vlad.of_vlad(), work=work)
             else:
-                folders = [work.folder(self.layout.mapping()), *queries]
                 extractor = chosen.make(work.placement)
-                found = extract_global_features(folders, extractor, work.out, work=work)
+                found = extract_global_features([mapping, *queries], extractor, work.out, work=work)
             counts[f"images_with_{chosen.name}"] = found["images"]
         return counts

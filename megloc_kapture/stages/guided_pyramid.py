@@ -1,28 +1,41 @@
-"""Guided pyramid matching of one image with others (MegLoc), and its output files.
+"""Pairs matched again by stronger means: a second matcher, then guided pyramids (MegLoc).
+
+The second matcher matches the best pairs of each image; guided pyramids match poor pairs at other
+scales and rotations.
 
 The result is a keypoints type ``T-pyramid``: the keypoints of T, unchanged, followed by the added
-ones, with the matches of all pairs. Indices into T are therefore valid in T-pyramid.
+ones, with the matches of all pairs. Indices into T are therefore valid in T-pyramid. All variants
+are matched before pairs are combined, so that the order of the added keypoints does not depend on
+the workers.
 """
 
 from __future__ import annotations
 
 import logging
-import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.io.csv_table import write_csv_table
 from megloc_kapture.io.files import hard_link
-from megloc_kapture.io.kapture import FeatureWriter, KaptureFolder
+from megloc_kapture.io.kapture import (
+    FeatureWriter,
+    ImagePair,
+    KaptureFolder,
+    MatchesWriter,
+    read_pairs,
+)
 from megloc_kapture.io.kapture.features import SUFFIX, feature_folder
+from megloc_kapture.io.tables import PairCount, read_match_counts
 from megloc_kapture.localization.map_index import ImageMatches
+from megloc_kapture.mapping.pairs import views_can_overlap
 from megloc_kapture.matching.guided_pyramid import (
     GuidedPyramidOptions,
     ImageVariant,
@@ -33,25 +46,39 @@ from megloc_kapture.matching.guided_pyramid import (
     pyramid_type,
 )
 from megloc_kapture.matching.pyramid_combination import Combined, KeypointUnion, combine
-from megloc_kapture.matching.verification import KnownPoseOptions, two_view_of_variants
+from megloc_kapture.matching.verification import (
+    KnownPoseOptions,
+    known_pose_of_variants,
+    two_view_of_variants,
+)
 from megloc_kapture.plugins import LocalFeatureExtractor, Matcher
-from megloc_kapture.stages.local_features import check_lengths, extract_all
-from megloc_kapture.stages.matches import Features, NoVerification, Verification, match_all
-from megloc_kapture.stages.work import BATCH, batched
+from megloc_kapture.stages.local_features import check_lengths, extract_all, read_frame
+from megloc_kapture.stages.matches import (
+    MATCHING_OPTIONS,
+    Features,
+    Verification,
+    best_pairs,
+    cached_features,
+    mapping_pairs,
+    match_all,
+    match_pairs,
+)
+from megloc_kapture.stages.stage import (
+    FEATURES,
+    LOCAL_FEATURES,
+    MAPPING_MATCHES,
+    MAPPING_PAIRS,
+    MAPPING_PYRAMID,
+    QUERY_MATCHES,
+    QUERY_PAIRS,
+    QUERY_PYRAMID,
+    Layout,
+    PipelineStage,
+    StageWork,
+)
+from megloc_kapture.stages.work import BATCH, HERE, FolderSpec, Work, batched
 
 _log = logging.getLogger(__name__)
-
-COLUMNS = (
-    "image",
-    "other",
-    "matches_before",
-    "matches_after",
-    "added_to_image",
-    "added_to_other",
-    "variants_tried",
-    "best_variant",
-    "skipped",
-)
 
 
 @dataclass(frozen=True)
@@ -72,19 +99,6 @@ UNVERIFIED = PairVerifier(lambda _, matches: np.ones(len(matches), dtype=bool))
 """Keeps every match of every variant."""
 
 
-@dataclass(frozen=True, eq=False)
-class MatchedVariants:
-    """Matches of an image's variants with each other image.
-
-    ``num_variants`` includes skipped ones; ``skipped`` lists the reasons.
-    """
-
-    found: list[list[VariantMatches]]
-    num_variants: list[int]
-    skipped: str
-    seconds: float
-
-
 def match_image_again(
     itself: Features,
     pixels: NDArray[np.uint8],
@@ -96,15 +110,16 @@ def match_image_again(
     *,
     only_scaled: Sequence[str] = (),
     name: str,
-) -> MatchedVariants:
+) -> tuple[list[list[VariantMatches]], str]:
     """Extract the variants of an image and match them with other images.
+
+    Return the matches by image and variant, and the reasons of skipped variants.
 
     Parameters
     ----------
     pixels, mask : RGB (H, W, 3), and True = use (H, W) or None.
     only_scaled : images to match with scaled, unrotated variants; their results come last.
     """
-    started = time.perf_counter()
     every = method.options.variants(itself.camera.width, itself.camera.height)
     scaled = [variant for variant in every if variant.scale != 1.0]
     variants, skipped = extract_variants(
@@ -122,8 +137,7 @@ def match_image_again(
             pairs = [f"pair {name}, {other}" for other in batch]
             match_with = partial(match_all, method.matcher, names=pairs)
             found += match_variants(used, loaded, match_with, list(map(judge, batch, loaded)))
-    counts = [len(every)] * len(others) + [len(scaled)] * len(only_scaled)
-    return MatchedVariants(found, counts, _described(skipped), time.perf_counter() - started)
+    return found, _described(skipped)
 
 
 def _described(skipped: Mapping[ImageVariant, str]) -> str:
@@ -133,40 +147,32 @@ def _described(skipped: Mapping[ImageVariant, str]) -> str:
     return "; ".join(f"{' '.join(map(str, some))}: {reason}" for reason, some in by_reason.items())
 
 
-def tried_row(
-    pair: tuple[str, str], before: int, combined: Combined, tried: int, best: str, skipped: str
-) -> list[str]:
-    """Format a row of ``guided_pyramid.csv``; see :data:`COLUMNS`."""
-    added = [len(new) for new in combined.added]
-    return [*pair, *map(str, (before, len(combined.matches), *added, tried)), best, skipped]
+class TriedPair(NamedTuple):
+    """Numbers of matches and added keypoints of a pair that was matched again."""
+
+    pair: tuple[str, str]
+    before: int
+    after: int
+    added: int
+    skipped: str
 
 
-def write_tried(
-    output: Path, local_type: str, rows: Sequence[Sequence[str]], seconds: float
-) -> dict[str, float]:
-    """Write the table of retried pairs, warn of skipped variants, and return sums for the log."""
-    path = table_path(output, local_type)
-    write_csv_table(path, COLUMNS, rows)
-    skipped = Counter(row[-1] for row in rows if row[-1])
-    if skipped:
-        said = "guided pyramid of %s: variants of %d pairs are skipped, most often %s; see %s"
-        often = skipped.most_common(1)[0][0]
-        _log.warning(said, local_type, skipped.total(), often, path.name)
-    numbers = np.array([row[2:6] for row in rows], np.int64).reshape(-1, 4)
-    before, after = numbers[:, 0], numbers[:, 1]
+def _tried(pair: tuple[str, str], before: int, combined: Combined, skipped: str) -> TriedPair:
+    return TriedPair(pair, before, len(combined.matches), sum(map(len, combined.added)), skipped)
+
+
+def _sums(local_type: str, tried: Sequence[TriedPair]) -> dict[str, float]:
+    """Warn of skipped variants, and return sums for the log."""
+    if skipped := Counter(one.skipped for one in tried if one.skipped):
+        said = "guided pyramid of %s: variants of %d pairs are skipped, most often %s"
+        _log.warning(said, local_type, skipped.total(), skipped.most_common(1)[0][0])
     return {
-        "pairs_tried": len(rows),
-        "pairs_gained": int((after > before).sum()),
-        "matches_before": int(before.sum()),
-        "matches_after": int(after.sum()),
-        "keypoints_added": int(numbers[:, 2:].sum()),
-        "seconds_per_tried_pair": round(seconds / max(len(rows), 1), 3),
+        "pairs_tried": len(tried),
+        "pairs_gained": sum(one.after > one.before for one in tried),
+        "matches_before": sum(one.before for one in tried),
+        "matches_after": sum(one.after for one in tried),
+        "keypoints_added": sum(one.added for one in tried),
     }
-
-
-def table_path(output: Path, local_type: str) -> Path:
-    matches = feature_folder(output, "matches", pyramid_type(local_type), orphan=True)
-    return matches.with_name("guided_pyramid.csv")
 
 
 class PyramidFeatures:
@@ -220,8 +226,7 @@ class RetriedQuery:
     added_px: NDArray[np.float32]
     added_descriptors: NDArray[Any]
     matches: list[ImageMatches]
-    rows: list[list[str]]
-    seconds: float
+    tried: list[TriedPair]
 
 
 def retry_query(
@@ -251,36 +256,339 @@ def retry_query(
     ]
     mode, verification = method.options.mode, method.verification
     if mode == "off" or not hard:
-        return RetriedQuery(
-            query.keypoints_px[:0], query.descriptors[:0], list(matches), [], seconds=0.0
-        )
-    if isinstance(verification, KnownPoseOptions):
-        raise ValueError("a query has no pose to verify with")
+        return RetriedQuery(query.keypoints_px[:0], query.descriptors[:0], list(matches), [])
+    assert not isinstance(verification, KnownPoseOptions)
 
     def judge(other: str, features: Features) -> PairVerifier:
-        if isinstance(verification, NoVerification):
+        if verification is None:
             return UNVERIFIED
         return two_view_of_variants(
             query.camera, query.keypoints_px, features.camera, features.keypoints_px, base[other],
             verification,
         )  # fmt: skip
 
-    matched = match_image_again(query, *frame(), hard, load, judge, method, name=name)
-    of_other = dict(zip(hard, zip(matched.found, matched.num_variants, strict=True), strict=True))
-    skipped = f"image {matched.skipped}" if matched.skipped else ""
+    matched, skipped = match_image_again(query, *frame(), hard, load, judge, method, name=name)
+    of_other = dict(zip(hard, matched, strict=True))
     keypoints = KeypointUnion(query.keypoints_px)
     descriptors: list[NDArray[Any]] = []
     richer: list[ImageMatches] = []
-    rows = []
+    tried = []
     for other, pairs, scores in matches:
         if other in of_other:
-            variants, num_variants = of_other[other]
-            tried_ones = [(0, each) for each in variants]
-            combined = combine((pairs, scores), tried_ones, mode, (keypoints, None))
-            best = "" if combined.best is None else f"image {variants[combined.best].variant}"
-            rows.append(tried_row((name, other), len(pairs), combined, num_variants, best, skipped))
+            variants = of_other[other]
+            of_image = [(0, each) for each in variants]
+            combined = combine((pairs, scores), of_image, mode, (keypoints, None))
+            tried.append(_tried((name, other), len(pairs), combined, skipped))
             descriptors += [variants[at].descriptors[k] for at, k in combined.added[0].tolist()]
             pairs, scores = combined.matches, combined.scores
         richer.append((other, pairs, scores))
     added = np.array(descriptors, query.descriptors.dtype).reshape(-1, query.descriptors.shape[1])
-    return RetriedQuery(keypoints.added(), added, richer, rows, matched.seconds)
+    return RetriedQuery(keypoints.added(), added, richer, tried)
+
+
+_Pair = tuple[str, str]
+
+
+def pyramid_mapping(
+    mapping: KaptureFolder,
+    pairs: Sequence[ImagePair],
+    local_type: str,
+    method: PyramidMethod,
+    output: Path,
+    *,
+    num_found: Mapping[_Pair, int] | None = None,
+    work: Work = HERE,
+) -> dict[str, float]:
+    """Match mapping pairs with few matches again, using scaled and rotated variants of each image.
+
+    ``output`` receives ``local_features/T-pyramid``. ``num_found`` counts matches before
+    verification, by default the stored ones. Return counts for the log.
+    """
+    data, poses = mapping.read(), mapping.read().poses()
+
+    def can_gain(a: str, b: str) -> bool:
+        if not (a in poses and b in poses):
+            return False  # cannot triangulate without a pose
+        return views_can_overlap(data.camera_of(a), poses[a], data.camera_of(b), poses[b])
+
+    named = sorted({(min(p.query, p.map), max(p.query, p.map)) for p in pairs})
+    stored, keypoints = mapping.matches(local_type), mapping.keypoints(local_type)
+    counts = {pair: len(stored.read(*pair)[0]) for pair in named}
+    found = num_found or {}
+    is_hard, mode = method.options.is_hard, method.options.mode
+    hard = [p for p in named if is_hard(found.get(p, counts[p]), counts[p]) and can_gain(*p)]
+    others: dict[str, tuple[list[str], list[str]]] = defaultdict(lambda: ([], []))
+    for a, b in hard:
+        others[a][0].append(b)
+        # rotating either image is equivalent, so b only gets scaled
+        others[b][1].append(a)
+
+    features = PyramidFeatures(output, mapping, local_type)
+    again = partial(_match_again, FolderSpec(mapping), local_type, method)
+    jobs = [(image, *others[image]) for image in sorted(others)]
+    plugins = method.extractor, method.matcher
+    results = work.map(again, jobs, "guided pyramid", plugins=plugins)
+    matched_of: dict[_Pair, tuple[list[VariantMatches], str]] = {}
+    for (image, *names), (of_pairs, skipped) in zip(jobs, results, strict=True):
+        for other, of_pair in zip(chain(*names), of_pairs, strict=True):
+            matched_of[image, other] = of_pair, skipped
+    unions: dict[str, KeypointUnion] = {}
+    added: dict[str, list[NDArray[Any]]] = defaultdict(list)  # descriptors
+    tried, hard_pairs = [], set(hard)
+    with MatchesWriter(output, pyramid_type(local_type), orphan=True) as writer:
+        for pair in named:
+            matches, scores = stored.read(*pair)
+            if pair in hard_pairs and mode != "off":
+                directed = matched_of[pair], matched_of[pair[::-1]]
+                variants = [
+                    (at, one) for at, (of_pair, _) in enumerate(directed) for one in of_pair
+                ]
+                for image in set(pair) - unions.keys():
+                    unions[image] = KeypointUnion(keypoints.read(image))
+                both = unions[pair[0]], unions[pair[1]]
+                combined = combine((matches, scores), variants, mode, both)
+                for image, new in zip(pair, combined.added, strict=True):
+                    added[image] += [variants[at][1].descriptors[row] for at, row in new.tolist()]
+                skipped = " | ".join(reason for _, reason in directed if reason)
+                tried.append(_tried(pair, len(matches), combined, skipped))
+                matches, scores = combined.matches, combined.scores
+            writer.write(*pair, matches, scores)
+    extended = sorted(image for image, descriptors in added.items() if descriptors)
+    for image in extended:
+        features.write(image, unions[image].added(), np.stack(added[image]))
+    features.write_rest()
+    return {
+        "images_extracted_again": len(jobs),
+        "images_extended": len(extended),
+        "pairs": len(named),
+        **_sums(local_type, tried),
+    }
+
+
+def _match_again(
+    mapping: FolderSpec,
+    local_type: str,
+    method: PyramidMethod,
+    job: tuple[str, Sequence[str], Sequence[str]],
+) -> tuple[list[list[VariantMatches]], str]:
+    image, others, only_scaled = job
+    folder, verification = mapping.open(), method.verification
+    itself = cached_features(mapping, local_type, image)
+
+    def judge(other: str, features: Features) -> PairVerifier:
+        if verification is None:
+            return UNVERIFIED
+        image_from_world = folder.read().cam_from_world(image)
+        other_from_world = folder.read().cam_from_world(other)
+        assert image_from_world is not None and other_from_world is not None
+        assert isinstance(verification, KnownPoseOptions)
+        other_from_image = other_from_world @ image_from_world.inverse()
+        return known_pose_of_variants(
+            itself.camera, features.rays, features.slopes, other_from_image, verification
+        )
+
+    return match_image_again(
+        itself,
+        *read_frame(folder, image, margin_px=method.mask_margin_px),
+        others,
+        partial(cached_features, mapping, local_type),
+        judge,
+        method,
+        only_scaled=only_scaled,
+        name=image,
+    )
+
+
+def pyramid_queries(
+    query: KaptureFolder,
+    mapping: KaptureFolder,
+    pairs: Sequence[ImagePair],
+    local_type: str,
+    method: PyramidMethod,
+    output: Path,
+    *,
+    num_found: Mapping[_Pair, int] | None = None,
+    work: Work = HERE,
+) -> dict[str, float]:
+    """Match query pairs with few matches again: variants of the query with the map's keypoints.
+
+    The map stays unchanged; its keypoints of ``T-pyramid`` are used if it has any. See
+    :func:`pyramid_mapping`.
+    """
+    before = num_found or {}
+    larger = pyramid_type(local_type)
+    there = all(larger in mapping.types(kind) for kind in ("keypoints", "descriptors"))
+    types = local_type, larger if there else local_type
+    candidates: dict[str, list[str]] = {}
+    both = dict.fromkeys((pair.query, pair.map) for pair in pairs)
+    for image, other in sorted(both, key=itemgetter(0)):
+        candidates.setdefault(image, []).append(other)
+    jobs = [
+        (image, others, {one: before[image, one] for one in others if (image, one) in before})
+        for image, others in candidates.items()
+    ]
+    features = PyramidFeatures(output, query, local_type)
+    retry = partial(_retry, FolderSpec(query), FolderSpec(mapping), types, method)
+    plugins = method.extractor, method.matcher
+    tried: list[TriedPair] = []
+    extended = 0
+    with MatchesWriter(output, larger, orphan=True) as writer:
+        results = work.map(retry, jobs, "guided pyramid", plugins=plugins)
+        for (image, *_), found in zip(jobs, results, strict=True):
+            for one in found.matches:
+                writer.write(image, *one)
+            features.write(image, found.added_px, found.added_descriptors)
+            tried += found.tried
+            extended += len(found.added_px) > 0
+    features.write_rest()
+    return {
+        "images_extracted_again": len({one.pair[0] for one in tried}),
+        "images_extended": extended,
+        "pairs": sum(map(len, candidates.values())),
+        **_sums(local_type, tried),
+    }
+
+
+def _retry(
+    query: FolderSpec,
+    mapping: FolderSpec,
+    types: tuple[str, str],
+    method: PyramidMethod,
+    job: tuple[str, Sequence[str], Mapping[str, int]],
+) -> RetriedQuery:
+    image, candidates, num_found = job
+    folder, stored = query.open(), query.open().matches(types[0])
+    return retry_query(
+        cached_features(query, types[0], image),
+        [(other, *stored.read(image, other)) for other in candidates],
+        partial(cached_features, mapping, types[1]),
+        method,
+        lambda: read_frame(folder, image, margin_px=method.mask_margin_px),
+        num_found=num_found,
+        name=image,
+    )
+
+
+class _AgainStage(PipelineStage):
+    """Match the best pairs again with a second matcher, and poor pairs in guided pyramids."""
+
+    version = 4
+    matches: ClassVar[str]
+    explained_by = (
+        "guided_pyramid.mode",
+        "guided_pyramid.min_matches",
+        "guided_pyramid.count",
+        "second_matching.matcher",
+        "second_matching.pairs",
+    )
+
+    def is_wanted(self) -> bool:
+        return self.options.matches_again()
+
+    def plugins(self) -> Sequence[object]:
+        extractors, second = self.options.make_extractors(), self.options.make_second_matcher()
+        matchers = [self.options.make_matcher(extractor.name) for extractor in extractors]
+        return [*extractors, *matchers, *(() if second is None else (second,))]
+
+    def _match_again(
+        self,
+        work: StageWork,
+        first: KaptureFolder,
+        second: KaptureFolder,
+        pairs: Sequence[ImagePair],
+        verification: Verification,
+    ) -> dict[str, float]:
+        options, out = self.options, work.out / self.writes[0]
+        second_matcher, within_one = options.make_second_matcher(), first.root == second.root
+        counts: dict[str, float] = {}
+        for extractor in options.make_extractors():
+            name = extractor.name
+            rows = _match_counts(work.path(self.matches), name)
+            if second_matcher is not None:
+                best = best_pairs(
+                    {pair: rows[pair].verified for pair in _named(pairs) & rows.keys()},
+                    options.second_matching.pairs,
+                    of_both=within_one,
+                )
+                again = [ImagePair(*pair, 1.0) for pair in best]
+                matched = match_pairs(
+                    first, second, again, name, second_matcher, verification, out, work=work
+                )
+                rows |= _match_counts(out, name)
+                counts |= {f"{name} second {key}": count for key, count in matched.items()}
+            if options.uses_pyramid():
+                matcher, margin_px = options.make_matcher(name), options.mask_margin_px
+                method = PyramidMethod(
+                    extractor, matcher, verification, options.guided_pyramid, margin_px
+                )
+                folder = first.with_features([out, *first.features_dirs])
+                retry = partial(pyramid_queries, folder, second)
+                if within_one:
+                    retry = partial(pyramid_mapping, folder)
+                num_found = {pair: row.matches for pair, row in rows.items()}
+                retried = retry(pairs, name, method, out, num_found=num_found, work=work)
+                counts |= {f"{name} {key}": count for key, count in retried.items()}
+        return counts
+
+
+def _match_counts(features_dir: Path, local_type: str) -> dict[_Pair, PairCount]:
+    return {(row.image, row.other): row for row in read_match_counts(features_dir, local_type)}
+
+
+def _named(pairs: Sequence[ImagePair]) -> set[_Pair]:
+    """Return the names of the pairs in both orders, as map pairs are stored in one."""
+    return {names for p in pairs for names in ((p.query, p.map), (p.map, p.query))}
+
+
+class PyramidMapping(_AgainStage):
+    """Match pairs of map images again: with a second matcher, at other scales and rotations."""
+
+    name = "mapping_pyramid"
+    matches = MAPPING_MATCHES
+    uses = (
+        *MATCHING_OPTIONS,
+        "mapping_verification",
+        "second_matching",
+        "guided_pyramid",
+        "mask_margin_px",
+    )
+    inputs = (Layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS, MAPPING_MATCHES)
+    outputs = (MAPPING_PYRAMID,)
+
+    def is_wanted(self) -> bool:
+        return super().is_wanted() and self.options.triangulates()
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        mapping = work.folder(self.layout.mapping(), FEATURES, MAPPING_MATCHES)
+        pairs = mapping_pairs(work, mapping)
+        return self._match_again(work, mapping, mapping, pairs, self.options.verify_mapping())
+
+
+class PyramidQueries(_AgainStage):
+    """Match queries with candidates again; see :class:`PyramidMapping`."""
+
+    name = "query_pyramid"
+    matches = QUERY_MATCHES
+    uses = (
+        *MATCHING_OPTIONS,
+        "map",
+        "query_verification",
+        "second_matching",
+        "guided_pyramid",
+        "mask_margin_px",
+    )
+    inputs = (
+        Layout.mapping,
+        Layout.query,
+        LOCAL_FEATURES,
+        Layout.mapping_matches,
+        QUERY_PAIRS,
+        QUERY_MATCHES,
+    )
+    outputs = (QUERY_PYRAMID,)
+
+    def run(self, work: StageWork) -> Mapping[str, float]:
+        query = work.folder(self.layout.query(), FEATURES, QUERY_MATCHES)
+        mapping = work.folder(self.layout.mapping(), FEATURES, *self.layout.mapping_matches())
+        pairs = read_pairs(work.path(QUERY_PAIRS))
+        return self._match_again(work, query, mapping, pairs, self.options.verify_queries())

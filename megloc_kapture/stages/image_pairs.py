@@ -1,8 +1,12 @@
-"""Stages: image pairs to match, within the map and between queries and map."""
+"""Stages: image pairs to match, within the map and between queries and map.
+
+Pairs of similar images are retrieved by one or several global features.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import Literal
@@ -11,9 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.errors import DataError, OptionError, suggestion
-from megloc_kapture.io.dataset_tables import SIDE_TABLES
-from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs, write_pairs
+from megloc_kapture.errors import DataError, OptionError, require, suggestion
+from megloc_kapture.io.dataset_tables import SIDE_TABLES, ImageGroup, read_groups, read_priors
+from megloc_kapture.io.kapture import (
+    FeatureReader,
+    ImagePair,
+    KaptureFolder,
+    read_pairs,
+    write_pairs,
+)
 from megloc_kapture.io.kapture.features import KaptureVectors
 from megloc_kapture.io.tables import read_match_counts
 from megloc_kapture.mapping.pairs import (
@@ -26,16 +36,14 @@ from megloc_kapture.mapping.pairs import (
     pairs_by_sequence,
 )
 from megloc_kapture.matching.guided_pyramid import base_type
-from megloc_kapture.retrieval.search import greedy_coverage
-from megloc_kapture.stages.candidates import (
-    UNRESTRICTED,
-    Candidates,
-    QueryPairsOptions,
-    Restrictions,
-    Retrieval,
-    vectors_of,
+from megloc_kapture.retrieval.search import (
+    Found,
+    FusedSearch,
+    FusionOptions,
+    as_blocks,
+    common_length,
+    greedy_coverage,
 )
-from megloc_kapture.stages.given_map import described_images
 from megloc_kapture.stages.matches import VerifiedMatches, iterate_candidates
 from megloc_kapture.stages.scene import check_points
 from megloc_kapture.stages.stage import (
@@ -53,6 +61,140 @@ from megloc_kapture.stages.stage import (
     StageWork,
 )
 from megloc_kapture.values import Options
+
+
+@dataclass(frozen=True, eq=False)
+class Restrictions:
+    """Priors of the queries, and the coordinate frames of the map images.
+
+    ``groups`` has each image's group. ``priors`` has the permitted map images, locations or frames
+    of each query; others are unrestricted.
+    """
+
+    groups: Mapping[str, ImageGroup] = field(default_factory=dict)
+    priors: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, side_tables: Path) -> Restrictions:
+        """Read from a workspace's ``megloc/`` folder; missing tables restrict nothing."""
+        return cls(read_groups(side_tables), read_priors(side_tables))
+
+    def frame(self, image: str) -> str:
+        """Return the coordinate frame of a map image; ``""`` if there is only one."""
+        group = self.groups.get(image)
+        return "" if group is None else group.frame
+
+    def frames(self, images: Sequence[str]) -> list[NDArray[np.int64]]:
+        """Return indices into ``images`` by frame, frames sorted by name."""
+        members: dict[str, list[int]] = {}
+        for position, image in enumerate(images):
+            members.setdefault(self.frame(image), []).append(position)
+        return [np.array(members[name], np.int64) for name in sorted(members)]
+
+    def pools(
+        self, queries: Sequence[str], images: Sequence[str]
+    ) -> Iterator[tuple[list[int], NDArray[np.int64]]]:
+        """Group queries by permitted images.
+
+        Yield indices into ``queries`` and sorted indices into ``images``, int64 (M,); M may be 0.
+        """
+        together: dict[tuple[str, ...] | None, list[int]] = {}
+        for position, query in enumerate(queries):
+            prior = self.priors.get(query)
+            together.setdefault(None if prior is None else tuple(prior), []).append(position)
+        members = self._members(images) if set(together) != {None} else {}
+        for permitted, positions in together.items():
+            if permitted is None:
+                yield positions, np.arange(len(images))
+                continue
+            found = [position for name in permitted for position in members.get(name, ())]
+            yield positions, np.unique(np.array(found, dtype=np.int64))
+
+    def _members(self, images: Sequence[str]) -> dict[str, list[int]]:
+        members: dict[str, list[int]] = {}
+        for position, image in enumerate(images):
+            group = self.groups.get(image, ImageGroup())
+            for name in {image, group.location, group.frame} - {""}:
+                members.setdefault(name, []).append(position)
+        return members
+
+
+UNRESTRICTED = Restrictions()
+
+
+Vectors = KaptureVectors | NDArray[np.float32]  # unit rows
+_QUERY_ELEMENTS = 1 << 27  # query vector elements in memory: 512 MiB of float32
+
+
+class QueryPairsOptions(Options):
+    by: Literal["retrieval", "exhaustive"] = Field(
+        default="retrieval", description="the most similar map images, or all"
+    )
+    top_k: int = Field(default=50, gt=0, description="number of most similar map images per query")
+
+
+@dataclass(frozen=True)
+class Retrieval:
+    """Global features, by kapture type name, and their fusion weights; equal if empty."""
+
+    types: tuple[str, ...]
+    weights: tuple[float, ...] = ()
+    fusion: FusionOptions = field(default_factory=FusionOptions)
+
+    def readers(self, folder: KaptureFolder) -> list[FeatureReader]:
+        return [folder.global_features(name) for name in self.types]
+
+    def rank(
+        self,
+        queries: Sequence[Vectors],
+        database: Sequence[Vectors],
+        top_k: int,
+    ) -> Found:
+        """Find the most similar database rows: indices and scores (Q, at most ``top_k``).
+
+        ``queries`` and ``database`` hold unit rows by type, read in parts.
+        """
+        search = FusedSearch(top_k, self.fusion, self.weights or None)
+        asked = [as_blocks(source) for source in queries]
+        total, width = common_length(asked), sum(one.dimension for one in asked)
+        step = max(1, _QUERY_ELEMENTS // max(width, 1))
+        found = []
+        for start in range(0, total, step) or (0,):
+            rows = [source.read(start, min(start + step, total)) for source in asked]
+            found.append(search.find(rows, database))
+        indices, scores = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
+        return indices, scores
+
+
+def vectors_of(readers: Sequence[FeatureReader], images: Sequence[str]) -> list[KaptureVectors]:
+    """Return lazily read unit vectors of the images by type."""
+    for reader in readers:
+        missing = [image for image in images if image not in reader]
+        if missing:
+            raise DataError(
+                f"{len(missing)} images have no global feature of type {reader.type_name}, "
+                f"the first is {missing[0]}"
+            )
+    return [KaptureVectors(reader, images) for reader in readers]
+
+
+def most_similar(
+    queries: Sequence[Vectors],
+    database: Sequence[Vectors],
+    permitted: NDArray[np.int64],
+    retrieval: Retrieval,
+    top_k: int,
+) -> Found:
+    """Return indices of the most similar images, best first, and scores: (Q, K), -1 for none.
+
+    Parameters
+    ----------
+    queries, database : unit vectors (Q, D) and (M, D) by type.
+    permitted : indices (M,) of the database's images.
+    """
+    index, scores = retrieval.rank(queries, database, top_k)
+    return np.where(index >= 0, permitted[np.maximum(index, 0)], -1), scores
+
 
 PairingMethod = Literal["poses", "covisibility", "retrieval", "sequence", "exhaustive"]
 
@@ -85,8 +227,7 @@ def _seen_points(
         points.append(observations.point_ids[image_ids >= 0])
         seeing.append(image_ids[image_ids >= 0])
     point_ids = np.concatenate(points)
-    if len(point_ids) == 0:
-        raise DataError("no image to be paired observes its points", path=folder.root)
+    require(len(point_ids) != 0, "no image to be paired observes its points", path=folder.root)
     return point_ids, np.concatenate(seeing)
 
 
@@ -190,13 +331,10 @@ def pair_queries(
     if retrieval is None:
         raise DataError("retrieval needs global features of map and queries")
     database, described = retrieval.readers(mapping), retrieval.readers(query)
-    candidates = Candidates(
-        lambda members: vectors_of(database, [images[member] for member in members.tolist()]),
-        retrieval,
-    )
     for positions, permitted in pools:
         asked = vectors_of(described, [queries[at] for at in positions])
-        index, scores = candidates.of(asked, permitted, options)
+        vectors = vectors_of(database, [images[member] for member in permitted.tolist()])
+        index, scores = most_similar(asked, vectors, permitted, retrieval, options.top_k)
         for at, row, row_scores in zip(positions, index.tolist(), scores.tolist(), strict=True):
             of_query[at] = [
                 ImagePair(queries[at], images[i], score)
@@ -241,7 +379,7 @@ class PairQueries(PipelineStage):
     version = 3
     uses = ("query_pairs", *RETRIEVAL_OPTIONS)
     explained_by = ("query_pairs.by", "query_pairs.top_k")
-    inputs = (Layout.mapping, Layout.query, SIDE_TABLES, GLOBAL_FEATURES, Layout.reference)
+    inputs = (Layout.mapping, Layout.query, SIDE_TABLES, GLOBAL_FEATURES)
     outputs = (Layout.candidates,)
 
     @property
@@ -250,7 +388,7 @@ class PairQueries(PipelineStage):
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         pairs = pair_queries(
-            described_images(work, self, self.options.main_type()),
+            work.folder(self.layout.mapping(), FEATURES),
             work.folder(self.layout.query(), FEATURES),
             self.options.query_pairs,
             retrieval=self.options.retrieval(),

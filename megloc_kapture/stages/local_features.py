@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError, PluginError
+from megloc_kapture.errors import DataError, PluginError, require
 from megloc_kapture.features.image_bound import (
     Frame,
     bounded_size,
@@ -23,15 +23,12 @@ from megloc_kapture.features.image_bound import (
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import FeatureConfig, FeatureReader, FeatureWriter, KaptureFolder
 from megloc_kapture.io.kapture.features import feature_folder, has_features
-from megloc_kapture.io.tables import append_mask_count, read_mask_counts, write_mask_counts
 from megloc_kapture.plugin_loading import checked_array
 from megloc_kapture.plugins import LocalFeatureExtractor
 from megloc_kapture.preprocessing.masks import with_margin
-from megloc_kapture.stages.given_map import check_given_type, has_descriptors
 from megloc_kapture.stages.stage import (
     LOCAL_FEATURES,
     LOCAL_TYPES,
-    REFERENCE,
     Layout,
     PipelineStage,
     StageWork,
@@ -73,12 +70,12 @@ def extract_local_features(
         _SIZE,
     )
     writers: tuple[FeatureWriter, FeatureWriter] | None = None
+    masked = 0
     label = resumed_label(f"{extractor.name} features", len(jobs), len(todo))
     results = work.map(steps, todo, label)
     for job, features in zip(todo, results, strict=True):
         writers = writers or _writers(output, extractor, features)
-        if job.has_mask:
-            append_mask_count(output, extractor.name, job.image, features.num_masked)
+        masked += features.num_masked
         writers[0].write(job.image, features.keypoints_px)
         writers[1].write(job.image, features.descriptors)  # last: it marks the image as finished
     place = feature_folder(output, "keypoints", extractor.name, orphan=True)
@@ -87,10 +84,8 @@ def extract_local_features(
     bound = max_megapixels_of(extractor)
     if reduced := sum(bounded_size(*job.size, bound) != job.size for job in jobs):
         counts["images_reduced"] = reduced
-    if any(job.has_mask for job in jobs):
-        masked = read_mask_counts(output, extractor.name)
-        write_mask_counts(output, extractor.name, masked)
-        counts |= {"images_with_mask": len(masked), "keypoints_masked": sum(masked.values())}
+    if with_mask := sum(job.has_mask for job in jobs):
+        counts |= {"images_with_mask": with_mask, "keypoints_masked": masked}
     return counts
 
 
@@ -98,10 +93,8 @@ def images_of(folders: Sequence[KaptureFolder], purpose: str) -> dict[str, Kaptu
     named = [(image, folder) for folder in folders for image in folder.read().image_names()]
     named.sort(key=itemgetter(0))
     for (image, _), (other, _) in pairwise(named):
-        if image == other:
-            raise DataError(f"image {image} is in two kapture folders")
-    if not named:
-        raise DataError(f"there are no images to {purpose}")
+        require(image != other, f"image {image} is in two kapture folders")
+    require(named, f"there are no images to {purpose}")
     return dict(named)
 
 
@@ -207,28 +200,23 @@ def _checked(extractor: LocalFeatureExtractor, features: Any, image: str) -> Loc
 
 
 class ExtractLocalFeatures(PipelineStage):
-    """Extract local features of all images; of a given map's, where it brings none."""
+    """Extract local features of all images."""
 
     name = "local_features"
     resumes = True
     uses = ("mask_margin_px", *LOCAL_TYPES)
     explained_by = ("local_features",)
-    inputs = (Layout.mapping, Layout.query, Layout.reference)
+    inputs = (Layout.mapping, Layout.query)
     outputs = (LOCAL_FEATURES,)
 
     def plugins(self) -> Sequence[object]:
-        return self.options.query_extractors()
+        return self.options.make_extractors()
 
     def run(self, work: StageWork) -> Mapping[str, float]:
-        everything = work.folders((self.layout.mapping(), self.layout.query()))
-        todo = [(extractor, everything) for extractor in self.options.own_extractors()]
-        if self.options.uses_given_map():
-            extractor, reference = self.options.make_given_extractor(), work.folder(REFERENCE)
-            check_given_type(reference, extractor.name)
-            todo.append((extractor, everything[1:] if has_descriptors(reference) else everything))
+        folders = work.folders((self.layout.mapping(), self.layout.query()))
         counts: Counter[str] = Counter()
-        margin_px = self.options.mask_margin_px
-        for extractor, folders in todo:
+        for extractor in self.options.make_extractors():
+            margin_px = self.options.mask_margin_px
             found = extract_local_features(
                 folders, extractor, work.out, mask_margin_px=margin_px, work=work
             )

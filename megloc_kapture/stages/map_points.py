@@ -1,4 +1,4 @@
-"""Stages: map points, triangulated, lifted through depth, or from a prebuilt model."""
+"""Stages: map points, triangulated or lifted through depth."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap import MapImage, TriangulatedPoints, TriangulationOptions, triangulate
 from megloc_kapture.io.files import link_images
 from megloc_kapture.io.kapture import (
@@ -23,14 +23,13 @@ from megloc_kapture.io.kapture import (
 from megloc_kapture.io.kapture.matches import MatchesReader
 from megloc_kapture.mapping.depth import lift_keypoints
 from megloc_kapture.matching.guided_pyramid import base_type
-from megloc_kapture.stages.given_map import check_given_type, copy_features, given_map
+from megloc_kapture.stages.map_features import copy_features
 from megloc_kapture.stages.scene import DepthRecord, depth_records, read_depth
 from megloc_kapture.stages.stage import (
     FEATURES,
     GLOBAL_FEATURES,
     LOCAL_FEATURES,
     LOCAL_TYPES,
-    REFERENCE,
     UNREFINED,
     Layout,
     PipelineStage,
@@ -63,8 +62,7 @@ def triangulate_map(
     types = tuple(dict.fromkeys([local_types] if isinstance(local_types, str) else local_types))
     data = mapping.read()
     images = sorted(data.poses())
-    if not images:
-        raise DataError("no mapping image has a pose", path=mapping.root)
+    require(images, "no mapping image has a pose", path=mapping.root)
     asked = None if pairs is None else {tuple(sorted((pair.query, pair.map))) for pair in pairs}
     of_type = {name: matched_pairs(matches.matches(name), images, asked) for name in types}
     for name in types:
@@ -93,14 +91,7 @@ def triangulate_map(
             "(cam_from_world) and cameras are right",
             path=mapping.root,
         )
-    write_sensors(output, data)
-    link_images(mapping.root, output)
-    # keep a pyramid's base type, as queries are first matched with that
-    there = mapping.types("keypoints")
-    copy_features(mapping, output, {*types, *map(base_type, types)}.intersection(there))
-    # kapture stores a colour per point; black means unknown
-    write_points3d(output, np.concatenate([xyz, np.zeros_like(xyz)], axis=1))
-    write_observations(output, observations)
+    _write_map(mapping, output, xyz, observations)
     num_observations = sum(map(len, observations.values()))
     return {
         "images": len(images),
@@ -168,12 +159,12 @@ def lift_map(
     records = depth_records(data)
     images = sorted(poses)
     with_depth = [image for image in images if image in records]
-    if not with_depth:
-        raise DataError(
-            "no mapping image has a pose and a depth map of its moment (records_depth.txt, a "
-            "rig with camera and depth sensor)",
-            path=mapping.root,
-        )
+    require(
+        with_depth,
+        "no mapping image has a pose and a depth map of its moment (records_depth.txt, a "
+        "rig with camera and depth sensor)",
+        path=mapping.root,
+    )
     spec, row_of = FolderSpec(mapping), {image: row for row, image in enumerate(images)}
     jobs = [(image, records[image]) for image in with_depth]
     points: list[NDArray[np.float64]] = []
@@ -198,11 +189,7 @@ def lift_map(
         )
         total += len(keypoints)
     xyz = np.concatenate(points)
-    write_sensors(output, data)
-    link_images(mapping.root, output)
-    copy_features(mapping, output, local_types)
-    write_points3d(output, np.concatenate([xyz, np.zeros_like(xyz)], axis=1))
-    write_observations(output, seen)
+    _write_map(mapping, output, xyz, seen)
     return {"images": len(images), "images_with_depth": len(with_depth), "points": len(xyz)}
 
 
@@ -222,67 +209,37 @@ def _lift(
     return points[valid], np.flatnonzero(valid).astype(np.int32)
 
 
-class GivenMap(PipelineStage):
-    """Use the points of the dataset's model."""
+def _write_map(
+    mapping: KaptureFolder,
+    output: Path,
+    xyz: NDArray[np.float64],
+    observations: Mapping[str, Observations],
+) -> None:
+    write_sensors(output, mapping.read())
+    link_images(mapping.root, output)
+    # keep a pyramid's base type, as queries are first matched with that
+    copy_features(mapping, output, {*observations, *map(base_type, observations)})
+    # kapture stores a colour per point; black means unknown
+    write_points3d(output, np.concatenate([xyz, np.zeros_like(xyz)], axis=1))
+    write_observations(output, observations)
+
+
+class MakePoints(PipelineStage):
+    """Triangulate the map's points, or lift them from keypoints through depth."""
 
     name = "points"
-    uses = ("map", "given_features")
+    version = 3
+    uses = ("map", "triangulation", "guided_pyramid.mode", *LOCAL_TYPES)
     explained_by = ("map",)
-    inputs = (REFERENCE, Layout.mapping, LOCAL_FEATURES, GLOBAL_FEATURES)
+    inputs = (Layout.mapping, LOCAL_FEATURES, GLOBAL_FEATURES, Layout.mapping_matches)
     outputs = (UNREFINED,)
 
-    def is_wanted(self) -> bool:
-        return self.options.map == "given"
-
     def run(self, work: StageWork) -> Mapping[str, float]:
-        reference = work.folder(REFERENCE)
-        check_given_type(reference, self.options.make_given_extractor().name)
-        mapping = work.folder(self.layout.mapping(), FEATURES)
-        return given_map(reference, mapping, work.out / UNREFINED)
-
-
-class LiftPoints(PipelineStage):
-    """Lift the map's points from keypoints through depth."""
-
-    name = "points"
-    uses = ("map", "local_features.name", "local_features.options")
-    explained_by = ("map",)
-    inputs = (Layout.mapping, LOCAL_FEATURES, GLOBAL_FEATURES)
-    outputs = (UNREFINED,)
-
-    def is_wanted(self) -> bool:
-        return self.options.map == "lift"
-
-    def run(self, work: StageWork) -> Mapping[str, float]:
-        mapping, types = work.folder(self.layout.mapping(), FEATURES), self.options.own_types()
-        return lift_map(mapping, types, work.out / UNREFINED, work=work)
-
-
-class TriangulatePoints(PipelineStage):
-    """Triangulate the map's points."""
-
-    name = "points"
-    version = 2
-    uses = ("triangulation", "guided_pyramid.mode", *LOCAL_TYPES)
-    explained_by = ("map",)
-    inputs = (
-        Layout.mapping,
-        LOCAL_FEATURES,
-        GLOBAL_FEATURES,
-        Layout.mapping_matches,
-    )
-    outputs = (UNREFINED,)
-
-    def is_wanted(self) -> bool:
-        return self.options.triangulates()
-
-    def run(self, work: StageWork) -> Mapping[str, float]:
+        options, out = self.options, work.out / UNREFINED
         mapping = work.folder(self.layout.mapping(), FEATURES, *self.layout.mapping_matches())
+        if not options.triangulates():
+            return lift_map(mapping, options.local_types(), out, work=work)
+        types, threads = options.point_types(), work.num_threads
         return triangulate_map(
-            mapping,
-            mapping,
-            self.options.point_types(),
-            work.out / UNREFINED,
-            self.options.triangulation,
-            num_threads=work.num_threads,
+            mapping, mapping, types, out, options.triangulation, num_threads=threads
         )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +46,8 @@ from megloc_kapture.mapping.uncertainty import (
     too_uncertain,
     track_lengths,
 )
-from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.given_map import copy_features
+from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.map_features import copy_features
 from megloc_kapture.stages.scene import DepthRecord, check_points, depth_records, read_depth
 from megloc_kapture.stages.stage import UNREFINED, Layout, PipelineStage, StageWork
 from megloc_kapture.stages.work import HERE, FolderSpec, Work
@@ -83,14 +83,14 @@ class MapSelection:
         self.xyz = np.ascontiguousarray(source.points3d()[:, :3])
         self._of_type = source.observations()
         types = list(self._of_type.values())
-        self.images = sorted({image for seen in types for image in seen.image_names})
+        # no localization uses observations by images without a pose
         poses = self.data.poses()
-        posed = np.array([image in poses for image in self.images], dtype=bool)
-        # entries without a pose keep the rows aligned; no judged observation refers to them
-        self._poses = [poses.get(image) for image in self.images]
+        observing = {image for seen in types for image in seen.image_names}
+        self.images = sorted(observing.intersection(poses))
+        self.cams_from_world = [poses[image] for image in self.images]
         row_of = {image: row for row, image in enumerate(self.images)}
         rows = [
-            np.array([row_of[i] for i in seen.image_names], dtype=np.int32)[seen.image_ids]
+            np.array([row_of.get(i, -1) for i in seen.image_names], dtype=np.int32)[seen.image_ids]
             for seen in types
         ]
         self._sizes = [len(seen) for seen in types]
@@ -100,32 +100,18 @@ class MapSelection:
         self._order: Any = slice(None) if len(types) == 1 else np.argsort(point_ids, kind="stable")
         self.point_ids, self.image_ids = point_ids[self._order], image_ids[self._order]
         self.kept_points = np.ones(len(self.xyz), dtype=bool)
-        self.kept = np.ones(len(self.point_ids), dtype=bool)
-        self._placed = posed[self.image_ids] if len(posed) else self.kept.copy()
+        self.kept = self.image_ids >= 0
         self.reports: list[FilterReport] = []
         self._covariances: Floats | None = None
 
-    @cached_property
-    def _views(self) -> tuple[list[Any], list[Any]]:
-        posed = next((row for row, pose in enumerate(self._poses) if pose is not None), None)
-        if posed is None:
-            return [], []
-        stand_in = self.data.camera_of(self.images[posed]), self._poses[posed]
-        views = [
-            stand_in if pose is None else (self.data.camera_of(image), pose)
-            for image, pose in zip(self.images, self._poses, strict=True)
-        ]
-        cameras, poses = zip(*views, strict=True)
-        return list(cameras), list(poses)
-
     def observed(self) -> tuple[ObservedPoints, NDArray[np.int64]]:
-        """Return the kept observations by posed images, and their rows."""
-        rows = np.flatnonzero(self.kept & self._placed)
-        point_ids, image_ids = self.point_ids, self.image_ids
-        if len(rows) < len(point_ids):
-            point_ids, image_ids = point_ids[rows], image_ids[rows]
-        cameras, poses = self._views
-        return ObservedPoints(self.xyz, point_ids, image_ids, cameras, poses), rows
+        """Return the kept observations and their rows."""
+        rows = np.flatnonzero(self.kept)
+        cameras = [self.data.camera_of(image) for image in self.images]
+        observed = ObservedPoints(
+            self.xyz, self.point_ids[rows], self.image_ids[rows], cameras, self.cams_from_world
+        )
+        return observed, rows
 
     def covariances(self) -> Floats:
         """Covariances (N, 6) from the kept observations; NaN where undetermined."""
@@ -222,9 +208,9 @@ def refine_map(
 ) -> dict[str, float]:
     """Write a map without the points and observations that the options reject.
 
-    Points are renumbered. Observations by images without a pose cannot be judged and stay as long
-    as their point does. ``link_features`` allows hard links to the features inside the source
-    folder, which must not be user data. Return counts for the log.
+    Points are renumbered. Observations by images without a pose are dropped. ``link_features``
+    allows hard links to the features inside the source folder, which must not be user data. Return
+    counts for the log.
     """
     check_points(source, "refine")
     selection = MapSelection(source)
@@ -326,12 +312,11 @@ class _Scan:
 def _scans(
     selection: MapSelection, with_depth: Mapping[int, DepthRecord], restrictions: Restrictions
 ) -> list[_Scan]:
-    poses = selection.data.poses()
-    images = [row for row in with_depth if selection.images[row] in poses]
+    images = list(with_depth)
     scans: list[_Scan] = []
     for members in restrictions.frames([selection.images[row] for row in images]):
         rows = [images[member] for member in members]
-        cams = [poses[selection.images[row]] for row in rows]
+        cams = [selection.cams_from_world[row] for row in rows]
         centres = np.array([cam.center() for cam in cams])
         pairs = cKDTree(centres).query_pairs(_SAME_CENTRE_M, output_type="ndarray")
         links = csr_array((np.ones(len(pairs)), pairs.T), shape=(len(rows), len(rows)))

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
-from collections import Counter, OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from itertools import combinations, groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.errors import DataError, PluginError
+from megloc_kapture.errors import PluginError, require
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.kapture import ImagePair, KaptureFolder, MatchesWriter, read_pairs
 from megloc_kapture.io.tables import (
@@ -39,7 +38,6 @@ from megloc_kapture.matching.verification import (
 )
 from megloc_kapture.plugin_loading import checked_array
 from megloc_kapture.plugins import Matcher, PluginChoice
-from megloc_kapture.stages.given_map import matched_images
 from megloc_kapture.stages.local_features import check_lengths
 from megloc_kapture.stages.stage import (
     FEATURES,
@@ -58,30 +56,26 @@ from megloc_kapture.stages.work import (
     Work,
     batched,
     in_batches,
+    open_folder,
     resumed_label,
 )
 from megloc_kapture.values import Camera, ImageFeatures, Options, RigidTransform
 
 _log = logging.getLogger(__name__)
 
-_CACHE_BYTES = 256 << 20  # per process: the descriptors of about a hundred images
+CACHED_IMAGES = 80  # per process: about 250 MB of RootSIFT
 _PAIRS_PER_ITEM = 32  # share an image, whose features are read once
 # image groups in which the given poses are checked against the matches
 _CHECKED_GROUPS = 6
 _RANKS = (0, 1, 3, 7, 15)  # ranks of the other group members among the images paired with the first
 
 
-class NoVerification(Options):
-    """Keep every match."""
-
-    kind: Literal["none"] = "none"
-
-
-Verification = KnownPoseOptions | TwoViewOptions | NoVerification
+Verification = KnownPoseOptions | TwoViewOptions | None
+"""Options of a verification by known poses or by a two-view model; None keeps every match."""
 
 
 class SecondMatchingOptions(Options):
-    """Options of a second pass of matching: the best pairs again, with another matcher."""
+    """Second pass of matching: the best pairs again, with another matcher."""
 
     matcher: PluginChoice | None = Field(
         default=None,
@@ -223,8 +217,7 @@ def check_given_poses(
     if contradiction is None:
         return
     message, most = contradiction
-    if most and not work.force:
-        raise DataError(f"{message} (--force continues anyway)", path=mapping.root)
+    require(not most or work.force, f"{message} (--force continues anyway)", path=mapping.root)
     _log.warning("%s", message)
 
 
@@ -355,7 +348,7 @@ def verification_of(
 
     def verify(a: Features, b: Features, matches: NDArray[np.int64]) -> NDArray[np.bool_]:
         rows_a, rows_b = matches.T
-        if isinstance(options, NoVerification):
+        if options is None:
             return np.ones(len(matches), dtype=bool)
         if isinstance(options, TwoViewOptions):
             points_px = a.keypoints_px[rows_a, :2], b.keypoints_px[rows_b, :2]
@@ -370,48 +363,17 @@ def verification_of(
     return verify
 
 
-class FeatureCache:
-    """Thread-safe LRU cache of image features, bounded in bytes."""
-
-    def __init__(self, max_bytes: int = _CACHE_BYTES) -> None:
-        self._items: OrderedDict[Hashable, Features] = OrderedDict()
-        self._bytes = 0
-        self._max_bytes = max_bytes
-        self._lock = threading.Lock()
-
-    def get(self, key: Hashable, load: Callable[[], Features]) -> Features:
-        with self._lock:
-            if key in self._items:
-                self._items.move_to_end(key)
-                return self._items[key]
-        features = load()
-        with self._lock:
-            if key not in self._items:
-                self._items[key] = features
-                self._bytes += _size(features)
-            while self._bytes > self._max_bytes and len(self._items) > 1:
-                _, old = self._items.popitem(last=False)
-                self._bytes -= _size(old)
-        return features
-
-
-def _size(features: Features) -> int:
-    rays_and_slopes = (3 + 4) * 8 * len(features.keypoints_px)  # counted even if not computed yet
-    return features.descriptors.nbytes + features.keypoints_px.nbytes + rays_and_slopes
-
-
-_cache = FeatureCache()
-
-
 def cached_features(spec: FolderSpec, local_type: str, image: str) -> Features:
-    def read() -> Features:
-        folder = spec.open()
-        keypoints, descriptors = folder.keypoints(local_type), folder.descriptors(local_type)
-        check_lengths(keypoints, descriptors, image)
-        camera = folder.read().camera_of(image)
-        return Features.of(camera, keypoints.read(image), descriptors.read(image))
+    return _features(spec.key, local_type, image)
 
-    return _cache.get((*spec.key, local_type, image), read)
+
+@lru_cache(maxsize=CACHED_IMAGES)
+def _features(key: tuple[Any, ...], local_type: str, image: str) -> Features:
+    folder = open_folder(*key)
+    keypoints, descriptors = folder.keypoints(local_type), folder.descriptors(local_type)
+    check_lengths(keypoints, descriptors, image)
+    camera = folder.read().camera_of(image)
+    return Features.of(camera, keypoints.read(image), descriptors.read(image))
 
 
 def iterate_candidates(pairs: Sequence[ImagePair]) -> Iterator[tuple[str, list[str]]]:
@@ -425,7 +387,8 @@ def iterate_candidates(pairs: Sequence[ImagePair]) -> Iterator[tuple[str, list[s
 
 
 # options that determine the local feature types and their matching
-MATCHING_OPTIONS = ("map", "local_features", "given_features", "matching", "verification")
+MATCHING_OPTIONS = ("local_features", "matching", "verification")
+EXPLAINED = ("map", *MATCHING_OPTIONS)
 
 
 def mapping_pairs(work: StageWork, mapping: KaptureFolder) -> list[ImagePair]:
@@ -434,22 +397,13 @@ def mapping_pairs(work: StageWork, mapping: KaptureFolder) -> list[ImagePair]:
     return [p for p in read_pairs(work.path(MAPPING_PAIRS)) if {p.query, p.map} <= names]
 
 
-class _MatchStage(PipelineStage):
-    resumes = True
-
-    def explain(self) -> str:
-        options = self.options
-        matched = (
-            f"{o.name} by {(o.matching or options.matching).name}" for o in options.local_features
-        )
-        return f"map = {options.map}, {', '.join(matched)}, verification = {options.verification}"
-
-
-class MatchMapping(_MatchStage):
+class MatchMapping(PipelineStage):
     """Match and verify pairs of map images."""
 
     name = "mapping_matches"
     version = 3
+    resumes = True
+    explained_by = EXPLAINED
     uses = (*MATCHING_OPTIONS, "mapping_verification")
     inputs = (Layout.mapping, LOCAL_FEATURES, MAPPING_PAIRS)
     outputs = (MAPPING_MATCHES,)
@@ -458,7 +412,7 @@ class MatchMapping(_MatchStage):
         return self.options.triangulates()
 
     def plugins(self) -> Sequence[object]:
-        return [self.options.make_matcher(name) for name in self.options.own_types()]
+        return [self.options.make_matcher(name) for name in self.options.local_types()]
 
     def verification(self) -> Verification:
         return self.options.verify_mapping()
@@ -468,22 +422,24 @@ class MatchMapping(_MatchStage):
         pairs, out = mapping_pairs(work, mapping), work.out / self.writes[0]
         # poses of photographs are estimated from matches, so they cannot contradict them
         if isinstance(self.verification(), KnownPoseOptions) and not self.layout.posed:
-            name = self.options.own_types()[0]
+            name = self.options.main_type()
             check_given_poses(mapping, pairs, name, self.options.make_matcher(name), work)
         counts: Counter[str] = Counter()
-        for name in self.options.own_types():
+        for name in self.options.local_types():
             matcher, how = self.options.make_matcher(name), self.verification()
             counts.update(match_pairs(mapping, mapping, pairs, name, matcher, how, out, work=work))
         return counts
 
 
-class MatchQueries(_MatchStage):
+class MatchQueries(PipelineStage):
     """Match and verify queries with their candidates, before reranking with all of them."""
 
     name = "query_matches"
     version = 4
+    resumes = True
+    explained_by = EXPLAINED
     uses = (*MATCHING_OPTIONS, "query_verification")
-    inputs = (Layout.mapping, Layout.query, LOCAL_FEATURES, Layout.candidates, Layout.given_map)
+    inputs = (Layout.mapping, Layout.query, LOCAL_FEATURES, Layout.candidates)
     outputs = (QUERY_MATCHES,)
 
     def plugins(self) -> Sequence[object]:
@@ -491,12 +447,10 @@ class MatchQueries(_MatchStage):
 
     def run(self, work: StageWork) -> Mapping[str, float]:
         query = work.folder(self.layout.query(), FEATURES)
+        mapping = work.folder(self.layout.mapping(), FEATURES)
         pairs, out = read_pairs(work.path(self.layout.candidates())), work.out / QUERY_MATCHES
         counts: Counter[str] = Counter()
         for name in self.options.local_types():
-            mapping = matched_images(work, self, name)
-            described = mapping.descriptors(name)
-            some = [pair for pair in pairs if pair.map in described]
             matcher, how = self.options.make_matcher(name), self.options.verify_queries()
-            counts.update(match_pairs(query, mapping, some, name, matcher, how, out, work=work))
+            counts.update(match_pairs(query, mapping, pairs, name, matcher, how, out, work=work))
         return counts

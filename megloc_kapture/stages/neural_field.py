@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from megloc_kapture.errors import DataError, OptionError
+from megloc_kapture.errors import DataError, check_option, require
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.io.files import (
     read_content,
@@ -140,8 +140,11 @@ def open_field(folder: Path, device: Device = "auto") -> NeuralField:
 
 
 def weights_file(folder: Path) -> WeightsFile:
-    if not (folder / FIELD_FILE).is_file():
-        raise DataError(f"no {FIELD_FILE} here; megloc train-field writes one", path=folder)
+    require(
+        (folder / FIELD_FILE).is_file(),
+        f"no {FIELD_FILE} here; megloc train-field writes one",
+        path=folder,
+    )
     return describe(FIELD_FILE, (folder / FIELD_FILE).absolute())
 
 
@@ -164,10 +167,9 @@ def views_between(data: KaptureData) -> KaptureData:
     names = [name for name in names if name in poses]
     near = PairsByPosesOptions(num_neighbours=_NEIGHBOURS, max_angle_deg=_MAX_ANGLE_DEG)
     pairs = pairs_by_poses([poses[name] for name in names], near).tolist()
-    if not pairs:
-        raise DataError(
-            "no two cameras have a similar viewing direction: there are no views between them"
-        )
+    require(
+        pairs, "no two cameras have a similar viewing direction: there are no views between them"
+    )
     found = KaptureData()
     for number, (a, b) in enumerate(pairs):
         first, second = poses[names[a]], poses[names[b]]
@@ -230,8 +232,7 @@ def render_along(
     min_shown : smallest share of pixels with depth; views with less are left out.
     """
     poses = data.poses()
-    if not poses:
-        raise DataError("no image here has a pose")
+    require(poses, "no image here has a pose")
     stems = {Path(name).with_suffix(""): name for name in poses}
     for name in poses:
         if (other := stems[Path(name).with_suffix("")]) != name:
@@ -300,11 +301,11 @@ class FieldRefiner:
 
     def __init__(self, options: FieldRefinerOptions | None = None) -> None:
         self.options = options or FieldRefinerOptions()
-        if not self.options.field:
-            raise OptionError(
-                "the pose refiner field needs a field that megloc train-field wrote: --set "
-                '\'pose_refinement.by=[{name="field",options={field="FOLDER"}}]\''
-            )
+        check_option(
+            self.options.field,
+            "the pose refiner field needs a field that megloc train-field wrote: --set "
+            '\'pose_refinement.by=[{name="field",options={field="FOLDER"}}]\'',
+        )
         placement = Placement(self.options.device, self.options.half_precision)
         self._features: LocalFeatureExtractor = load_chosen(
             LOCAL_FEATURES, self.options.features, placement

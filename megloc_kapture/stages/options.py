@@ -21,12 +21,16 @@ from megloc_kapture.plugins import (
     PluginChoice,
 )
 from megloc_kapture.retrieval.search import FusionOptions
-from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
 from megloc_kapture.stages.densifying import DensifyOptions
 from megloc_kapture.stages.global_features import GlobalFeaturesChoice
-from megloc_kapture.stages.image_pairs import MappingPairsOptions, RerankingOptions
+from megloc_kapture.stages.image_pairs import (
+    MappingPairsOptions,
+    QueryPairsOptions,
+    RerankingOptions,
+    Retrieval,
+)
 from megloc_kapture.stages.map_refinement import MapRefinementOptions
-from megloc_kapture.stages.matches import NoVerification, SecondMatchingOptions, Verification
+from megloc_kapture.stages.matches import SecondMatchingOptions, Verification
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions
 from megloc_kapture.stages.preprocessing import PreprocessingOptions
 from megloc_kapture.stages.query_poses import LocalizationOptions
@@ -86,13 +90,10 @@ class PipelineOptions(Options):
     query_verification: TwoViewOptions = TwoViewOptions()
     second_matching: SecondMatchingOptions = SecondMatchingOptions()
     guided_pyramid: GuidedPyramidOptions = GuidedPyramidOptions()
-    map: Literal["triangulate", "lift", "given"] = Field(
+    map: Literal["triangulate", "lift"] = Field(
         default="triangulate",
-        description="map points: triangulated from matches, lifted from keypoints through depth "
-        "maps, or given by the dataset's model",
-    )
-    given_features: PluginChoice = Field(
-        default=PluginChoice(name="sift"), description="features of a given model"
+        description="map points: triangulated from matches, or lifted from keypoints through depth "
+        "maps",
     )
     triangulation: TriangulationOptions = TriangulationOptions()
     refinement: MapRefinementOptions = MapRefinementOptions()
@@ -113,26 +114,8 @@ class PipelineOptions(Options):
             load_chosen(LOCAL_FEATURES, chosen, self.placement) for chosen in self.local_features
         ]
 
-    def make_given_extractor(self) -> LocalFeatureExtractor:
-        made: LocalFeatureExtractor = load_chosen(
-            LOCAL_FEATURES, self.given_features, self.placement
-        )
-        return made
-
     def preprocesses(self) -> bool:
         return self.preprocessing != PreprocessingOptions()
-
-    def changes_frames(self) -> bool:
-        """Return whether image size or projection changes."""
-        masked = PreprocessingOptions(masks=self.preprocessing.masks)
-        return self.preprocessing != masked
-
-    def uses_given_map(self) -> bool:
-        return self.map == "given"
-
-    def makes_points(self) -> bool:
-        """Return whether the map has points of features extracted in this run."""
-        return self.map != "given"
 
     def uses_pyramid(self) -> bool:
         """Return whether guided pyramid matching is enabled."""
@@ -149,8 +132,8 @@ class PipelineOptions(Options):
         return self.triangulates() and self.mapping_pairs.needs_points()
 
     def point_types(self) -> list[str]:
-        """Return keypoints types with points made in this run, possibly pyramid types."""
-        types = self.own_types()
+        """Return keypoints types with map points, possibly pyramid types."""
+        types = self.local_types()
         if self.uses_pyramid() and self.triangulates():
             return [pyramid_type(local_type) for local_type in types]
         return types
@@ -160,26 +143,11 @@ class PipelineOptions(Options):
         types = self.local_types()
         return [pyramid_type(name) for name in types] if self.uses_pyramid() else types
 
-    def own_extractors(self) -> list[LocalFeatureExtractor]:
-        """Create the extractors of types that get points in this run; none for a prebuilt map."""
-        return self.make_extractors() if self.makes_points() else []
-
-    def query_extractors(self) -> list[LocalFeatureExtractor]:
-        """Create the extractors of all query types, the prebuilt map's last."""
-        given = [self.make_given_extractor()] if self.uses_given_map() else []
-        return [*self.own_extractors(), *given]
-
-    def own_types(self) -> list[str]:
-        return [extractor.name for extractor in self.own_extractors()]
-
     def local_types(self) -> list[str]:
         """Return the keypoints types used for localization, VLAD's type first."""
-        types = [extractor.name for extractor in self.query_extractors()]
+        types = [extractor.name for extractor in self.make_extractors()]
         if twice := _first_twice(types):
-            raise OptionError(
-                f"keypoints type {twice!r} is asked for twice, in local_features or of the given "
-                f"map (map = {self.map})"
-            )
+            raise OptionError(f"keypoints type {twice!r} is asked for twice in local_features")
         return types
 
     def main_type(self) -> str:
@@ -196,10 +164,9 @@ class PipelineOptions(Options):
         return Retrieval(tuple(types), weights, self.fusion)
 
     def matching_of(self, local_type: str) -> PluginChoice:
-        if self.makes_points():
-            for chosen, extractor in zip(self.local_features, self.make_extractors(), strict=True):
-                if extractor.name == base_type(local_type) and chosen.matching is not None:
-                    return chosen.matching
+        for chosen, extractor in zip(self.local_features, self.make_extractors(), strict=True):
+            if extractor.name == base_type(local_type) and chosen.matching is not None:
+                return chosen.matching
         return self.matching
 
     def make_matcher(self, local_type: str) -> Matcher:
@@ -212,10 +179,10 @@ class PipelineOptions(Options):
         return None if chosen is None else load_chosen(MATCHERS, chosen, self.placement)
 
     def verify_mapping(self) -> Verification:
-        return NoVerification() if self.verification == "none" else self.mapping_verification
+        return None if self.verification == "none" else self.mapping_verification
 
     def verify_photographs(self) -> Verification:
-        return NoVerification() if self.verification == "none" else self.query_verification
+        return None if self.verification == "none" else self.query_verification
 
     def verify_queries(self) -> Verification:
-        return self.query_verification if self.verification == "geometric" else NoVerification()
+        return self.query_verification if self.verification == "geometric" else None

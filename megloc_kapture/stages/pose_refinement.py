@@ -9,7 +9,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Literal
 
 from pydantic import Field
 
@@ -45,8 +44,8 @@ from megloc_kapture.refinement.references import (
     judge_consistency,
     spread_names,
 )
-from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.localized_folder import write_result_tables, write_timing
+from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.query_poses import write_result_tables, write_timing
 from megloc_kapture.stages.scene import KaptureScene
 from megloc_kapture.stages.stage import (
     LOCALIZED,
@@ -69,11 +68,6 @@ _MAX_REFERENCES = 30
 class PoseRefinementOptions(Options):
     by: tuple[PluginChoice, ...] = Field(
         default=(), description="pose refiners, applied in order; empty: no refinement"
-    )
-    references: Literal["cluster", "frame"] = Field(
-        default="cluster",
-        description="reference images for refiners: those of the pose's cluster, or also others "
-        "of its coordinate frame",
     )
 
     def with_refiners(self, names: Sequence[str]) -> PoseRefinementOptions:
@@ -160,7 +154,7 @@ class MapRefiners:
             pose.candidates,
             max_references=_MAX_REFERENCES,
             # a pose made elsewhere comes from no cluster
-            only_first=self._options.references == "cluster" and bool(pose.candidates),
+            only_first=bool(pose.candidates),
         )
         return tuple(near), tuple(one.reason if one else "" for one in self._verdicts[frame])
 
@@ -316,7 +310,7 @@ class RefinePoses(PipelineStage):
     name = "refine_poses"
     version = 4
     uses = ("pose_refinement",)
-    explained_by = ("pose_refinement.by", "pose_refinement.references")
+    explained_by = ("pose_refinement.by",)
     inputs = (SIDE_TABLES, Layout.query, MAP, UNREFINED_POSES)
     outputs = (LOCALIZED, REFINEMENT_TIMING)
 

@@ -1,43 +1,50 @@
 """Stage: resized, undistorted and masked images, as a new kapture without features and points.
 
-Names, poses, rigs, records and sensor ids are kept. Unchanged files and depth maps are linked.
+Names, poses, rigs, records and sensor ids are kept. Unchanged files and depth maps are linked. The
+masks of all sources are combined by AND.
 """
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache, partial
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
 
-from megloc_kapture.errors import DataError, OptionError, OutputError
+from megloc_kapture.errors import DataError, OptionError, OutputError, PluginError, require
 from megloc_kapture.io.files import (
     link_file,
     link_records,
     write_json,
 )
-from megloc_kapture.io.images import image_size, write_image
+from megloc_kapture.io.images import image_as_read_back, image_size, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
-from megloc_kapture.plugin_loading import Placement, load_chosen
-from megloc_kapture.plugins import SEGMENTERS, Segmenter
-from megloc_kapture.preprocessing.frames import FrameOptions, FramePlan, plan_frame
-from megloc_kapture.preprocessing.masks import UnchangingRegion
-from megloc_kapture.stages.image_masks import (
-    JPEG_QUALITY,
-    ClassMasks,
-    Mask,
-    MaskOptions,
-    ProcessedFrame,
-    StandingMasks,
-    find_unchanging_regions,
-    mask_files,
-    read_masks,
+from megloc_kapture.plugin_loading import Placement, checked_array, load_chosen
+from megloc_kapture.plugins import SEGMENTERS, PluginChoice, Segmenter
+from megloc_kapture.preprocessing.frames import (
+    FrameOptions,
+    FramePlan,
+    plan_frame,
+    processed_image,
+    processed_mask,
+    reached_region,
 )
-from megloc_kapture.stages.local_features import check_size, read_image_of
+from megloc_kapture.preprocessing.masks import (
+    MAX_IMAGES,
+    MIN_IMAGES,
+    FixedMask,
+    UnchangingRegion,
+    edge_directions,
+    find_unchanging_region,
+)
+from megloc_kapture.stages.local_features import check_size, mask_path, read_image_of, read_mask
 from megloc_kapture.stages.stage import (
     MAPPING,
     PREPROCESSED,
@@ -47,6 +54,250 @@ from megloc_kapture.stages.stage import (
     files_fingerprint,
 )
 from megloc_kapture.stages.work import HERE, Work
+from megloc_kapture.values import Camera, Options
+
+# median motion of keypoints 0.03 px, and a third of the size of PNG
+JPEG_QUALITY = 98
+
+Mask = NDArray[np.bool_]
+_SIZE = attrgetter("width", "height")
+
+
+class MaskOptions(Options):
+    """Mask sources in addition to the kapture's masks; by default none."""
+
+    segmenter: PluginChoice | None = Field(
+        default=None, description="network that predicts the class of each pixel"
+    )
+    dynamic: tuple[str, ...] | None = Field(
+        default=None, description="classes to mask; unset: the segmenter's dynamic classes"
+    )
+    fixed: tuple[FixedMask, ...] = Field(default=(), description="static masks per camera")
+    unchanging: bool = Field(
+        default=False,
+        description="detect and mask the static ego-vehicle region of each camera",
+    )
+    user_masks: Path | None = Field(
+        default=None, description="folder of masks IMAGE.png, 0 for ignored pixels"
+    )
+
+    def make_classes(
+        self, placement: Placement, segmenter: Segmenter | None = None
+    ) -> ClassMasks | None:
+        if segmenter is None and self.segmenter is not None:
+            segmenter = load_chosen(SEGMENTERS, self.segmenter, placement)
+        return None if segmenter is None else ClassMasks.of(segmenter, self.dynamic)
+
+
+def mask_files(
+    folder: KaptureFolder, images: Iterable[str], user_masks: Path | None
+) -> dict[str, dict[str, Path]]:
+    """Find mask files by image and source (``own`` or ``user``)."""
+    if user_masks is not None and not user_masks.is_dir():
+        raise DataError("no such folder of masks", path=user_masks)
+    files_of = {}
+    for image in images:
+        paths = {"own": mask_path(folder, image)}
+        if user_masks is not None:
+            paths["user"] = user_masks / f"{image}.png"
+        files_of[image] = {source: path for source, path in paths.items() if path.is_file()}
+    if user_masks is not None and not any("user" in files for files in files_of.values()):
+        example = next(iter(files_of), "a/b.jpg")
+        raise DataError(
+            f"no mask of any image in this folder; the mask of {example} would be {example}.png",
+            path=user_masks,
+        )
+    return files_of
+
+
+def read_masks(files: Mapping[str, Path], shape: tuple[int, ...]) -> dict[str, Mask]:
+    """Read the masks of an image by source, bool (H, W), True = use."""
+    masks = {source: read_mask(path, shape) for source, path in files.items()}
+    return {source: mask for source, mask in masks.items() if mask is not None}
+
+
+class StandingMasks:
+    """Cached per-camera masks: fixed masks, and static regions by sensor id."""
+
+    def __init__(self, fixed: Sequence[FixedMask], regions: Mapping[str, UnchangingRegion]) -> None:
+        self._fixed, self._regions = tuple(fixed), dict(regions)
+        self._used: set[FixedMask] = set()
+        self._standing = lru_cache(maxsize=64)(_standing)
+
+    def of(self, sensor_id: str, image: str, camera: Camera) -> dict[str, Mask]:
+        """Return an image's per-camera masks by source, bool (H, W), in original pixels."""
+        region = self._regions.get(sensor_id)
+        fitting = [fixed for fixed in self._fixed if fixed.is_for(sensor_id, image)]
+        self._used.update(fitting)
+        applied = tuple(fixed for fixed in fitting if not (fixed.fallback and region))
+        return self._standing(applied, region, camera.width, camera.height)
+
+    def unused(self) -> list[FixedMask]:
+        return [fixed for fixed in self._fixed if fixed not in self._used]
+
+
+def _standing(
+    fixed: Sequence[FixedMask], region: UnchangingRegion | None, width: int, height: int
+) -> dict[str, Mask]:
+    masks = {}
+    if fixed:
+        masks["fixed"] = np.logical_and.reduce([_drawn(each, width, height) for each in fixed])
+    if region:
+        masks["unchanging"] = region.mask(width, height)
+    return masks
+
+
+def _drawn(fixed: FixedMask, width: int, height: int) -> Mask:
+    if fixed.file is None:
+        return fixed.drawn(width, height)
+    mask = read_mask(fixed.file, (height, width))
+    if mask is None:
+        raise DataError("no such mask", path=fixed.file)
+    return mask
+
+
+@dataclass(frozen=True)
+class ClassMasks:
+    """A segmenter with its ignored classes, in the order of their labels."""
+
+    segmenter: Segmenter
+    dynamic: tuple[str, ...]
+
+    @classmethod
+    def of(cls, segmenter: Segmenter, dynamic: Sequence[str] | None = None) -> ClassMasks:
+        """Create with the given dynamic classes, by default the segmenter's."""
+        wanted = segmenter.dynamic if dynamic is None else dynamic
+        unknown = sorted(set(wanted) - set(segmenter.classes))
+        if unknown:
+            raise OptionError(
+                f"segmenter {segmenter.name!r} has no class {unknown[0]!r}; "
+                f"it has: {', '.join(segmenter.classes)}"
+            )
+        return cls(segmenter, tuple(name for name in segmenter.classes if name in wanted))
+
+    def labels(self, image: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+        """Return the label of each pixel, uint8 (H, W), of an image (H, W, 3)."""
+        who = f"plugin {self.segmenter.name!r} on image {name}"
+        found = checked_array(who, self.segmenter.segment(image), image.shape[:2], "uint8")
+        if found.max() >= len(self.segmenter.classes):
+            raise PluginError(
+                f"{who}: label {found.max()}, but there are {len(self.segmenter.classes)} classes"
+            )
+        return found
+
+    def mask(self, labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Return the mask bool (H, W), True = use."""
+        used = np.array([name not in self.dynamic for name in self.segmenter.classes])
+        return np.asarray(used[labels])
+
+
+def find_unchanging_regions(
+    folder: KaptureFolder, sequences: Sequence[KaptureFolder] = (), *, work: Work = HERE
+) -> dict[str, UnchangingRegion]:
+    """Find the static region of each camera, by sensor id; without one it is false, with a reason.
+
+    ``sequences`` are folders with more images of these cameras: for queries, the map.
+    """
+    chosen: dict[str, list[tuple[Path, Camera]]] = {}
+    regions: dict[str, UnchangingRegion] = {}
+    for sensor in sorted({sensor for _, sensor in folder.read().records_camera}):
+        images = _images_of(sensor, [folder, *sequences])
+        if len(images) < MIN_IMAGES:
+            reason = f"it has {len(images)} images; at least {MIN_IMAGES} of a sequence are needed"
+            regions[sensor] = UnchangingRegion((), reason)
+        else:
+            number = min(len(images), MAX_IMAGES)
+            rows = np.linspace(0, len(images) - 1, number).round().astype(int)
+            chosen[sensor] = [images[k] for k in rows]
+    jobs = [image for images in chosen.values() for image in images]
+    results = iter(work.map(_edges, jobs, "unchanging regions"))
+    for sensor, images in chosen.items():
+        regions[sensor] = find_unchanging_region(next(results) for _ in images)
+    for _ in results:  # exhaust the iterator so that the progress bar completes
+        pass
+    return regions
+
+
+def _images_of(sensor: str, folders: Sequence[KaptureFolder]) -> list[tuple[Path, Camera]]:
+    images: list[tuple[Path, Camera]] = []
+    for folder in folders:
+        data = folder.read()
+        if sensor not in data.sensors or data.sensors[sensor].sensor_type != "camera":
+            continue
+        records = sorted((t, image) for (t, s), image in data.records_camera.items() if s == sensor)
+        for _, image in records:
+            camera = data.camera_of(image)
+            if not images or _SIZE(camera) == _SIZE(images[0][1]):
+                images.append((folder.image_path(image), camera))
+    return images
+
+
+def _edges(image: tuple[Path, Camera]) -> NDArray[np.float32]:
+    return edge_directions(read_image_of(*image))
+
+
+class ProcessedFrame:
+    """An image after pre-processing, with lazily computed pixels and masks.
+
+    ``read`` returns uint8 (H, W, 3) RGB, ``masks`` bool (H, W), True = use, by source.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        plan: FramePlan,
+        read: Callable[[], NDArray[np.uint8]],
+        masks: Callable[[], Mapping[str, Mask]],
+        classes: Callable[[], ClassMasks | None],
+    ) -> None:
+        self.name, self.plan = name, plan
+        self._read, self._original_masks, self._classes = read, masks, classes
+
+    @cached_property
+    def pixels(self) -> NDArray[np.uint8]:
+        """Return the new image, uint8 (H, W, 3) RGB."""
+        image = self._read()
+        return processed_image(image, self.plan) if self.plan.changes_pixels else image
+
+    @property
+    def written(self) -> NDArray[np.uint8]:
+        """Return the pixels to write: one channel for grey images, a third of the size."""
+        red = self.pixels[..., 0]
+        grey = all(np.array_equal(red, self.pixels[..., channel]) for channel in (1, 2))
+        return np.ascontiguousarray(red) if grey else self.pixels
+
+    @cached_property
+    def stored(self) -> NDArray[np.uint8]:
+        """Return the new image as read back, after JPEG loss."""
+        if not self.plan.changes_pixels:
+            return self.pixels
+        read = image_as_read_back(self.written, self.name, jpeg_quality=JPEG_QUALITY)
+        return read if read.ndim == 3 else self.pixels
+
+    @cached_property
+    def labels(self) -> NDArray[np.uint8] | None:
+        """Return the class of each pixel, uint8 (H, W), if there is a segmenter."""
+        classes = self._classes()
+        return None if classes is None else classes.labels(self.pixels, self.name)
+
+    @cached_property
+    def masks(self) -> dict[str, Mask]:
+        """Return the masks of the new image by source, bool (H, W), True = use."""
+        original = self._original_masks()
+        masks = {source: processed_mask(mask, self.plan) for source, mask in original.items()}
+        classes = self._classes()
+        if classes is not None and self.labels is not None:
+            masks["classes"] = classes.mask(self.labels)
+        reached = reached_region(self.plan)
+        if reached is not None:
+            masks["unseen"] = reached
+        return masks
+
+    @property
+    def mask(self) -> Mask | None:
+        """Return the combined mask; None means no mask."""
+        return np.logical_and.reduce(list(self.masks.values())) if self.masks else None
+
 
 CLASSES, CLASSES_FILE = "classes", "classes.json"
 _log = logging.getLogger(__name__)
@@ -108,7 +359,7 @@ def preprocess_images(
     output = Path(output)
     if output.resolve().is_relative_to(folder.root.resolve()):
         raise OutputError(f"{output}: is inside the input kapture folder, which is not modified")
-    classes = _class_masks(options.masks, segmenter, work.placement)
+    classes = options.masks.make_classes(work.placement, segmenter)
     data = folder.read()
     plans = _plans(data, options)
     images = data.image_names()
@@ -155,18 +406,6 @@ def preprocess_images(
     }
 
 
-def _class_masks(
-    options: MaskOptions, segmenter: Segmenter | None, placement: Placement
-) -> ClassMasks | None:
-    if segmenter is None and options.segmenter is not None:
-        segmenter = load_chosen(SEGMENTERS, options.segmenter, placement)
-    if segmenter is not None:
-        return ClassMasks.of(segmenter, options.dynamic)
-    if options.dynamic is not None:
-        raise OptionError("dynamic classes need a segmenter")
-    return None
-
-
 def _plans(data: KaptureData, options: FrameOptions) -> dict[str, FramePlan]:
     plans: dict[str, FramePlan] = {}
     for (_, sensor_id), image in sorted(data.records_camera.items()):
@@ -209,8 +448,7 @@ def _link_records(folder: KaptureFolder, output: Path, plans: Mapping[str, Frame
         return True
     for name in sorted(folder.read().records_depth.values()):
         source = folder.depth_path(name)
-        if not source.is_file():
-            raise DataError("no such depth map", path=source)
+        require(source.is_file(), "no such depth map", path=source)
         link_file(source, output / "sensors" / "records_data" / name)
     return False
 

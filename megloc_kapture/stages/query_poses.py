@@ -6,10 +6,11 @@ one, which is refined with the images of its cluster (MegLoc, "Cluster-wise loca
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
 from typing import Protocol
@@ -18,8 +19,29 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from megloc_kapture.io.dataset_tables import SIDE_TABLES
-from megloc_kapture.io.kapture import ImagePair, KaptureFolder, read_pairs
+from megloc_kapture.errors import DataError
+from megloc_kapture.io.csv_table import write_csv_table
+from megloc_kapture.io.dataset_tables import SIDE_TABLES, read_unreadable, write_unreadable
+from megloc_kapture.io.files import link_images
+from megloc_kapture.io.kapture import (
+    ImagePair,
+    KaptureData,
+    KaptureFolder,
+    Sensor,
+    read_pairs,
+    write_sensors,
+)
+from megloc_kapture.io.tables import (
+    CLUSTERS_FILE,
+    COVARIANCE_FILE,
+    POSES_FILE,
+    REFINEMENT_FILE,
+    STATUS_FILE,
+    write_clusters,
+    write_covariances,
+    write_refinement,
+    write_status,
+)
 from megloc_kapture.localization.absolute_pose import AbsolutePoseOptions
 from megloc_kapture.localization.cluster_poses import (
     ClusterOptions,
@@ -32,17 +54,15 @@ from megloc_kapture.localization.map_index import PoseProblem, QueryView, TypedM
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.plugin_loading import AUTO, Placement, load_chosen
 from megloc_kapture.plugins import POSE_RANKERS, PluginChoice, PoseRanker, RankingScene
-from megloc_kapture.stages.candidates import UNRESTRICTED, Restrictions
-from megloc_kapture.stages.localized_folder import (
-    unreadable_queries,
-    write_localized,
-)
+from megloc_kapture.stages.image_pairs import UNRESTRICTED, Restrictions
+from megloc_kapture.stages.local_features import read_image_of
 from megloc_kapture.stages.matches import iterate_candidates
 from megloc_kapture.stages.scene import (
     KaptureScene,
     Unit,
     index_map,
     open_index,
+    poses_through_rig,
     query_units,
     shared_index,
     with_noise,
@@ -69,10 +89,140 @@ from megloc_kapture.values import (
     MIN_CONFIDENCE,
     Failure,
     Fallback,
+    LocalizationResult,
     Options,
     Pose,
     RigidTransform,
 )
+
+
+def write_localized(
+    output: Path,
+    query: KaptureFolder | KaptureData,
+    results: Iterable[Pose | Failure],
+    *,
+    fallback: Fallback = "none",
+    first_candidates: dict[str, tuple[str, RigidTransform]] | None = None,
+    timing: Path | None = None,
+) -> dict[str, int]:
+    """Write localized queries as kapture with tables of status, poses, clusters and covariances.
+
+    A query with an estimated focal length gets a separate camera.
+
+    Parameters
+    ----------
+    fallback : pose of a failed query: none, that of its best retrieved image, or the one derived
+        from a localized camera of the same rig and timestamp.
+    first_candidates : best retrieved map image and its pose by query, for "retrieval".
+    timing : optional file for seconds per query and step.
+    """
+    data = query.read() if isinstance(query, KaptureFolder) else query
+    ordered = sorted(results, key=lambda result: result.name)
+    found = {result.name: result for result in ordered if isinstance(result, Pose)}
+    guesses: Mapping[str, tuple[str, RigidTransform]] = {}
+    if fallback == "retrieval":
+        guesses = first_candidates or {}
+    elif fallback == "rig":
+        guesses = poses_through_rig(data, found)
+    poses: dict[tuple[int, str], RigidTransform] = {}
+    sensors, records = dict(data.sensors), dict(data.records_camera)
+    written: list[LocalizationResult] = []
+    for result in ordered:
+        image = result.name
+        if isinstance(result, Pose):
+            record = data.record_of(image)
+            if result.camera is not None:
+                del records[record]
+                given = sensors[record[1]]
+                record = (record[0], f"{record[1]}-{record[0]}")
+                records[record] = image
+                sensors[record[1]] = Sensor.from_camera(result.camera, name=given.name)
+            poses[record] = result.cam_from_world
+        elif image in guesses:
+            poses[data.record_of(image)] = guesses[image][1]
+            result = replace(result, fallback=fallback)
+        written.append(result)
+    localized = KaptureData(sensors=sensors, trajectories=poses, records_camera=records)
+    write_sensors(output, localized)
+    if isinstance(query, KaptureFolder):
+        link_images(query.root, output)
+    write_result_tables(output, localized.poses(), written)
+    write_clusters(output / CLUSTERS_FILE, written)
+    if timing is not None:
+        write_timing(timing, written)
+    return {
+        "queries": len(written),
+        "localized": len(found),
+        "failed": len(written) - len(found),
+        "fallbacks": len(poses) - len(found),
+    }
+
+
+def write_result_tables(
+    output: Path, poses: Mapping[str, RigidTransform], results: Sequence[LocalizationResult]
+) -> None:
+    """Write tables of poses, status, covariances and, if there is one, refinement."""
+    write_poses(output / POSES_FILE, poses)
+    write_status(output / STATUS_FILE, results)
+    write_covariances(output / COVARIANCE_FILE, results)
+    if any(result.refinements for result in results):
+        write_refinement(output / REFINEMENT_FILE, results)
+
+
+def write_poses(path: Path, poses: Mapping[str, RigidTransform]) -> None:
+    """Write ``poses.csv``: ``cam_from_world`` and camera centre in the world by image."""
+    columns = ("image", "qw", "qx", "qy", "qz", "tx", "ty", "tz")
+    rows = (
+        (image, *map(repr, (*pose.quat_wxyz, *pose.translation, *pose.center().tolist())))
+        for image, pose in sorted(poses.items())
+    )
+    write_csv_table(path, (*columns, "center_x", "center_y", "center_z"), rows)
+
+
+def write_timing(path: Path, results: Iterable[LocalizationResult]) -> None:
+    rows = (
+        (result.name, step, f"{seconds:.5f}")
+        for result in results
+        for step, seconds in result.seconds.items()
+    )
+    write_csv_table(path, ("image", "step", "seconds"), rows)
+
+
+def set_aside_unreadable(query: Path, tables: Path, work: Work) -> Mapping[str, str]:
+    """Remove unreadable images from a workspace's queries; write the reasons to ``tables``."""
+    folder = KaptureFolder(query)
+    data = folder.read()
+    names = data.image_names()
+    faults = work.map(partial(_fault, FolderSpec(folder)), names, "reading queries")
+    reasons = {name: fault for name, fault in zip(names, faults, strict=True) if fault}
+    if not reasons:
+        return {}
+    if len(reasons) == len(names):
+        # report the target, as the link may be temporary
+        raise DataError(reasons[names[0]], path=Path(os.path.realpath(folder.image_path(names[0]))))
+    records = {key: name for key, name in data.records_camera.items() if name not in reasons}
+    write_sensors(query, replace(data, records_camera=records))
+    write_unreadable(tables, reasons)
+    return reasons
+
+
+def unreadable_queries(tables: Path) -> Iterator[Failure]:
+    for name, reason in read_unreadable(tables).items():
+        yield unreadable_image(name, reason)
+
+
+def unreadable_image(name: str, reason: str) -> Failure:
+    return Failure(f"the image cannot be used: {reason}", name=name)
+
+
+def _fault(spec: FolderSpec, name: str) -> str:
+    folder = spec.open()
+    try:
+        read_image_of(folder.image_path(name), folder.read().camera_of(name))
+    except DataError as error:
+        return error.message
+    return ""
+
 
 _FIRST_TURN = 5
 # below this even the right pose can be decimetres off, which more candidates improve
@@ -115,9 +265,9 @@ class LocalizationOptions(Options):
 def localize_unit(
     views: Sequence[QueryView],
     candidates: Sequence[str],
-    frames: Sequence[str],
     options: LocalizationOptions,
     *,
+    frame_of: Callable[[str], str],
     centers: Mapping[str, NDArray[np.float64]],
     ranker: PoseRanker,
     scene: RankingScene,
@@ -128,13 +278,13 @@ def localize_unit(
 
     Parameters
     ----------
-    candidates : map images, best first, with a coordinate frame each in ``frames``.
+    candidates : map images, best first.
+    frame_of : names the coordinate frame of a map image.
     centers : camera centres (3,) of the candidates in the world.
     """
 
     def localize(together: Sequence[QueryView]) -> tuple[Pose | Failure, PoseProblem | None]:
         matched = {image for view in together for image in view.matched_images()}
-        frame_of = dict(zip(candidates, frames, strict=True))
         images = [image for image in candidates if image in matched]
         if not images:
             reason = "no map image matches" if candidates else "no map image is a candidate"
@@ -143,7 +293,7 @@ def localize_unit(
         indices = {id(typed.index): typed.index for view in together for typed in view.matches}
         clusters = cluster_candidates(
             images,
-            [frame_of[image] for image in images],
+            list(map(frame_of, images)),
             options.clusters,
             centers=centers,
             indices=list(indices.values()),
@@ -154,7 +304,7 @@ def localize_unit(
             clusters,
             options.pose,
             rank=lambda hypotheses: ranker.score(hypotheses, scene),
-            frames=[frame_of[cluster[0]] for cluster in clusters],
+            frames=[frame_of(cluster[0]) for cluster in clusters],
             centers=centers,
             min_confidence=options.min_confidence,
             scene=scene,
@@ -167,22 +317,6 @@ def localize_unit(
             return poses_of_cameras(views, result, problem)
     results = [localize([QueryView(v.name, v.camera, v.matches)])[0] for v in views]
     return [replace(result, name=v.name) for v, result in zip(views, results, strict=True)]
-
-
-def in_turn(
-    solve: Callable[[int], list[Pose | Failure]], num_candidates: int, options: LocalizationOptions
-) -> list[Pose | Failure]:
-    """Localize with the first few candidates, and with more until the result is certain."""
-    sure, few = options.sure_confidence, _FIRST_TURN
-    while sure is not None and few < num_candidates:
-        solved = solve(few)
-        if all(
-            isinstance(r, Pose) and (r.confidence or 0.0) >= sure and r.num_inliers >= _SURE_INLIERS
-            for r in solved
-        ):
-            return solved
-        few *= 2
-    return solve(num_candidates)
 
 
 class QuerySource(Protocol):
@@ -198,6 +332,17 @@ class QuerySource(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class StoredSource:
+    """Matches that were read from kapture folders."""
+
+    stored: QueryView
+    candidates: Sequence[str]
+
+    def view(self, count: int) -> QueryView:
+        return self.stored.among(self.candidates[:count])
+
+
 def localize_query(
     sources: Sequence[QuerySource],
     options: LocalizationOptions,
@@ -210,34 +355,32 @@ def localize_query(
     """Localize a query, or the cameras of a rig; return a result per camera.
 
     ``megloc eval``, ``megloc localize``, ``Localizer`` and the HTTP service all call this function.
-    ``frame_of`` names the coordinate frame of a map image; see :func:`localize_unit`.
+    With ``sure_confidence``, candidates are taken in turn until the pose is certain. See
+    :func:`localize_unit`.
     """
 
     def solve(count: int) -> list[Pose | Failure]:
-        views = [source.view(count) for source in sources]
-        candidates = interleave([source.candidates[:count] for source in sources])
         return localize_unit(
-            views,
-            candidates,
-            [frame_of(image) for image in candidates],
+            [source.view(count) for source in sources],
+            interleave([source.candidates[:count] for source in sources]),
             options,
+            frame_of=frame_of,
             centers=centers,
             ranker=ranker,
             scene=scene,
         )
 
-    return in_turn(solve, max((len(source.candidates) for source in sources), default=0), options)
-
-
-@dataclass(frozen=True)
-class StoredSource:
-    """Matches that were read from kapture folders."""
-
-    stored: QueryView
-    candidates: Sequence[str]
-
-    def view(self, count: int) -> QueryView:
-        return self.stored.among(self.candidates[:count])
+    num_candidates = max((len(source.candidates) for source in sources), default=0)
+    sure, count = options.sure_confidence, _FIRST_TURN
+    while sure is not None and count < num_candidates:
+        results = solve(count)
+        if all(
+            isinstance(r, Pose) and (r.confidence or 0.0) >= sure and r.num_inliers >= _SURE_INLIERS
+            for r in results
+        ):
+            return results
+        count *= 2
+    return solve(num_candidates)
 
 
 # a unit, the candidates of each image, and their coordinate frames

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import json
 import math
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Protocol
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import require
 from megloc_kapture.geometry.cameras import focal_px
-from megloc_kapture.io.files import atomic_write, owned_name, write_bytes, writing
+from megloc_kapture.io.files import atomic_write, owned_name, write_bytes
 from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Observations
 from megloc_kapture.io.kapture.points import read_point_covariances
@@ -34,12 +34,12 @@ _SAMPLED_IMAGES = 32
 
 def check_points(folder: KaptureFolder, purpose: str) -> None:
     """Raise DataError if a folder has no map points for a purpose, such as ``localize in``."""
-    if not folder.has_points():
-        raise DataError(
-            f"no map to {purpose}: reconstruction/points3d.txt or observations.txt is missing; "
-            "`megloc triangulate` makes one from images with poses",
-            path=folder.root,
-        )
+    require(
+        folder.has_points(),
+        f"no map to {purpose}: reconstruction/points3d.txt or observations.txt is missing; "
+        "`megloc triangulate` makes one from images with poses",
+        path=folder.root,
+    )
 
 
 def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
@@ -49,8 +49,11 @@ def index_map(folder: KaptureFolder, local_type: str) -> MapIndex:
     """
     observations = folder.observations().get(local_type)
     if observations is None:
-        if local_type not in folder.types("keypoints"):
-            raise DataError(f"the map has no observations of type {local_type!r}", path=folder.root)
+        require(
+            local_type in folder.types("keypoints"),
+            f"the map has no observations of type {local_type!r}",
+            path=folder.root,
+        )
         nothing = np.zeros(0, np.int32)
         observations = Observations(local_type, (), nothing.astype(np.int64), nothing, nothing)
     points = folder.points3d()
@@ -134,16 +137,10 @@ def shared_index(
     indices: Mapping[str, MapIndex], scratch: Path | None = None
 ) -> Iterator[dict[str, Path]]:
     """Share indices by keypoints type as temporary folders; open indices stay valid afterwards."""
-    where = tempfile.gettempdir() if scratch is None else scratch
-    with writing(where):
-        place = tempfile.TemporaryDirectory(
-            prefix=f".{owned_name()}", dir=where, ignore_cleanup_errors=True
-        )
-    with place as name:
-        folders = {}
-        for number, (keypoints_type, index) in enumerate(indices.items()):
-            folders[keypoints_type] = Path(name) / str(number)
-            write_index(index, folders[keypoints_type])
+    with TemporaryDirectory(prefix=f".{owned_name()}", dir=scratch) as place:
+        folders = {name: Path(place) / str(at) for at, name in enumerate(indices)}
+        for name, folder in folders.items():
+            write_index(indices[name], folder)
         yield folders
 
 
@@ -252,8 +249,7 @@ def _carried(data: KaptureData) -> _Carried:
     """Return ``sensor_from_rig`` by sensor for each top-level rig, through nested rigs."""
 
     def members(rig: str, above: frozenset[str]) -> dict[str, RigidTransform]:
-        if rig in above:
-            raise DataError(f"rig {rig!r} contains itself")
+        require(rig not in above, f"rig {rig!r} contains itself")
         found = {}
         for member, member_from_rig in data.rigs[rig].items():
             if member not in data.rigs:
@@ -326,22 +322,6 @@ def _images_of(folder: KaptureFolder) -> _Images:
     return _Images(folder)
 
 
-class QueryScene(Protocol):
-    """Pixels, mask and depth of query images; see :class:`KaptureScene`."""
-
-    def image(self, name: str) -> NDArray[np.uint8]:
-        """RGB pixels (H, W, 3)."""
-        ...
-
-    def mask(self, name: str) -> NDArray[np.bool_] | None:
-        """Mask (H, W), True = use, or None."""
-        ...
-
-    def depth(self, name: str) -> DepthView | None:
-        """Depth taken with the image, or None."""
-        ...
-
-
 def depth_of(folder: KaptureFolder, name: str) -> DepthView | None:
     """Return the depth taken with an image, or None."""
     return _images_of(folder).depth(name)
@@ -350,49 +330,31 @@ def depth_of(folder: KaptureFolder, name: str) -> DepthView | None:
 class KaptureScene:
     """:class:`~megloc_kapture.plugins.RankingScene` of a map folder and its queries.
 
+    ``query`` is a folder, or images by name with ``pixels``, ``mask`` and ``depth``.
     ``map_camera`` returns the camera of a map image by name, by default the stored one.
     """
 
     def __init__(
         self,
         mapping: KaptureFolder,
-        query: KaptureFolder | QueryScene | None = None,
+        query: KaptureFolder | Mapping[str, Any] | None = None,
         *,
         map_camera: Callable[[str], Camera] | None = None,
     ) -> None:
         self._map = _images_of(mapping)
-        known = _images_of(query) if isinstance(query, KaptureFolder) else query
-        self._query: QueryScene | None = known
-        self._map_camera = map_camera or self._map.camera
-
-    def query_image(self, name: str) -> NDArray[np.uint8]:
-        if self._query is None:
-            raise DataError(f"the pixels of query {name} are not known")
-        return self._query.image(name)
-
-    def query_mask(self, name: str) -> NDArray[np.bool_] | None:
-        return None if self._query is None else self._query.mask(name)
-
-    def query_depth(self, name: str) -> DepthView | None:
-        return None if self._query is None else self._query.depth(name)
-
-    def map_image(self, name: str) -> NDArray[np.uint8]:
-        return self._map.image(name)
-
-    def map_mask(self, name: str) -> NDArray[np.bool_] | None:
-        return self._map.mask(name)
-
-    def map_depth(self, name: str) -> DepthView | None:
-        return self._map.depth(name)
-
-    def map_points(self, name: str) -> NDArray[np.float64]:
-        return self._map.points(name)
-
-    def map_camera(self, name: str) -> Camera:
-        return self._map_camera(name)
+        if isinstance(query, KaptureFolder):
+            queries = _images_of(query)
+            self.query_image, self.query_mask = queries.image, queries.mask
+            self.query_depth = queries.depth
+        elif query is not None:
+            self.query_image = lambda name: query[name].pixels
+            self.query_mask = lambda name: query[name].mask
+            self.query_depth = lambda name: query[name].depth
+        self.map_image = self._map.image
+        self.map_mask = self._map.mask
+        self.map_depth = self._map.depth
+        self.map_points = self._map.points
+        self.map_camera = map_camera or self._map.camera
 
     def map_pose(self, name: str) -> RigidTransform:
-        pose = self._map.folder.read().cam_from_world(name)
-        if pose is None:
-            raise DataError(f"map image {name} has no pose", path=self._map.folder.root)
-        return pose
+        return self._map.folder.read().poses()[name]

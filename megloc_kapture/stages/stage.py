@@ -97,16 +97,9 @@ class Layout:
     def query(self) -> str:
         return f"{PREPROCESSED}/{QUERY}" if self.options.preprocesses() else QUERY
 
-    def reference(self) -> tuple[str, ...]:
-        """Return the dataset's prebuilt model, if the map has its points."""
-        return (REFERENCE,) if self.options.uses_given_map() else ()
-
     def pairing_points(self) -> tuple[str, ...]:
         """Return the dataset's prebuilt model, if its points are used to pair map images."""
         return (REFERENCE,) if self.options.pairs_by_points() else ()
-
-    def given_map(self) -> tuple[str, ...]:
-        return (MAP,) if self.options.uses_given_map() else ()
 
     def mapping_matches(self) -> tuple[str, ...]:
         if not self.options.triangulates():
@@ -228,7 +221,7 @@ class Stage(ABC):
 
 
 # options that determine the local feature types
-LOCAL_TYPES = ("map", "local_features.name", "local_features.options", "given_features")
+LOCAL_TYPES = ("local_features.name", "local_features.options")
 
 
 class PipelineStage(Stage):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from megloc_kapture.errors import DataError
+from megloc_kapture.errors import DataError, require
 from megloc_kapture.geometry.poses import GeoPosition, align_to_earth
 from megloc_kapture.io.colmap_mapping import Mapper, Model, Photograph, reconstruct
 from megloc_kapture.io.dataset_tables import (
@@ -181,12 +181,10 @@ def _scaled(model: Model, structure: StructureOptions) -> tuple[World, Model, di
     if structure.distance is not None:
         first, second, metres = structure.distance
         for name in (first, second):
-            if name not in model.poses:
-                raise DataError(f"--scale: the map has no photograph {name!r}")
+            require(name in model.poses, f"--scale: the map has no photograph {name!r}")
         one, other = (model.poses[name].center() for name in (first, second))
         apart = float(np.linalg.norm(one - other))
-        if apart == 0:
-            raise DataError(f"--scale: {first} and {second} were taken at the same place")
+        require(apart != 0, f"--scale: {first} and {second} were taken at the same place")
         scale = metres / apart
         return World(unit=METRES), _moved(model, scale), {"metres_per_unit": scale}
     if structure.gps is None:

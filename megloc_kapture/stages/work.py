@@ -30,10 +30,6 @@ BATCH = 8  # for batch plugins without a device option
 MOST_AT_ONCE = {"cpu": 1, "cuda": 16}
 
 
-class DeviceMemoryError(MeglocError):
-    """Out of memory for a single image or pair."""
-
-
 def on_gpu(plugin: object) -> bool:
     return _device_of(plugin) not in (None, "cpu")
 
@@ -69,7 +65,7 @@ def in_batches(
 ) -> list[Result]:
     """Run a plugin on items in batches, halved when memory runs out.
 
-    Raise DeviceMemoryError if one item does not fit.
+    Raise MeglocError if one item does not fit.
     """
     key = type(plugin).__qualname__, many, repr(getattr(plugin, "options", None))
     found: list[Result] = []
@@ -82,7 +78,7 @@ def in_batches(
             if not is_out_of_memory(error):
                 raise
             if len(batch) == 1:
-                raise DeviceMemoryError(
+                raise MeglocError(
                     f"{name(len(found))}: there is not enough memory for it alone; make images "
                     "smaller (max_megapixels, preprocessing.max_size_px), keep fewer keypoints, or "
                     "compute on another device (--device)"
@@ -288,11 +284,11 @@ class FolderSpec:
         self.key = (folder.root, folder.features_dirs, folder.allow_links_below, uuid4().hex)
 
     def open(self) -> KaptureFolder:
-        return _open_folder(*self.key)
+        return open_folder(*self.key)
 
 
 @lru_cache(maxsize=8)
-def _open_folder(
+def open_folder(
     root: Path, features_dirs: tuple[Path, ...], links_below: tuple[Path, ...], run_id: str
 ) -> KaptureFolder:
     return KaptureFolder(root, features_dirs=features_dirs, allow_links_below=links_below)

@@ -10,8 +10,7 @@ from kloc import kloc, merged, needs_kapture_localization, pose_errors
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
 from megloc_kapture.io.kapture.features import KaptureVectors
 from megloc_kapture.retrieval.search import FusedSearch, FusionOptions
-from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
-from megloc_kapture.stages.image_pairs import pair_queries
+from megloc_kapture.stages.image_pairs import QueryPairsOptions, Retrieval, pair_queries
 
 pytestmark = [needs_kapture_localization, pytest.mark.slow]
 

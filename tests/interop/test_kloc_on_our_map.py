@@ -10,9 +10,12 @@ from kloc import kloc, merged, needs_kapture_localization, pose_errors, proxy
 
 from megloc_kapture.io.colmap import TriangulationOptions
 from megloc_kapture.io.kapture import KaptureFolder, read_pairs
-from megloc_kapture.stages.localized_folder import write_localized
 from megloc_kapture.stages.map_points import triangulate_map
-from megloc_kapture.stages.query_poses import LocalizationOptions, localize_from_matches
+from megloc_kapture.stages.query_poses import (
+    LocalizationOptions,
+    localize_from_matches,
+    write_localized,
+)
 
 pytestmark = [needs_kapture_localization, pytest.mark.slow]
 

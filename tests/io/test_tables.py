@@ -24,13 +24,11 @@ from megloc_kapture.io.csv_table import (
 )
 from megloc_kapture.io.tables import (
     ConsistencyRow,
-    mask_counts_path,
     read_consistency,
     read_refinement,
     read_status,
     write_clusters,
     write_consistency,
-    write_mask_counts,
     write_refinement,
     write_status,
 )
@@ -228,13 +226,6 @@ def test_refinements_read_back_by_image_with_their_steps_in_order(tmp_path: Path
     assert list(read) == ["a.jpg", "b.jpg"]
     for result in RESULTS:
         assert list(map(vars, read[result.name])) == list(map(vars, result.refinements))
-
-
-def test_counts_come_back(tmp_path: Path) -> None:
-    counts = {"b/2.jpg": 0, 'a/"1".jpg': 1234}
-    write_mask_counts(tmp_path, "rootsift", counts)
-    rows = mask_counts_path(tmp_path, "rootsift").read_text().splitlines()
-    assert rows == ["image,num_masked", '"a/""1"".jpg",1234', "b/2.jpg,0"]
 
 
 ROW = ConsistencyRow("DUC1", "rendering", 13, 2, 0.016, 0.25, 1.5, 0.024, 0.3, 11.5, "")

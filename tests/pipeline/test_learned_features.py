@@ -1,8 +1,7 @@
-"""Learned features in whole runs: several types in one map, presets, and queries from Python."""
+"""A preset with learned features, in a whole run and from Python."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.results import Results
 from megloc_kapture.stages.options import PipelineOptions
-from tests.pipeline.runs import errors, evaluated, recall
+from tests.pipeline.runs import errors, evaluated
 
 pytestmark = pytest.mark.slow
 
@@ -29,24 +28,6 @@ def modern(*assignments: str) -> PipelineOptions:
     small = ("preprocessing.max_size_px=640", "global_features.options.num_clusters=16")
     few = "local_features.aliked.options.max_keypoints=600"
     return options_of_preset("modern", assignments=[*assignments, few, *small])
-
-
-def test_several_types_are_one_map_and_one_problem(fountain: Path, tmp_path: Path) -> None:
-    options = modern(
-        'local_features=["aliked", "xfeat"]',
-        "local_features.xfeat.matching.name=lighterglue",
-        "local_features.xfeat.options.max_keypoints=300",
-    )
-    workspace = evaluated(tmp_path / "workspace", fountain, options)
-    seen = workspace.folder("map").observations()
-    assert {name for name, some in seen.items() if len(some)} == {"aliked-n16", "xfeat"}
-    assert recall(workspace)[0] == 1.0
-    manifest = json.loads(workspace.path("stages/local_features.json").read_text())
-    weights = manifest["options"]["weights"]
-    assert list(weights) == ["aliked-n16.pth", "xfeat.pt"]
-    assert all(len(sha256) == 64 for sha256 in weights.values())
-    matching = json.loads(workspace.path("stages/query_matches.json").read_text())["options"]
-    assert list(matching["weights"]) == ["xfeat-lighterglue.pt"]
 
 
 def test_modern_maps_smaller_images_and_localizes_whole_ones(

@@ -11,9 +11,8 @@ import pytest
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.pipeline.kapture_map import KaptureMap
-from megloc_kapture.pipeline.local_types import extract_again, local_types_of
+from megloc_kapture.pipeline.live_source import extract_again, local_types_of
 from megloc_kapture.pipeline.presets import options_of_preset
-from megloc_kapture.stages.matches import FeatureCache
 
 
 @pytest.fixture
@@ -99,6 +98,6 @@ def test_an_unknown_type_is_refused_with_the_known_ones_and_a_remedy(map_copy: P
     observations = map_copy / "reconstruction" / "observations.txt"
     observations.write_text(observations.read_text().replace("rootsift", "D2-Net"))
     opened = KaptureMap.open(map_copy)
-    (local,) = local_types_of(opened, options_of_preset("classic"), FeatureCache())
+    (local,) = local_types_of(opened, options_of_preset("classic"))
     with pytest.raises(DataError, match=r"'D2-Net'.*known: .*rootsift.*D2-Net/keypoints\.txt"):
         _ = local.extractor

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import gc
 import tarfile
-import threading
 from collections.abc import Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +19,6 @@ from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.query_folders import KaptureQueries
-from megloc_kapture.pipeline.results import Results
 from megloc_kapture.stages.options import PipelineOptions
 from megloc_kapture.values import LocalFeatures
 from tests.pipeline.runs import errors
@@ -237,24 +233,6 @@ def test_a_map_in_a_tar(localizer: Localizer, map_copy: Path, queries: list[Quer
         results = list(again.localize_many(queries, executor))
     for query, found in zip(queries, results, strict=True):
         assert same(found, localizer.localize_query(query))
-
-
-def test_results_that_nobody_reads_on_wait_for_no_worker(
-    localizer: Localizer, scene: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    released, waiting = threading.Event(), []
-
-    def localize_units(units: Any, executor: Executor, **_: Any) -> Iterator[list[Failure]]:
-        waiting.append(executor.submit(released.wait, 20))
-        yield from ([Failure("none")] for _ in units)
-
-    monkeypatch.setattr(localizer, "localize_units", localize_units)
-    results = Results(localizer, scene / "query")
-    assert results["0001.jpg"].reason == "none"
-    del results
-    gc.collect()  # in whatever thread it runs
-    released.set()
-    assert waiting[0].result() is True
 
 
 @pytest.mark.slow

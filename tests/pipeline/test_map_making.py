@@ -25,11 +25,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from megloc_kapture.cli.main import main
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.geometry.poses import earth_from_enu, geodetic
 from megloc_kapture.io.dataset_tables import read_unreadable, read_world
-from megloc_kapture.io.images import read_image_rgb, write_image
+from megloc_kapture.io.images import write_image
 from megloc_kapture.pipeline.map_making import options_of_photographs
 from megloc_kapture.values import Camera, Pose, RigidTransform
 from tests.rendering import corner
@@ -265,27 +264,6 @@ def test_gps_tells_scale_and_axes(room: Path, tmp_path: Path) -> None:
     assert np.linalg.norm(apart, axis=1).max() < 2.0  # East, North, Up
 
 
-@pytest.mark.slow
-def test_photographs_of_one_size_may_have_other_cameras(
-    room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Three are zoomed, and no EXIF says so."""
-    photos = put(tmp_path / "photos", (room / "photos").iterdir())
-    zoomed = ("0004.jpg", "0006.jpg", "0008.jpg")
-    for name in zoomed:
-        image = read_image_rgb(photos / name)
-        height, width = image.shape[:2]
-        part = image[height * 3 // 20 : height * 17 // 20, width * 3 // 20 : width * 17 // 20]
-        write_image(photos / name, cv2.resize(part, (width, height), interpolation=cv2.INTER_CUBIC))
-    made = megloc.map_photographs(photos, workspace=tmp_path / "map", **FEW)
-    found, _, _ = errors(made.kapture_map.poses, true_poses(room / "mapping", room / "query_gt"))
-    assert len(found) == 11 and np.median(found) < 0.01 and found.max() < 0.03
-    for name in (image.name for image in photos.iterdir()):
-        focal = 301 / 0.7 if name in zoomed else 301
-        assert made.kapture_map.camera(name).params[0] == pytest.approx(focal, rel=0.06)
-    assert f"another camera (a zoom, a crop): {', '.join(zoomed)}" in caplog.text
-
-
 def test_two_scenes_are_two_models(
     room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -380,32 +358,3 @@ def test_surveyed_facades(shared_data: Path, tmp_path: Path, scene: str, mapper:
     assert shares.max() < worst
     focal = found.kapture_map.camera(found.kapture_map.images[0]).params[0]
     assert abs(focal / 1381 - 1) < 0.01
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("focal_35mm", [None, 25])
-def test_twenty_photographs_in_three_commands(
-    shared_data: Path, tmp_path: Path, focal_35mm: int | None
-) -> None:
-    """The true focal length is 32 mm of a 35 mm film."""
-    root = shared_data / "scenes" / "herzjesu_p25"
-    photos, others = images_of(root), images_of(root)[2::5]
-    for image in photos:
-        folder = put(tmp_path / ("others" if image in others else "photos"), [image])
-        if focal_35mm is not None:
-            with_exif(folder / image.name, focal_35mm=focal_35mm)
-    workspace, localized = tmp_path / "map", tmp_path / "localized"
-    for arguments in (
-        ("map", tmp_path / "photos", "-o", workspace),
-        ("localize", "-i", workspace, "--images", tmp_path / "others", "-o", localized),
-        ("view", workspace, localized, "-o", tmp_path / "view.html"),
-    ):
-        with pytest.raises(SystemExit) as end:
-            main([str(argument) for argument in arguments])
-        assert end.value.code == 0
-    truth = true_poses(root / "mapping", root / "query_gt")
-    found = KaptureFolder(workspace / "map").read().poses()
-    queries = KaptureFolder(localized).read().poses()
-    assert (len(found), len(queries)) == (20, 5)
-    shares, _, _ = errors({**found, **queries}, truth)
-    assert shares.max() < 0.006

@@ -43,8 +43,6 @@ def test_names_are_paths_below_what_was_given(tmp_path: Path) -> None:
     write(tmp_path / "in" / "f.jpg").rename(tmp_path / "in" / "frame_000007")
     photos = Photographs([tmp_path / "in", other])
     assert photos.names == ["a dir/c.PNG", "b.jpg", "e.jpg", "frame_000007"]
-    assert photos.passed_over == ["notes.txt"]
-    assert photos.describe() == ["1 files that are no images are left out: notes.txt"]
     assert list(photos.unreadable) == ["raw.NEF"]
     assert ".nef cannot be read" in photos.unreadable["raw.NEF"].lower()
 
@@ -228,27 +226,22 @@ def test_either_type_serves_the_other(
     assert queries.lacking(of_map) is None
     assert queries.lacking("superpoint") == queries.names[0]
     queries.check()
-    assert all(list(one.features) == [brought] for one in queries)
+    assert all(list(one.features) == ["rootsift"] for one in queries)
     results = Results(Localizer(opened, options=options_of_preset(assignments=[FEW])), folder)
     assert all(results.values())
 
 
-def test_of_both_the_fitting_type_is_read_and_an_image_without_either_is_named(
+def test_an_image_without_stored_features_is_named(
     workspaces: dict[str, Workspace], tmp_path: Path
 ) -> None:
-    place = workspaces["rootsift-pyramid"]
-    both = place.folder("query", "", "pyramid/query")
-    for of_map, expected in (("rootsift", TYPES[:1]), ("rootsift-pyramid", TYPES)):
-        opened = KaptureMap.open(workspaces[of_map].path("map"))
-        assert tuple(opened.stored_types()) == expected
-        assert all(tuple(one.features) == expected for one in KaptureQueries(both, opened))
-    features = Path(shutil.copytree(place.path("pyramid/query"), tmp_path / "features"))
-    name = both.read().image_names()[2]
+    place = workspaces["rootsift"]
+    features = Path(shutil.copytree(place.path("local_features"), tmp_path / "local_features"))
+    name = place.folder("query").read().image_names()[2]
     for suffix in ("kpt", "desc"):
         (found,) = features.rglob(f"{name}.{suffix}")
         found.unlink()
-    queries = KaptureQueries(KaptureFolder(place.path("query"), features_dirs=[features]), opened)
-    assert queries.lacking("rootsift") == name
+    folder = KaptureFolder(place.path("query"), features_dirs=[tmp_path])
+    assert KaptureQueries(folder, KaptureMap.open(place.path("map"))).lacking("rootsift") == name
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ from aachen_files import write_v1_0, write_v1_1
 from kapture_forms import aachen_with_kapture
 
 from megloc_kapture.cli.main import main
-from megloc_kapture.errors import MeglocError
+from megloc_kapture.errors import MeglocError, OptionError
 from megloc_kapture.io.weights import MissingWeightsError
-from megloc_kapture.pipeline.datasets import DatasetChoice, find_benchmark
+from megloc_kapture.pipeline.datasets import DatasetChoice, choose_dataset, find_benchmark
 from megloc_kapture.pipeline.evaluation_plan import (
     Run,
     choose_run,
@@ -41,7 +41,7 @@ def test_each_stage_says_whether_it_is_on_and_why() -> None:
     off = {name for name, line in lines.items() if not line["on"]}
     assert off == {"densify", "refine_poses"}
     assert lines["local_features"]["why"] == "local_features = superpoint + aslfeat"
-    assert "superpoint by superglue, aslfeat by nn" in lines["query_matches"]["why"]
+    assert "local_features = superpoint + aslfeat" in lines["query_matches"]["why"]
     assert lines["mapping_pairs"]["why"].endswith("by = poses + covisibility + retrieval")
     assert lines["query_pairs"]["why"] == (
         "reranking.by = verified, reranking.keep = 20, reranking.local_type = superpoint"
@@ -110,3 +110,10 @@ def test_explaining_runs_nothing_and_needs_no_data(
         expected = explained(explain(run_of("inloc", "megloc").options))
         assert capsys.readouterr().out.rstrip("\n") == expected
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["synthetic", "synthetic-4seasons"])
+def test_pairs_by_covisibility_need_a_model(name: str) -> None:
+    options = options_of_preset(assignments=['mapping_pairs.by=["covisibility"]'])
+    with pytest.raises(OptionError, match=f"{name} comes with no model: .*by covisibility"):
+        plan_evaluation(Run(choose_dataset(name, None), "classic", options))

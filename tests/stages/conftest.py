@@ -33,9 +33,14 @@ from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.matching.verification import KnownPoseOptions, TwoViewOptions
 from megloc_kapture.pipeline.executors import open_executor, single_threaded
 from megloc_kapture.plugins import LocalFeatureExtractor
-from megloc_kapture.stages.candidates import QueryPairsOptions, Retrieval
 from megloc_kapture.stages.global_features import extract_vlad
-from megloc_kapture.stages.image_pairs import MappingPairsOptions, pair_map_images, pair_queries
+from megloc_kapture.stages.image_pairs import (
+    MappingPairsOptions,
+    QueryPairsOptions,
+    Retrieval,
+    pair_map_images,
+    pair_queries,
+)
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.map_points import triangulate_map
 from megloc_kapture.stages.matches import match_pairs

@@ -12,18 +12,16 @@ from hypothesis import strategies as st
 
 from megloc_kapture.io.dataset_tables import ImageGroup, write_groups, write_priors
 from megloc_kapture.io.kapture import (
-    KaptureData,
     KaptureFolder,
-    write_sensors,
 )
 from megloc_kapture.retrieval.search import FusionOptions, fuse
-from megloc_kapture.stages.candidates import (
+from megloc_kapture.stages.image_pairs import (
     UNRESTRICTED,
     QueryPairsOptions,
     Restrictions,
     Retrieval,
+    pair_queries,
 )
-from megloc_kapture.stages.image_pairs import pair_queries
 
 Folders = tuple[KaptureFolder, KaptureFolder]
 SIZES = {"short": 3, "long": 8}
@@ -66,18 +64,6 @@ def test_fused_pairs_are_those_of_the_fused_similarities(
     ]
     assert [(p.query, p.map) for p in found] == [(q, m) for q, m, _ in expected]
     np.testing.assert_allclose([p.score for p in found], [s for _, _, s in expected], atol=1e-6)
-
-
-@pytest.fixture
-def two_types(write_features: Any, tmp_path: Path) -> KaptureFolder:
-    """300 images, described by two types."""
-    rng = np.random.default_rng(7)
-    for name, width in (("one", 8), ("two", 5)):
-        rows = rng.normal(size=(300, width)).astype(np.float32)
-        vectors = {f"{image:03}.jpg": row for image, row in enumerate(rows)}
-        write_features(tmp_path, "global_features", name, vectors)
-    write_sensors(tmp_path / "map", KaptureData())
-    return KaptureFolder(tmp_path / "map", features_dirs=[tmp_path])
 
 
 # ----------------------------------------------------------------------------------- restrictions

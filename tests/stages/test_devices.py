@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from megloc_kapture.errors import OptionError, PluginError
+from megloc_kapture.errors import MeglocError, OptionError, PluginError
 from megloc_kapture.features.aslfeat import AslFeatNet
 from megloc_kapture.features.rootsift import RootSift, RootSiftOptions
 from megloc_kapture.features.superpoint import SuperPointNet
@@ -39,7 +39,7 @@ from megloc_kapture.stages.local_features import (
 )
 from megloc_kapture.stages.matches import MatchQueries, match_all, match_pairs
 from megloc_kapture.stages.stage import wanted_stages
-from megloc_kapture.stages.work import DeviceMemoryError, Work, in_batches, is_out_of_memory
+from megloc_kapture.stages.work import Work, in_batches, is_out_of_memory
 from megloc_kapture.values import ImageFeatures, LocalFeatures
 
 Image = NDArray[np.uint8]
@@ -145,10 +145,10 @@ def test_memory_that_runs_out_halves_the_batch(eight_at_once: None, frames: Any)
         assert plugin.seen == sizes
         plugin.seen.clear()
     none = Limited(most=0)
-    with pytest.raises(DeviceMemoryError, match=r"image 0\.jpg: there is not enough memory"):
+    with pytest.raises(MeglocError, match=r"image 0\.jpg: there is not enough memory"):
         extract_all(none, frames, NAMES)
     image = ImageFeatures(np.zeros((3, 2), np.float32), np.zeros((3, 4), np.float32), 8, 8)
-    with pytest.raises(DeviceMemoryError, match="pair 0, 1: there is not enough memory"):
+    with pytest.raises(MeglocError, match="pair 0, 1: there is not enough memory"):
         match_all(none, image, [image] * 3, ["pair 0, 1", "pair 0, 2", "pair 0, 3"])
     assert none.seen == [5, 2, 1, 2, 1]
 

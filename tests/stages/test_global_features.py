@@ -16,9 +16,6 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.stages import work as devices
 from megloc_kapture.stages.global_features import (
-    PROJECTION_FILE,
-    SETTINGS_FILE,
-    VOCABULARY_FILE,
     describe_images,
     extract_global_features,
     extract_vlad,
@@ -97,17 +94,7 @@ def test_what_a_plugin_may_not_return(returned: Any, what: str) -> None:
         describe_images(Wrong(), [np.zeros((4, 4, 3), np.uint8)], ["a.png"])
 
 
-def test_vectors_of_different_lengths_are_refused(world: Any, tmp_path: Path) -> None:
-    class Growing:
-        name = "growing"
-        size = 2
-
-        def describe(self, image: np.ndarray) -> np.ndarray:
-            self.size += 1
-            return np.eye(self.size, dtype=np.float32)[0]
-
-    with pytest.raises(PluginError, match="growing.*4 values, 3 of the images before"):
-        extract_global_features([world.mapping()], Growing(), tmp_path)
+def test_an_image_in_two_folders_is_refused(world: Any, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="is in two kapture folders"):
         extract_global_features([world.mapping(), world.mapping()], Colours(), tmp_path)
 
@@ -188,24 +175,3 @@ def test_a_vocabulary_comes_back_as_it_was(
         for part in ("mean", "projection"):
             mine, theirs = (getattr(one.whitening, part) for one in (found[0], vocabulary))
             np.testing.assert_array_equal(mine, theirs)
-
-
-def test_a_broken_vocabulary_is_refused_by_name(tmp_path: Path) -> None:
-    write_vocabulary(tmp_path, WITH_PCA, "r2d2", SOFT_PCA)
-    path = tmp_path / VOCABULARY_FILE
-    content = np.load(path)
-    for wrong in (content.astype(np.float64), np.full_like(content, np.nan), np.array([{}])):
-        np.save(path, wrong, allow_pickle=True)
-        with pytest.raises(DataError, match=r"vocabulary\.npy: not a vocabulary"):
-            read_vocabulary(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("name", "damage"),
-    [(PROJECTION_FILE, Path.unlink), (SETTINGS_FILE, lambda p: p.write_text('{"local_type": 3}'))],
-)
-def test_a_file_beside_the_vocabulary_is_named(tmp_path: Path, name: str, damage: Any) -> None:
-    write_vocabulary(tmp_path, WITH_PCA, "r2d2", SOFT_PCA)
-    damage(tmp_path / name)
-    with pytest.raises(DataError, match=name):
-        read_vocabulary(tmp_path)

@@ -26,15 +26,18 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.tables import PairCount, match_counts_path, write_match_counts
 from megloc_kapture.mapping import pairs as pairs_module
-from megloc_kapture.stages.candidates import QueryPairsOptions, Restrictions, Retrieval, vectors_of
 from megloc_kapture.stages.image_pairs import (
     MappingPairsOptions,
+    QueryPairsOptions,
     RerankingOptions,
+    Restrictions,
+    Retrieval,
     counted,
     pair_map_images,
     pair_queries,
     rerank,
     reranked,
+    vectors_of,
 )
 from megloc_kapture.stages.matches import VerifiedMatches, iterate_candidates
 

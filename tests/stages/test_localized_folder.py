@@ -21,7 +21,7 @@ from megloc_kapture.io.tables import (
     read_covariances,
     read_status,
 )
-from megloc_kapture.stages.localized_folder import write_localized
+from megloc_kapture.stages.query_poses import write_localized
 from megloc_kapture.values import Failure, Pose
 
 

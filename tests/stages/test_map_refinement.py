@@ -29,7 +29,7 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.kapture.points import read_point_covariances
 from megloc_kapture.mapping.uncertainty import point_covariances
-from megloc_kapture.stages.candidates import Restrictions
+from megloc_kapture.stages.image_pairs import Restrictions
 from megloc_kapture.stages.map_refinement import (
     MapRefinementOptions,
     RefinementReport,
@@ -227,24 +227,12 @@ def test_a_point_is_as_uncertain_as_in_its_worst_direction(
     np.testing.assert_array_equal(folder.points3d(), wall.points3d()[sure])
 
 
-def test_observations_of_an_image_without_pose_stay(tmp_path: Path) -> None:
+def test_observations_of_an_image_without_pose_are_dropped(tmp_path: Path) -> None:
     wall = write_wall(tmp_path / "map", unposed=[3])
     folder, _ = refined(wall, tmp_path / "out", uncertainty={"max_robust_sigmas": 1.0})
-    before, after = contents(wall), contents(folder)
-    left = {point for rows in after.values() for point, _, _ in rows}
-    for name, observed in before.items():
-        unposed = {row for row in observed if row[1] == "wall/3.png" and row[0] in left}
-        assert unposed
-        assert unposed <= after[name]
-
-
-def test_a_map_without_poses_is_left_as_it_is(tmp_path: Path) -> None:
-    wall = write_wall(tmp_path / "map", unposed=range(NUM_IMAGES))
-    folder, _ = refined(wall, tmp_path / "out", uncertainty={"max_robust_sigmas": 0.1})
-    assert contents(folder) == contents(wall)
-    covariances = read_point_covariances(tmp_path / "out", 66)
-    assert covariances is not None
-    assert np.isnan(covariances).all()
+    for observed in contents(folder).values():
+        images = {image for _, image, _ in observed}
+        assert images and "wall/3.png" not in images
 
 
 def lifted_from(wall: KaptureFolder, shares: Sequence[float]) -> KaptureFolder:

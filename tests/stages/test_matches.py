@@ -20,9 +20,6 @@ from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import LOCAL_FEATURES
 from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import (
-    FeatureCache,
-    Features,
-    NoVerification,
     best_pairs,
     check_given_poses,
     iterate_candidates,
@@ -53,7 +50,7 @@ def run(world: Any, kind: str, verification: Any, output: Path, **more: Any) -> 
 def test_all_of_the_matchers_matches_are_kept_or_those_that_are_verified(
     world: Any, tmp_path: Path
 ) -> None:
-    run(world, "query", NoVerification(), tmp_path / "all")
+    run(world, "query", None, tmp_path / "all")
     run(world, "query", TwoViewOptions(), tmp_path / "verified")
     everything, verified = (
         world.mapping().with_features([tmp_path / name]).matches("rootsift")
@@ -96,8 +93,8 @@ def test_a_pair_without_matches_is_known_and_one_asked_for_twice_matched_once(
     matcher = NearestNeighbours()
     for pairs, how, name, counts in (
         (asked, KnownPoseOptions(), "none verified", (2, 0, 0)),
-        (asked, NoVerification(), "all", (2, 1, 4)),
-        ([], NoVerification(), "no pairs", (0, 0, 0)),
+        (asked, None, "all", (2, 1, 4)),
+        ([], None, "no pairs", (0, 0, 0)),
     ):
         output = tmp_path / name
         found = match_pairs(folder, folder, pairs, "toy", matcher, how, output)
@@ -163,42 +160,13 @@ def test_what_has_no_features_is_named(world: Any, tmp_path: Path) -> None:
     def match(image: str, local_type: str) -> None:
         match_pairs(
             world.mapping(), world.mapping(), [ImagePair("left/0.png", image, 1.0)], local_type,
-            NearestNeighbours(), NoVerification(), tmp_path,
+            NearestNeighbours(), None, tmp_path,
         )  # fmt: skip
 
     with pytest.raises(DataError, match="no keypoints of type 'r2d2' .* there are: rootsift"):
         match("left/1.png", "r2d2")
     with pytest.raises(DataError, match=r"nowhere\.png"):
         match("nowhere.png", "rootsift")
-
-
-def test_the_cache_is_bounded_and_forgets_what_was_used_longest_ago() -> None:
-    def features() -> Features:
-        return Features.of(CAMERA, np.zeros((100, 2), np.float32), np.zeros((100, 4), np.float32))
-
-    one = features()
-    # rays and their slopes are made when they are needed, and counted from the start
-    slopes = 100 * 2 * 2 * 8
-    size = one.descriptors.nbytes + one.keypoints_px.nbytes + one.rays.nbytes + slopes
-    cache = FeatureCache(max_bytes=3 * size)
-    loaded: list[str] = []
-
-    def get(key: str) -> None:
-        def load() -> Features:
-            loaded.append(key)
-            return features()
-
-        cache.get(key, load)
-
-    for key in "abcab":
-        get(key)
-    assert loaded == ["a", "b", "c"]
-    get("d")  # c was used longest ago
-    for key in "abd":
-        get(key)
-    assert loaded == ["a", "b", "c", "d"]
-    get("c")
-    assert loaded == ["a", "b", "c", "d", "c"]
 
 
 def test_candidates_come_best_first_and_ties_by_name() -> None:

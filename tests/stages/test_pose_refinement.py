@@ -26,9 +26,9 @@ from megloc_kapture.io.tables import (
 from megloc_kapture.plugin_loading import plugin_names
 from megloc_kapture.plugins import POSE_REFINERS, PluginChoice, PoseRefinement
 from megloc_kapture.refinement.references import Displacement
-from megloc_kapture.stages.candidates import Restrictions
-from megloc_kapture.stages.localized_folder import write_localized
+from megloc_kapture.stages.image_pairs import Restrictions
 from megloc_kapture.stages.pose_refinement import PoseRefinementOptions, refine_poses
+from megloc_kapture.stages.query_poses import write_localized
 from megloc_kapture.stages.work import Work
 from megloc_kapture.values import Camera, Failure, Pose, RigidTransform
 
@@ -142,36 +142,13 @@ def test_a_pose_that_stays_keeps_its_covariance(
     assert kept["moved"] == {}  # this refiner does not know that of its poses
 
 
-def test_references_look_the_same_way_and_are_of_one_frame(
+def test_references_are_the_candidates_of_the_pose(
     world: Any, localized: KaptureFolder, tmp_path: Path
 ) -> None:
-    first = min(world.query_poses)
-    images = sorted(world.map_poses)
-    groups = {image: ImageGroup(frame="a" if k < 3 else "b") for k, image in enumerate(images)}
-    refiner = Shift()
-    refine_poses(
-        world.mapping(), world.query(), localized, tmp_path / "out",
-        Chosen(refiners=(refiner,), references="frame"),
-        restrictions=Restrictions(groups=groups),
-    )  # fmt: skip
-    assert set(refiner.asked[first]) <= set(images[:3])
-    # the image that the pose comes from is among them
-    assert images[0] in refiner.asked[first]
-
-
-def test_references_of_the_cluster_are_none_but_the_pose_s_candidates(
-    world: Any, localized: KaptureFolder, tmp_path: Path
-) -> None:
-    first = min(world.query_poses)
-    asked = {}
-    for references in ("cluster", "frame"):
-        refiner = Shift()
-        options = Chosen(refiners=(refiner,), references=references)
-        out = tmp_path / references
-        refine_poses(world.mapping(), world.query(), localized, out, options)
-        asked[references] = refiner.asked[first]
-    assert asked["cluster"] == [min(world.map_poses)]
-    assert set(asked["cluster"]) < set(asked["frame"])
+    refiner, first = Shift(), min(world.query_poses)
+    options = Chosen(refiners=(refiner,))
+    refine_poses(world.mapping(), world.query(), localized, tmp_path / "out", options)
+    assert refiner.asked[first] == [min(world.map_poses)]
 
 
 def test_wrong_refiners_are_refused(world: Any, localized: KaptureFolder, tmp_path: Path) -> None:

@@ -28,9 +28,9 @@ from megloc_kapture.io.images import (
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.preprocessing.frames import carry_points
 from megloc_kapture.preprocessing.masks import FixedMask
-from megloc_kapture.stages.image_masks import MaskOptions
 from megloc_kapture.stages.local_features import extract_local_features, mask_path, read_mask
 from megloc_kapture.stages.preprocessing import (
+    MaskOptions,
     PreprocessingOptions,
     preprocess_images,
 )
@@ -393,7 +393,5 @@ def test_what_a_segmenter_must_not_return(
 def test_classes_that_nobody_knows(street: KaptureFolder, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="no class 'bicycle'; it has: road, sky, car"):
         run(street, tmp_path / "new", {"dynamic": ("car", "bicycle")}, segmenter=Halves())
-    with pytest.raises(OptionError, match="need a segmenter"):
-        run(street, tmp_path / "new", {"dynamic": ("car",)})
     with pytest.raises(PluginError, match="no plugin 'nobody'"):
         run(street, tmp_path / "new", {"segmenter": {"name": "nobody"}})

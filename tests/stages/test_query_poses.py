@@ -29,8 +29,8 @@ from megloc_kapture.stages.local_features import extract_local_features
 from megloc_kapture.stages.matches import match_pairs
 from megloc_kapture.stages.query_poses import (
     LocalizationOptions,
-    in_turn,
     localize_from_matches,
+    localize_query,
     localize_unit,
 )
 from megloc_kapture.stages.scene import KaptureScene
@@ -96,24 +96,48 @@ def test_an_unknown_ranker_is_refused_before_the_first_query(world: Any) -> None
         world.localized(rank=PluginChoice(name="no-such"))
 
 
-def test_candidates_are_taken_in_turn_until_the_pose_is_sure_and_well_supported() -> None:
-    asked: list[int] = []
+class _Turns:
+    """A query whose pose gets surer with more candidates, and the counts that were asked for."""
 
-    def solve(count: int) -> list[Pose | Failure]:
-        asked.append(count)
-        confidence, inliers = {5: (0.99, 29), 10: (0.89, 30), 20: (0.9, 30)}.get(count, (1.0, 99))
+    def __init__(self, count: int) -> None:
+        self.candidates = [str(number) for number in range(count)]
+        self.asked: list[int] = []
+
+    def view(self, count: int) -> QueryView:
+        self.asked.append(count)
+        return QueryView("q", cast(Camera, None), ())
+
+
+@pytest.mark.parametrize(
+    ("count", "sure", "expected"),
+    [
+        (50, 0.9, [5, 10, 20]),
+        (15, 0.9, [5, 10, 15]),
+        (50, 1.0, [5, 10, 20, 40, 50]),
+        (50, None, [50]),
+    ],
+)
+def test_candidates_are_taken_in_turn_until_the_pose_is_sure_and_well_supported(
+    count: int, sure: float | None, expected: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = _Turns(count)
+
+    def solve(*_: Any, **__: Any) -> list[Pose]:
+        turns = {5: (0.99, 29), 10: (0.89, 30), 20: (0.9, 30)}
+        confidence, inliers = turns.get(source.asked[-1], (0.95, 99))
         return [Pose(RigidTransform.identity(), 100, inliers, confidence=confidence)]
 
-    def turns(count: int, options: LocalizationOptions, *also: Failure) -> list[int]:
-        asked.clear()
-        in_turn(lambda few: [*solve(few), *also], count, options)
-        return asked.copy()
-
-    options = LocalizationOptions(sure_confidence=0.9)
-    assert turns(50, options) == [5, 10, 20]
-    assert turns(15, options) == [5, 10, 15]  # all of them where no turn is sure
-    assert turns(50, options, Failure("none")) == [5, 10, 20, 40, 50]  # a rig's other camera
-    assert turns(50, LocalizationOptions()) == [50]
+    monkeypatch.setattr("megloc_kapture.stages.query_poses.localize_unit", solve)
+    nothing: Any = None
+    localize_query(
+        [source],
+        LocalizationOptions(sure_confidence=sure),
+        frame_of=lambda _: "",
+        centers={},
+        ranker=nothing,
+        scene=nothing,
+    )
+    assert source.asked == expected
 
 
 def test_map_points_are_those_that_an_image_observes(world: Any) -> None:
@@ -169,8 +193,8 @@ def test_every_cluster_gives_a_pose_whichever_retrieval_ranks_first(first: str) 
     (found,) = localize_unit(
         [QueryView("q", camera, (TypedMatches(index, seen, matches),))],
         sorted(names, key=lambda name: not name.startswith(first)),
-        [""] * 4,
         LocalizationOptions(),
+        frame_of=lambda _: "",
         centers={
             name: np.array([0.0 if name.startswith("right") else 50.0, 0.0, 0.0]) for name in names
         },
@@ -196,8 +220,8 @@ def test_places_whose_poses_agree_are_one_but_in_two_frames(
     (found,) = localize_unit(
         [QueryView("q", camera, (TypedMatches(index, seen, matches),))],
         ["a", "b"],
-        frames,
         LocalizationOptions(clusters=ClusterOptions(by="poses", radius=1.0)),
+        frame_of=dict(zip("ab", frames, strict=True)).__getitem__,
         centers={"a": np.zeros(3), "b": np.full(3, 9.0)},
         ranker=load_plugin(POSE_RANKERS, "inliers"),
         scene=cast(RankingScene, None),

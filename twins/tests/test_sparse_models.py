@@ -29,7 +29,6 @@ from megloc_kapture.datasets.robotcar.adapter import RobotCar, RobotCarOptions
 from megloc_kapture.io.colmap import px_from_cam
 from megloc_kapture.io.colmap_model import SparsePoints
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.stages.given_map import has_descriptors
 from megloc_kapture.values import Camera, RigidTransform
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
@@ -192,7 +191,7 @@ def test_the_database_is_what_colmap_extracts(root: Path, tmp_path: Path) -> Non
         write_official(adapter.read(root), tmp_path / version)
         reference = KaptureFolder(tmp_path / version / "reference")
         reference.validate()
-        assert has_descriptors(reference) == (version == "1.0")
+        assert bool(reference.types("descriptors")) == (version == "1.0")
 
 
 @pytest.mark.slow
@@ -237,7 +236,7 @@ def test_robotcars_models_share_a_database(tmp_path: Path) -> None:
         reference = KaptureFolder(out / "reference")
         # features and models fit each other, or the import would refuse them
         reference.validate()
-        assert has_descriptors(reference)
+        assert reference.types("descriptors") == ["sift"]
         seen = reference.observations()["sift"]
         observations.append((seen.point_ids, seen.image_ids, seen.keypoint_ids))
         assert len(seen) > 300

@@ -1,17 +1,13 @@
-"""A published map as the map to localize in: alone, without its descriptors, beside our own."""
+"""A model without descriptors as a map: its points are moved to features extracted again."""
 
 from __future__ import annotations
 
-import shutil
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.features.rootsift import (
@@ -29,16 +25,14 @@ from megloc_kapture.io.kapture import (
     write_points3d,
     write_sensors,
 )
-from megloc_kapture.stages.given_map import (
+from megloc_kapture.stages.global_features import extract_vlad, read_vocabulary
+from megloc_kapture.stages.local_features import extract_local_features
+from megloc_kapture.stages.map_features import (
     copy_features,
-    given_map,
-    given_type,
-    has_descriptors,
+    move_points,
     rows_at_their_places,
     rows_found_again,
 )
-from megloc_kapture.stages.global_features import extract_vlad, read_vocabulary
-from megloc_kapture.stages.local_features import extract_local_features
 
 TYPE = "rootsift"
 
@@ -83,23 +77,6 @@ def _stored(folder: KaptureFolder, image: str) -> Any:
     return folder.keypoints(TYPE).read(image)
 
 
-def test_a_map_with_descriptors_is_taken_as_it_is(world, tmp_path: Path, folder_bytes: Any) -> None:
-    reference = world.map()
-    assert given_type(reference) == TYPE
-    assert has_descriptors(reference)
-    counts = given_map(reference, world.mapping(), tmp_path / "map")
-    seen = reference.observations()[TYPE]
-    assert counts == {
-        "images": 5,
-        "points": len(reference.points3d()),
-        "observations": len(seen),
-        "share_found_again": 1.0,
-    }
-    # nothing differs: sensors, points, observations, local and global features
-    for part in ("sensors", "reconstruction"):
-        assert folder_bytes(tmp_path / "map" / part) == folder_bytes(reference.root / part)
-
-
 def test_the_vocabulary_and_its_whitening_are_copied(world: Any, tmp_path: Path) -> None:
     options = VladOptions(num_clusters=8, dimensions=3)
     extract_vlad(world.mapping(), [world.mapping()], TYPE, tmp_path, options)
@@ -113,16 +90,11 @@ def test_without_descriptors_the_observations_move_to_the_features_extracted_ane
 ) -> None:
     truth = world.map()
     reference = published(truth, tmp_path / "reference")
-    assert not has_descriptors(reference)
-    counts = given_map(reference, world.mapping(), tmp_path / "map")
+    counts = move_points(reference, world.mapping(), TYPE, tmp_path / "map")
     assert counts["share_found_again"] == 1.0
     made = KaptureFolder(tmp_path / "map")
     made.validate()
-    assert has_descriptors(made)
-    theirs, ours = (
-        folder_bytes(folder.root / "reconstruction" / "global_features") for folder in (truth, made)
-    )
-    assert theirs == ours
+    assert made.types("descriptors") == [TYPE]
     np.testing.assert_array_equal(made.points3d(), truth.points3d())
     # the features that see points, as they were extracted: each one's number there
     number: dict[tuple[str, int], int] = {}
@@ -148,22 +120,6 @@ def test_without_descriptors_the_observations_move_to_the_features_extracted_ane
         assert np.linalg.norm(off, axis=1).min() < 0.1
 
 
-def test_another_implementation_may_find_them_some_tenths_of_a_pixel_away(
-    world: Any, tmp_path: Path
-) -> None:
-    truth = world.map()
-    reference = published(truth, tmp_path / "reference", shift_px=0.3)
-    assert given_map(reference, world.mapping(), tmp_path / "map")["share_found_again"] == 1.0
-    expected, found = (
-        {
-            (point, image, place(folder, image, keypoint))
-            for point, image, keypoint in triples(folder)
-        }
-        for folder in (truth, KaptureFolder(tmp_path / "map"))
-    )
-    assert len(expected - found) < 0.05 * len(expected)
-
-
 def fewer(world: Any, root: Path, max_keypoints: int) -> KaptureFolder:
     """The mapping images with fewer features than the map was made of."""
     extractor = RootSift(RootSiftOptions(max_keypoints=max_keypoints))
@@ -175,7 +131,7 @@ def test_what_is_not_found_again_is_left_out(world: Any, tmp_path: Path) -> None
     truth = world.map()
     reference = published(truth, tmp_path / "reference")
     some = fewer(world, tmp_path / "features", 450)
-    counts = given_map(reference, some, tmp_path / "map")
+    counts = move_points(reference, some, TYPE, tmp_path / "map")
     made = KaptureFolder(tmp_path / "map")
     made.validate()
     keypoints = some.keypoints(TYPE)
@@ -199,23 +155,8 @@ def test_a_map_of_other_features_is_refused(world: Any, tmp_path: Path) -> None:
     reference = published(world.map(), tmp_path / "reference")
     some = fewer(world, tmp_path / "features", 100)
     with pytest.raises(DataError, match=r"only \d+% have a keypoint that extracting rootsift"):
-        given_map(reference, some, tmp_path / "map")
+        move_points(reference, some, TYPE, tmp_path / "map")
     assert not (tmp_path / "map").exists()
-    bare = KaptureFolder(world.root / "mapping")
-    with pytest.raises(DataError, match="have not been extracted again"):
-        given_map(reference, bare, tmp_path / "map")
-
-
-def test_what_is_no_map_to_localize_in_is_refused(world: Any, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no given map.*import_options.reference_model=true"):
-        given_type(world.mapping())
-    shutil.copytree(world.root / "map", tmp_path / "two", symlinks=True)
-    seen = world.map().observations()[TYPE]
-    write_observations(
-        tmp_path / "two", {TYPE: seen, "other": replace(seen, keypoints_type="other")}
-    )
-    with pytest.raises(DataError, match="of one keypoints type, found: other, rootsift"):
-        given_type(KaptureFolder(tmp_path / "two"))
 
 
 # ---------------------------------------------------------------------------- keypoints by place
@@ -256,13 +197,3 @@ def test_all_orientations_of_the_nearest_place_are_found() -> None:
     assert at_places(stored, extracted, 0.2) == [(2, 0), (2, 2)]
     assert at_places([(30, 30)], extracted, 0.2) == []
     assert at_places(NOWHERE, [(1, 1)], 1.0) == at_places([(1, 1)], NOWHERE, 1.0) == []
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.floats(0, 0.4))
-def test_shifted_and_shuffled_keypoints_are_all_found(seed: int, count: int, shift: float) -> None:
-    rng = np.random.default_rng(seed)
-    # a place each, at least 2 px from the next
-    places = (rng.permutation(400)[:count, None] // [20, 1] % 20 * 3.0).astype(np.float32)
-    order = rng.permutation(count)
-    moved = (places + rng.uniform(-shift, shift, places.shape)).astype(np.float32)[order]
-    assert at_places(places, moved, 1.0) == list(enumerate(np.argsort(order).tolist()))

@@ -1,0 +1,191 @@
+"""Features of map images: copies into new maps, and points of a model without features.
+
+Points of such a model are moved to extracted keypoints at the same positions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from megloc_kapture.errors import require
+from megloc_kapture.io.files import hard_link, link_images
+from megloc_kapture.io.kapture import (
+    FeatureReader,
+    FeatureWriter,
+    KaptureFolder,
+    Observations,
+    write_observations,
+    write_points3d,
+    write_sensors,
+)
+from megloc_kapture.io.kapture.features import SUFFIX, ArrayKind
+
+# detector implementations differ by some tenths of a pixel
+_MAX_SHIFT_PX = 1.0
+_MIN_FOUND_AGAIN = 0.5
+# identical keypoints only differ by rounding
+_SAME_PLACE_PX = 0.1
+
+
+def move_points(
+    model: KaptureFolder, mapping: KaptureFolder, local_type: str, output: Path
+) -> dict[str, float]:
+    """Write a model as a map with the features of ``mapping``; return counts for the log.
+
+    Only keypoints that see points are kept; points without observations are dropped.
+    """
+    seen = model.observations()[local_type]
+    moved, rows_of, num_found = _moved(model, mapping, seen)
+    require(
+        num_found >= _MIN_FOUND_AGAIN * len(seen),
+        f"the model has no descriptors, and of its {len(seen)} observations only "
+        f"{num_found / len(seen):.0%} have a keypoint that extracting {local_type} again "
+        "finds: it was made with another detector, other options or other images",
+        path=model.root,
+    )
+    none = np.zeros(0, np.int64)
+    for reader in (mapping.keypoints(local_type), mapping.descriptors(local_type)):
+        with FeatureWriter(output, reader.kind, local_type, reader.config) as writer:
+            for image in sorted(mapping.read().poses()):
+                writer.write(image, reader.read(image)[rows_of.get(image, none)])
+    xyz_rgb = model.points3d()
+    kept = np.bincount(moved.point_ids, minlength=len(xyz_rgb)) > 0
+    number = np.cumsum(kept) - 1
+    write_sensors(output, model.read())
+    link_images(model.root, output)
+    write_points3d(output, xyz_rgb[kept])
+    write_observations(output, {local_type: replace(moved, point_ids=number[moved.point_ids])})
+    return {
+        "images": len(np.unique(moved.image_ids)),
+        "points": int(kept.sum()),
+        "observations": len(moved),
+        "share_found_again": round(num_found / len(seen), 4),
+    }
+
+
+def _moved(
+    reference: KaptureFolder, mapping: KaptureFolder, seen: Observations
+) -> tuple[Observations, dict[str, NDArray[np.int64]], int]:
+    """Transfer observations to all extracted keypoints at the same position (one per orientation).
+
+    Return observations that index the kept rows, these rows by image, and the transferred number.
+    """
+    local_type = seen.keypoints_type
+    stored, extracted = reference.keypoints(local_type), mapping.keypoints(local_type)
+    order = np.argsort(seen.image_ids, kind="stable")
+    ends = np.cumsum(np.bincount(seen.image_ids, minlength=len(seen.image_names)))
+    point_ids, image_ids, keypoint_ids = [], [], []
+    rows_of, num_found = {}, 0
+    for row, rows in enumerate(np.split(order, ends[:-1])):
+        image = seen.image_names[row]
+        if len(rows) == 0:
+            continue
+        places = stored.read(image)[seen.keypoint_ids[rows], :2]
+        of, keypoints = rows_at_their_places(places, extracted.read(image)[:, :2], _MAX_SHIFT_PX)
+        # stored keypoints at one position that see one point are duplicates
+        pairs = np.unique(np.stack([seen.point_ids[rows[of]], keypoints], axis=1), axis=0)
+        num_found += len(np.unique(of))
+        rows_of[image], numbers = np.unique(pairs[:, 1], return_inverse=True)
+        point_ids.append(pairs[:, 0])
+        image_ids.append(np.full(len(pairs), row, np.int32))
+        keypoint_ids.append(numbers.astype(np.int32))
+    points = np.concatenate(point_ids)
+    by_point = np.argsort(points, kind="stable")
+    observations = replace(
+        seen,
+        point_ids=points[by_point],
+        image_ids=np.concatenate(image_ids)[by_point],
+        keypoint_ids=np.concatenate(keypoint_ids)[by_point],
+    )
+    return observations, rows_of, num_found
+
+
+def rows_found_again(
+    stored: NDArray[np.float32], extracted: NDArray[np.float32]
+) -> NDArray[np.int64]:
+    """Return the row of ``extracted`` (M, 2) for each row of ``stored`` (N, 2), or -1.
+
+    Each extracted row is used once. Keypoints at one position with different orientations are
+    assigned in order.
+    """
+    rows, used = np.full(len(stored), -1, dtype=np.int64), set[int]()
+    of, again = rows_at_their_places(stored, extracted, _MAX_SHIFT_PX)
+    for row, candidate in zip(of.tolist(), again.tolist(), strict=True):
+        if rows[row] < 0 and candidate not in used:
+            rows[row] = candidate
+            used.add(candidate)
+    return rows
+
+
+def rows_at_their_places(
+    stored: NDArray[np.float32], extracted: NDArray[np.float32], max_shift_px: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return all pairs of stored (N, 2) and extracted (M, 2) keypoints at the same position.
+
+    The position of a stored keypoint is that of the nearest extracted one within ``max_shift_px``.
+    Return rows of both, int64 (K,) each, sorted by the first, then the second.
+    """
+    none = np.zeros(0, dtype=np.int64)
+    if len(stored) == 0 or len(extracted) == 0:
+        return none, none
+    tree = cKDTree(extracted)
+    distance, nearest = tree.query(stored)
+    found = np.flatnonzero(distance <= max_shift_px)
+    near = tree.query_ball_point(extracted[nearest[found]], _SAME_PLACE_PX, return_sorted=True)
+    lengths = [len(rows) for rows in near]
+    return np.repeat(found, lengths), np.concatenate([none, *near]).astype(np.int64)
+
+
+_READ: dict[ArrayKind, Callable[[KaptureFolder, str], FeatureReader]] = {
+    "keypoints": KaptureFolder.keypoints,
+    "descriptors": KaptureFolder.descriptors,
+    "global_features": KaptureFolder.global_features,
+}
+VOCABULARY_FILE, SETTINGS_FILE = "vocabulary.npy", "vlad.json"
+MEAN_FILE, PROJECTION_FILE = "whitening_mean.npy", "whitening_projection.npy"
+_VLAD_FILES = (VOCABULARY_FILE, SETTINGS_FILE, MEAN_FILE, PROJECTION_FILE)
+
+
+def copy_features(
+    source: KaptureFolder,
+    output: Path,
+    local_types: Iterable[str] | None = None,
+    *,
+    link_own: bool = False,
+) -> None:
+    """Add features of the map images to the kapture at ``output``.
+
+    Files are hard links where possible. The source's internal features are user data and copied,
+    unless ``link_own``. ``local_types`` does not restrict global features.
+    """
+    wanted = None if local_types is None else set(local_types)
+    for kind in _READ:
+        for name in source.types(kind):
+            if kind == "global_features" or wanted is None or name in wanted:
+                _copy_type(source, output, kind, name, link_own=link_own)
+
+
+def _copy_type(
+    source: KaptureFolder, output: Path, kind: ArrayKind, type_name: str, *, link_own: bool
+) -> None:
+    copies = output / "reconstruction" / kind / type_name
+    reader, own = _READ[kind](source, type_name), source.root / "reconstruction"
+    with FeatureWriter(output, kind, type_name, reader.config) as writer:
+        for image in filter(reader.__contains__, source.read().image_names()):
+            file = Path(reader.where(image))
+            if file.is_file() and (link_own or not file.is_relative_to(own)):
+                hard_link(file, copies / f"{image}{SUFFIX[kind]}")
+            else:  # user data, or a member of a tar
+                writer.write(image, reader.read(image))
+    if kind == "global_features":
+        folders = [own / kind / type_name, *(d / kind / type_name for d in source.features_dirs)]
+        for folder, name in product(folders, _VLAD_FILES):
+            if (folder / name).is_file() and not (copies / name).exists():
+                hard_link(folder / name, copies / name)
