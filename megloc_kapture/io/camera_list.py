@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.files import check_relative
-from megloc_kapture.io.text_lines import read_lines
+from megloc_kapture.io.text_lines import fields_of, reading_lines
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera
 
 _ROW = re.compile(
@@ -55,9 +55,9 @@ def read_cameras(path: Path) -> Camera | CameraList:
 def read_camera_rows(path: Path) -> dict[str, Camera]:
     """Read the cameras of a list by image name, in file order."""
     cameras: dict[str, Camera] = {}
-    for line in read_lines(path, comments=True):
-        with line.named():
-            row = _ROW.fullmatch(line.text)
+    with reading_lines(path, comments=True) as lines:
+        for line in lines:
+            row = _ROW.fullmatch(line)
             if row is None:
                 raise DataError(
                     "expected a row NAME MODEL WIDTH HEIGHT PARAMS..., MODEL one of "
@@ -65,16 +65,7 @@ def read_camera_rows(path: Path) -> dict[str, Camera]:
                 )
             name = check_relative(row["name"])
             require(name not in cameras, f"{name!r} is listed twice")
-            cameras[name] = _camera(row["model"], re.split(r"[\s,]+", row["numbers"]))
+            width, height, *params = fields_of(row["numbers"])
+            cameras[name] = Camera(row["model"], int(width), int(height), tuple(map(float, params)))
     require(cameras, "no camera in this list", path=path)
     return cameras
-
-
-def _camera(model: str, fields: list[str]) -> Camera:
-    try:
-        width, height, *params = map(float, fields)
-    except ValueError as error:
-        raise DataError(f"width, height and parameters must be numbers, got {fields}") from error
-    if not width.is_integer() or not height.is_integer():
-        raise DataError(f"image size {width:g}x{height:g} is not in whole pixels")
-    return Camera(model, int(width), int(height), tuple(params))

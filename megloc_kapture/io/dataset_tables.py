@@ -35,7 +35,7 @@ from megloc_kapture.io.files import (
     write_bytes,
     write_json_model,
 )
-from megloc_kapture.io.text_lines import read_lines
+from megloc_kapture.io.text_lines import reading_lines
 from megloc_kapture.values import Options, RigidTransform
 
 SIDE_TABLES = "megloc"
@@ -320,11 +320,8 @@ def read_nowhere(truth: Path | str) -> tuple[str, ...]:
     path = Path(truth) / NOWHERE_FILE
     if not path.is_file():
         return ()
-    names: set[str] = set()
-    for line in read_lines(path, comments=True):
-        with line.named():
-            names.add(check_relative(line.text))
-    return tuple(sorted(names))
+    with reading_lines(path, comments=True) as lines:
+        return tuple(sorted(set(map(check_relative, lines))))
 
 
 def write_nowhere(truth: Path, names: Iterable[str]) -> None:
