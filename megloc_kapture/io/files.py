@@ -110,18 +110,6 @@ def safe_join(root: Path, relative_text: str) -> Path:
     return Path(root) / check_relative(relative_text)
 
 
-def check_no_escape(roots: Sequence[Path], path: Path) -> Path:
-    """Return ``path`` if it is in one of the ``roots``, links followed, else raise DataError."""
-    real = Path(os.path.realpath(path))
-    if not any(real.is_relative_to(os.path.realpath(root)) for root in roots):
-        raise DataError(
-            f"is or lies behind a link that leaves {roots[0]}, to {real}; images may be links to "
-            "anywhere, other files only to folders given by --allow-links-below",
-            path=path,
-        )
-    return path
-
-
 # -------------------------------------------------------------------------------- temporary names
 
 

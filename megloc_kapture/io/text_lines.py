@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -46,9 +47,14 @@ def fields_of(text: str) -> list[str]:
 
 def numbers_of(fields: Sequence[str], form: str) -> list[float]:
     """Parse finite numbers, as many as the blank-separated names in ``form``."""
-    require(len(fields) == len(form.split()), f"expected {form}, got {len(fields)} fields")
-    values = list(map(float, fields))
-    require(np.isfinite(values).all(), f"{form}: not all of {' '.join(fields)} are finite")
+    try:
+        values = list(map(float, fields))
+    except ValueError:
+        values = []
+    require(
+        len(values) == len(form.split()) and all(map(math.isfinite, values)),
+        f"expected finite numbers {form}, got {' '.join(fields)!r}",
+    )
     return values
 
 

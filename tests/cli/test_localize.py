@@ -170,21 +170,14 @@ def test_proxy_folders_of_kapture_localization(
         link = tmp_path / "map" / "reconstruction" / points
         link.symlink_to((foreign / "map" / "reconstruction" / points).resolve())
     command = queries_of(tmp_path, tmp_path / "localized")
-    # links lead only where the user lets them
-    megloc(*command).refused("lies behind a link that leaves .*--allow-links-below")
-    elsewhere = ("--allow-links-below", tmp_path)
-    megloc(*command, *elsewhere).refused("lies behind a link that leaves")
-    allowed = ("--allow-links-below", foreign)
-    done = megloc(*command, *allowed)
+    done = megloc(*command)
     assert done.out.startswith("4 of 4"), done
     assert megloc(*queries_of(foreign, tmp_path / "expected")).status == 0
     for name in ("status.csv", "sensors/trajectories.txt"):
         expected = (tmp_path / "expected" / name).read_bytes()
         assert (tmp_path / "localized" / name).read_bytes() == expected
     number = len(KaptureFolder(foreign / "map").points3d())
-    assert re.search(
-        f"^points +{number}$", megloc("info", tmp_path / "map", *allowed).out, re.MULTILINE
-    )
+    assert re.search(f"^points +{number}$", megloc("info", tmp_path / "map").out, re.MULTILINE)
 
 
 def test_given_pairs_take_the_place_of_retrieval(megloc: Any, foreign: Path) -> None:

@@ -231,8 +231,8 @@ def test_a_repeated_pair_counts_once(tmp_path: Path) -> None:
     ("row", "match"),
     [
         ("a, b", "expected 3 columns, got 2"),
-        ("a, b, c", "score 'c' is not a number"),
-        ("a, b, nan", "not finite"),
+        ("a, b, c", "expected finite numbers score, got 'c'"),
+        ("a, b, nan", "finite numbers"),
         ("a, ../b, 1", "leads out"),
         (", b, 1", "empty"),
     ],
