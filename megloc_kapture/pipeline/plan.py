@@ -29,7 +29,7 @@ from megloc_kapture.io.files import (
     writing,
 )
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.io.output_folders import claim_folder, replace_directory
+from megloc_kapture.io.output_folders import claim_folder, release_folder, replace_directory
 from megloc_kapture.stages.stage import (
     CODE_OF,
     PROTOCOL,
@@ -59,7 +59,7 @@ class Workspace:
 
     def __init__(self, root: Path, *, force: bool = False) -> None:
         self.root, self.force = Path(root).absolute(), force
-        self._undo_claim = claim_folder(self.root, kind="workspace", force=force)
+        claim_folder(self.root, kind="workspace", force=force)
         self._published = False
 
     def path(self, relative: str) -> Path:
@@ -124,7 +124,7 @@ class Workspace:
         with contextlib.suppress(OSError):
             (self.root / LOCK).unlink(missing_ok=True)
             (self.root / PARTIAL).rmdir()
-        self._undo_claim()
+        release_folder(self.root)
 
     @contextmanager
     def staging(self, stage: str, mark: str, *, resumes: bool = False) -> Iterator[Path]:

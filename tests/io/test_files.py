@@ -200,21 +200,6 @@ def test_a_folder_of_somebody_else_is_refused(foreign: Path) -> None:
     assert tree(foreign) == {**before, MARKER: b"map\n"}
 
 
-def test_a_claim_is_undone(tmp_path: Path, foreign: Path) -> None:
-    claim_folder(tmp_path / "a" / "b" / "c", kind="map")()
-    assert not (tmp_path / "a").exists()
-    before = tree(foreign)
-    claim_folder(foreign, kind="map", force=True)()
-    assert tree(foreign) == before
-    claim_folder(foreign, kind="features", force=True)
-    claim_folder(foreign, kind="map", force=True)()
-    assert (foreign / MARKER).read_text() == "features\n"
-    undo = claim_folder(tmp_path / "d" / "e", kind="map")
-    (tmp_path / "d" / "e" / "file").write_text("kept")
-    undo()
-    assert tree(tmp_path / "d") == {"e": None, "e/file": b"kept"}
-
-
 @contextlib.contextmanager
 def writing(place: Path, *names: str, **how: Any) -> Iterator[None]:
     with staged_output(place, kind="map", **how) as out:
