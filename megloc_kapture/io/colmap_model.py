@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap import load_pycolmap, quiet_stderr
-from megloc_kapture.io.files import check_relative, named, owned_name
+from megloc_kapture.io.files import TEMPORARY, check_relative, named
 from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
@@ -124,7 +124,7 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
         require(path.is_file(), "file is missing", path=path)
         if path.name in _RECORDS:
             _check_complete(path)
-    with tempfile.TemporaryDirectory(prefix=f".{owned_name()}") as links:
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as links:
         for path in paths:
             link = Path(links) / path.name
             if path.name == TEXT_FILES[1]:

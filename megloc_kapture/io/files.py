@@ -7,13 +7,10 @@ state or the new one; fsync would be too slow for thousands of small files.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
-import re
 import secrets
 import shutil
-import socket
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -113,38 +110,18 @@ def safe_join(root: Path, relative_text: str) -> Path:
 # -------------------------------------------------------------------------------- temporary names
 
 
-def owned_name() -> str:
-    """Return a prefix of temporary names that identifies this process."""
-    return f"megloc-{_machine()}.{os.getpid()}-"
-
-
-@lru_cache(maxsize=1)
-def _machine() -> str:
-    """Return a short id of the machine or container: socket names have at most 100 characters."""
-    return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:6]
+TEMPORARY = ".megloc-"  # begins temporary names, which all readers skip
 
 
 def temporary_name() -> str:
-    """Return an unused temporary name, hidden from all readers."""
-    return f".{owned_name()}{secrets.token_hex(8)}.tmp"
+    """Return an unused temporary name."""
+    return f"{TEMPORARY}{secrets.token_hex(8)}.tmp"
 
 
-def clear_leftovers(folder: Path) -> None:
-    """Remove stale temporary files of dead processes of this machine from a folder."""
-    pattern = re.compile(rf"(\.|sem\.)?megloc-{_machine()}\.([0-9]+)-.*")
-    try:
-        names = os.listdir(folder)
-    except OSError:
-        return
-    for name in names:
-        if (found := pattern.fullmatch(name)) and not _lives(int(found[2])):
-            with contextlib.suppress(OSError):
-                remove(Path(folder) / name)
-
-
-def clear_temporary(folder: Path) -> None:
-    """Remove unfinished files below a folder that has no other writers."""
-    for path in list(Path(folder).rglob(".megloc-*.tmp")):
+def clear_temporary(folder: Path, *, nested: bool = True) -> None:
+    """Remove unfinished files in a folder that has no other writers, or also ``nested`` ones."""
+    find = folder.rglob if nested else folder.glob
+    for path in list(find(f"{TEMPORARY}*")):
         remove(path)
 
 
@@ -154,16 +131,6 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-def _lives(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:
-        pass  # another user's process
-    return True
 
 
 # ------------------------------------------------------------------------------------ writing

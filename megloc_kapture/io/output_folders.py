@@ -15,7 +15,6 @@ from pathlib import Path
 from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.io.files import (
     check_relative,
-    clear_leftovers,
     clear_temporary,
     output_error,
     temporary_name,
@@ -79,7 +78,6 @@ def staged_output(
     folder = Path(folder)
     check_claim(folder, kind=kind, force=force)
     place = next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
-    clear_leftovers(place)
     staging = place / temporary_name()
     try:
         with writing(folder):

@@ -42,7 +42,6 @@ from megloc_kapture.io.dataset_tables import (
     write_unreadable,
 )
 from megloc_kapture.io.files import (
-    clear_leftovers,
     output_error,
     remove,
     temporary_name,
@@ -356,7 +355,6 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
     made = folder / temporary_name()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        clear_leftovers(folder)
         made.mkdir()
         import_colmap(source, made, work=work)
         write_bytes(made / _STAMP, stamp)

@@ -20,7 +20,6 @@ from pydantic import Field
 from megloc_kapture.errors import DataError, OptionError, OutputError, suggestion
 from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.io.files import (
-    clear_leftovers,
     clear_temporary,
     read_json_model,
     remove,
@@ -102,7 +101,7 @@ class Workspace:
                 ) from error
             self._clear_partial()
             for folder in (self.root, self.root / "stages"):
-                clear_leftovers(folder)
+                clear_temporary(folder, nested=False)
             try:
                 yield
             finally:

@@ -23,11 +23,11 @@ from megloc_kapture.datasets.kapture_folders import (
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.camera_list import CameraList
 from megloc_kapture.io.files import (
+    TEMPORARY,
     check_relative,
     hard_link,
     link_file,
     link_images,
-    owned_name,
 )
 from megloc_kapture.io.images import (
     UNREAD_SUFFIXES,
@@ -430,7 +430,7 @@ class Photographs(Queries):
         self, name: str, path: Path, camera: Camera | CameraList | None, every: int
     ) -> None:
         if self._frames is None:
-            self._frames = tempfile.TemporaryDirectory(prefix=f".{owned_name()}")
+            self._frames = tempfile.TemporaryDirectory(prefix=TEMPORARY)
         folder = Path(self._frames.name) / name
         for frame in extract_frames(path, folder, every):
             self._add(f"{name}/{frame}", folder / frame, camera, is_frame=True)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import focal_px
-from megloc_kapture.io.files import atomic_write, owned_name, write_bytes, writing
+from megloc_kapture.io.files import TEMPORARY, atomic_write, write_bytes, writing
 from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Observations
 from megloc_kapture.io.kapture.points import read_point_covariances
@@ -136,9 +136,7 @@ def shared_index(
     """Share indices by keypoints type as temporary folders; open indices stay valid afterwards."""
     where = tempfile.gettempdir() if scratch is None else scratch
     with writing(where):
-        place = tempfile.TemporaryDirectory(
-            prefix=f".{owned_name()}", dir=where, ignore_cleanup_errors=True
-        )
+        place = tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=where, ignore_cleanup_errors=True)
     with place as name:
         folders = {}
         for number, (keypoints_type, index) in enumerate(indices.items()):

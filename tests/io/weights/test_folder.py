@@ -18,7 +18,6 @@ from hostile import Runs
 from safetensors.torch import save_file
 
 from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError
-from megloc_kapture.io import weights as weights_module
 from megloc_kapture.io.weights import (
     SOURCE_KEY,
     MissingWeightsError,
@@ -29,7 +28,6 @@ from megloc_kapture.io.weights import (
     read_weights,
     registry,
     sha256_of,
-    share_weights,
     weights_folder,
 )
 
@@ -278,29 +276,6 @@ def test_convert_views_of_one_memory_and_refuses(tmp_path: Path) -> None:
         with pytest.raises(kind, match=message):
             convert_weights(wrong, target)
     convert_weights(source, place, force=True)
-
-
-def test_what_was_read_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "own.pth"
-    tensors = {"a": torch.rand(3, 4), "half": torch.rand(5).half(), "t": torch.rand(4, 2).T}
-    torch.save(tensors, path)
-    monkeypatch.setattr(weights_module, "_shared_folder", None)
-    share_weights(tmp_path / "shared")
-    try:
-        file = describe("own", path)
-        first = read_weights(file)  # the folder is not there: as without
-        (tmp_path / "shared").mkdir()
-        second, third = read_weights(file), read_weights(file)
-        path.write_bytes(b"something else")
-        fourth = read_weights(file)
-    finally:
-        share_weights(None)
-    assert not getattr(first["a"], "is_shared_file", False)
-    for found in (first, second, third, fourth):
-        assert found.keys() == tensors.keys()
-        for name, tensor in tensors.items():
-            assert torch.equal(found[name], tensor) and found[name].dtype == tensor.dtype
-    assert second["a"].is_shared_file  # type: ignore[attr-defined]
 
 
 def test_a_score_of_numpy_beside_the_weights(tmp_path: Path) -> None:
