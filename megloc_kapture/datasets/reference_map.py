@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import SparsePoints
-from megloc_kapture.io.files import check_relative, link_records
+from megloc_kapture.io.files import check_relative, link_records, named, reading
 from megloc_kapture.io.kapture import (
     FeatureConfig,
     FeatureWriter,
@@ -63,7 +63,9 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
             self.images = {}
             with self._reading():
                 for name, image_id in self._rows("SELECT name, image_id FROM images ORDER BY name"):
-                    self.images[check_relative(str(name).removeprefix("./"))] = int(image_id)
+                    with named(path):
+                        name = check_relative(str(name).removeprefix("./"))
+                    self.images[name] = int(image_id)
         except BaseException:
             self._connection.close()
             raise
@@ -116,14 +118,8 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
     def _rows(self, query: str) -> Iterator[tuple[Any, ...]]:
         return self._connection.execute(query)
 
-    @contextmanager
-    def _reading(self) -> Iterator[None]:
-        try:
-            yield
-        except DataError as error:
-            raise self._error(error.message) from error
-        except (sqlite3.Error, UnicodeDecodeError, OverflowError, ValueError, TypeError) as error:
-            raise self._error(f"not a readable COLMAP database: {error}") from error
+    def _reading(self) -> AbstractContextManager[None]:
+        return reading(self.path, "a COLMAP database")
 
     def _error(self, message: str) -> DataError:
         return DataError(message, path=self.path)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,7 +19,7 @@ from typing import Any, BinaryIO, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from megloc_kapture.errors import DataError, OutputError, require
+from megloc_kapture.errors import DataError, MeglocError, OutputError, require
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -46,14 +47,28 @@ def read_text(path: Path | str) -> str:
 
 
 @contextlib.contextmanager
-def reading(path: Path | str) -> Iterator[None]:
-    """Turn an OSError of the block into a DataError that names this file or folder."""
+def reading(path: Path | str | None, what: str = "") -> Iterator[None]:
+    """Turn an error of the block into a DataError that names this file or folder.
+
+    ``what`` the file should be; without it, only an OSError is converted.
+    """
     try:
         yield
     except FileNotFoundError as error:
         raise DataError("cannot read: the file is missing", path=path) from error
     except OSError as error:
-        raise DataError(f"cannot read: {error.strerror or error}", path=path) from error
+        reason = "cannot read" if error.strerror or not what else f"not {what}, or broken"
+        raise DataError(f"{reason}: {_text_of(error)}", path=path) from error
+    except Exception as error:  # libraries raise many kinds on broken files
+        if not what or isinstance(error, MeglocError):
+            raise
+        raise DataError(f"not {what}, or broken: {_text_of(error)}", path=path) from error
+
+
+def _text_of(error: Exception) -> str:
+    """Return the first sentence of an error, without addresses in memory, which vary."""
+    text = getattr(error, "strerror", None) or str(error)
+    return " ".join(re.sub(r"<\S+ object at \S+>|[.;]\s.*", "", text, flags=re.S).split())
 
 
 @contextlib.contextmanager

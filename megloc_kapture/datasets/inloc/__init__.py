@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError, require
-from megloc_kapture.io.files import named, read_text
+from megloc_kapture.io.files import named, read_text, reading
 from megloc_kapture.io.text_lines import reading_lines, transform_of
 from megloc_kapture.values import RigidTransform
 
@@ -101,10 +101,8 @@ def read_cutout_points(path: Path | str, width: int, height: int) -> NDArray[np.
     """Read the scanned points float64 (height, width, 3), metres in the scan's frame, or NaN."""
     from scipy.io import loadmat
 
-    try:
+    with reading(path, f"a MAT file with {POINTS}"):
         points = np.asarray(loadmat(path, variable_names=[POINTS])[POINTS], np.float64)
-    except Exception as error:  # SciPy raises many kinds on broken files
-        raise DataError(f"not a MAT file with {POINTS}: {error}", path=path) from error
     if points.shape != (height, width, 3):
         found = "x".join(map(str, points.shape))
         raise DataError(f"{POINTS} is {found}, expected {height}x{width}x3", path=path)

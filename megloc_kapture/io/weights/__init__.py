@@ -275,12 +275,8 @@ def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
     if file.path.suffix == ".safetensors":
         from safetensors.torch import load_file
 
-        try:
+        with reading(file.path, "a safetensors file"):
             return _state_dict(load_file(file.path), file.path)
-        except DataError:
-            raise
-        except Exception as error:  # safetensors has its own error class
-            raise DataError(f"no safetensors file: {error}", path=file.path) from error
     mapped = zipfile.is_zipfile(file.path)  # torch's format since 1.6
     tensors = _state_dict(_load_torch(file.path, mapped), file.path)
     for tensor in tensors.values():
@@ -308,18 +304,9 @@ def _load_torch(path: Path, mapped: bool) -> Any:
     names = ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
     of_scores: list[Any] = [np.dtype, type(np.dtype("f4")), type(np.dtype("f8"))]
     of_scores += [(scalar, name) for name in names]
-    try:
-        with torch.serialization.safe_globals(of_scores):
-            return torch.load(path, weights_only=True, map_location="cpu", mmap=mapped)
-    except Exception as error:  # torch raises many kinds on damaged files
-        reason = "or it is damaged"
-        if "Unsupported global" in str(error) or "GLOBAL" in str(error):
-            reason = "because loading its objects would run code"
-        raise DataError(
-            f"no file of weights that can be read (torch's or safetensors), {reason}; "
-            "docs/weights.md says which files are converted first",
-            path=path,
-        ) from error
+    what = "weights of torch or safetensors that hold no code (docs/weights.md converts others)"
+    with reading(path, what), torch.serialization.safe_globals(of_scores):
+        return torch.load(path, weights_only=True, map_location="cpu", mmap=mapped)
 
 
 def _state_dict(found: Any, path: Path) -> dict[str, torch.Tensor]:

@@ -159,7 +159,7 @@ def test_another_file_under_a_published_name_is_refused(folder: Path) -> None:
 
 def test_code_is_not_run(tmp_path: Path) -> None:
     torch.save({"a": torch.ones(1), "optimizer": Runs(tmp_path / "made")}, tmp_path / "x.pth")
-    with pytest.raises(DataError, match=r"x\.pth: no file of weights .* would run code"):
+    with pytest.raises(DataError, match=r"x\.pth: not weights of torch .* that hold no code"):
         read_weights(find_weights(str(tmp_path / "x.pth")))
     assert not (tmp_path / "made").exists()
 
@@ -211,8 +211,8 @@ def test_add_refuses_what_is_broken_and_on_request_takes_another_file(
     broken.write_bytes(b"<html>sign in</html>")
     for source, unverified, told in (
         (own, False, r"published superpoint_v1\.pth .* instead of 52b67"),
-        (broken, False, "no file of weights that can be read"),
-        (broken, True, "no file of weights that can be read"),
+        (broken, False, "not weights of torch"),
+        (broken, True, "not weights of torch"),
         (tmp_path / "nowhere.pth", False, "no such file"),
     ):
         with pytest.raises(DataError, match=told):
