@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 import tyro
 
 from megloc_kapture.errors import DataError, OptionError, check_option, require
-from megloc_kapture.io.camera_list import CameraList, read_cameras
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
+from megloc_kapture.io.text_lines import CameraList, read_cameras
 from megloc_kapture.pipeline.executors import (
     ExecutorKind,
     available_cores,

@@ -245,9 +245,7 @@ class _DatabaseFeatures(AbstractContextManager["_DatabaseFeatures"]):
         if self._type != keypoints_type:
             raise self._error(f"has features of type {self._type}, not {keypoints_type}")
         self._output, self._names = output, names
-        self._by_stem: dict[str, list[str]] = {}
-        for name in database.images:
-            self._by_stem.setdefault(_without_suffix(name), []).append(name)
+        self._by_stem = {_without_suffix(name): name for name in database.images}
         self._writer: FeatureWriter | None = None
         self._without: list[str] = []
 
@@ -262,19 +260,12 @@ class _DatabaseFeatures(AbstractContextManager["_DatabaseFeatures"]):
             self._without.append(name)
             return np.empty((0, 2), np.float32)
         keypoints = self._database.keypoints(name_there)
-        if len(features) and features.max() >= len(keypoints):
-            raise self._error(
-                f"is not of this model: its image {name_there!r} has {len(keypoints)} keypoints, "
-                f"the model names feature {features.max()}"
-            )
-        shifts = np.abs(keypoints[features] - xy_px).max(axis=1, initial=0.0)
-        if len(shifts) and shifts.max() > _MAX_SHIFT_PX:
-            worst = int(shifts.argmax())
-            (x, y), (model_x, model_y) = keypoints[features[worst]], xy_px[worst]
-            raise self._error(
-                f"is not of this model: feature {features[worst]} of {name_there!r} is at "
-                f"({x:.1f}, {y:.1f}), in the model at ({model_x:.1f}, {model_y:.1f})"
-            )
+        fits = features.max(initial=-1) < len(keypoints)
+        if fits:
+            shifts = np.abs(keypoints[features] - xy_px)
+            fits = shifts.max(initial=0.0) <= _MAX_SHIFT_PX
+        if not fits:
+            raise self._error(f"is not of this model: its features of {name_there!r} are others")
         descriptors = self._database.descriptors(name_there, self._dtype)
         if descriptors is not None:
             self._write(name, descriptors, len(keypoints))
@@ -292,10 +283,7 @@ class _DatabaseFeatures(AbstractContextManager["_DatabaseFeatures"]):
         name = self._names.get(name, name)
         if name in self._database.images:
             return name
-        found = self._by_stem.get(_without_suffix(name), [])
-        if len(found) > 1:
-            raise self._error(f"has several images for {name!r}: {', '.join(found)}")
-        return found[0] if found else None
+        return self._by_stem.get(_without_suffix(name))
 
     def _write(self, name: str, descriptors: NDArray[Any], num_keypoints: int) -> None:
         kind, size = self._type, descriptors.shape[1]
@@ -303,10 +291,11 @@ class _DatabaseFeatures(AbstractContextManager["_DatabaseFeatures"]):
             config = FeatureConfig(kind.upper(), descriptors.dtype, size, kind, "L2")
             self._writer = FeatureWriter(self._output, "descriptors", kind, config)
         expected = (num_keypoints, self._writer.config.dsize)
-        if descriptors.shape != expected:
-            raise self._error(
-                f"descriptors of {name!r} have the shape {descriptors.shape}, expected {expected}"
-            )
+        require(
+            descriptors.shape == expected,
+            f"descriptors of {name!r} have the shape {descriptors.shape}, expected {expected}",
+            path=self._database.path,
+        )
         self._writer.write(name, descriptors)
 
     def _error(self, message: str) -> DataError:

@@ -1,17 +1,22 @@
-"""Lines and numbers of small text files, with errors that name file and line."""
+"""Lines, numbers, transforms and camera lists of small text files.
+
+Errors name file and line. A camera list has a row ``NAME MODEL WIDTH HEIGHT PARAMS...`` per image
+(Aachen, hloc), or one for all images (COLMAP's cameras.txt).
+"""
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from megloc_kapture.errors import DataError, require
-from megloc_kapture.io.files import named, read_text
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.io.files import check_relative, named, read_text
+from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
 # of R^T R - I; published matrices have six decimals
 MAX_ROTATION_ERROR = 1e-3
@@ -77,3 +82,63 @@ def read_transform(path: Path, *, comments: bool = False) -> RigidTransform:
     """Read a 4x4 matrix of comma- or blank-separated numbers."""
     with reading_lines(path, comments=comments) as lines:
         return transform_of([field for line in lines for field in fields_of(line)])
+
+
+# ------------------------------------------------------------------------------- camera lists
+
+
+_ROW = re.compile(
+    rf"(?P<name>\S.*?)[\s,]+(?P<model>{'|'.join(CAMERA_MODEL_NUM_PARAMS)})[\s,]+(?P<numbers>.*)"
+)
+
+
+class CameraList:
+    """Cameras by the names of their images.
+
+    An image gets the row with the longest name that its path ends with, by whole folders; else the
+    only row whose name ends with the image's.
+    """
+
+    def __init__(self, cameras: Mapping[str, Camera]) -> None:
+        self._cameras = cameras
+        self._by_file: dict[str, list[str]] = {}
+        for name in cameras:
+            self._by_file.setdefault(PurePosixPath(name).name, []).append(name)
+
+    def of(self, image: str, path: Path) -> Camera | None:
+        """Return the camera of an image by name and file; None without a row."""
+        names = self._by_file.get(PurePosixPath(image).name, [])
+        file = path.absolute().as_posix()
+        ending = [name for name in names if file.endswith(f"/{name}")]
+        if not ending:
+            ending = [name for name in names if name.endswith(f"/{image}")]
+            if len(ending) > 1:
+                return None
+        return self._cameras[max(ending, key=len)] if ending else None
+
+
+def read_cameras(path: Path) -> Camera | CameraList:
+    """Read a list; a single row with a number as its name (COLMAP's id) applies to all images."""
+    cameras = read_camera_rows(path)
+    if len(cameras) == 1 and next(iter(cameras)).isdigit():
+        return next(iter(cameras.values()))
+    return CameraList(cameras)
+
+
+def read_camera_rows(path: Path) -> dict[str, Camera]:
+    """Read the cameras of a list by image name, in file order."""
+    cameras: dict[str, Camera] = {}
+    with reading_lines(path, comments=True) as lines:
+        for line in lines:
+            row = _ROW.fullmatch(line)
+            if row is None:
+                raise DataError(
+                    "expected a row NAME MODEL WIDTH HEIGHT PARAMS..., MODEL one of "
+                    f"{', '.join(CAMERA_MODEL_NUM_PARAMS)}"
+                )
+            name = check_relative(row["name"])
+            require(name not in cameras, f"{name!r} is listed twice")
+            width, height, *params = fields_of(row["numbers"])
+            cameras[name] = Camera(row["model"], int(width), int(height), tuple(map(float, params)))
+    require(cameras, "no camera in this list", path=path)
+    return cameras

@@ -21,7 +21,6 @@ from megloc_kapture.datasets.kapture_folders import (
     with_cameras_of_images,
 )
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.camera_list import CameraList
 from megloc_kapture.io.files import (
     TEMPORARY,
     check_relative,
@@ -45,6 +44,7 @@ from megloc_kapture.io.images import (
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, writable_name
 from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.output_folders import MARKER
+from megloc_kapture.io.text_lines import CameraList
 from megloc_kapture.matching.guided_pyramid import equivalent_types
 from megloc_kapture.pipeline.kapture_map import KaptureMap, plain_name
 from megloc_kapture.pipeline.queries import Query, Unit

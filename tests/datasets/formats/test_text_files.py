@@ -13,8 +13,7 @@ from megloc_kapture.datasets import fourseasons as fourseasons_files
 from megloc_kapture.datasets import robotcar
 from megloc_kapture.datasets.inloc import read_transformation, read_wrong_scans
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.camera_list import read_camera_rows
-from megloc_kapture.io.text_lines import read_transform
+from megloc_kapture.io.text_lines import read_camera_rows, read_transform
 
 TIME = 1602074877390449152
 POSE = "-0.06,0.05,-0.15,0,0.6,0,0.8"
