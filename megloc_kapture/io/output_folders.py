@@ -152,22 +152,3 @@ def _is_data(folder: Path, name: str) -> bool:
         return False
     # a link to a folder around it never ends
     return not (path.is_symlink() and folder.resolve().is_relative_to(path.resolve()))
-
-
-def replace_directory(new: Path, path: Path) -> None:
-    """Replace folder ``path``, which need not exist, by folder ``new`` on the same file system.
-
-    A run killed in between leaves the old folder under a temporary name.
-    """
-    new, path = Path(new), Path(path)
-    if path.is_symlink() or (path.exists() and not path.is_dir()):
-        raise OutputError(f"{path}: is a link or a file, not a folder; move it away first")
-    old = path.with_name(temporary_name())
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists():
-            os.rename(path, old)
-        os.rename(new, path)
-        shutil.rmtree(old, ignore_errors=True)
-    except OSError as error:
-        raise output_error(path, error) from error

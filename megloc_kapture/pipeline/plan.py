@@ -28,7 +28,7 @@ from megloc_kapture.io.files import (
     writing,
 )
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.io.output_folders import claim_folder, release_folder, replace_directory
+from megloc_kapture.io.output_folders import claim_folder, release_folder
 from megloc_kapture.stages.stage import (
     CODE_OF,
     PROTOCOL,
@@ -155,12 +155,9 @@ class Workspace:
             new, place = staging / output, self.root / output
             with writing(place):
                 place.parent.mkdir(parents=True, exist_ok=True)
-                if new.is_dir():
-                    replace_directory(new, place)
-                elif new.exists():
-                    os.replace(new, place)
-                else:
-                    remove(place)
+                remove(place)
+                if new.exists():
+                    os.rename(new, place)
 
     def remove(self, outputs: Iterable[str]) -> None:
         for output in outputs:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from kapture.io.csv import kapture_from_dir
 
 from megloc_kapture.evaluation.evaluate import evaluate
 from megloc_kapture.geometry.cameras import focal_px, scale_focal
@@ -90,34 +89,6 @@ def test_a_wrong_focal_length_is_the_reason(megloc: Any, foreign: Path) -> None:
         right_px = focal_px(data.camera_of(image))
         assert abs(float(named) - right_px) <= 3 * float(deviation)
         assert float(deviation) < 0.1 * right_px
-
-
-@pytest.mark.slow
-def test_a_real_foreign_map(megloc: Any, virtual_gallery: Path, tmp_path: Path) -> None:
-    before = state(virtual_gallery)
-    result = tmp_path / "localized"
-    done = megloc(*queries_of(virtual_gallery, result))
-    assert done.status == 0
-    assert done.out.startswith("4 of 4 queries localized in ")
-    assert "pixel origin: centre" in done.err
-    share, median_m, median_deg = medians(result, virtual_gallery / "query_gt")
-    assert share == 1.0
-    assert median_m <= 0.010 and median_deg <= 0.16
-    assert state(virtual_gallery) == before
-    # what is written is kapture
-    theirs = kapture_from_dir(str(result))
-    ours = KaptureFolder(result).read()
-    assert len(theirs.records_camera.data_list()) == 4
-    poses = {
-        (timestamp, device): theirs.trajectories[timestamp, device]
-        for timestamp, device in theirs.trajectories.key_pairs()
-    }
-    assert poses.keys() == ours.trajectories.keys()
-    for key, pose in poses.items():
-        np.testing.assert_allclose(pose.t_raw, ours.trajectories[key].translation, atol=1e-12)
-    statuses = read_status(result / "status.csv")
-    assert list(statuses) == ours.image_names()
-    assert all(s.status == "localized" and s.num_inliers > 50 for s in statuses.values())
 
 
 @pytest.mark.parametrize("given", FOREIGN_MAPS)

@@ -163,13 +163,10 @@ def test_an_empty_line_of_features_is_consumed(tmp_path: Path) -> None:
         ("cameras", "1 PINHOLE 5 5\n", "cameras.txt, images.txt"),
         ("cameras", "\n1 NEW 5 5 1\n", "Camera model does not exist"),
         ("cameras", "1 PINHOLE 0 5 1 1 1 1\n", "cameras.txt: camera 1: image size 0x5"),
-        ("cameras", "", "a model that COLMAP can read"),
         ("images", "7 0 0 0 0 0 0 0 1 a\n\n", "images.txt: image 'a': .*quaternion"),
         ("images", "7 1 0 0 0 0 nan 0 1 a\n\n", "a model that COLMAP can read"),
         ("images", "7 1 0 0 0 0 0 0 1 ../a\n\n", "images.txt: image '../a': .*leads out"),
         ("images", IMAGES.replace("8.jpg", "7.jpg") + "0 1 9\n", "'db/7.jpg': is listed twice"),
-        ("images", IMAGES + "0 1\n", "a model that COLMAP can read"),
-        ("points3D", POINTS + "1 1 nan 1 1 1 1 1\n", "a model that COLMAP can read"),
         ("points3D", "1 1 1 1 1 1 1 1 8 7\n", "a model that COLMAP can read"),
     ],
 )

@@ -24,6 +24,7 @@ from megloc_kapture.io.weights import (
     add_weights,
     convert_weights,
     describe,
+    fetch,
     find_weights,
     read_weights,
     registry,
@@ -155,6 +156,13 @@ def test_another_file_under_a_published_name_is_refused(folder: Path) -> None:
     told += f"{sha256_of(file)} instead"
     with pytest.raises(DataError, match=re.escape(f"{told} of {known}; ")):
         read_weights(file)
+
+
+def test_a_broken_download_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    with pytest.raises(MeglocError, match="the transfer broke"):
+        fetch("http://127.0.0.1:9/net.pth", tmp_path / "net.pth")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_code_is_not_run(tmp_path: Path) -> None:
