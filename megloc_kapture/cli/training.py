@@ -145,14 +145,14 @@ class TrainField(Linked, Common):
             )
 
         mapping, state = self.kapture_map(self.input), self.output / STATE_FILE
-        claim_folder(self.output, kind=FIELD, force=self.force)
+        is_new = claim_folder(self.output, kind=FIELD, force=self.force)
         try:
             if self.force:
                 remove(state)
             with single_threaded():
                 psnr_db = train_field_of_map(mapping, self.output, options, progress=progress)
         except BaseException:
-            if not state.exists():
+            if is_new and not state.exists():
                 release_folder(self.output)
             raise
         mean = f"{sum(psnr_db.values()) / len(psnr_db):.1f} dB" if psnr_db else "none held out"

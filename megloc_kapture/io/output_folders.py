@@ -26,16 +26,18 @@ MARKER = ".megloc"
 _ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z")
 
 
-def claim_folder(folder: Path, *, kind: str, force: bool = False) -> None:
+def claim_folder(folder: Path, *, kind: str, force: bool = False) -> bool:
     """Create and mark a folder that is new, empty or of the same ``kind`` (one word).
 
-    Others raise OutputError, unless forced.
+    Others raise OutputError, unless forced. Return whether the mark is new, and may be released.
     """
     check_claim(folder, kind=kind, force=force)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        if _read_mark(folder)[:1] != [kind]:
+        is_new = _read_mark(folder)[:1] != [kind]
+        if is_new:
             _write_mark(folder, kind)
+    return is_new
 
 
 def check_claim(folder: Path, *, kind: str, force: bool = False) -> None:

@@ -38,6 +38,7 @@ from megloc_kapture.io.csv_table import (
     read_records,
     write_csv_table,
 )
+from megloc_kapture.io.files import reading
 from megloc_kapture.values import Fallback, LocalizationResult, Pose, PoseRefinement, RigidTransform
 
 STATUS_FILE = "status.csv"
@@ -122,11 +123,12 @@ _COVARIANCE_COLUMNS = ("image", *(f"{_AXES[i]}_{_AXES[j]}" for i, j in zip(*_UPP
 def read_covariances(path: Path | str) -> dict[str, NDArray[np.float64]]:
     """Read covariances (6, 6) by image from their upper triangles ``rx_rx, rx_ry, ... tz_tz``."""
     found = {}
-    for _, row in read_csv_table(path, _COVARIANCE_COLUMNS):
-        image, *texts = (row[name] for name in _COVARIANCE_COLUMNS)
-        covariance = np.empty((6, 6))
-        covariance[_UPPER] = covariance.T[_UPPER] = [float(text) for text in texts]
-        found[image] = covariance
+    with reading(path, "a table of covariances"):
+        for _, row in read_csv_table(path, _COVARIANCE_COLUMNS):
+            image, *texts = (row[name] for name in _COVARIANCE_COLUMNS)
+            covariance = np.empty((6, 6))
+            covariance[_UPPER] = covariance.T[_UPPER] = [float(text) for text in texts]
+            found[image] = covariance
     return found
 
 

@@ -58,7 +58,7 @@ class Workspace:
 
     def __init__(self, root: Path, *, force: bool = False) -> None:
         self.root, self.force = Path(root).absolute(), force
-        claim_folder(self.root, kind="workspace", force=force)
+        self._is_new = claim_folder(self.root, kind="workspace", force=force)
         self._published = False
 
     def path(self, relative: str) -> Path:
@@ -123,7 +123,8 @@ class Workspace:
         with contextlib.suppress(OSError):
             (self.root / LOCK).unlink(missing_ok=True)
             (self.root / PARTIAL).rmdir()
-        release_folder(self.root)
+        if self._is_new:
+            release_folder(self.root)
 
     @contextmanager
     def staging(self, stage: str, mark: str, *, resumes: bool = False) -> Iterator[Path]:
