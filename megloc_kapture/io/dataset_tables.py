@@ -21,7 +21,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, FiniteFloat, field_validator
@@ -158,27 +158,28 @@ class RelocalizationPair:
     query: ImageName
 
 
-class _GroupRow(NamedTuple):
-    image: ImageName
-    condition: str
-    frame: str
-    location: str
-    scored: bool
+# columns of the tables, in the order of the parameters
 
 
-class _PriorRow(NamedTuple):
-    query: ImageName
-    permitted: str
+def _group(
+    image: ImageName, condition: str, frame: str, location: str, scored: bool
+) -> tuple[str, ImageGroup]:
+    return image, ImageGroup(condition=condition, frame=frame, location=location, scored=scored)
 
 
-class _NameRow(NamedTuple):
-    image: ImageName
-    name: Annotated[str, Field(pattern=r"^\S+$")]  # one word of a pose file
+def _prior(query: ImageName, permitted: str) -> tuple[str, str]:
+    return query, permitted
 
 
-class _ReasonRow(NamedTuple):
-    image: ImageName
-    reason: str
+def _name(
+    image: ImageName,
+    name: Annotated[str, Field(pattern=r"^\S+$")],  # one word of a pose file
+) -> tuple[str, str]:
+    return image, name
+
+
+def _unreadable(image: ImageName, reason: str) -> tuple[str, str]:
+    return image, reason
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -219,13 +220,8 @@ def write_side_tables(folder: Path, tables: SideTables) -> None:
 
 
 def read_groups(folder: Path | str) -> dict[str, ImageGroup]:
-    rows = read_records(Path(folder) / GROUPS_FILE, _GroupRow, missing_ok=True)
-    return {
-        row.image: ImageGroup(
-            condition=row.condition, frame=row.frame, location=row.location, scored=row.scored
-        )
-        for row in sorted(rows)
-    }
+    groups = dict(read_records(Path(folder) / GROUPS_FILE, _group, missing_ok=True))
+    return dict(sorted(groups.items()))
 
 
 def write_groups(folder: Path | str, groups: Mapping[str, ImageGroup]) -> None:
@@ -233,13 +229,13 @@ def write_groups(folder: Path | str, groups: Mapping[str, ImageGroup]) -> None:
         (image, group.condition, group.frame, group.location, int(group.scored))
         for image, group in sorted(groups.items())
     ]
-    write_csv_table(Path(folder) / GROUPS_FILE, _GroupRow._fields, rows)
+    write_csv_table(Path(folder) / GROUPS_FILE, columns_of(_group), rows)
 
 
 def read_priors(folder: Path | str) -> dict[str, tuple[str, ...]]:
     """Read ``priors.csv``: query -> permitted names, sorted; other queries are unrestricted."""
     permitted: dict[str, tuple[str, ...]] = {}
-    rows = read_records(Path(folder) / PRIORS_FILE, _PriorRow, missing_ok=True)
+    rows = read_records(Path(folder) / PRIORS_FILE, _prior, missing_ok=True)
     for query, group in sorted(set(rows)):
         permitted[query] = (*permitted.get(query, ()), group)
     return permitted
@@ -247,25 +243,25 @@ def read_priors(folder: Path | str) -> dict[str, tuple[str, ...]]:
 
 def write_priors(folder: Path | str, priors: Mapping[str, Sequence[str]]) -> None:
     rows = sorted({(query, group) for query in priors for group in priors[query]})
-    write_csv_table(Path(folder) / PRIORS_FILE, _PriorRow._fields, rows)
+    write_csv_table(Path(folder) / PRIORS_FILE, columns_of(_prior), rows)
 
 
 def read_names(folder: Path | str) -> dict[str, str]:
-    return dict(read_records(Path(folder) / NAMES_FILE, _NameRow, missing_ok=True))
+    return dict(read_records(Path(folder) / NAMES_FILE, _name, missing_ok=True))
 
 
 def write_names(folder: Path | str, names: Mapping[str, str]) -> None:
-    write_csv_table(Path(folder) / NAMES_FILE, _NameRow._fields, names.items())
+    write_csv_table(Path(folder) / NAMES_FILE, columns_of(_name), names.items())
 
 
 def read_unreadable(folder: Path | str, name: str = UNREADABLE_FILE) -> dict[str, str]:
-    return dict(sorted(read_records(Path(folder) / name, _ReasonRow, missing_ok=True)))
+    return dict(sorted(read_records(Path(folder) / name, _unreadable, missing_ok=True)))
 
 
 def write_unreadable(
     folder: Path | str, reasons: Mapping[str, str], name: str = UNREADABLE_FILE
 ) -> None:
-    write_csv_table(Path(folder) / name, _ReasonRow._fields, sorted(reasons.items()))
+    write_csv_table(Path(folder) / name, columns_of(_unreadable), sorted(reasons.items()))
 
 
 def tables_of(root: Path | str) -> Path | None:
