@@ -191,10 +191,7 @@ def difference(folder: Path, reference: Path, name: str, images: KaptureFolder) 
     ours, theirs = files_below(folder), files_below(reference)
     if ours == theirs:
         return "same bytes"
-    a, b = (
-        KaptureFolder(images.root, features_dirs=[each], allow_links_below=images.allow_links_below)
-        for each in (folder, reference)
-    )
+    a, b = (KaptureFolder(images.root, features_dirs=[each]) for each in (folder, reference))
     if a.types("matches"):
         both = [
             (x.read(*pair), y.read(*pair))
@@ -228,7 +225,7 @@ def throughput(scene: Path, names: list[str], device: str) -> list[tuple[str, ..
     ]
     with tempfile.TemporaryDirectory(prefix="megloc-gpu-") as temporary:
         root = Path(temporary)
-        folder = KaptureFolder(subset(scene, names, root / "images"), allow_links_below=[scene])
+        folder = KaptureFolder(subset(scene, names, root / "images"))
         pairs = [ImagePair(a, b, 1.0) for k, a in enumerate(names) for b in names[k + 1 : k + 9]]
         for features, matches, options in kinds:
             weights = {"weights": "aliked-n16rot"} if features == "aliked" else {}
@@ -238,9 +235,7 @@ def throughput(scene: Path, names: list[str], device: str) -> list[tuple[str, ..
             matcher = Clocked(load_plugin(MATCHERS, matches, {**options, "device": device}))
             name = extractor.name
             loop = root / f"{name}-loop"
-            described = KaptureFolder(
-                folder.root, features_dirs=[loop], allow_links_below=folder.allow_links_below
-            )
+            described = KaptureFolder(folder.root, features_dirs=[loop])
             extractor.extract(read_image_rgb(folder.image_path(names[0])))  # loads the network
 
             def extracting(

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 import tyro
 
 from megloc_kapture.errors import DataError, OptionError, check_option, require
-from megloc_kapture.io.camera_list import CameraList, read_cameras
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
+from megloc_kapture.io.text_lines import CameraList, read_cameras
 from megloc_kapture.pipeline.executors import (
     ExecutorKind,
     available_cores,
@@ -210,14 +210,17 @@ class Working(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Linked:
-    """Flags of commands that read kapture folders, which may consist of links."""
+    """Flags of commands that read kapture folders."""
 
     allow_links_below: Folders = ()
-    """Folder to which links in the kapture folders may lead, as in kapture-localization's proxy
-    folders; may be repeated."""
+    """Accepted for older scripts: links in kapture folders may lead anywhere."""
+
+    @property
+    def features_dirs(self) -> tuple[Path, ...]:
+        return ()
 
     def kapture(self, root: Path) -> KaptureFolder:
-        return KaptureFolder(root, allow_links_below=existing(self.allow_links_below))
+        return KaptureFolder(root, features_dirs=self.features_dirs)
 
     def kapture_map(self, root: Path) -> KaptureFolder:
         """Open the kapture folder of a map or workspace."""
@@ -234,12 +237,9 @@ class Reading(Linked):
     features_dir: Folders = ()
     """Folder of features outside the kapture folders; may be repeated."""
 
-    def kapture(self, root: Path) -> KaptureFolder:
-        return KaptureFolder(
-            root,
-            features_dirs=existing(self.features_dir),
-            allow_links_below=existing(self.allow_links_below),
-        )
+    @property
+    def features_dirs(self) -> tuple[Path, ...]:
+        return existing(self.features_dir)
 
     def open_map(
         self, path: Path, keypoints_types: tuple[str, ...], pixel_origin: PixelOriginChoice
@@ -249,9 +249,8 @@ class Reading(Linked):
         return KaptureMap.open(
             path,
             keypoints_types=keypoints_types,
-            features_dirs=existing(self.features_dir),
+            features_dirs=self.features_dirs,
             pixel_origin=pixel_origin,
-            allow_links_below=existing(self.allow_links_below),
         )
 
 

@@ -125,7 +125,7 @@ class TrainField(Linked, Common):
         from pydantic import ValidationError
 
         from megloc_kapture.io.files import first_problem, remove
-        from megloc_kapture.io.output_folders import claim_folder
+        from megloc_kapture.io.output_folders import claim_folder, release_folder
         from megloc_kapture.refinement.field_training import FieldTrainingOptions
         from megloc_kapture.stages.neural_field import STATE_FILE, train_field_of_map
 
@@ -145,15 +145,15 @@ class TrainField(Linked, Common):
             )
 
         mapping, state = self.kapture_map(self.input), self.output / STATE_FILE
-        undo_claim = claim_folder(self.output, kind=FIELD, force=self.force)
+        is_new = claim_folder(self.output, kind=FIELD, force=self.force)
         try:
             if self.force:
                 remove(state)
             with single_threaded():
                 psnr_db = train_field_of_map(mapping, self.output, options, progress=progress)
         except BaseException:
-            if not state.exists():
-                undo_claim()
+            if is_new and not state.exists():
+                release_folder(self.output)
             raise
         mean = f"{sum(psnr_db.values()) / len(psnr_db):.1f} dB" if psnr_db else "none held out"
         console.result(f"{self.output}: PSNR of {len(psnr_db)} held-out images: {mean}")

@@ -13,7 +13,6 @@ are not read; docs/training.md shows how to convert them to plain arrays.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -24,7 +23,7 @@ from pydantic import Field
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import read_colmap_model
-from megloc_kapture.io.files import check_component, link_records, safe_join
+from megloc_kapture.io.files import check_component, link_records, reading, safe_join
 from megloc_kapture.io.images import image_size, write_depth_map
 from megloc_kapture.io.kapture import KaptureData, Sensor, write_sensors
 from megloc_kapture.preprocessing.frames import scaled_camera
@@ -74,11 +73,8 @@ def read_megadepth_depth(path: Path) -> NDArray[np.float32] | None:
     """Read a depth map (H, W), 0 if unknown; return None for images with ordinal depth only."""
     import h5py
 
-    try:
-        with h5py.File(path, "r") as file:
-            depth_m = np.asarray(file["depth"], np.float32)
-    except (OSError, RuntimeError, KeyError, ValueError) as error:
-        raise DataError(f"cannot read 'depth' as HDF5: {error}", path=path) from error
+    with reading(path, "an HDF5 file with 'depth'"), h5py.File(path, "r") as file:
+        depth_m = np.asarray(file["depth"], np.float32)
     if depth_m.ndim != 2 or not depth_m.size:
         raise DataError(f"depth is of shape {depth_m.shape}, not an image", path=path)
     # ordinal depth has negative labels
@@ -121,15 +117,9 @@ def _depth_of(root: Path, scene: str, image: str) -> Path | None:
 
 
 def _of_table(root: Path, scene: str, table: Path) -> Iterator[_Image]:
-    try:
-        with np.load(table, allow_pickle=False) as file:
-            images, intrinsics, poses = (file[name] for name in _ARRAYS)
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise DataError(
-            "its arrays are Python objects, which are not read, or broken; docs/training.md "
-            f"shows how to convert them to plain arrays ({error})",
-            path=table,
-        ) from error
+    what = "a file of plain arrays (docs/training.md shows how to convert Python objects to these)"
+    with reading(table, what), np.load(table, allow_pickle=False) as file:
+        images, intrinsics, poses = (file[name] for name in _ARRAYS)
     shapes = [(len(images), *shape) for shape in ((), (3, 3), (4, 4))]
     for name, array, shape in zip(_ARRAYS, (images, intrinsics, poses), shapes, strict=True):
         kinds = "U" if array is images else "fiu"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import SparsePoints
-from megloc_kapture.io.files import check_relative, link_records
+from megloc_kapture.io.files import check_relative, link_records, named, reading
 from megloc_kapture.io.kapture import (
     FeatureConfig,
     FeatureWriter,
@@ -63,7 +63,9 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
             self.images = {}
             with self._reading():
                 for name, image_id in self._rows("SELECT name, image_id FROM images ORDER BY name"):
-                    self.images[check_relative(str(name).removeprefix("./"))] = int(image_id)
+                    with named(path):
+                        name = check_relative(str(name).removeprefix("./"))
+                    self.images[name] = int(image_id)
         except BaseException:
             self._connection.close()
             raise
@@ -116,14 +118,8 @@ class ColmapDatabase(AbstractContextManager["ColmapDatabase"]):
     def _rows(self, query: str) -> Iterator[tuple[Any, ...]]:
         return self._connection.execute(query)
 
-    @contextmanager
-    def _reading(self) -> Iterator[None]:
-        try:
-            yield
-        except DataError as error:
-            raise self._error(error.message) from error
-        except (sqlite3.Error, UnicodeDecodeError, OverflowError, ValueError, TypeError) as error:
-            raise self._error(f"not a readable COLMAP database: {error}") from error
+    def _reading(self) -> AbstractContextManager[None]:
+        return reading(self.path, "a COLMAP database")
 
     def _error(self, message: str) -> DataError:
         return DataError(message, path=self.path)
@@ -249,9 +245,7 @@ class _DatabaseFeatures(AbstractContextManager["_DatabaseFeatures"]):
         if self._type != keypoints_type:
             raise self._error(f"has features of type {self._type}, not {keypoints_type}")
         self._output, self._names = output, names
-        self._by_stem: dict[str, list[str]] = {}
-        for name in database.images:
-            self._by_stem.setdefault(_without_suffix(name), []).append(name)
+        self._by_stem = {_without_suffix(name): name for name in database.images}
         self._writer: FeatureWriter | None = None
         self._without: list[str] = []
 
@@ -266,19 +260,12 @@ class _DatabaseFeatures(AbstractContextManager["_DatabaseFeatures"]):
             self._without.append(name)
             return np.empty((0, 2), np.float32)
         keypoints = self._database.keypoints(name_there)
-        if len(features) and features.max() >= len(keypoints):
-            raise self._error(
-                f"is not of this model: its image {name_there!r} has {len(keypoints)} keypoints, "
-                f"the model names feature {features.max()}"
-            )
-        shifts = np.abs(keypoints[features] - xy_px).max(axis=1, initial=0.0)
-        if len(shifts) and shifts.max() > _MAX_SHIFT_PX:
-            worst = int(shifts.argmax())
-            (x, y), (model_x, model_y) = keypoints[features[worst]], xy_px[worst]
-            raise self._error(
-                f"is not of this model: feature {features[worst]} of {name_there!r} is at "
-                f"({x:.1f}, {y:.1f}), in the model at ({model_x:.1f}, {model_y:.1f})"
-            )
+        fits = features.max(initial=-1) < len(keypoints)
+        if fits:
+            shifts = np.abs(keypoints[features] - xy_px)
+            fits = shifts.max(initial=0.0) <= _MAX_SHIFT_PX
+        if not fits:
+            raise self._error(f"is not of this model: its features of {name_there!r} are others")
         descriptors = self._database.descriptors(name_there, self._dtype)
         if descriptors is not None:
             self._write(name, descriptors, len(keypoints))
@@ -296,10 +283,7 @@ class _DatabaseFeatures(AbstractContextManager["_DatabaseFeatures"]):
         name = self._names.get(name, name)
         if name in self._database.images:
             return name
-        found = self._by_stem.get(_without_suffix(name), [])
-        if len(found) > 1:
-            raise self._error(f"has several images for {name!r}: {', '.join(found)}")
-        return found[0] if found else None
+        return self._by_stem.get(_without_suffix(name))
 
     def _write(self, name: str, descriptors: NDArray[Any], num_keypoints: int) -> None:
         kind, size = self._type, descriptors.shape[1]
@@ -307,10 +291,11 @@ class _DatabaseFeatures(AbstractContextManager["_DatabaseFeatures"]):
             config = FeatureConfig(kind.upper(), descriptors.dtype, size, kind, "L2")
             self._writer = FeatureWriter(self._output, "descriptors", kind, config)
         expected = (num_keypoints, self._writer.config.dsize)
-        if descriptors.shape != expected:
-            raise self._error(
-                f"descriptors of {name!r} have the shape {descriptors.shape}, expected {expected}"
-            )
+        require(
+            descriptors.shape == expected,
+            f"descriptors of {name!r} have the shape {descriptors.shape}, expected {expected}",
+            path=self._database.path,
+        )
         self._writer.write(name, descriptors)
 
     def _error(self, message: str) -> DataError:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from megloc_kapture.errors import DataError, OutputError, require
-from megloc_kapture.io.files import output_error, owned_name
+from megloc_kapture.io.files import TEMPORARY, output_error
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 NEVER = 2**31 - 1
@@ -104,7 +104,7 @@ def undistorted_pinhole(camera: Camera) -> Camera:
 def focal_from_exif(jpeg: bytes) -> float | None:
     """Return COLMAP's focal length in pixels from the EXIF of a JPEG file; None without one."""
     pycolmap = load_pycolmap()
-    with tempfile.TemporaryDirectory(prefix=f".{owned_name()}") as folder:
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as folder:
         path = Path(folder) / "blank.jpg"
         path.write_bytes(jpeg)
         camera = pycolmap.infer_camera_from_image(str(path))
@@ -244,7 +244,7 @@ def database_folder(
     try:
         Path(place).mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(
-            prefix=f".{owned_name()}", dir=place, ignore_cleanup_errors=True
+            prefix=TEMPORARY, dir=place, ignore_cleanup_errors=True
         ) as folder:
             free = disk_usage(folder).free
             if free < needed:

@@ -32,7 +32,7 @@ from megloc_kapture.io.colmap import (
     write_database,
     write_model,
 )
-from megloc_kapture.io.files import write_bytes
+from megloc_kapture.io.files import reading, write_bytes
 from megloc_kapture.io.images import write_image
 from megloc_kapture.values import Camera, RigidTransform
 
@@ -379,11 +379,8 @@ def map_path(root: Path, kind: Literal["depth", "normal"], name: str) -> Path:
 
 def read_map(path: Path) -> NDArray[np.float32]:
     """Read depth (H, W), 0 where unknown, or normals (H, W, 3) in the camera frame."""
-    try:
-        content = path.read_bytes()
-        *sizes, values = content.split(b"&", 3)
+    with reading(path, "a map of COLMAP's stereo"):
+        *sizes, values = path.read_bytes().split(b"&", 3)
         width, height, channels = (int(size) for size in sizes)
         found = np.frombuffer(values, "<f4").astype(np.float32).reshape(channels, height, width)
-    except (OSError, ValueError) as error:
-        raise DataError(f"no map of COLMAP's stereo: {error}", path=path) from error
     return found[0] if channels == 1 else np.ascontiguousarray(found.transpose(1, 2, 0))

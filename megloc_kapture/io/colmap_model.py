@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap import load_pycolmap, quiet_stderr
-from megloc_kapture.io.files import check_relative, named, owned_name
+from megloc_kapture.io.files import TEMPORARY, check_relative, named, reading
 from megloc_kapture.io.kapture.sensors import unit_quaternion
 from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
@@ -124,7 +124,7 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
         require(path.is_file(), "file is missing", path=path)
         if path.name in _RECORDS:
             _check_complete(path)
-    with tempfile.TemporaryDirectory(prefix=f".{owned_name()}") as links:
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as links:
         for path in paths:
             link = Path(links) / path.name
             if path.name == TEXT_FILES[1]:
@@ -135,17 +135,9 @@ def read_colmap_model(folder: Path, *, with_points: bool = True) -> ColmapModel:
         if not with_points:
             no_points = bytes(8) if paths[0].suffix == ".bin" else b""
             (Path(links) / f"points3D{paths[0].suffix}").write_bytes(no_points)
-        try:
-            with quiet_stderr():
-                model = load_pycolmap().Reconstruction(links)
-        except (OSError, RuntimeError, ValueError, IndexError) as error:
-            reason = str(error).partition("] ")[2] or str(error)
-            names = ", ".join(path.name for path in paths)
-            raise DataError(
-                f"COLMAP cannot read the model ({names}): {' '.join(reason.split())}; if the "
-                "files were copied, copy them again",
-                path=folder,
-            ) from error
+        names = ", ".join(path.name for path in paths)
+        with reading(folder, f"a model that COLMAP can read ({names})"), quiet_stderr():
+            model = load_pycolmap().Reconstruction(links)
     cameras = {camera_id: _camera(camera, paths[0]) for camera_id, camera in model.cameras.items()}
     if paths[0].suffix == ".bin":
         size = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())

@@ -21,13 +21,12 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, FiniteFloat, field_validator
 
-from megloc_kapture.errors import require
-from megloc_kapture.io.csv_table import Column, ImageName, Table, flag
+from megloc_kapture.io.csv_table import ImageName, columns_of, read_records, write_csv_table
 from megloc_kapture.io.files import (
     ModelT,
     check_relative,
@@ -35,7 +34,7 @@ from megloc_kapture.io.files import (
     write_bytes,
     write_json_model,
 )
-from megloc_kapture.io.text_lines import read_lines
+from megloc_kapture.io.text_lines import reading_lines
 from megloc_kapture.values import Options, RigidTransform
 
 SIDE_TABLES = "megloc"
@@ -150,16 +149,6 @@ class Protocol(Options):
     pools: dict[str, tuple[str, ...]] = Field(default_factory=dict)
 
 
-def _word(text: str) -> str:
-    require(text.split() == [text], f"a pose file cannot hold the name {text!r}")
-    return text
-
-
-def _not_empty(text: str) -> str:
-    require(text, "permitted is empty")
-    return text
-
-
 @dataclass(frozen=True, slots=True)
 class RelocalizationPair:
     """One row of an MLAD relocalization file, with kapture's image names."""
@@ -169,19 +158,28 @@ class RelocalizationPair:
     query: ImageName
 
 
-_GROUPS: Table[Any] = Table(
-    {"image": ImageName, "condition": str, "frame": str, "location": str, "scored": flag("1", "0")},
-    keys=[("image",)],
-)
-_PRIORS: Table[Any] = Table(
-    {"query": ImageName, "permitted": Column("a group or an image", _not_empty)},
-    keys=[("query", "permitted")],
-)
-_NAMES: Table[Any] = Table(
-    {"image": ImageName, "name": Column("one word", _word)}, keys=[("image",), ("name",)]
-)
-_UNREADABLE: Table[Any] = Table({"image": ImageName, "reason": str}, keys=[("image",)])
-_RELOCALIZATION = Table(RelocalizationPair)
+# columns of the tables, in the order of the parameters
+
+
+def _group(
+    image: ImageName, condition: str, frame: str, location: str, scored: bool
+) -> tuple[str, ImageGroup]:
+    return image, ImageGroup(condition=condition, frame=frame, location=location, scored=scored)
+
+
+def _prior(query: ImageName, permitted: str) -> tuple[str, str]:
+    return query, permitted
+
+
+def _name(
+    image: ImageName,
+    name: Annotated[str, Field(pattern=r"^\S+$")],  # one word of a pose file
+) -> tuple[str, str]:
+    return image, name
+
+
+def _unreadable(image: ImageName, reason: str) -> tuple[str, str]:
+    return image, reason
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -222,47 +220,48 @@ def write_side_tables(folder: Path, tables: SideTables) -> None:
 
 
 def read_groups(folder: Path | str) -> dict[str, ImageGroup]:
-    names = tuple(ImageGroup.model_fields)
-    return {
-        image: ImageGroup(**dict(zip(names, values, strict=True)))
-        for image, *values in sorted(_GROUPS.read_if_there(Path(folder) / GROUPS_FILE))
-    }
+    groups = dict(read_records(Path(folder) / GROUPS_FILE, _group, missing_ok=True))
+    return dict(sorted(groups.items()))
 
 
 def write_groups(folder: Path | str, groups: Mapping[str, ImageGroup]) -> None:
-    rows = [(image, *group.model_dump().values()) for image, group in sorted(groups.items())]
-    _GROUPS.write(Path(folder) / GROUPS_FILE, rows)
+    rows = [
+        (image, group.condition, group.frame, group.location, int(group.scored))
+        for image, group in sorted(groups.items())
+    ]
+    write_csv_table(Path(folder) / GROUPS_FILE, columns_of(_group), rows)
 
 
 def read_priors(folder: Path | str) -> dict[str, tuple[str, ...]]:
     """Read ``priors.csv``: query -> permitted names, sorted; other queries are unrestricted."""
     permitted: dict[str, tuple[str, ...]] = {}
-    for query, group in sorted(_PRIORS.read_if_there(Path(folder) / PRIORS_FILE)):
+    rows = read_records(Path(folder) / PRIORS_FILE, _prior, missing_ok=True)
+    for query, group in sorted(set(rows)):
         permitted[query] = (*permitted.get(query, ()), group)
     return permitted
 
 
 def write_priors(folder: Path | str, priors: Mapping[str, Sequence[str]]) -> None:
     rows = sorted({(query, group) for query in priors for group in priors[query]})
-    _PRIORS.write(Path(folder) / PRIORS_FILE, rows)
+    write_csv_table(Path(folder) / PRIORS_FILE, columns_of(_prior), rows)
 
 
 def read_names(folder: Path | str) -> dict[str, str]:
-    return dict(_NAMES.read_if_there(Path(folder) / NAMES_FILE))
+    return dict(read_records(Path(folder) / NAMES_FILE, _name, missing_ok=True))
 
 
 def write_names(folder: Path | str, names: Mapping[str, str]) -> None:
-    _NAMES.write(Path(folder) / NAMES_FILE, names.items())
+    write_csv_table(Path(folder) / NAMES_FILE, columns_of(_name), names.items())
 
 
 def read_unreadable(folder: Path | str, name: str = UNREADABLE_FILE) -> dict[str, str]:
-    return dict(sorted(_UNREADABLE.read_if_there(Path(folder) / name)))
+    return dict(sorted(read_records(Path(folder) / name, _unreadable, missing_ok=True)))
 
 
 def write_unreadable(
     folder: Path | str, reasons: Mapping[str, str], name: str = UNREADABLE_FILE
 ) -> None:
-    _UNREADABLE.write(Path(folder) / name, sorted(reasons.items()))
+    write_csv_table(Path(folder) / name, columns_of(_unreadable), sorted(reasons.items()))
 
 
 def tables_of(root: Path | str) -> Path | None:
@@ -287,11 +286,14 @@ def unit_of(root: Path | str) -> str:
 
 
 def read_relocalization(folder: Path | str) -> list[RelocalizationPair]:
-    return _RELOCALIZATION.read_if_there(Path(folder) / RELOCALIZATION_FILE)
+    path = Path(folder) / RELOCALIZATION_FILE
+    return read_records(path, RelocalizationPair, missing_ok=True)
 
 
 def write_relocalization(folder: Path | str, pairs: Iterable[RelocalizationPair]) -> None:
-    _RELOCALIZATION.write(Path(folder) / RELOCALIZATION_FILE, pairs)
+    rows = ((pair.file, pair.reference, pair.query) for pair in pairs)
+    path = Path(folder) / RELOCALIZATION_FILE
+    write_csv_table(path, columns_of(RelocalizationPair), rows)
 
 
 def read_world(folder: Path | str) -> World:
@@ -320,11 +322,8 @@ def read_nowhere(truth: Path | str) -> tuple[str, ...]:
     path = Path(truth) / NOWHERE_FILE
     if not path.is_file():
         return ()
-    names: set[str] = set()
-    for line in read_lines(path, comments=True):
-        with line.named():
-            names.add(check_relative(line.text))
-    return tuple(sorted(names))
+    with reading_lines(path, comments=True) as lines:
+        return tuple(sorted(set(map(check_relative, lines))))
 
 
 def write_nowhere(truth: Path, names: Iterable[str]) -> None:

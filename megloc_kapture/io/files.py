@@ -7,13 +7,11 @@ state or the new one; fsync would be too slow for thousands of small files.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import re
 import secrets
 import shutil
-import socket
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -21,7 +19,7 @@ from typing import Any, BinaryIO, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from megloc_kapture.errors import DataError, OutputError, require
+from megloc_kapture.errors import DataError, MeglocError, OutputError, require
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -49,14 +47,28 @@ def read_text(path: Path | str) -> str:
 
 
 @contextlib.contextmanager
-def reading(path: Path | str) -> Iterator[None]:
-    """Turn an OSError of the block into a DataError that names this file or folder."""
+def reading(path: Path | str | None, what: str = "") -> Iterator[None]:
+    """Turn an error of the block into a DataError that names this file or folder.
+
+    ``what`` the file should be; without it, only an OSError is converted.
+    """
     try:
         yield
     except FileNotFoundError as error:
         raise DataError("cannot read: the file is missing", path=path) from error
     except OSError as error:
-        raise DataError(f"cannot read: {error.strerror or error}", path=path) from error
+        reason = "cannot read" if error.strerror or not what else f"not {what}, or broken"
+        raise DataError(f"{reason}: {_text_of(error)}", path=path) from error
+    except Exception as error:  # libraries raise many kinds on broken files
+        if not what or isinstance(error, MeglocError):
+            raise
+        raise DataError(f"not {what}, or broken: {_text_of(error)}", path=path) from error
+
+
+def _text_of(error: Exception) -> str:
+    """Return the first sentence of an error, without addresses in memory, which vary."""
+    text = getattr(error, "strerror", None) or str(error)
+    return " ".join(re.sub(r"<\S+ object at \S+>|[.;]\s.*", "", text, flags=re.S).split())
 
 
 @contextlib.contextmanager
@@ -110,53 +122,21 @@ def safe_join(root: Path, relative_text: str) -> Path:
     return Path(root) / check_relative(relative_text)
 
 
-def check_no_escape(roots: Sequence[Path], path: Path) -> Path:
-    """Return ``path`` if it is in one of the ``roots``, links followed, else raise DataError."""
-    real = Path(os.path.realpath(path))
-    if not any(real.is_relative_to(os.path.realpath(root)) for root in roots):
-        raise DataError(
-            f"is or lies behind a link that leaves {roots[0]}, to {real}; images may be links to "
-            "anywhere, other files only to folders given by --allow-links-below",
-            path=path,
-        )
-    return path
-
-
 # -------------------------------------------------------------------------------- temporary names
 
 
-def owned_name() -> str:
-    """Return a prefix of temporary names that identifies this process."""
-    return f"megloc-{_machine()}.{os.getpid()}-"
-
-
-@lru_cache(maxsize=1)
-def _machine() -> str:
-    """Return a short id of the machine or container: socket names have at most 100 characters."""
-    return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:6]
+TEMPORARY = ".megloc-"  # begins temporary names, which all readers skip
 
 
 def temporary_name() -> str:
-    """Return an unused temporary name, hidden from all readers."""
-    return f".{owned_name()}{secrets.token_hex(8)}.tmp"
+    """Return an unused temporary name."""
+    return f"{TEMPORARY}{secrets.token_hex(8)}.tmp"
 
 
-def clear_leftovers(folder: Path) -> None:
-    """Remove stale temporary files of dead processes of this machine from a folder."""
-    pattern = re.compile(rf"(\.|sem\.)?megloc-{_machine()}\.([0-9]+)-.*")
-    try:
-        names = os.listdir(folder)
-    except OSError:
-        return
-    for name in names:
-        if (found := pattern.fullmatch(name)) and not _lives(int(found[2])):
-            with contextlib.suppress(OSError):
-                remove(Path(folder) / name)
-
-
-def clear_temporary(folder: Path) -> None:
-    """Remove unfinished files below a folder that has no other writers."""
-    for path in list(Path(folder).rglob(".megloc-*.tmp")):
+def clear_temporary(folder: Path, *, nested: bool = True) -> None:
+    """Remove unfinished files in a folder that has no other writers, or also ``nested`` ones."""
+    find = folder.rglob if nested else folder.glob
+    for path in list(find(f"{TEMPORARY}*")):
         remove(path)
 
 
@@ -166,16 +146,6 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-def _lives(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:
-        pass  # another user's process
-    return True
 
 
 # ------------------------------------------------------------------------------------ writing

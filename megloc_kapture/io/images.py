@@ -63,10 +63,8 @@ def decode_image_rgb(content: bytes, path: Path | str | None = None) -> NDArray[
     """Decode the bytes of an image file; errors name the ``path``."""
     image = _decoded_by_opencv(content)
     if image is None:
-        try:
+        with reading(path, "an image"):
             image = _decoded_by_pillow(content)
-        except Exception as error:  # pillow raises many kinds on broken data
-            raise DataError("not an image, or broken", path=path) from error
     else:
         _check_complete(path, content)
     return with_8_bits(image)
@@ -135,11 +133,8 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     from PIL import Image
 
     check_image_file(path)
-    try:
-        with _quiet(), Image.open(path) as image:
-            yield image
-    except Exception as error:
-        raise DataError("not an image, or broken", path=path) from error
+    with reading(path, "an image"), _quiet(), Image.open(path) as image:
+        yield image
 
 
 def write_image(path: Path | str, image: NDArray[np.uint8], *, jpeg_quality: int = 95) -> None:
@@ -200,11 +195,8 @@ def _check_complete(path: Path | str | None, content: bytes) -> None:
         return
     from PIL import Image
 
-    try:
-        with Image.open(BytesIO(content)) as image:
-            image.load()
-    except Exception as error:
-        raise DataError(f"not an image, or truncated ({error})", path=path) from error
+    with reading(path, "an image"), Image.open(BytesIO(content)) as image:
+        image.load()
 
 
 def read_depth_map(path: Path | str, *, width: int, height: int) -> NDArray[np.float32]:

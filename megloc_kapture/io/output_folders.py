@@ -9,71 +9,64 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from megloc_kapture.errors import DataError, OutputError
 from megloc_kapture.io.files import (
     check_relative,
-    clear_leftovers,
     clear_temporary,
     output_error,
     temporary_name,
     write_bytes,
+    writing,
 )
 
 MARKER = ".megloc"
 _ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z")
 
 
-def claim_folder(folder: Path, *, kind: str, force: bool = False) -> Callable[[], None]:
-    """Claim a folder that is new, empty or of the same ``kind`` (one word), or any by ``force``.
+def claim_folder(folder: Path, *, kind: str, force: bool = False) -> bool:
+    """Create and mark a folder that is new, empty or of the same ``kind`` (one word).
 
-    Others raise OutputError. Returns a function that undoes the claim: it restores the former mark
-    and removes the folders that the claim created; written files stay.
+    Others raise OutputError, unless forced. Return whether the mark is new, and may be released.
     """
-    folder = Path(folder)
-    mark = folder / MARKER
-    try:
-        made = tuple(path for path in (folder, *folder.parents) if not path.exists())
-        if not made and not folder.is_dir():
+    check_claim(folder, kind=kind, force=force)
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        is_new = _read_mark(folder)[:1] != [kind]
+        if is_new:
+            _write_mark(folder, kind)
+    return is_new
+
+
+def check_claim(folder: Path, *, kind: str, force: bool = False) -> None:
+    """Raise OutputError for a folder that :func:`claim_folder` refuses."""
+    with writing(folder):
+        if folder.exists() and not folder.is_dir():
             raise OutputError(f"{folder}: is a file, a folder is needed")
-        old_mark = mark.read_bytes() if mark.is_file() else None
-        ours = old_mark is not None and _kind(old_mark) == kind
-        if not made and not ours and not force and any(folder.iterdir()):
+        ours = force or not folder.exists() or _read_mark(folder)[:1] == [kind]
+        if not ours and any(folder.iterdir()):
             raise OutputError(
                 f"{folder}: is not empty and not a {kind} of megloc; give an empty folder, "
                 "or -f to write into it all the same"
             )
-    except OSError as error:
-        raise output_error(folder, error) from error
-
-    def undo() -> None:
-        with contextlib.suppress(OSError, OutputError):
-            if old_mark is None:
-                mark.unlink(missing_ok=True)
-            elif mark.read_bytes() != old_mark:
-                write_bytes(mark, old_mark)
-        for created in made:
-            with contextlib.suppress(OSError):
-                created.rmdir()
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if not ours:
-            write_bytes(mark, _mark_of(kind))
-    except (OSError, OutputError) as error:
-        undo()
-        raise error if isinstance(error, OutputError) else output_error(folder, error) from error
-    return undo
 
 
-def _kind(mark: bytes) -> str:
-    return mark.partition(b"\n")[0].decode(errors="replace")
+def release_folder(folder: Path) -> None:
+    """Remove the mark of a folder that got no results, and the folder if it is empty."""
+    with contextlib.suppress(OSError):
+        (folder / MARKER).unlink(missing_ok=True)
+        folder.rmdir()
 
 
-def _mark_of(kind: str, names: Iterable[str] = ()) -> bytes:
-    return b"".join(os.fsencode(line) + b"\n" for line in (kind, *sorted(names)))
+def _read_mark(folder: Path) -> list[str]:
+    path = folder / MARKER
+    return os.fsdecode(path.read_bytes()).splitlines() if path.is_file() else []
+
+
+def _write_mark(folder: Path, kind: str, names: Iterable[str] = ()) -> None:
+    write_bytes(folder / MARKER, os.fsencode("\n".join((kind, *sorted(names))) + "\n"))
 
 
 @contextlib.contextmanager
@@ -85,31 +78,28 @@ def staged_output(
     Files of the last command of the same kind are removed, unless ``adds`` is set; others stay.
     """
     folder = Path(folder)
-    old_names = _listed(folder / MARKER, kind)
-    undo_claim = claim_folder(folder, kind=kind, force=force)
-    clear_leftovers(folder)
-    staging = folder / temporary_name()
+    check_claim(folder, kind=kind, force=force)
+    place = next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
+    staging = place / temporary_name()
     try:
-        try:
+        with writing(folder):
             staging.mkdir()
-            yield staging
+        yield staging
+        with writing(folder):
             clear_temporary(staging)
+            claim_folder(folder, kind=kind, force=True)
             if not adds:
                 new = _files_below(staging)
-                _remove_old_files(folder, old_names - new)
-                write_bytes(folder / MARKER, _mark_of(kind, new))
+                _remove_old_files(folder, set(_read_mark(folder)[1:]) - new)
+                _write_mark(folder, kind, new)
             _merge(staging, folder)
-        finally:
-            shutil.rmtree(staging, ignore_errors=True)
     except OSError as error:
-        undo_claim()
         # an error without a file name comes from writing: full disk or exceeded quota
-        if error.filename is not None and not _lies_in(error.filename, folder):
-            raise
-        raise output_error(folder, error) from error
-    except BaseException:
-        undo_claim()
+        if error.filename is None or Path(error.filename).is_relative_to(staging):
+            raise output_error(folder, error) from error
         raise
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
 
 
 def _files_below(folder: Path) -> set[str]:
@@ -118,13 +108,6 @@ def _files_below(folder: Path) -> set[str]:
         links = [name for name in folders if os.path.islink(os.path.join(place, name))]
         found |= {os.path.relpath(os.path.join(place, name), folder) for name in files + links}
     return found
-
-
-def _listed(path: Path, kind: str) -> set[str]:
-    mark = path.read_bytes() if path.is_file() else b""
-    if _kind(mark) != kind:
-        return set()
-    return {os.fsdecode(line) for line in mark.split(b"\n")[1:] if line}
 
 
 def _remove_old_files(folder: Path, names: Iterable[str]) -> None:
@@ -138,10 +121,6 @@ def _remove_old_files(folder: Path, names: Iterable[str]) -> None:
             path.unlink()
             for parent in parents:
                 parent.rmdir()
-
-
-def _lies_in(name: str, folder: Path) -> bool:
-    return Path(os.path.abspath(name)).is_relative_to(os.path.abspath(folder))
 
 
 def _merge(source: Path, target: Path) -> None:
@@ -175,22 +154,3 @@ def _is_data(folder: Path, name: str) -> bool:
         return False
     # a link to a folder around it never ends
     return not (path.is_symlink() and folder.resolve().is_relative_to(path.resolve()))
-
-
-def replace_directory(new: Path, path: Path) -> None:
-    """Replace folder ``path``, which need not exist, by folder ``new`` on the same file system.
-
-    A run killed in between leaves the old folder under a temporary name.
-    """
-    new, path = Path(new), Path(path)
-    if path.is_symlink() or (path.exists() and not path.is_dir()):
-        raise OutputError(f"{path}: is a link or a file, not a folder; move it away first")
-    old = path.with_name(temporary_name())
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists():
-            os.rename(path, old)
-        os.rename(new, path)
-        shutil.rmtree(old, ignore_errors=True)
-    except OSError as error:
-        raise output_error(path, error) from error

@@ -15,7 +15,6 @@ Readers and writers take the file itself and keep its order, unless they say oth
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,27 +22,23 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from megloc_kapture.errors import DataError
 from megloc_kapture.io.csv_table import (
     ImageName,
-    Table,
-    flag,
-    list_of,
-    number,
-    or_empty,
-    pose_text,
+    Names,
+    OrNan,
+    OrNone,
+    Parts,
+    PoseCell,
+    append_csv_row,
+    columns_of,
     read_csv_table,
+    read_records,
     write_csv_table,
 )
-from megloc_kapture.io.files import named
-from megloc_kapture.values import (
-    Fallback,
-    LocalizationResult,
-    Pose,
-    PoseRefinement,
-    RigidTransform,
-)
+from megloc_kapture.io.files import reading
+from megloc_kapture.values import Fallback, LocalizationResult, Pose, PoseRefinement, RigidTransform
 
 STATUS_FILE = "status.csv"
 COVARIANCE_FILE = "covariance.csv"
@@ -81,10 +76,10 @@ def _result_of_row(
     reason: str = "",
     num_matches: int = 0,
     num_inliers: int = 0,
-    confidence: Annotated[float | None, or_empty(number(".4f", most=1.0))] = None,
-    cluster: int | None = None,
+    confidence: Annotated[Annotated[float, Field(ge=0, le=1)] | None, OrNone] = None,
+    cluster: Annotated[int | None, OrNone] = None,
     fallback: Fallback = "none",
-    candidates: tuple[str, ...] = (),
+    candidates: Names = (),
     refinement: str = "",
     remarks: str = "",
 ) -> LocalizationResult:
@@ -103,16 +98,20 @@ def _result_of_row(
     )
 
 
-_STATUS = Table(_result_of_row, keys=[("image",)], later=("confidence", "remarks"))
-
-
 def read_status(path: Path | str) -> dict[str, LocalizationResult]:
     """Read ``status.csv``: results by name, without poses and refinements."""
-    return {row.name: row for row in sorted(_STATUS.read(path), key=lambda row: row.name)}
+    rows = read_records(path, _result_of_row, optional=("confidence", "remarks"))
+    return {row.name: row for row in sorted(rows, key=lambda row: row.name)}
 
 
 def write_status(path: Path | str, results: Iterable[LocalizationResult]) -> None:
-    _STATUS.write(path, sorted(map(status_row, results), key=lambda row: str(row["image"])))
+    rows = []
+    for result in sorted(results, key=lambda result: result.name):
+        row = status_row(result)
+        if result.confidence is not None:
+            row["confidence"] = f"{result.confidence:.4f}"
+        rows.append(row.values())
+    write_csv_table(path, columns_of(_result_of_row), rows)
 
 
 _UPPER = np.triu_indices(6)
@@ -123,16 +122,11 @@ _COVARIANCE_COLUMNS = ("image", *(f"{_AXES[i]}_{_AXES[j]}" for i, j in zip(*_UPP
 def read_covariances(path: Path | str) -> dict[str, NDArray[np.float64]]:
     """Read covariances (6, 6) by image from their upper triangles ``rx_rx, rx_ry, ... tz_tz``."""
     found = {}
-    for line, row in read_csv_table(path, _COVARIANCE_COLUMNS):
-        with named(path, line):
+    with reading(path, "a table of covariances"):
+        for _, row in read_csv_table(path, _COVARIANCE_COLUMNS):
             image, *texts = (row[name] for name in _COVARIANCE_COLUMNS)
             covariance = np.empty((6, 6))
-            try:
-                covariance[_UPPER] = covariance.T[_UPPER] = [float(text) for text in texts]
-                if not np.isfinite(np.linalg.cholesky(covariance)).all():
-                    raise ValueError
-            except ValueError as error:  # LinAlgError is one
-                raise DataError(f"{image!r} has no positive definite covariance") from error
+            covariance[_UPPER] = covariance.T[_UPPER] = [float(text) for text in texts]
             found[image] = covariance
     return found
 
@@ -153,14 +147,14 @@ def write_clusters(path: Path, results: Iterable[LocalizationResult]) -> None:
     rows = [
         (
             result.name,
-            str(index),
+            index,
             "yes" if index == result.cluster else "no",
-            str(cluster.num_matches),
-            str(cluster.num_inliers),
-            "" if cluster.score is None else f"{cluster.score:.6g}",
+            cluster.num_matches,
+            cluster.num_inliers,
+            None if cluster.score is None else f"{cluster.score:.6g}",
             cluster.reason,
-            ",".join(cluster.candidates),
-            "" if cluster.cam_from_world is None else pose_text(cluster.cam_from_world),
+            cluster.candidates,
+            cluster.cam_from_world,
         )
         for result in sorted(results, key=lambda result: result.name)
         for index, cluster in enumerate(result.clusters)
@@ -171,12 +165,12 @@ def write_clusters(path: Path, results: Iterable[LocalizationResult]) -> None:
 def _refinement_row(
     image: str,
     method: str,
-    accepted: Annotated[bool, flag("yes", "no")],
+    accepted: bool,
     reason: str,
-    moved_m: Annotated[float, number(".6f")],
-    turned_deg: Annotated[float, number(".6f")],
-    measures: Annotated[tuple[str, ...], list_of(";")],
-    before: RigidTransform,
+    moved_m: float,
+    turned_deg: float,
+    measures: Parts,
+    before: PoseCell,
 ) -> tuple[str, PoseRefinement]:
     named_values = (text.partition("=") for text in measures)
     return image, PoseRefinement(
@@ -190,15 +184,12 @@ def _refinement_row(
     )
 
 
-_REFINEMENT = Table(_refinement_row)
-
-
 def read_refinement(
     path: Path | str, refined: Mapping[str, RigidTransform]
 ) -> dict[str, tuple[PoseRefinement, ...]]:
     """Read ``refinement.csv``: steps by image, of which the last led to the ``refined`` pose."""
     by_image: dict[str, list[PoseRefinement]] = {}
-    for image, step in _REFINEMENT.read(path):
+    for image, step in read_records(path, _refinement_row):
         by_image.setdefault(image, []).append(step)
     found = {}
     for image, steps in by_image.items():
@@ -213,19 +204,20 @@ def read_refinement(
 def write_refinement(path: Path, results: Iterable[LocalizationResult]) -> None:
     """Write ``refinement.csv`` sorted by image; the steps of an image stay in order."""
     rows = [
-        {
-            **vars(step),
-            "image": result.name,
-            "accepted": step.accepted,
-            "measures": tuple(f"{name}={value:.6g}" for name, value in step.measures.items()),
-        }
+        (
+            result.name,
+            step.method,
+            "yes" if step.accepted else "no",
+            step.reason,
+            f"{step.moved_m:.6f}",
+            f"{step.turned_deg:.6f}",
+            ";".join(f"{name}={value:.6g}" for name, value in step.measures.items()),
+            step.before,
+        )
         for result in sorted(results, key=lambda result: result.name)
         for step in result.refinements
     ]
-    _REFINEMENT.write(path, rows)
-
-
-_Median = Annotated[float, or_empty(number(".6g"), math.nan)]
+    write_csv_table(path, columns_of(_refinement_row), rows)
 
 
 @dataclass(frozen=True)
@@ -240,17 +232,25 @@ class ConsistencyRow:
     method: str
     images: int
     contradicting: int
-    moved_m: _Median
-    turned_deg: _Median
-    moved_px: _Median
-    claimed_m: _Median
-    claimed_deg: _Median
-    squared_distance: _Median
+    moved_m: OrNan
+    turned_deg: OrNan
+    moved_px: OrNan
+    claimed_m: OrNan
+    claimed_deg: OrNan
+    squared_distance: OrNan
     reason: str
 
 
-_CONSISTENCY = Table(ConsistencyRow)
-read_consistency, write_consistency = _CONSISTENCY.read, _CONSISTENCY.write
+def read_consistency(path: Path) -> list[ConsistencyRow]:
+    return read_records(path, ConsistencyRow)
+
+
+def write_consistency(path: Path, rows: Iterable[ConsistencyRow]) -> None:
+    write_csv_table(path, columns_of(ConsistencyRow), map(_rounded, rows))
+
+
+def _rounded(row: object) -> list[object]:
+    return [f"{v:.6g}" if isinstance(v, float) and v == v else v for v in vars(row).values()]
 
 
 @dataclass(frozen=True)
@@ -261,15 +261,19 @@ class DepthRow:
     """
 
     image: str
-    sources: tuple[str, ...]
-    near_m: Annotated[float, number(".6g")]
-    far_m: Annotated[float, number(".6g")]
-    fill: Annotated[float, number(".4f")]
+    sources: Names
+    near_m: float
+    far_m: float
+    fill: float
     reason: str
 
 
-_DEPTH = Table(DepthRow)
-read_depth_rows, write_depth_rows = _DEPTH.read, _DEPTH.write
+def read_depth_rows(path: Path) -> list[DepthRow]:
+    return read_records(path, DepthRow)
+
+
+def write_depth_rows(path: Path, rows: Iterable[DepthRow]) -> None:
+    write_csv_table(path, columns_of(DepthRow), map(_rounded, rows))
 
 
 @dataclass(frozen=True)
@@ -280,9 +284,6 @@ class PairCount:
     verified: int
 
 
-_MATCH_COUNTS = Table(PairCount)
-
-
 def match_counts_path(features_dir: Path, type_name: str) -> Path:
     return features_dir / "local_features" / type_name / "match_counts.csv"
 
@@ -291,12 +292,14 @@ def read_match_counts(
     features_dir: Path, type_name: str, *, missing_ok: bool = False
 ) -> list[PairCount]:
     path = match_counts_path(features_dir, type_name)
-    return _MATCH_COUNTS.read_if_there(path) if missing_ok else _MATCH_COUNTS.read(path)
+    return read_records(path, PairCount, missing_ok=missing_ok)
 
 
 def append_match_count(features_dir: Path, type_name: str, count: PairCount) -> None:
-    _MATCH_COUNTS.append(match_counts_path(features_dir, type_name), count)
+    path = match_counts_path(features_dir, type_name)
+    append_csv_row(path, columns_of(PairCount), vars(count).values())
 
 
 def write_match_counts(features_dir: Path, type_name: str, counts: Iterable[PairCount]) -> None:
-    _MATCH_COUNTS.write(match_counts_path(features_dir, type_name), counts)
+    path = match_counts_path(features_dir, type_name)
+    write_csv_table(path, columns_of(PairCount), (vars(count).values() for count in counts))

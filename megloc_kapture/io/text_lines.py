@@ -1,110 +1,144 @@
-"""Lines and fields of small text files, with errors that name file and line."""
+"""Lines, numbers, transforms and camera lists of small text files.
+
+Errors name file and line. A camera list has a row ``NAME MODEL WIDTH HEIGHT PARAMS...`` per image
+(Aachen, hloc), or one for all images (COLMAP's cameras.txt).
+"""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
-from collections.abc import Iterable, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path, PurePosixPath
 
 import numpy as np
-from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, require
-from megloc_kapture.io.files import named, read_text
-from megloc_kapture.values import RigidTransform
+from megloc_kapture.io.files import check_relative, named, read_text
+from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
 
 # of R^T R - I; published matrices have six decimals
 MAX_ROTATION_ERROR = 1e-3
 
-_SHOWN = 40
+
+@contextlib.contextmanager
+def reading_lines(path: Path, *, comments: bool = False) -> Iterator[Iterator[str]]:
+    """Yield an iterator of the stripped lines that are not blank; ``comments`` drops # lines.
+
+    Errors of the block get file and line; a ValueError, as of ``float``, becomes a DataError.
+    """
+    texts = read_text(path).split("\n")
+    number: int | None = None
+
+    def lines() -> Iterator[str]:
+        nonlocal number
+        for number, text in enumerate(texts, start=1):  # noqa: B007  of the message below
+            if text.strip() and not (comments and text.strip().startswith("#")):
+                yield text.strip()
+        number = None
+
+    try:
+        yield lines()
+    except (DataError, ValueError) as error:
+        with named(path, number):
+            raise error if isinstance(error, DataError) else DataError(str(error)) from error
 
 
-@dataclass(frozen=True)
-class Line:
-    path: Path
-    number: int
-    text: str
-
-    @cached_property
-    def fields(self) -> list[str]:
-        return self.text.split()
-
-    @cached_property
-    def comma_fields(self) -> list[str]:
-        """Return comma-separated fields; blank-separated fields in lines without commas."""
-        if "," not in self.text:
-            return self.fields
-        return [field.strip() for field in self.text.removesuffix(",").split(",")]
-
-    def error(self, message: str) -> DataError:
-        return DataError(message, path=self.path, line=self.number)
-
-    def require(self, condition: object, message: str) -> None:
-        """Raise DataError with file and line unless the condition is true."""
-        require(condition, message, path=self.path, line=self.number)
-
-    def named(self) -> AbstractContextManager[None]:
-        """Add this line to DataErrors that name no file."""
-        return named(self.path, self.number)
-
-    def expect(self, fields: Sequence[str], counts: int | Iterable[int], form: str) -> None:
-        """Raise DataError for another number of fields; ``form`` lists their names."""
-        expected = (counts,) if isinstance(counts, int) else tuple(counts)
-        self.require(
-            len(fields) in expected,
-            f"expected {' or '.join(map(str, expected))} fields ({form}), got {len(fields)}",
-        )
-
-    def number_of(self, text: str, what: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        self.require(math.isfinite(value), f"{what} {shown(text)} is not a finite number")
-        return value
-
-    def numbers_of(self, texts: Iterable[str], what: str) -> list[float]:
-        return [self.number_of(text, what) for text in texts]
-
-    def count_of(self, text: str, what: str) -> int:
-        whole = re.fullmatch("[0-9]{1,18}", text)
-        self.require(whole, f"{what} {shown(text)} is not a whole number of at least 0")
-        return int(text)
-
-    def rigid_transform(self, matrix: NDArray[np.float64]) -> RigidTransform:
-        rotation, position = matrix[:3, :3], matrix[:3, 3]
-        error = np.abs(rotation.T @ rotation - np.eye(3)).max()
-        if not (error < MAX_ROTATION_ERROR and np.linalg.det(rotation) > 0):
-            raise self.error("the upper left 3x3 of the matrix is not a rotation matrix")
-        last_row_error = np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max()
-        self.require(
-            last_row_error < MAX_ROTATION_ERROR, "the last row of the matrix is not 0 0 0 1"
-        )
-        return RigidTransform.from_matrix(rotation, position)
+def fields_of(text: str) -> list[str]:
+    """Split a line at commas and blanks."""
+    return text.replace(",", " ").split()
 
 
-def read_lines(path: Path, *, comments: bool = False) -> list[Line]:
-    """Read stripped lines that are not blank; ``comments`` drops # lines."""
-    texts = (text.strip() for text in read_text(path).split("\n"))
-    return [
-        Line(path, number, text)
-        for number, text in enumerate(texts, start=1)
-        if text and not (comments and text.startswith("#"))
-    ]
+def numbers_of(fields: Sequence[str], form: str) -> list[float]:
+    """Parse finite numbers, as many as the blank-separated names in ``form``."""
+    try:
+        values = list(map(float, fields))
+    except ValueError:
+        values = []
+    require(
+        len(values) == len(form.split()) and all(map(math.isfinite, values)),
+        f"expected finite numbers {form}, got {' '.join(fields)!r}",
+    )
+    return values
 
 
-def read_rigid_matrix(path: Path, *, comments: bool = False) -> RigidTransform:
-    """Read a 4x4 matrix of comma- or blank-separated numbers as a transform."""
-    lines = read_lines(path, comments=comments)
-    if [len(line.comma_fields) for line in lines] != [4] * 4:
-        raise DataError("expected four lines of four numbers", path=path)
-    rows = [line.numbers_of(line.comma_fields, "matrix element") for line in lines]
-    return lines[-1].rigid_transform(np.array(rows))
+def transform_of(elements: Sequence[str]) -> RigidTransform:
+    """Parse the 16 elements of a 4x4 matrix, row by row."""
+    require(len(elements) == 16, f"expected the 16 elements of a matrix, got {len(elements)}")
+    matrix = np.array(list(map(float, elements))).reshape(4, 4)
+    rotation = matrix[:3, :3]
+    require(
+        np.isfinite(matrix).all()
+        and np.allclose(rotation.T @ rotation, np.eye(3), rtol=0, atol=MAX_ROTATION_ERROR)
+        and np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), rtol=0, atol=MAX_ROTATION_ERROR)
+        and np.linalg.det(rotation) > 0,
+        "not a rotation and a translation, with the last row 0 0 0 1",
+    )
+    return RigidTransform.from_matrix(rotation, matrix[:3, 3])
 
 
-def shown(text: str) -> str:
-    return repr(text if len(text) <= _SHOWN else text[:_SHOWN] + "...")
+def read_transform(path: Path, *, comments: bool = False) -> RigidTransform:
+    """Read a 4x4 matrix of comma- or blank-separated numbers."""
+    with reading_lines(path, comments=comments) as lines:
+        return transform_of([field for line in lines for field in fields_of(line)])
+
+
+# ------------------------------------------------------------------------------- camera lists
+
+
+_ROW = re.compile(
+    rf"(?P<name>\S.*?)[\s,]+(?P<model>{'|'.join(CAMERA_MODEL_NUM_PARAMS)})[\s,]+(?P<numbers>.*)"
+)
+
+
+class CameraList:
+    """Cameras by the names of their images.
+
+    An image gets the row with the longest name that its path ends with, by whole folders; else the
+    only row whose name ends with the image's.
+    """
+
+    def __init__(self, cameras: Mapping[str, Camera]) -> None:
+        self._cameras = cameras
+        self._by_file: dict[str, list[str]] = {}
+        for name in cameras:
+            self._by_file.setdefault(PurePosixPath(name).name, []).append(name)
+
+    def of(self, image: str, path: Path) -> Camera | None:
+        """Return the camera of an image by name and file; None without a row."""
+        names = self._by_file.get(PurePosixPath(image).name, [])
+        file = path.absolute().as_posix()
+        ending = [name for name in names if file.endswith(f"/{name}")]
+        if not ending:
+            ending = [name for name in names if name.endswith(f"/{image}")]
+            if len(ending) > 1:
+                return None
+        return self._cameras[max(ending, key=len)] if ending else None
+
+
+def read_cameras(path: Path) -> Camera | CameraList:
+    """Read a list; a single row with a number as its name (COLMAP's id) applies to all images."""
+    cameras = read_camera_rows(path)
+    if len(cameras) == 1 and next(iter(cameras)).isdigit():
+        return next(iter(cameras.values()))
+    return CameraList(cameras)
+
+
+def read_camera_rows(path: Path) -> dict[str, Camera]:
+    """Read the cameras of a list by image name, in file order."""
+    cameras: dict[str, Camera] = {}
+    with reading_lines(path, comments=True) as lines:
+        for line in lines:
+            row = _ROW.fullmatch(line)
+            if row is None:
+                raise DataError(
+                    "expected a row NAME MODEL WIDTH HEIGHT PARAMS..., MODEL one of "
+                    f"{', '.join(CAMERA_MODEL_NUM_PARAMS)}"
+                )
+            name = check_relative(row["name"])
+            require(name not in cameras, f"{name!r} is listed twice")
+            width, height, *params = fields_of(row["numbers"])
+            cameras[name] = Camera(row["model"], int(width), int(height), tuple(map(float, params)))
+    require(cameras, "no camera in this list", path=path)
+    return cameras

@@ -6,7 +6,6 @@ import multiprocessing
 import os
 import signal
 import sys
-import tempfile
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
@@ -17,7 +16,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from megloc_kapture.errors import MeglocError, OptionError, check_option
-from megloc_kapture.io.files import clear_leftovers, output_error, owned_name
 
 ExecutorKind = Literal["inline", "processes", "dask"]
 
@@ -72,14 +70,11 @@ def enter_single_threaded() -> None:
     threadpool_limits(1)
 
 
-def _start_worker(shared: Path) -> None:
-    from megloc_kapture.io.weights import share_weights
-
+def _start_worker() -> None:
     # the parent ends its workers when a terminal interrupts the process group
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     end_with_parent()
-    share_weights(shared)
     enter_single_threaded()
 
 
@@ -128,26 +123,18 @@ def _process_pool(count: int) -> Iterator[Executor]:
     # fork is unsafe with the threads of BLAS and OpenCV
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["megloc_kapture.stages.query_poses"])
-    with ExitStack() as stack:
-        try:
-            clear_leftovers(Path(tempfile.gettempdir()))
-            folder = stack.enter_context(  # for weights shared by workers
-                tempfile.TemporaryDirectory(prefix=owned_name(), ignore_cleanup_errors=True)
-            )
-            pool = ProcessPoolExecutor(count, context, _start_worker, (Path(folder),))
-        except OSError as error:
-            raise output_error(tempfile.gettempdir(), error) from error
-        try:
-            yield pool
-        except BaseException as error:
-            _kill(pool)
-            if isinstance(error, BrokenProcessPool):
-                raise MeglocError(
-                    "a worker process died, perhaps out of memory; try fewer with --workers"
-                ) from error
-            raise
-        finally:
-            pool.shutdown(cancel_futures=True)
+    pool = ProcessPoolExecutor(count, context, _start_worker)
+    try:
+        yield pool
+    except BaseException as error:
+        _kill(pool)
+        if isinstance(error, BrokenProcessPool):
+            raise MeglocError(
+                "a worker process died, perhaps out of memory; try fewer with --workers"
+            ) from error
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _kill(pool: ProcessPoolExecutor) -> None:

@@ -119,7 +119,6 @@ class KaptureMap:
         keypoints_types: Sequence[str] = (),
         features_dirs: Sequence[Path | str] = (),
         pixel_origin: PixelOriginChoice = "auto",
-        allow_links_below: Sequence[Path | str] = (),
     ) -> KaptureMap:
         """Open a kapture map.
 
@@ -128,15 +127,12 @@ class KaptureMap:
         keypoints_types : types used for localization; by default all that have points.
         features_dirs : additional feature folders in the orphan layout.
         pixel_origin : origin of the map's intrinsics; "auto" estimates it (see ``.pixel_origin``).
-        allow_links_below : folders that links in the map may lead to.
         """
         check_option(
             pixel_origin in ("auto", "corner", "centre"),
             f"pixel_origin is {pixel_origin!r}; give auto, corner or centre",
         )
-        folder = KaptureFolder(
-            path, features_dirs=features_dirs, allow_links_below=allow_links_below
-        )
+        folder = KaptureFolder(path, features_dirs=features_dirs)
         folder.read()
         check_points(folder, "localize in")
         indices = _read_indices(folder, keypoints_types)

@@ -42,7 +42,6 @@ from megloc_kapture.io.dataset_tables import (
     write_unreadable,
 )
 from megloc_kapture.io.files import (
-    clear_leftovers,
     output_error,
     remove,
     temporary_name,
@@ -50,7 +49,6 @@ from megloc_kapture.io.files import (
     write_bytes,
 )
 from megloc_kapture.io.kapture import KaptureFolder, write_sensors
-from megloc_kapture.io.output_folders import replace_directory
 from megloc_kapture.pipeline.executors import single_threaded
 from megloc_kapture.pipeline.plan import Workspace, map_of_workspace, run_plan
 from megloc_kapture.pipeline.presets import (
@@ -356,11 +354,11 @@ def kapture_of(path: Path | str, *, work: Work = HERE) -> Path:
     made = folder / temporary_name()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        clear_leftovers(folder)
         made.mkdir()
         import_colmap(source, made, work=work)
         write_bytes(made / _STAMP, stamp)
-        replace_directory(made, kept)
+        remove(kept)
+        made.rename(kept)
     except OSError as error:
         raise output_error(folder, error) from error
     finally:

@@ -20,7 +20,6 @@ from pydantic import Field
 from megloc_kapture.errors import DataError, OptionError, OutputError, check_option, suggestion
 from megloc_kapture.evaluation.pose_files import package_versions
 from megloc_kapture.io.files import (
-    clear_leftovers,
     clear_temporary,
     read_json_model,
     remove,
@@ -29,7 +28,7 @@ from megloc_kapture.io.files import (
     writing,
 )
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.io.output_folders import claim_folder, replace_directory
+from megloc_kapture.io.output_folders import claim_folder, release_folder
 from megloc_kapture.stages.stage import (
     CODE_OF,
     PROTOCOL,
@@ -59,7 +58,7 @@ class Workspace:
 
     def __init__(self, root: Path, *, force: bool = False) -> None:
         self.root, self.force = Path(root).absolute(), force
-        self._undo_claim = claim_folder(self.root, kind="workspace", force=force)
+        self._is_new = claim_folder(self.root, kind="workspace", force=force)
         self._published = False
 
     def path(self, relative: str) -> Path:
@@ -102,7 +101,7 @@ class Workspace:
                 ) from error
             self._clear_partial()
             for folder in (self.root, self.root / "stages"):
-                clear_leftovers(folder)
+                clear_temporary(folder, nested=False)
             try:
                 yield
             finally:
@@ -124,7 +123,8 @@ class Workspace:
         with contextlib.suppress(OSError):
             (self.root / LOCK).unlink(missing_ok=True)
             (self.root / PARTIAL).rmdir()
-        self._undo_claim()
+        if self._is_new:
+            release_folder(self.root)
 
     @contextmanager
     def staging(self, stage: str, mark: str, *, resumes: bool = False) -> Iterator[Path]:
@@ -156,12 +156,9 @@ class Workspace:
             new, place = staging / output, self.root / output
             with writing(place):
                 place.parent.mkdir(parents=True, exist_ok=True)
-                if new.is_dir():
-                    replace_directory(new, place)
-                elif new.exists():
-                    os.replace(new, place)
-                else:
-                    remove(place)
+                remove(place)
+                if new.exists():
+                    os.rename(new, place)
 
     def remove(self, outputs: Iterable[str]) -> None:
         for output in outputs:

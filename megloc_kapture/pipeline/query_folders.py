@@ -21,13 +21,12 @@ from megloc_kapture.datasets.kapture_folders import (
     with_cameras_of_images,
 )
 from megloc_kapture.errors import DataError, OptionError, require
-from megloc_kapture.io.camera_list import CameraList
 from megloc_kapture.io.files import (
+    TEMPORARY,
     check_relative,
     hard_link,
     link_file,
     link_images,
-    owned_name,
 )
 from megloc_kapture.io.images import (
     UNREAD_SUFFIXES,
@@ -51,6 +50,7 @@ from megloc_kapture.io.kapture import (
 )
 from megloc_kapture.io.kapture.format import UNKNOWN_CAMERA
 from megloc_kapture.io.output_folders import MARKER
+from megloc_kapture.io.text_lines import CameraList
 from megloc_kapture.matching.guided_pyramid import base_type
 from megloc_kapture.pipeline.kapture_map import KaptureMap, MapKeypoints, plain_name
 from megloc_kapture.pipeline.queries import Query, Unit
@@ -430,7 +430,7 @@ class Photographs(Queries):
         self, name: str, path: Path, camera: Camera | CameraList | None, every: int
     ) -> None:
         if self._frames is None:
-            self._frames = tempfile.TemporaryDirectory(prefix=f".{owned_name()}")
+            self._frames = tempfile.TemporaryDirectory(prefix=TEMPORARY)
         folder = Path(self._frames.name) / name
         for frame in extract_frames(path, folder, every):
             self._add(f"{name}/{frame}", folder / frame, camera, is_frame=True)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from megloc_kapture.errors import require
 from megloc_kapture.geometry.cameras import focal_px
-from megloc_kapture.io.files import atomic_write, owned_name, write_bytes
+from megloc_kapture.io.files import TEMPORARY, atomic_write, write_bytes
 from megloc_kapture.io.images import read_depth_map
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Observations
 from megloc_kapture.io.kapture.points import read_point_covariances
@@ -137,7 +137,7 @@ def shared_index(
     indices: Mapping[str, MapIndex], scratch: Path | None = None
 ) -> Iterator[dict[str, Path]]:
     """Share indices by keypoints type as temporary folders; open indices stay valid afterwards."""
-    with TemporaryDirectory(prefix=f".{owned_name()}", dir=scratch) as place:
+    with TemporaryDirectory(prefix=TEMPORARY, dir=scratch) as place:
         folders = {name: Path(place) / str(at) for at, name in enumerate(indices)}
         for name, folder in folders.items():
             write_index(indices[name], folder)

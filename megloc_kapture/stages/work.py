@@ -281,14 +281,12 @@ class FolderSpec:
     """A kapture folder that is cheap to pickle and opened once per process and run."""
 
     def __init__(self, folder: KaptureFolder) -> None:
-        self.key = (folder.root, folder.features_dirs, folder.allow_links_below, uuid4().hex)
+        self.key = (folder.root, folder.features_dirs, uuid4().hex)
 
     def open(self) -> KaptureFolder:
         return open_folder(*self.key)
 
 
 @lru_cache(maxsize=8)
-def open_folder(
-    root: Path, features_dirs: tuple[Path, ...], links_below: tuple[Path, ...], run_id: str
-) -> KaptureFolder:
-    return KaptureFolder(root, features_dirs=features_dirs, allow_links_below=links_below)
+def open_folder(root: Path, features_dirs: tuple[Path, ...], run_id: str) -> KaptureFolder:
+    return KaptureFolder(root, features_dirs=features_dirs)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from megloc_kapture.io.images import write_image
-from tests.cli.foreign import DESCRIPTORS, GLOBAL, KEYPOINTS, rename_type
+from tests.cli.foreign import DESCRIPTORS, KEYPOINTS, rename_type
 
 Contents = Callable[[Path], dict[str, bytes]]
 Spoil = Callable[[Path], Any]
@@ -50,11 +50,6 @@ def quaternion_times(factor: float) -> Callable[[str], str]:
     return fields(lambda f: [*f[:2], *(repr(factor * float(q)) for q in f[2:6]), *f[6:]])
 
 
-def again(number: int) -> Callable[[Path], Any]:
-    """Repeat a line of the trajectories."""
-    return line(TIMES, number, lambda text: text + text)
-
-
 def point_past(root: Path) -> None:
     """The first point that is not there is observed."""
     rows = (root / "reconstruction/points3d.txt").read_text().splitlines()
@@ -76,33 +71,16 @@ MAPS: dict[str, tuple[Spoil, str]] = {
         remove(f"{KEYPOINTS}/{FIRST}.kpt"),
         r"observations\.txt: points are observed in '.*0000\.jpg', which has no keypoints",
     ),
-    "descriptors cut": (cut(f"{DESCRIPTORS}/{FIRST}.desc"), r"0000\.jpg\.desc: .*truncated"),
-    "global cut": (cut(f"{GLOBAL}/{FIRST}.gfeat"), r"0000\.jpg\.gfeat: .*truncated"),
     "lengths differ": (
         cut(f"{DESCRIPTORS}/{FIRST}.desc", 128 * 4 * 799),
         r"0000\.jpg\.desc: 799 descriptors for 800 keypoints",
     ),
     "sensor column": (line("sensors/sensors.txt", 3, NO_COLUMN), r"sensors\.txt:3: "),
     "pose column": (line(TIMES, 4, NO_COLUMN), r"trajectories\.txt:4: .*columns"),
-    "record column": (line(RECORDS, 5, NO_COLUMN), r"records_camera\.txt:5: .*columns"),
-    "point column": (
-        line("reconstruction/points3d.txt", 10, NO_COLUMN),
-        r"points3d\.txt: .*columns",
-    ),
-    "observation column": (
-        line("reconstruction/observations.txt", 7, NO_COLUMN),
-        r"observations\.txt: expected point3d_id",
-    ),
-    "config column": (line(f"{KEYPOINTS}/keypoints.txt", 3, NO_COLUMN), r"keypoints\.txt:3: "),
     "pose of nan": (line(TIMES, 3, NAN), r"trajectories\.txt:3: .*nan"),
     "pose not unit": (
         line(TIMES, 3, quaternion_times(1.002)),
         r"trajectories\.txt:3: .*unit quaternion",
-    ),
-    "pose twice": (again(4), r"trajectories\.txt:5: .*listed twice"),
-    "record twice": (
-        line(RECORDS, 4, lambda text: text + text.replace(".jpg", "_b.jpg")),
-        r"records_camera\.txt:5: timestamp .*listed twice",
     ),
     "path upwards": (line(RECORDS, 3, UPWARDS), r"records_camera\.txt:3: .*'\.\.'"),
     "keypoint past the end": (
@@ -178,16 +156,6 @@ DATASETS: dict[str, tuple[Spoil, str]] = {
     "not an image": (not_an_image, r"records_data/0005\.jpg: not an image"),
     "other size": (other_size, r"records_data/0005\.jpg: .*200x100.*400x300"),
     "pose column": (line(f"mapping/{TIMES}", 4, NO_COLUMN), r"mapping/.*trajectories\.txt:4: "),
-    "true pose column": (line(f"query_gt/{TIMES}", 4, NO_COLUMN), r"query_gt/.*txt:4: "),
-    "pose of nan": (line(f"mapping/{TIMES}", 3, NAN), r"mapping/.*trajectories\.txt:3: .*nan"),
-    "pose not unit": (
-        line(f"mapping/{TIMES}", 3, quaternion_times(0.998)),
-        r"trajectories\.txt:3: .*unit quaternion",
-    ),
-    "record twice": (
-        line(f"mapping/{RECORDS}", 4, lambda text: text + text.replace(".jpg", "_b.jpg")),
-        r"records_camera\.txt:5: timestamp .*listed twice",
-    ),
     "path upwards": (
         line(f"query/{RECORDS}", 3, fields(lambda f: [*f[:2], "a/../../" + f[2]])),
         r"records_camera\.txt:3: .*'\.\.'",
@@ -209,7 +177,7 @@ def test_a_bad_dataset_is_refused(
         "import": ["import", "kapture", dataset, "-o", new / "imported"],
     }[command]
     megloc(*arguments).refused(message)
-    assert not new.exists()
+    assert not any(new.glob("*"))
     assert contents(dataset) == before
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +13,9 @@ from PIL import Image
 
 from megloc_kapture.cli.main import main
 from megloc_kapture.evaluation.evaluate import evaluate
-from megloc_kapture.geometry.cameras import focal_px, scale_focal
-from megloc_kapture.io.images import image_size, read_image_rgb, write_image
+from megloc_kapture.io.images import image_size, write_image
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.tables import read_status
-from megloc_kapture.pipeline.kapture_map import KaptureMap
-from megloc_kapture.pipeline.localizer import Localizer
-from megloc_kapture.pipeline.queries import Query
-from megloc_kapture.values import Pose
 
 INVERSE = {
     1: None,
@@ -156,23 +150,3 @@ def test_real_photographs(
     row = evaluate(out, scene / "query_gt").row()
     assert row.median_position_m is not None and row.median_angle_deg is not None
     assert row.median_position_m < 0.07 and row.median_angle_deg < 0.15
-
-
-@pytest.mark.slow
-def test_wrong_focal_lengths(facade: tuple[Path, Path]) -> None:
-    """One that is uncertain is estimated, of one that is given it is said that it does not fit."""
-    scene, kapture_map = facade
-    localizer = Localizer(KaptureMap.open(kapture_map))
-    query = KaptureFolder(scene / "query")
-    true = next(iter(query.read().sensors.values())).camera()
-    for name in query.read().image_names()[::3]:
-        image = read_image_rgb(query.image_path(name))
-        features = {"rootsift": localizer.types[0].extractor.extract(image, None)}
-        for share in (-0.3, -0.1, 0.1, 0.2):
-            wrong = scale_focal(true, 1 + share)
-            found = localizer.localize_query(Query(wrong, image, name, features=features))
-            assert any("does not fit" in remark for remark in found.remarks)
-            unsure = replace(wrong, focal_deviation=0.1)
-            found = localizer.localize_query(Query(unsure, image, name, features=features))
-            assert isinstance(found, Pose) and found.camera is not None
-            assert focal_px(found.camera) == pytest.approx(1381, rel=0.015)

@@ -140,7 +140,7 @@ def test_fetch_refuses(megloc: Any, served: Path, folder: Path) -> None:
     megloc(*fetch, "free", "-q").refused("exists, but is not the published file")
     assert megloc(*fetch, "free", "-f", "-q").status == 0
     (served / "unknown.pth").write_bytes(b"something else")
-    megloc(*fetch, "unknown", "-q").refused("no file of weights that can be read")
+    megloc(*fetch, "unknown", "-q").refused("not weights of torch")
     (served / "free.pth").write_bytes(BOUND)
     wrong, right = (hashlib.sha256(content).hexdigest() for content in (BOUND, FREE))
     megloc(*fetch, "free", "-f", "-q").refused(f"expected sha256:{right} but got {wrong}")

@@ -113,7 +113,7 @@ def test_a_scene_by_its_table(tmp_path: Path) -> None:
     root = tmp_path / "root"
     write_sample(root, "0015", model=False)
     # the folder of the images alone is no model
-    with pytest.raises(DataError, match=r"0015\.npz: its arrays are Python objects.*training\.md"):
+    with pytest.raises(DataError, match=r"0015\.npz: not a file of plain arrays .*training\.md"):
         import_megadepth(root, tmp_path / "refused")
     docs = Path(__file__).parent.parent.parent / "docs" / "training.md"
     lines = docs.read_text().split("<!-- plain arrays -->\n```\n")[1].split("```")[0]

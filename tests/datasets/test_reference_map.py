@@ -140,9 +140,8 @@ def test_a_database_gives_all_features_under_its_numbers(tmp_path: Path) -> None
     ("names", "options", "match"),
     [
         ({"db/a.png": 10}, {}, "has no image 'db/b.jpg'"),
-        ({**FEATURES, "db/a.jpeg": 10}, {}, "several images for 'db/a.jpg': db/a.jpeg, db/a.png"),
-        ({**FEATURES, "db/b.png": 900}, {}, "not of this model: .*'db/b.png' has 900 keypoints"),
-        (FEATURES, {"shift": 1.5}, r"feature 7 of 'db/a.png' is at \(4.5, 4.0\), .*\(3.0, 4.0\)"),
+        ({**FEATURES, "db/b.png": 900}, {}, "not of this model: its features of 'db/b.png'"),
+        (FEATURES, {"shift": 1.5}, "not of this model: its features of 'db/a.png'"),
         (FEATURES, {"descriptors": 9}, r"descriptors of 'db/a.jpg' have the shape \(9, 128\)"),
     ],
 )

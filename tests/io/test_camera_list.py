@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from megloc_kapture.io.camera_list import read_camera_rows
+from megloc_kapture.io.text_lines import read_camera_rows
 from megloc_kapture.values import Camera
 
 LINE = "query/day/nexus4/IMG_20140520_182846.jpg SIMPLE_RADIAL 1600 1200 1469.2 800 600 -0.0353019"

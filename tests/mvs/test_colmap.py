@@ -104,7 +104,7 @@ def test_maps_are_those_of_colmap(tmp_path: Path) -> None:
     as_colmap = values.reshape((CAMERA.width, CAMERA.height, 3), order="F").transpose(1, 0, 2)
     np.testing.assert_array_equal(as_colmap, normals)
     ours.write_bytes(ours.read_bytes()[:-3])
-    with pytest.raises(DataError, match="no map of COLMAP's stereo") as refused:
+    with pytest.raises(DataError, match="not a map of COLMAP's stereo") as refused:
         read_map(ours)
     assert "ours.bin" in str(refused.value)
 

@@ -13,10 +13,10 @@ from PIL import Image
 
 from megloc_kapture import KaptureMap, Localizer
 from megloc_kapture.errors import DataError, OptionError
-from megloc_kapture.io.camera_list import read_cameras
 from megloc_kapture.io.images import image_size, read_image_rgb, read_photo, write_image
 from megloc_kapture.io.kapture import KaptureData, KaptureFolder, Sensor, write_sensors
 from megloc_kapture.io.output_folders import claim_folder
+from megloc_kapture.io.text_lines import read_cameras
 from megloc_kapture.pipeline.plan import Workspace
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.query_folders import KaptureQueries, Photographs

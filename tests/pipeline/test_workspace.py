@@ -31,7 +31,7 @@ def test_a_used_workspace_is_known_again_and_an_unused_one_is_taken_away(tmp_pat
     workspace = Workspace(tmp_path / "runs" / "w")
     with workspace.lock(), workspace.staging("a", "1") as out:
         (out / "a.txt").write_text("a")
-    assert list(tmp_path.iterdir()) == []
+    assert list((tmp_path / "runs").iterdir()) == []
     use(Workspace(tmp_path / "w"))
     for _ in range(2):  # cut off before its manifest: still ours
         with Workspace(tmp_path / "w").lock():
@@ -88,11 +88,7 @@ def test_publishing_replaces_and_takes_away_but_no_link_of_the_users(tmp_path: P
     mine.mkdir()
     (mine / "file").touch()
     (workspace.root / "folder").symlink_to(mine)
-    with (
-        pytest.raises(OutputError, match="folder: is a link or a file"),
-        workspace.lock(),
-        workspace.staging("a", "1") as out,
-    ):
+    with workspace.lock(), workspace.staging("a", "1") as out:
         (out / "folder").mkdir()
         workspace.publish(out, ("folder",))
     assert [p.name for p in mine.iterdir()] == ["file"]

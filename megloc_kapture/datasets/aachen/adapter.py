@@ -28,12 +28,12 @@ from megloc_kapture.datasets.official import (
 from megloc_kapture.datasets.reference_map import ReferenceModel, check_model_files
 from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.evaluation.protocols import protocol_of
-from megloc_kapture.io.camera_list import read_camera_rows
 from megloc_kapture.io.colmap_model import SparsePoints, colmap_model_files, read_colmap_model
 from megloc_kapture.io.dataset_tables import ImageGroup, World
 from megloc_kapture.io.files import named
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureData, Sensor
+from megloc_kapture.io.text_lines import read_camera_rows
 from megloc_kapture.values import Camera, Options, RigidTransform
 
 Version = Literal["1.0", "1.1"]

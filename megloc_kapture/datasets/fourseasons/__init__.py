@@ -16,8 +16,9 @@ from typing import TypeVar
 from megloc_kapture.datasets.official import Count, Missing
 from megloc_kapture.errors import DataError, OptionError, require
 from megloc_kapture.evaluation.pose_files import RelativePose
+from megloc_kapture.io.files import named
 from megloc_kapture.io.kapture.sensors import unit_quaternion
-from megloc_kapture.io.text_lines import Line, read_lines, read_rigid_matrix, shown
+from megloc_kapture.io.text_lines import fields_of, numbers_of, read_transform, reading_lines
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA_FILES = ("undistorted_calib_0.txt", "undistorted_calib_1.txt")
@@ -50,28 +51,20 @@ class StereoCalibration:
 
 def read_calibration(folder: Path) -> StereoCalibration:
     cam0, cam1 = (read_pinhole(folder / name) for name in CAMERA_FILES)
-    return StereoCalibration(cam0, cam1, read_rigid_matrix(folder / STEREO_FILE, comments=True))
+    return StereoCalibration(cam0, cam1, read_transform(folder / STEREO_FILE, comments=True))
 
 
 def read_pinhole(path: Path) -> Camera:
     """Read ``undistorted_calib_N.txt``: ``Pinhole fx fy cx cy 0 0 0 0``, the size, twice."""
-    form = "'Pinhole fx fy cx cy 0.0 0.0 0.0 0.0', 'width height', 'crop', 'width height'"
-    lines = read_lines(path, comments=True)
-    require(len(lines) in (2, 4), f"expected the lines {form}, got {len(lines)}", path=path)
-    first = lines[0]
-    model, *values = first.comma_fields
-    params = first.numbers_of(values, "camera parameter")
-    if model != "Pinhole" or len(values) not in (4, 8) or any(params[4:]):
-        raise first.error(f"expected {form}, without distortion, as images are undistorted")
-    sizes = []
-    for line in lines[1::2]:
-        line.expect(line.comma_fields, 2, "width height, in pixels")
-        sizes.append([line.count_of(text, "size") for text in line.comma_fields])
-    lines[-1].require(
-        sizes[0] == sizes[-1], f"the image size is {sizes[0]} first, then {sizes[-1]}"
-    )
-    width, height = sizes[0]
-    with first.named():
+    with reading_lines(path, comments=True) as lines:
+        (model, *values), *sizes = map(fields_of, lines)
+        params = list(map(float, values))
+        require(
+            model == "Pinhole" and len(params) in (4, 8) and not any(params[4:]),
+            "expected 'Pinhole fx fy cx cy', without distortion, as images are undistorted",
+        )
+        require(len(sizes) in (1, 3) and sizes[0] == sizes[-1], "expected one image size, twice")
+        width, height = map(int, sizes[0])
         return Camera("PINHOLE", width, height, tuple(params[:4]))
 
 
@@ -95,20 +88,17 @@ def read_gnss_poses(path: Path) -> dict[int, GnssPose]:
     10 fields, their header announces 11.
     """
 
-    def parse(line: Line) -> GnssPose:
-        fields = line.comma_fields
-        form = "timestamp tx ty tz qx qy qz qw scale fusion_quality v3"
-        line.expect(fields, range(8, 12), form)
-        scale = _scale(line, fields[8]) if len(fields) > 8 else None
-        quality = line.number_of(fields[9], "fusion_quality") if fields[9:] else None
-        return GnssPose(_transform(line, fields[1:8]), scale, quality)
+    def parse(fields: list[str]) -> GnssPose:
+        scale = _scale(fields[7]) if len(fields) > 7 else None
+        quality = float(fields[8]) if len(fields) > 8 else None
+        return GnssPose(_transform(fields[:7]), scale, quality)
 
     return _by_timestamp(path, parse)
 
 
 def read_poses(path: Path) -> dict[int, RigidTransform]:
     """Read ``poses.txt`` (ECCV 2020 challenge): ``world_from_cam`` by timestamp (ns), metres."""
-    return _by_timestamp(path, lambda line: _transform(line, line.comma_fields[1:]))
+    return _by_timestamp(path, _transform)
 
 
 def timestamp_of_name(stem: str) -> int | None:
@@ -116,32 +106,28 @@ def timestamp_of_name(stem: str) -> int | None:
     return int(stem) if _TIMESTAMP.fullmatch(stem) else None
 
 
-def _by_timestamp(path: Path, parse: Callable[[Line], Row]) -> dict[int, Row]:
+def _by_timestamp(path: Path, parse: Callable[[list[str]], Row]) -> dict[int, Row]:
     rows: dict[int, Row] = {}
-    for line in read_lines(path, comments=True):
-        timestamp = _timestamp(line, line.comma_fields[0])
-        line.require(timestamp not in rows, f"timestamp {timestamp} is given twice")
-        rows[timestamp] = parse(line)
+    with reading_lines(path, comments=True) as lines:
+        for timestamp, *fields in map(fields_of, lines):
+            rows[_timestamp(timestamp)] = parse(fields)
     require(rows, "the file has no rows", path=path)
     return rows
 
 
-def _timestamp(line: Line, text: str) -> int:
-    if not _TIMESTAMP.fullmatch(text):
-        raise line.error(f"{shown(text)} is not a timestamp, a whole number of nanoseconds")
+def _timestamp(text: str) -> int:
+    require(_TIMESTAMP.fullmatch(text), f"{text!r} is not a timestamp in whole nanoseconds")
     return int(text)
 
 
-def _transform(line: Line, fields: Sequence[str]) -> RigidTransform:
-    line.expect(fields, 7, "tx ty tz qx qy qz qw")
-    tx, ty, tz, qx, qy, qz, qw = line.numbers_of(fields, "pose")
-    with line.named():
-        return RigidTransform(unit_quaternion((qw, qx, qy, qz)), (tx, ty, tz))
+def _transform(fields: Sequence[str]) -> RigidTransform:
+    tx, ty, tz, qx, qy, qz, qw = numbers_of(fields, "tx ty tz qx qy qz qw")
+    return RigidTransform(unit_quaternion((qw, qx, qy, qz)), (tx, ty, tz))
 
 
-def _scale(line: Line, text: str) -> float:
-    scale = line.number_of(text, "scale")
-    line.require(
+def _scale(text: str) -> float:
+    scale = float(text)
+    require(
         1 / _MAX_SCALE < scale < _MAX_SCALE, f"scale {text} is not a factor between units of length"
     )
     return scale
@@ -163,22 +149,20 @@ class Transformations:
 
 def read_transformations(path: Path) -> Transformations:
     """Read ``Transformations.txt``: pairs of a line ``# name: ...`` and a line of numbers."""
-    found: dict[str, Line] = {}
+    texts: dict[str, str] = {}
     name = ""
-    for line in read_lines(path):
-        if line.text.startswith("#"):
-            name = line.text[1:].partition(":")[0].strip()
-        elif name in found:
-            raise line.error(f"{name!r} is given twice")
-        else:
-            found[name] = line
+    with reading_lines(path) as lines:
+        for line in lines:
+            if line.startswith("#"):
+                name = line[1:].partition(":")[0].strip()
+            else:
+                texts[name] = line
     transforms = []
     for name in ("transform_S_AS", "transform_w_gpsw", "transform_e_gpsw"):
-        require(name in found, f"there is no {name}", path=path)
-        transforms.append(_transform(found[name], found[name].comma_fields))
-    scale = None
-    if (row := found.get("GNSS scale")) is not None:
-        scale = _scale(row, row.text)
+        with named(path, about=name):
+            transforms.append(_transform(fields_of(texts.get(name, ""))))
+    with named(path):
+        scale = _scale(texts["GNSS scale"]) if "GNSS scale" in texts else None
     s_from_as, w_from_gpsw, e_from_gpsw = transforms
     return Transformations(s_from_as, w_from_gpsw, e_from_gpsw, scale)
 
@@ -194,12 +178,11 @@ def parse_relocalization_name(name: str) -> tuple[str | None, str] | None:
 
 def read_relocalization(path: Path) -> list[RelativePose]:
     rows: dict[tuple[int, int], RelativePose] = {}
-    for line in read_lines(path, comments=True):
-        fields = line.comma_fields
-        line.expect(fields, (2, 9), "reference query [tx ty tz qx qy qz qw]")
-        reference, query = (_timestamp(line, field) for field in fields[:2])
-        pose = _transform(line, fields[2:]) if len(fields) == 9 else None
-        rows.setdefault((reference, query), RelativePose(reference, query, pose))
+    with reading_lines(path, comments=True) as lines:
+        for first, second, *fields in map(fields_of, lines):
+            reference, query = _timestamp(first), _timestamp(second)
+            pose = _transform(fields) if fields else None
+            rows.setdefault((reference, query), RelativePose(reference, query, pose))
     require(rows, "no pair in the file", path=path)
     return list(rows.values())
 

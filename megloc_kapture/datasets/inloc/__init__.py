@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError, require
-from megloc_kapture.io.files import named
-from megloc_kapture.io.text_lines import Line, read_lines
+from megloc_kapture.io.files import named, read_text, reading
+from megloc_kapture.io.text_lines import reading_lines, transform_of
 from megloc_kapture.values import RigidTransform
 
 FLOORS = ("DUC1", "DUC2")
@@ -85,40 +85,33 @@ def parse_cutout_name(name: str) -> Cutout:
 
 def read_transformation(path: Path | str) -> RigidTransform:
     """Read ``floor_from_scan``: the second 4x4 matrix of the file, after refinement."""
-    path = Path(path)
-    rows = [line for line in read_lines(path) if _has_four_numbers(line)]
-    require(
-        len(rows) == 8,
-        f"{len(rows)} rows of four numbers; expected two matrices of four rows each",
-        path=path,
-    )
-    matrix = np.array([row.numbers_of(row.fields, "matrix element") for row in rows[4:]])
-    return rows[7].rigid_transform(matrix)
+    with reading_lines(Path(path)) as lines:
+        rows = [fields for fields in map(str.split, lines) if _are_numbers(fields)]
+    with named(path):
+        require(len(rows) == 8, f"expected two matrices of four rows each, got {len(rows)} rows")
+        return transform_of([field for row in rows[4:] for field in row])
 
 
 def read_wrong_scans(path: Path | str) -> frozenset[str]:
     """Read the numbers of wrongly placed scans, of up to 3 digits."""
-    lines = read_lines(Path(path))
-    return frozenset(n.zfill(3) for line in lines for n in _SCAN_NUMBER.findall(line.text))
+    return frozenset(number.zfill(3) for number in _SCAN_NUMBER.findall(read_text(path)))
 
 
 def read_cutout_points(path: Path | str, width: int, height: int) -> NDArray[np.float64]:
     """Read the scanned points float64 (height, width, 3), metres in the scan's frame, or NaN."""
     from scipy.io import loadmat
 
-    try:
+    with reading(path, f"a MAT file with {POINTS}"):
         points = np.asarray(loadmat(path, variable_names=[POINTS])[POINTS], np.float64)
-    except Exception as error:  # SciPy raises many kinds on broken files
-        raise DataError(f"not a MAT file with {POINTS}: {error}", path=path) from error
     if points.shape != (height, width, 3):
         found = "x".join(map(str, points.shape))
         raise DataError(f"{POINTS} is {found}, expected {height}x{width}x3", path=path)
     return points
 
 
-def _has_four_numbers(line: Line) -> bool:
+def _are_numbers(fields: list[str]) -> bool:
     try:
-        return len(list(map(float, line.fields))) == 4
+        return len(list(map(float, fields))) == 4
     except ValueError:
         return False
 

@@ -6,9 +6,9 @@ import os
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -16,7 +16,8 @@ from megloc_kapture.datasets.nvm import read_nvm
 from megloc_kapture.datasets.official import Missing
 from megloc_kapture.errors import DataError, require
 from megloc_kapture.io.colmap_model import SparsePoints, colmap_model_files, read_colmap_model
-from megloc_kapture.io.text_lines import Line, read_lines, shown
+from megloc_kapture.io.files import named
+from megloc_kapture.io.text_lines import reading_lines, transform_of
 from megloc_kapture.values import RigidTransform
 
 CAMERAS = ("left", "rear", "right")
@@ -27,6 +28,7 @@ _MODEL = re.compile(r"([0-9]{1,6})_aligned")
 _QUERY_LIST = re.compile(r"queries_location_([0-9]{1,6})\.txt")
 INTRINSICS_KEYS = ("fx", "fy", "cx", "cy")
 
+Value = TypeVar("Value")
 ModelChoice = Literal["auto", "merged", "individual"]
 
 _PART = r"[A-Za-z0-9][A-Za-z0-9_-]*"
@@ -63,59 +65,45 @@ def parse_image(text: str) -> ImageKey | None:
 
 def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
     """Read fx, fy, cx, cy in pixels from ``<camera>_intrinsics.txt``."""
-    values: dict[str, float] = {}
-    for line in read_lines(path):
-        line.expect(line.fields, 2, "key value")
-        values[line.fields[0]] = line.number_of(line.fields[1], line.fields[0])
+    with reading_lines(path) as lines:
+        values = {key: float(text) for key, text in map(str.split, lines)}
     if absent := [key for key in INTRINSICS_KEYS if key not in values]:
         raise DataError(f"{', '.join(absent)} missing", path=path)
     fx, fy, cx, cy = (values[key] for key in INTRINSICS_KEYS)
     return fx, fy, cx, cy
 
 
-def read_query_location(path: Path) -> list[tuple[ImageKey, Line]]:
+def read_query_location(path: Path) -> list[ImageKey]:
     """Read ``queries_location_NNN.txt``."""
-    return [(_image_of(line, line.text), line) for line in _some_lines(path)]
+    return list(_read_list(path, lambda fields: None))
 
 
-def read_test_list(path: Path) -> list[tuple[ImageKey, Line]]:
+def read_test_list(path: Path) -> dict[ImageKey, str]:
     """Read ``robotcar_v2_test.txt``; its names have no condition (``rear/1.png``)."""
-    listed: dict[tuple[str, str], tuple[ImageKey, Line]] = {}
-    for line in _some_lines(path):
-        image = _image_of(line, line.text, conditions=False)
-        line.require((image.camera, image.stem) not in listed, f"{line.text!r} is listed twice")
-        listed[image.camera, image.stem] = image, line
-    return list(listed.values())
+    return _read_list(path, lambda fields: fields[0], conditions=False)
 
 
-def read_train_poses(path: Path) -> list[tuple[ImageKey, Line, RigidTransform]]:
-    """Read ``robotcar_v2_train.txt``, ``world_from_cam``; return image, line, ``cam_from_world``.
+def read_train_poses(path: Path) -> dict[ImageKey, RigidTransform]:
+    """Read ``robotcar_v2_train.txt``, ``world_from_cam``; return ``cam_from_world``.
 
     A line is a name and the 16 elements of a 4x4 matrix.
     """
-    listed: dict[ImageKey, tuple[ImageKey, Line, RigidTransform]] = {}
-    for line in _some_lines(path):
-        line.expect(line.fields, 17, "a name and 16 matrix elements")
-        image = _image_of(line, line.fields[0])
-        line.require(image not in listed, f"{line.fields[0]!r} is given twice")
-        values = line.numbers_of(line.fields[1:], "matrix element")
-        world_from_cam = line.rigid_transform(np.array(values).reshape(4, 4))
-        listed[image] = image, line, world_from_cam.inverse()
-    return list(listed.values())
+    return _read_list(path, lambda fields: transform_of(fields[1:]).inverse())
 
 
-def _some_lines(path: Path) -> list[Line]:
-    lines = read_lines(path)
-    require(lines, "no image in the list", path=path)
-    return lines
-
-
-def _image_of(line: Line, text: str, *, conditions: bool = True) -> ImageKey:
-    image = parse_image(text)
-    if image is None or (conditions and not image.condition):
-        form = "condition/camera/time.jpg" if conditions else "camera/time.png"
-        raise line.error(f"expected {form}, got {shown(text)}")
-    return image
+def _read_list(
+    path: Path, parse: Callable[[list[str]], Value], *, conditions: bool = True
+) -> dict[ImageKey, Value]:
+    form = "condition/camera/time.jpg" if conditions else "camera/time.png"
+    values: dict[ImageKey, Value] = {}
+    with reading_lines(path) as lines:
+        for fields in map(str.split, lines):
+            image = parse_image(fields[0])
+            if image is None or (conditions and not image.condition):
+                raise DataError(f"expected {form}, got {fields[0]!r}")
+            values[image] = parse(fields)
+    require(values, "no image in the list", path=path)
+    return values
 
 
 class Layout:
@@ -231,7 +219,8 @@ def read_reference(
     path = layout.merged_model if merged else layout.individual_model("").parent
     at_time: dict[tuple[str, int], ImageKey] = {}
     for key in poses:
-        note_time(key, at_time, partial(DataError, path=path))
+        with named(path):
+            note_time(key, at_time)
     return Reference(poses, locations, merged)
 
 
@@ -285,8 +274,9 @@ def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missin
     locations: dict[ImageKey, tuple[str, ...]] = {}
     at_time: dict[tuple[str, int], ImageKey] = {}
     for location, path in lists.items():
-        for image, line in read_query_location(path):
-            note_time(image, at_time, line.error)
+        for image in read_query_location(path):
+            with named(path):
+                note_time(image, at_time)
             others = locations.get(image, ())
             if location not in others:
                 locations[image] = (*others, location)
@@ -296,8 +286,9 @@ def read_queries(layout: Layout, version: int, missing: Missing, *, allow_missin
     # optional for version 1
     wanted = version == 2 and missing.require(layout.train_list)
     if wanted or layout.train_list.is_file():
-        for image, line, cam_from_world in read_train_poses(layout.train_list):
-            known = _scored_query(image, line, at_time, allow_missing)
+        for image, cam_from_world in read_train_poses(layout.train_list).items():
+            with named(layout.train_list):
+                known = _scored_query(image, at_time, allow_missing)
             unlisted += known is None
             if known is not None:
                 train[known] = cam_from_world
@@ -317,40 +308,38 @@ def read_test_names(
     """Read version 2's test list: query -> its text in the list; count unknown entries."""
     test: dict[ImageKey, str] = {}
     unlisted = 0
-    for image, line in read_test_list(path):
-        known = _scored_query(image, line, at_time, allow_missing)
+    for image, text in read_test_list(path).items():
+        with named(path):
+            known = _scored_query(image, at_time, allow_missing)
+            require(known not in train, f"{text!r} is a training image too")
         unlisted += known is None
-        line.require(known not in train, f"{line.text!r} is a training image too")
         if known is not None:
-            test[known] = line.text
+            test[known] = text
     return test, unlisted
 
 
-def note_time(
-    image: ImageKey, at_time: dict[tuple[str, int], ImageKey], error: Callable[[str], DataError]
-) -> None:
-    """Register camera and time of an image; raise ``error`` if another image has both."""
+def note_time(image: ImageKey, at_time: dict[tuple[str, int], ImageKey]) -> None:
+    """Register camera and time of an image; DataError if another image has both."""
     if image.camera not in CAMERAS:
         known = ", ".join(CAMERAS)
-        raise error(f"{image.path} is of camera {image.camera!r}; known: {known}")
+        raise DataError(f"{image.path} is of camera {image.camera!r}; known: {known}")
     other = at_time.setdefault((image.camera, image.timestamp), image)
-    if other != image:
-        raise error(f"{image.path} and {other.path} are of one camera and time")
+    require(other == image, f"{image.path} and {other.path} are of one camera and time")
 
 
 def _scored_query(
-    image: ImageKey, line: Line, at_time: Mapping[tuple[str, int], ImageKey], allow_missing: bool
+    image: ImageKey, at_time: Mapping[tuple[str, int], ImageKey], allow_missing: bool
 ) -> ImageKey | None:
-    line.require(
+    require(
         image.camera == SCORED_CAMERA,
-        f"an image of camera {image.camera!r}, expected {SCORED_CAMERA!r} only",
+        f"{image.path}: an image of camera {image.camera!r}, expected {SCORED_CAMERA!r} only",
     )
     found = at_time.get((image.camera, image.timestamp))
     if found is not None and image.condition in ("", found.condition):
         return found
     if allow_missing:
         return None
-    raise line.error(
+    raise DataError(
         f"{image.camera}/{image.stem} is in no list of queries_per_location; "
         "--allow-missing leaves it out"
     )

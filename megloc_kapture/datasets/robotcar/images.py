@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +27,7 @@ from megloc_kapture.geometry.poses import rotation_angles_deg, stack_poses
 from megloc_kapture.io.files import named
 from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureData, Sensor
-from megloc_kapture.io.text_lines import read_rigid_matrix
+from megloc_kapture.io.text_lines import read_transform
 from megloc_kapture.values import Camera, RigidTransform
 
 RIG_ID = "car"
@@ -139,7 +138,7 @@ def read_car(layout: Layout, selection: Selection, missing: Missing) -> Car:
             sensors[camera] = Sensor.from_camera(pinhole, name=camera)
         path = layout.extrinsics(camera)
         if missing.require(path) and camera in sensors:
-            members[camera] = read_rigid_matrix(path).inverse()  # car_from_cam, metres
+            members[camera] = read_transform(path).inverse()  # car_from_cam, metres
     return Car(sensors, members)
 
 
@@ -213,7 +212,8 @@ def read_kapture_images(form: KaptureForm, missing: Missing) -> dict[ImageKey, K
             raise DataError(
                 f"image {image.name!r}; expected condition/camera/time.jpg", path=image.file
             )
-        note_time(key, at_time, partial(DataError, path=image.file))
+        with named(image.file):
+            note_time(key, at_time)
         require(
             cameras.setdefault(key.camera, image.camera) == image.camera,
             f"camera {key.camera} is not that of other images; all of RobotCar's images are "

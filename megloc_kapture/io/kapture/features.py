@@ -180,14 +180,11 @@ class TarBlobs:
         self._index: dict[str, tuple[int, int]] = {}
         if path.stat().st_size == 0:
             return  # kapture creates an empty tar by touch
-        try:
-            with named(path), tarfile.open(path, "r:") as tar:
-                for member in tar:
-                    if member.isreg() and member.name.endswith(suffix):
-                        name = check_relative(member.name.removeprefix("./"))
-                        self._index[name] = (member.offset_data, member.size)
-        except (tarfile.TarError, OSError, ValueError) as error:
-            raise DataError(f"not a readable uncompressed tar ({error})", path=path) from error
+        with reading(path, "an uncompressed tar"), named(path), tarfile.open(path, "r:") as tar:
+            for member in tar:
+                if member.isreg() and member.name.endswith(suffix):
+                    name = check_relative(member.name.removeprefix("./"))
+                    self._index[name] = (member.offset_data, member.size)
 
     def names(self) -> list[str]:
         return sorted(self._index)

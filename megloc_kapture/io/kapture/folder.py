@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from megloc_kapture.errors import DataError, require
-from megloc_kapture.io.files import check_no_escape, safe_join
+from megloc_kapture.io.files import safe_join
 from megloc_kapture.io.images import read_image_rgb
 from megloc_kapture.io.kapture.features import (
     ArrayKind,
@@ -31,20 +31,12 @@ _ARRAY_KINDS: tuple[ArrayKind, ...] = ("keypoints", "descriptors", "global_featu
 class KaptureFolder:
     """Lazy, read-only access to a kapture folder and to feature folders in the orphan layout.
 
-    The kapture's own features take precedence. Links may lead below any given folder, including
-    ``allow_links_below``; links of images in ``sensors/records_data`` anywhere.
+    The kapture's own features take precedence.
     """
 
-    def __init__(
-        self,
-        root: Path | str,
-        *,
-        features_dirs: Sequence[Path | str] = (),
-        allow_links_below: Sequence[Path | str] = (),
-    ) -> None:
+    def __init__(self, root: Path | str, *, features_dirs: Sequence[Path | str] = ()) -> None:
         self.root = Path(root)
         self.features_dirs = tuple(Path(d) for d in features_dirs)
-        self.allow_links_below = tuple(Path(d) for d in allow_links_below)
         self._points_path = self.root / "reconstruction" / "points3d.txt"
         self._observations_path = self.root / "reconstruction" / "observations.txt"
         self._data: KaptureData | None = None
@@ -53,9 +45,7 @@ class KaptureFolder:
 
     def with_features(self, features_dirs: Sequence[Path | str]) -> KaptureFolder:
         """Return a reader of the same folder with other feature folders."""
-        return KaptureFolder(
-            self.root, features_dirs=features_dirs, allow_links_below=self.allow_links_below
-        )
+        return KaptureFolder(self.root, features_dirs=features_dirs)
 
     def check_features_apart(self, other: KaptureFolder) -> None:
         """Refuse readable features shared by two different images of one name."""
@@ -76,9 +66,7 @@ class KaptureFolder:
     def read(self) -> KaptureData:
         """Return sensors, rigs, trajectories and records; parsed once."""
         if self._data is None:
-            self._data = read_kapture_data(
-                self.root, allow_links_below=(*self.features_dirs, *self.allow_links_below)
-            )
+            self._data = read_kapture_data(self.root)
         return self._data
 
     def image_path(self, image: str) -> Path:
@@ -112,7 +100,7 @@ class KaptureFolder:
     def points3d(self) -> NDArray[np.float64]:
         """Return 3D points, float64 (N, 6): X Y Z R G B (0 if missing); cached, read-only."""
         if self._points is None:
-            points = read_points3d(self._inside(self._points_path))
+            points = read_points3d(self._points_path)
             points.setflags(write=False)
             self._points = points
         return self._points
@@ -120,7 +108,7 @@ class KaptureFolder:
     def observations(self) -> dict[str, Observations]:
         """Return the observations of the 3D points by keypoints type; cached, read-only."""
         if self._observations is None:
-            path = self._inside(self._observations_path)
+            path = self._observations_path
             found = read_observations(path)
             num_points = len(self.points3d())
             for observations in found.values():
@@ -163,14 +151,10 @@ class KaptureFolder:
     def _features(self, kind: ArrayKind, type_name: str) -> FeatureReader:
         return FeatureReader(kind, type_name, self._folders(kind, type_name))
 
-    def _inside(self, path: Path, root: Path | None = None) -> Path:
-        folders = (root or self.root, self.root, *self.features_dirs, *self.allow_links_below)
-        return check_no_escape(folders, path)
-
     def _folders(self, kind: FeatureKind, type_name: str) -> list[Path]:
         candidates = [(self.root, False), *((folder, True) for folder in self.features_dirs)]
         found = [
-            self._inside(feature_folder(root, kind, type_name, orphan=orphan), root)
+            feature_folder(root, kind, type_name, orphan=orphan)
             for root, orphan in candidates
             if type_name in list_types(root, kind, orphan=orphan)
         ]

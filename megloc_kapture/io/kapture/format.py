@@ -8,15 +8,16 @@ second to import and 100 MB per worker; this one takes 20 ms and names file and 
 from __future__ import annotations
 
 import contextlib
-import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 
 from megloc_kapture.errors import DataError, require
-from megloc_kapture.io.files import check_relative, has_control_characters, named, read_text
-from megloc_kapture.values import CAMERA_MODEL_NUM_PARAMS, Camera, RigidTransform
+from megloc_kapture.io.files import check_relative, has_control_characters, named
+from megloc_kapture.io.text_lines import reading_lines
+from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA_SENSOR_TYPES = ("camera", "depth")
 UNKNOWN_CAMERA = "UNKNOWN_CAMERA"
@@ -28,7 +29,6 @@ _READ_VERSIONS = ("1.0", FORMAT_VERSION)  # the tables are the same in both
 # stricter than float(), which takes "1_0", "nan" and digits of other scripts
 FLOAT_PATTERN = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _VERSION_PATTERN = re.compile(r"# kapture format:\s*([0-9]+\.[0-9]+)")
-_INTEGER_PATTERN = re.compile(r"[+-]?[0-9]{1,40}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,24 +42,17 @@ class Sensor:
     def camera(self) -> Camera:
         if self.sensor_type not in CAMERA_SENSOR_TYPES:
             raise DataError(f"a sensor of type {self.sensor_type!r} has no camera model")
-        model = self.params[0] if self.params else ""
-        if model == UNKNOWN_CAMERA:
+        if self.params[:1] == (UNKNOWN_CAMERA,):
             raise DataError(
                 "camera is not calibrated (UNKNOWN_CAMERA); give it intrinsics, or localize the "
                 "image with `megloc localize --query`, which estimates the focal length"
             )
-        if model not in CAMERA_MODEL_NUM_PARAMS:
-            known = ", ".join([*CAMERA_MODEL_NUM_PARAMS, UNKNOWN_CAMERA])
-            raise DataError(f"unknown camera model {model!r}; known: {known}")
-        expected = CAMERA_MODEL_NUM_PARAMS[model] + 2
-        require(
-            len(self.params) == expected + 1,
-            f"camera model {model} takes {expected} parameters "
-            f"(width and height included), got {len(self.params) - 1}",
-        )
-        width, height = (_pixels(text) for text in self.params[1:3])
-        params = tuple(parse_float(text, "camera parameter") for text in self.params[3:])
-        return Camera(model, width, height, params)
+        require(len(self.params) > 2, "expected a camera model, width, height and parameters")
+        model, *texts = self.params
+        width, height, *params = map(float, texts)
+        size = width, height
+        require(size == (int(width), int(height)), f"image size {size} is not in whole pixels")
+        return Camera(model, int(width), int(height), tuple(params))
 
     @classmethod
     def from_camera(cls, camera: Camera, *, name: str = "", sensor_type: str = "camera") -> Sensor:
@@ -150,12 +143,6 @@ class KaptureData:
         return self._rigs_of
 
 
-def _pixels(text: str) -> int:
-    value = parse_float(text, "camera parameter")
-    require(value == int(value), f"image size {text!r} is not a whole number of pixels")
-    return int(value)
-
-
 def _shortest(value: float) -> str:
     """Return the shortest text of a float64; whole numbers are written as in kapture."""
     value = float(value)
@@ -167,23 +154,12 @@ def _shortest(value: float) -> str:
 
 @contextlib.contextmanager
 def read_rows(path: Path, *, version_required: bool = False) -> Iterator[Iterator[list[str]]]:
-    """Read rows of stripped fields, without comments; a DataError of the block gets the line."""
-    lines = read_text(path).split("\n")
-    check_version(path, lines[0], required=version_required)
-    number = 0
-
-    def rows() -> Iterator[list[str]]:
-        nonlocal number
-        for number, line in enumerate(lines, start=1):  # noqa: B007  of the message below
-            if line.strip() and not line.startswith("#"):
-                yield [text.strip() for text in line.split(",")]
-
-    try:
-        yield rows()
-    except DataError as error:
-        if error.path is not None:
-            raise
-        raise DataError(error.message, path=path, line=number) from error.__cause__
+    """Read rows of stripped fields, without comments; errors of the block name file and line."""
+    with reading_lines(path) as lines:
+        first = next(lines, "")
+        check_version(path, first, required=version_required)
+        rows = (line for line in chain([first], lines) if line and not line.startswith("#"))
+        yield ([text.strip() for text in row.split(",")] for row in rows)
 
 
 def check_version(path: Path, first_line: str, *, required: bool) -> None:
@@ -198,23 +174,6 @@ def check_version(path: Path, first_line: str, *, required: bool) -> None:
 def check_columns(fields: Sequence[str], expected: int) -> None:
     if len(fields) != expected:
         raise DataError(f"expected {expected} columns, got {len(fields)}")
-
-
-def parse_integer(text: str, what: str) -> int:
-    """Parse a decimal integer exactly, never through float."""
-    if not _INTEGER_PATTERN.fullmatch(text):
-        raise DataError(f"{what} {text!r} is not an integer")
-    return int(text)
-
-
-def parse_float(text: str, what: str) -> float:
-    try:
-        value = float(text)
-    except ValueError as error:
-        raise DataError(f"{what} {text!r} is not a number") from error
-    if not math.isfinite(value):
-        raise DataError(f"{what} {text!r} is not finite")
-    return value
 
 
 def writable_name(name: str) -> str:

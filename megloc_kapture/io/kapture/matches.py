@@ -27,9 +27,9 @@ from megloc_kapture.io.kapture.format import (
     check_columns,
     check_field,
     format_table,
-    parse_float,
     read_rows,
 )
+from megloc_kapture.io.text_lines import numbers_of
 
 _BETWEEN = ".overlapping/"
 _ROW_BYTES = 3 * 8
@@ -150,7 +150,7 @@ def read_pairs(path: Path | str) -> list[ImagePair]:
         for fields in rows:
             check_columns(fields, 3)
             pair = check_relative(fields[0]), check_relative(fields[1])
-            score = parse_float(fields[2], "score")
+            (score,) = numbers_of(fields[2:], "score")
             if pair not in seen:
                 seen.add(pair)
                 pairs.append(ImagePair(*pair, score))

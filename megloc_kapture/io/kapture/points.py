@@ -40,17 +40,13 @@ _PLY_TYPES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
 
 def read_points3d(path: Path) -> NDArray[np.float64]:
     """Read ``points3d.txt`` as float64 (N, 6): X Y Z R G B, colours 0 if missing."""
-    with reading(path), open(path, encoding="utf-8-sig", errors="replace") as file:
+    what = "a table of 3 or 6 columns in all rows"
+    with reading(path, what), open(path, encoding="utf-8-sig", errors="replace") as file:
         check_version(path, file.readline(), required=False)
         file.seek(0)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "loadtxt: input contained no data")
-            try:
-                points = np.loadtxt(file, delimiter=",", comments="#", ndmin=2)
-            except ValueError as error:
-                message = str(error).partition(";")[0]  # without numpy's advice to programmers
-                message = f"expected 3 or 6 columns in all rows: {message}"
-                raise DataError(message, path=path) from error
+            points = np.loadtxt(file, delimiter=",", comments="#", ndmin=2)
     if points.size == 0:
         return np.zeros((0, 6))
     if points.shape[1] not in POINTS_HEADERS:
@@ -245,10 +241,8 @@ def read_point_covariances(root: Path, num_points: int) -> NDArray[np.float64] |
         return None
     if num_points == 0:
         return np.zeros((0, 6))  # an empty file cannot be mapped
-    try:
+    with reading(path, "an array of numpy"):
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # numpy parses the header as Python literals
-        raise DataError(f"no array of numpy: {error}", path=path) from error
     require(
         array.dtype == np.float64 and array.shape == (num_points, 6),
         f"{array.dtype} {array.shape}, expected float64 ({num_points}, 6): one row per point",

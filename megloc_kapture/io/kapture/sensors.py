@@ -7,13 +7,12 @@ poses: rows with an entirely blank rotation or translation are skipped, other bl
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from megloc_kapture.errors import DataError, require
-from megloc_kapture.io.files import check_no_escape, check_relative, remove, write_bytes
+from megloc_kapture.io.files import check_relative, remove, write_bytes
 from megloc_kapture.io.kapture.format import (
     CAMERA_SENSOR_TYPES,
     UNKNOWN_CAMERA,
@@ -21,10 +20,9 @@ from megloc_kapture.io.kapture.format import (
     Sensor,
     check_columns,
     format_table,
-    parse_float,
-    parse_integer,
     read_rows,
 )
+from megloc_kapture.io.text_lines import numbers_of
 from megloc_kapture.values import RigidTransform
 
 # |q| may differ from 1 by less than this (few digits in the text) and is normalised
@@ -45,7 +43,7 @@ _HEADERS = {
 # ------------------------------------------------------------------------------------ reading
 
 
-def read_kapture_data(root: Path, *, allow_links_below: Sequence[Path] = ()) -> KaptureData:
+def read_kapture_data(root: Path) -> KaptureData:
     """Read and check ``sensors/`` of a kapture; only sensors.txt must exist."""
     folder = root / "sensors"
     require(root.exists(), "no such kapture folder", path=root)
@@ -56,9 +54,9 @@ def read_kapture_data(root: Path, *, allow_links_below: Sequence[Path] = ()) -> 
         path=root,
     )
     paths = {
-        name: check_no_escape((root, *allow_links_below), folder / f"{name}.txt")
+        name: folder / f"{name}.txt"
         for name in _HEADERS
-        if name == "sensors" or os.path.lexists(folder / f"{name}.txt")
+        if name == "sensors" or (folder / f"{name}.txt").exists()
     }
     data = KaptureData(read_sensors(paths["sensors"]))
     if "rigs" in paths:
@@ -158,7 +156,7 @@ def read_records(
 def _record_key(
     fields: Sequence[str], devices: Collection[str], known: Collection[tuple[int, str]]
 ) -> tuple[int, str]:
-    key = (parse_integer(fields[0], "timestamp"), fields[1])
+    key = (int(fields[0]), fields[1])
     if key[1] not in devices:
         raise DataError(f"unknown sensor or rig {key[1]!r}")
     if key in known:
@@ -171,8 +169,7 @@ def _pose(fields: Sequence[str]) -> RigidTransform | None:
     if not any(rotation) or not any(translation):
         return None
     require(all(fields), "some but not all fields of a pose are blank")
-    qw, qx, qy, qz = (parse_float(text, "rotation") for text in rotation)
-    tx, ty, tz = (parse_float(text, "translation") for text in translation)
+    qw, qx, qy, qz, tx, ty, tz = numbers_of(fields, "qw qx qy qz tx ty tz")
     return RigidTransform(unit_quaternion((qw, qx, qy, qz)), (tx, ty, tz))
 
 

@@ -8,14 +8,13 @@ others.
 
 from __future__ import annotations
 
-import fcntl
 import glob
 import hashlib
 import os
 import shutil
 import tomllib
+import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -49,7 +48,6 @@ if TYPE_CHECKING:
 
 FOLDER_VARIABLE = "MEGLOC_WEIGHTS"
 UNVERIFIED = "unverified"  # folder of user files that replace published ones
-_shared_folder: Path | None = None
 _REGISTRY = Path(__file__).with_name("registry.toml")
 # keys under which training scripts keep the state dict
 _STATE_KEYS = ("state_dict", "model_state", "model", "extractor")
@@ -268,49 +266,22 @@ def sha256_of(file: WeightsFile) -> str:
 
 
 def read_weights(file: WeightsFile) -> dict[str, torch.Tensor]:
-    """Read the tensors of a checkpoint by name, without ``module.``; none of its code runs."""
-    if _shared_folder is None:
-        return _read(file)
-    import torch
+    """Read the tensors of a checkpoint by name, without ``module.``; none of its code runs.
 
-    path = _shared_folder / f"weights-{hashlib.sha256(repr(file).encode()).hexdigest()[:16]}"
-    found: dict[str, torch.Tensor] = {}
-    try:
-        with open(path.with_suffix(".lock"), "wb") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            if not path.is_file():
-                found = _read(file)
-                with atomic_write(path) as written:
-                    # clones: a view would be written with its whole base tensor
-                    torch.save({name: t.contiguous().clone() for name, t in found.items()}, written)
-    except (OSError, OutputError, RuntimeError):  # torch raises RuntimeError on a full disk
-        with suppress(OSError):
-            path.unlink()
-        return found or _read(file)
-    found = torch.load(path, mmap=True, weights_only=True)
-    for tensor in found.values():  # ``load_strictly`` keeps such memory
-        tensor.is_shared_file = True  # type: ignore[attr-defined]
-    return found
-
-
-def share_weights(folder: Path | None) -> None:
-    """Share loaded tensors with other processes that use the same folder."""
-    global _shared_folder
-    _shared_folder = folder
-
-
-def _read(file: WeightsFile) -> dict[str, torch.Tensor]:
+    Files of ``torch.save`` are mapped, so that the workers of one machine share their memory;
+    ``load_strictly`` keeps tensors with ``is_shared_file``.
+    """
     check_sha256(file, file.published)
     if file.path.suffix == ".safetensors":
         from safetensors.torch import load_file
 
-        try:
+        with reading(file.path, "a safetensors file"):
             return _state_dict(load_file(file.path), file.path)
-        except DataError:
-            raise
-        except Exception as error:  # safetensors has its own error class
-            raise DataError(f"no safetensors file: {error}", path=file.path) from error
-    return _state_dict(_load_torch(file.path), file.path)
+    mapped = zipfile.is_zipfile(file.path)  # torch's format since 1.6
+    tensors = _state_dict(_load_torch(file.path, mapped), file.path)
+    for tensor in tensors.values():
+        tensor.is_shared_file = mapped  # type: ignore[attr-defined]
+    return tensors
 
 
 def check_sha256(file: WeightsFile, published: PublishedFile | None) -> None:
@@ -324,7 +295,7 @@ def check_sha256(file: WeightsFile, published: PublishedFile | None) -> None:
         )
 
 
-def _load_torch(path: Path) -> Any:
+def _load_torch(path: Path, mapped: bool) -> Any:
     import numpy as np
     import torch
 
@@ -333,18 +304,9 @@ def _load_torch(path: Path) -> Any:
     names = ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
     of_scores: list[Any] = [np.dtype, type(np.dtype("f4")), type(np.dtype("f8"))]
     of_scores += [(scalar, name) for name in names]
-    try:
-        with torch.serialization.safe_globals(of_scores):
-            return torch.load(path, weights_only=True, map_location="cpu")
-    except Exception as error:  # torch raises many kinds on damaged files
-        reason = "or it is damaged"
-        if "Unsupported global" in str(error) or "GLOBAL" in str(error):
-            reason = "because loading its objects would run code"
-        raise DataError(
-            f"no file of weights that can be read (torch's or safetensors), {reason}; "
-            "docs/weights.md says which files are converted first",
-            path=path,
-        ) from error
+    what = "weights of torch or safetensors that hold no code (docs/weights.md converts others)"
+    with reading(path, what), torch.serialization.safe_globals(of_scores):
+        return torch.load(path, weights_only=True, map_location="cpu", mmap=mapped)
 
 
 def _state_dict(found: Any, path: Path) -> dict[str, torch.Tensor]:

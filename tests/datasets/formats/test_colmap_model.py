@@ -160,17 +160,14 @@ def test_an_empty_line_of_features_is_consumed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "match"),
     [
-        ("cameras", "1 PINHOLE 5 5\n", "cameras.txt, images.txt, .*copy them again"),
+        ("cameras", "1 PINHOLE 5 5\n", "cameras.txt, images.txt"),
         ("cameras", "\n1 NEW 5 5 1\n", "Camera model does not exist"),
         ("cameras", "1 PINHOLE 0 5 1 1 1 1\n", "cameras.txt: camera 1: image size 0x5"),
-        ("cameras", "", "cannot read the model"),
         ("images", "7 0 0 0 0 0 0 0 1 a\n\n", "images.txt: image 'a': .*quaternion"),
-        ("images", "7 1 0 0 0 0 nan 0 1 a\n\n", "cannot read the model"),
+        ("images", "7 1 0 0 0 0 nan 0 1 a\n\n", "a model that COLMAP can read"),
         ("images", "7 1 0 0 0 0 0 0 1 ../a\n\n", "images.txt: image '../a': .*leads out"),
         ("images", IMAGES.replace("8.jpg", "7.jpg") + "0 1 9\n", "'db/7.jpg': is listed twice"),
-        ("images", IMAGES + "0 1\n", "cannot read the model"),
-        ("points3D", POINTS + "1 1 nan 1 1 1 1 1\n", "cannot read the model"),
-        ("points3D", "1 1 1 1 1 1 1 1 8 7\n", "cannot read the model"),
+        ("points3D", "1 1 1 1 1 1 1 1 8 7\n", "a model that COLMAP can read"),
     ],
 )
 def test_bad_text_is_named(tmp_path: Path, name: str, text: str, match: str) -> None:
@@ -229,9 +226,9 @@ def test_truncated_binary_files_are_named(tmp_path: Path, name: str) -> None:
     content = (tmp_path / name).read_bytes()
     for cut in (content[:4], content[:-1], content[: len(content) // 2], content + b"\0"):
         (tmp_path / name).write_bytes(cut)
-        with pytest.raises(DataError, match=rf"{name}: .*cut short|COLMAP cannot read"):
+        with pytest.raises(DataError, match=rf"{name}: .*cut short|COLMAP can read"):
             read_colmap_model(tmp_path)
     # pycolmap would fill the memory
     (tmp_path / name).write_bytes(struct.pack("<Q", 2**40) + content[8:])
-    with pytest.raises(DataError, match=rf"{name}: .*cut short|COLMAP cannot read"):
+    with pytest.raises(DataError, match=rf"{name}: .*cut short|COLMAP can read"):
         read_colmap_model(tmp_path)

@@ -6,14 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from megloc_kapture.datasets import fourseasons as fourseasons_files
 from megloc_kapture.datasets import robotcar
 from megloc_kapture.datasets.inloc import read_transformation, read_wrong_scans
 from megloc_kapture.errors import DataError
-from megloc_kapture.io.camera_list import read_camera_rows
-from megloc_kapture.io.text_lines import read_rigid_matrix
+from megloc_kapture.io.text_lines import read_camera_rows, read_transform
 
 TIME = 1602074877390449152
 POSE = "-0.06,0.05,-0.15,0,0.6,0,0.8"
@@ -21,7 +21,7 @@ MATRIX = "0 -1 0 5.0\n1 0 0 2.0\n0 0 1 -1e-1\n0 0 0 1\n"
 TEXTS: dict[Callable[[Path], Any], str] = {
     fourseasons_files.read_pinhole: "Pinhole 501.5 502.5 421.8 167.7 0.0 0.0 0.0 0.0\n800 400\n"
     "crop\n800 400\n",
-    read_rigid_matrix: MATRIX,
+    read_transform: MATRIX,
     fourseasons_files.read_gnss_poses: f"# header\n{TIME},{POSE},0.96,2\n{TIME + 1},{POSE},1,2,5\n",
     fourseasons_files.read_poses: f"{TIME},{POSE}\n{TIME + 1},{POSE}\n".replace(",", " "),
     fourseasons_files.read_relocalization: f"{TIME} 1\n{TIME} 2 {POSE.replace(',', ' ')}\n",
@@ -56,22 +56,52 @@ def test_line_ends_and_blanks_do_not_matter(tmp_path: Path, reader: Callable[[Pa
         assert repr(reader(path)) == expected, other
 
 
-@READERS
-def test_what_is_no_such_file(tmp_path: Path, reader: Callable[[Path], Any]) -> None:
+@pytest.mark.parametrize("separator", [",", " , "])
+def test_a_transform(tmp_path: Path, separator: str) -> None:
     path = tmp_path / "file.txt"
-    for content in (b"", b"\n\r\n  \n", b"\xef\xbb\xbf"):
-        path.write_bytes(content)
-        if reader is read_wrong_scans:
-            assert not reader(path)
-        else:
-            with pytest.raises(DataError, match=r"file\.txt\b"):
-                reader(path)
+    path.write_text(MATRIX.replace(" ", separator))
+    moved = read_transform(path).apply(np.array([[1.0, 0, 0]]))
+    np.testing.assert_allclose(moved, [[5, 3, -0.1]], atol=1e-15)
+
+
+@READERS
+def test_empty_and_binary_files_are_named(tmp_path: Path, reader: Callable[[Path], Any]) -> None:
+    path = tmp_path / "file.txt"
+    path.write_bytes(b"\n\r\n  \n")
+    if reader is not read_wrong_scans:
+        with pytest.raises(DataError, match=r"file\.txt\b"):
+            reader(path)
     path.write_bytes(b"1\n2 \xff")
     with pytest.raises(DataError, match=r"file\.txt:2: not a text file in UTF-8"):
         reader(path)
-    path.unlink()
-    with pytest.raises(DataError, match=r"file\.txt: cannot read: the file is missing"):
+
+
+@pytest.mark.parametrize(
+    ("reader", "old", "new", "line", "message"),
+    [
+        (read_transform, "0 0 1 -1e-1", "0 0 1", None, "expected the 16 elements"),
+        (read_transform, "-1e-1", "nan", None, "not a rotation and a translation"),
+        (read_transform, "1 0 0 2.0", "2 0 0 2.0", None, "not a rotation"),
+        (fourseasons_files.read_poses, "0 0.6", "", 1, "expected finite numbers tx ty tz"),
+        (fourseasons_files.read_poses, "0.6 0 0.8", "0 0 0", 1, "not a unit quaternion"),
+        (fourseasons_files.read_poses, f"{TIME + 1}", "1.5", 2, "is not a timestamp"),
+        (robotcar.read_intrinsics, "cy 4", "cz 4", None, "cy missing"),
+        (robotcar.read_query_location, "dawn/rear", "../a/rear", 2, "expected condition/camera"),
+        (robotcar.read_train_poses, "10.0", "x", 1, "could not convert string to float: 'x'"),
+        (read_camera_rows, "768", "wide", 2, "invalid literal for int.*'wide'"),
+        (read_camera_rows, "PINHOLE", "PIN", 2, "expected a row NAME MODEL"),
+    ],
+)
+def test_a_wrong_row_is_named(
+    tmp_path: Path,
+    reader: Callable[[Path], Any],
+    old: str,
+    new: str,
+    line: int | None,
+    message: str,
+) -> None:
+    path = tmp_path / "file.txt"
+    path.write_text(TEXTS[reader].replace("\r\n", "\n").replace(old, new))
+    with pytest.raises(DataError, match=message) as caught:
         reader(path)
-    path.mkdir()
-    with pytest.raises(DataError, match=r"file\.txt: cannot read"):
-        reader(path)
+    assert (caught.value.path, caught.value.line) == (path, line)

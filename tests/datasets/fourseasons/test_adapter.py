@@ -32,8 +32,7 @@ from scipy.spatial.transform import Rotation
 from tools.kapture_import_4seasons import import_4seasons_trajectory, load_4seasons_cameras
 
 from megloc_kapture.datasets.fourseasons import Recording
-from megloc_kapture.datasets.fourseasons.adapter import FourSeasons
-from megloc_kapture.datasets.fourseasons.images import LocalFrame, read_keyframe_poses
+from megloc_kapture.datasets.fourseasons.adapter import FourSeasons, LocalFrame, read_keyframe_poses
 from megloc_kapture.datasets.official import Missing, write_official
 from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.io.dataset_tables import (

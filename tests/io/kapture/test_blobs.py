@@ -37,7 +37,7 @@ def test_members_are_read_by_name(tar: Path) -> None:
 def test_what_is_no_tar_is_named(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "x.tar"
     path.write_bytes(content)
-    with pytest.raises(DataError, match=r"x\.tar: not a readable uncompressed tar"):
+    with pytest.raises(DataError, match=r"x\.tar: not an uncompressed tar"):
         TarBlobs(path, ".kpt")
     path.write_bytes(b"")
     assert TarBlobs(path, ".kpt").names() == []

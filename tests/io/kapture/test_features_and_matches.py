@@ -94,15 +94,10 @@ def config_file(folder: Path, kind: ArrayKind, row: str) -> Path:
     ("kind", "row", "match"),
     [
         ("keypoints", "n, float32", "expected 3 columns, got 2"),
-        ("descriptors", "n, float32, 2", "expected 5 columns, got 3"),
         ("descriptors", "n, float32, 2, ../k, L2", "leads out"),
-        ("global_features", "n, float32, 2", "expected 4 columns"),
         ("keypoints", "n, float16, 2", "dtype 'float16' is not one of"),
         ("keypoints", "n, __import__('os').system('touch owned'), 2", "is not one of"),
         ("keypoints", "n, float32, 0", "dsize '0'"),
-        ("keypoints", "n, float32, -2", "dsize '-2'"),
-        ("keypoints", "n, float32, 2.0", "dsize '2.0'"),
-        ("keypoints", "n, float32, 99999999999999", "dsize"),
     ],
 )
 def test_bad_configurations_name_file_and_line(
@@ -231,8 +226,8 @@ def test_a_repeated_pair_counts_once(tmp_path: Path) -> None:
     ("row", "match"),
     [
         ("a, b", "expected 3 columns, got 2"),
-        ("a, b, c", "score 'c' is not a number"),
-        ("a, b, nan", "not finite"),
+        ("a, b, c", "expected finite numbers score, got 'c'"),
+        ("a, b, nan", "finite numbers"),
         ("a, ../b, 1", "leads out"),
         (", b, 1", "empty"),
     ],

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from convert_weights import apgem_state, main, netvlad_state, read_tensorflow
+from convert_weights import apgem_state, main, netvlad_state
 from hostile import Runs
 from numpy.typing import NDArray
 from scipy.io import loadmat, savemat
@@ -20,7 +20,6 @@ from scipy.io import loadmat, savemat
 from megloc_kapture.errors import DataError
 from megloc_kapture.io.weights import MissingWeightsError, add_weights, find_weights, read_weights
 
-BUNDLES = Path(__file__).parent / "data" / "tensor_bundle"
 CONVOLUTIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
 SIZE, CLUSTERS, OUTPUT = 6, 4, 5
 MEAN = (123.68, 116.779, 103.939)
@@ -177,12 +176,3 @@ def test_the_command_writes_where_the_network_finds_it(
     mat.write_bytes(b"another file")
     assert main(["netvlad-pitts30k", str(mat)]) == 2
     assert "is not the published file" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_tensorflow_reads_its_checkpoints() -> None:
-    pytest.importorskip("tensorflow")
-    graph = read_tensorflow(BUNDLES / "graph.ckpt-7.index")
-    assert graph["global_step"] == -7
-    objects = read_tensorflow(BUNDLES / "object.index")
-    assert "model/kernel/.ATTRIBUTES/VARIABLE_VALUE" in objects

@@ -18,18 +18,17 @@ from hostile import Runs
 from safetensors.torch import save_file
 
 from megloc_kapture.errors import DataError, MeglocError, OptionError, OutputError
-from megloc_kapture.io import weights as weights_module
 from megloc_kapture.io.weights import (
     SOURCE_KEY,
     MissingWeightsError,
     add_weights,
     convert_weights,
     describe,
+    fetch,
     find_weights,
     read_weights,
     registry,
     sha256_of,
-    share_weights,
     weights_folder,
 )
 
@@ -159,9 +158,16 @@ def test_another_file_under_a_published_name_is_refused(folder: Path) -> None:
         read_weights(file)
 
 
+def test_a_broken_download_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    with pytest.raises(MeglocError, match="the transfer broke"):
+        fetch("http://127.0.0.1:9/net.pth", tmp_path / "net.pth")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_code_is_not_run(tmp_path: Path) -> None:
     torch.save({"a": torch.ones(1), "optimizer": Runs(tmp_path / "made")}, tmp_path / "x.pth")
-    with pytest.raises(DataError, match=r"x\.pth: no file of weights .* would run code"):
+    with pytest.raises(DataError, match=r"x\.pth: not weights of torch .* that hold no code"):
         read_weights(find_weights(str(tmp_path / "x.pth")))
     assert not (tmp_path / "made").exists()
 
@@ -213,8 +219,8 @@ def test_add_refuses_what_is_broken_and_on_request_takes_another_file(
     broken.write_bytes(b"<html>sign in</html>")
     for source, unverified, told in (
         (own, False, r"published superpoint_v1\.pth .* instead of 52b67"),
-        (broken, False, "no file of weights that can be read"),
-        (broken, True, "no file of weights that can be read"),
+        (broken, False, "not weights of torch"),
+        (broken, True, "not weights of torch"),
         (tmp_path / "nowhere.pth", False, "no such file"),
     ):
         with pytest.raises(DataError, match=told):
@@ -278,29 +284,6 @@ def test_convert_views_of_one_memory_and_refuses(tmp_path: Path) -> None:
         with pytest.raises(kind, match=message):
             convert_weights(wrong, target)
     convert_weights(source, place, force=True)
-
-
-def test_what_was_read_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "own.pth"
-    tensors = {"a": torch.rand(3, 4), "half": torch.rand(5).half(), "t": torch.rand(4, 2).T}
-    torch.save(tensors, path)
-    monkeypatch.setattr(weights_module, "_shared_folder", None)
-    share_weights(tmp_path / "shared")
-    try:
-        file = describe("own", path)
-        first = read_weights(file)  # the folder is not there: as without
-        (tmp_path / "shared").mkdir()
-        second, third = read_weights(file), read_weights(file)
-        path.write_bytes(b"something else")
-        fourth = read_weights(file)
-    finally:
-        share_weights(None)
-    assert not getattr(first["a"], "is_shared_file", False)
-    for found in (first, second, third, fourth):
-        assert found.keys() == tensors.keys()
-        for name, tensor in tensors.items():
-            assert torch.equal(found[name], tensor) and found[name].dtype == tensor.dtype
-    assert second["a"].is_shared_file  # type: ignore[attr-defined]
 
 
 def test_a_score_of_numpy_beside_the_weights(tmp_path: Path) -> None:

@@ -1,11 +1,8 @@
-"""The registry is whole and says what nets.md, the reference of all networks, says."""
+"""The registry is whole and agrees with itself."""
 
 from __future__ import annotations
 
 import re
-from fnmatch import fnmatchcase
-from itertools import product
-from pathlib import Path
 
 import pytest
 
@@ -26,14 +23,6 @@ NAMES = (
     *("deeplabv3plus-resnet101", "deeplabv3plus-mobilenet"),
     *("apgem-resnet101", "apgem-resnet101-lm18", "delg-r50-gld", "delg-r101-gldv2clean"),
 )
-# in the reference's table, but no file that the registry keeps
-BESIDE = ("*.data-00000-of-00001", "*.meta", "*.onnx")
-# in the registry, but not in that table
-EXTRA = {
-    *("superpoint_lightglue.pth", "aliked_lightglue.pth"),
-    *("best_deeplabv3plus_resnet101_cityscapes_os16.pth", "r50delg_gldv2clean_20200914.tar.gz"),
-    *("MegaLoc/model.safetensors", "megaloc.torch", "depth-save.pth", "disk_lightglue.pth"),
-}
 
 
 def test_all_plugins_find_theirs() -> None:
@@ -67,32 +56,6 @@ def test_places_licences_and_hashes_fit_the_files() -> None:
                 assert all(part in place for part in file.name.split("/")), file.url
                 assert next(place, None) is None
     assert checked == 3
-
-
-def expanded(text: str) -> set[str]:
-    """``a.{b,c}`` to ``a.b`` and ``a.c``."""
-    parts = re.split(r"\{([^}]*)\}", text)
-    choices = [part.split(",") if row % 2 else [part] for row, part in enumerate(parts)]
-    return {"".join(chosen) for chosen in product(*choices)}
-
-
-def test_the_reference_names_the_same_files(shared_data: Path) -> None:
-    reference = shared_data.parent / "reference" / "nets.md"
-    if not reference.is_file():
-        pytest.skip(f"no {reference}")
-    section = reference.read_text(encoding="utf-8").split("\n## ")[1]
-    rows = [line.split("|") for line in section.splitlines() if line.startswith("|")][2:]
-    told = {
-        n for row in rows for quoted in re.findall(r"`([^`]+)`", row[3]) for n in expanded(quoted)
-    }
-    told = {name for name in told if not any(fnmatchcase(name, b) for b in BESIDE)}
-    kept = {n for w in registry().values() for file in w.files for n in file.names}
-    assert len(told) > 30
-    for name in told:
-        assert any(fnmatchcase(k, name) for k in kept), f"{name} is not in the registry"
-    first = {file.name for w in registry().values() for file in w.files}
-    for name in first - EXTRA:
-        assert any(fnmatchcase(name, t) for t in told), f"{name} is not in the reference"
 
 
 def test_lookup() -> None:
