@@ -16,7 +16,6 @@ from megloc_kapture.evaluation.check import (
     Finding,
     Reference,
     check_submission,
-    read_reference,
 )
 from megloc_kapture.io.dataset_tables import (
     Protocol,
@@ -24,7 +23,6 @@ from megloc_kapture.io.dataset_tables import (
     SimilarityTransform,
     World,
 )
-from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
 
 OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -127,20 +125,6 @@ def test_the_five_conventions(check: Check, scene: Callable[..., Poses]) -> None
     for mistake, words in CONVENTIONS.items():
         error = only(check(lines_of(poses, mistake), reference))
         assert (error.severity, error.kind) == ("error", "convention") and words in error.message
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["fountain_p11", "herzjesu_p25", "herzjesu_wide", "redkitchen_rgbd"]
-)
-def test_the_conventions_on_real_scenes(shared_data: Path, check: Check, name: str) -> None:
-    folder = shared_data / "scenes" / name
-    poses = KaptureFolder(folder / "query_gt").read().poses()
-    reference = read_reference(folder)
-    assert not check(lines_of(poses), reference).findings
-    for mistake, words in CONVENTIONS.items():
-        # where cameras hardly turn several conventions are named
-        assert words in only(check(lines_of(poses, mistake), reference)).message
 
 
 def test_a_recentred_map(check: Check) -> None:

@@ -24,9 +24,7 @@ from megloc_kapture.evaluation.report.reports import (
 from megloc_kapture.evaluation.results import Result
 from megloc_kapture.evaluation.scoring import (
     evaluate_pairs,
-    relative_translation_errors,
 )
-from megloc_kapture.geometry.poses import stack_poses
 from megloc_kapture.io.dataset_tables import (
     RelocalizationPair,
     write_protocol,
@@ -161,32 +159,6 @@ def test_a_rotation_costs_the_chord_it_cuts_and_a_shift_its_length(
     found = evaluate_all(shifted, {"q.png": turned}, references, pairs)
     for errors in (found.errors, found.by_center.errors):
         assert errors.position_m[0] == pytest.approx(np.hypot(0.1, 0.2))
-
-
-def test_equal_to_matrices() -> None:
-    rng = np.random.default_rng(0)
-
-    def random_poses() -> list[RigidTransform]:
-        return [
-            RigidTransform.from_matrix(Rotation.random(rng=rng).as_matrix(), rng.normal(size=3) * 9)
-            for _ in range(20)
-        ]
-
-    def matrix(pose: RigidTransform) -> np.ndarray:
-        result = np.eye(4)
-        quat = np.array(pose.quat_wxyz)
-        result[:3, :3] = Rotation.from_quat(quat, scalar_first=True).as_matrix()
-        result[:3, 3] = pose.translation
-        return result
-
-    estimated, truth, references = random_poses(), random_poses(), random_poses()
-    expected = []
-    for found, true, reference in zip(estimated, truth, references, strict=True):
-        world_from_reference = np.linalg.inv(matrix(reference))
-        apart = matrix(found) @ world_from_reference - matrix(true) @ world_from_reference
-        expected.append(np.linalg.norm(apart[:3, 3]))
-    ours = relative_translation_errors(*map(stack_poses, (estimated, truth, references)))
-    np.testing.assert_allclose(ours, expected, rtol=1e-12)
 
 
 def test_pairs_count_and_files_are_conditions() -> None:

@@ -85,7 +85,7 @@ def test_every_threshold_and_pair_is_tested_and_corrected() -> None:
 
 def test_the_interval_of_a_median_difference_covers_the_true_one() -> None:
     rng = np.random.default_rng(3)
-    num_runs, held = 200, 0
+    num_runs, held = 60, 0
     # log-normal errors: medians 0.1 and 0.13
     for _ in range(num_runs):
         shared = rng.normal(0, 0.7, 90)

@@ -20,12 +20,6 @@ from megloc_kapture.features.aliked import (
     AlikedOptions,
     aliked_from,
 )
-from megloc_kapture.geometry.cameras import bearing_rays
-from megloc_kapture.io.images import read_image_rgb
-from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.io.weights import find_weights, read_weights
-from megloc_kapture.matching.nearest_neighbours import match_nearest
-from megloc_kapture.matching.verification import ray_slopes, sampson_error_px
 
 
 @pytest.fixture
@@ -93,26 +87,6 @@ def test_a_peak_of_the_score_map_lies_at_its_pixels_centre(monkeypatch: pytest.M
 
 
 @pytest.mark.usefixtures("weights")
-def test_matches_of_real_images_lie_on_epipolar_lines(shared_data: Path) -> None:
-    folder = KaptureFolder(shared_data / "scenes" / "redkitchen_rgbd" / "mapping")
-    data = folder.read()
-    poses = data.poses()
-    names = sorted(poses)[:6:5]
-    features = [
-        extractor().extract(read_image_rgb(folder.image_path(name))[:300, :400]) for name in names
-    ]
-    matches, _ = match_nearest(*(each.descriptors for each in features))
-    sides = []
-    for name, found, rows in zip(names, features, matches.T, strict=True):
-        px, camera = found.keypoints_px[rows, :2], data.camera_of(name)
-        rays = bearing_rays(camera, px)
-        sides += [rays, ray_slopes(camera, px, rays)]
-    error = sampson_error_px(*sides, poses[names[1]] @ poses[names[0]].inverse())
-    assert len(matches) > 80
-    assert (error < 2).mean() > 0.6
-
-
-@pytest.mark.usefixtures("weights")
 def test_many_keypoints_are_described_in_parts(
     cropped: Image, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -174,21 +148,3 @@ def test_random_weights_give_kornias_maps(variant: str) -> None:
     # readings some pixels off in maps of this size: 1e-4 is what float32 leaves of them
     assert (our_scores - scores[0, 0]).abs().max() < 1e-4
     assert (our_features - features[0]).abs().max() < 1e-4
-
-
-def test_descriptors_are_kornias_everywhere(shared_data: Path) -> None:
-    variant = "aliked-t16"
-    tensors = read_weights(find_weights(str(shared_data / "weights" / "aliked" / f"{variant}.pth")))
-    image = texture(96, 128)
-    generator = torch.Generator().manual_seed(1)
-    # all over the map, its border included
-    xy = torch.rand(200, 2, generator=generator) * torch.tensor([127.0, 95.0])
-    net = aliked_from(tensors, variant)
-    theirs = kornias(variant, tensors)
-    with torch.inference_mode():
-        features, _ = theirs.extract_dense_map(image)
-        normalised = xy / torch.tensor([127.0, 95.0]) * 2 - 1
-        expected = theirs.desc_head(features, [normalised])[0][0]
-        found = net.desc_head(net(image)[0], xy)
-    assert (found - expected).abs().max() < 2e-5
-    assert (found.norm(dim=1) - 1).abs().max() < 1e-5

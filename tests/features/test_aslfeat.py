@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from convert_weights import aslfeat_state
-from images import random_image, texture
 from safetensors.torch import save_file
 
 from megloc_kapture.errors import DataError
@@ -20,10 +19,8 @@ from megloc_kapture.features.aslfeat import (
     AslFeatMaps,
     AslFeatOptions,
     aslfeat_from,
-    conv_same,
     on_no_edge,
     peakiness,
-    resize_as_tensorflow_1,
 )
 from megloc_kapture.values import LocalFeatures
 
@@ -81,30 +78,6 @@ def test_weak_peaks_and_peaks_at_the_border_are_left_out(on_maps: OnMaps) -> Non
     np.testing.assert_allclose(found.keypoints_px[:, :2], [[5.5, 45.5], [74.5, 40.5]], atol=0.01)
 
 
-def test_a_descriptor_is_read_at_a_quarter_of_the_pixel(on_maps: OnMaps) -> None:
-    rows, columns = torch.meshgrid(torch.arange(15.0), torch.arange(20.0), indexing="ij")
-    features = torch.zeros(128, 15, 20)
-    features[0], features[1], features[2] = rows, columns, 1.0
-    x, y = 41.2, 22.3
-    found = on_maps(blobs([(x, y)], [2.0]), features)
-    descriptor = found.descriptors[0]
-    assert np.linalg.norm(descriptor) == pytest.approx(1, abs=1e-6)
-    at = found.keypoints_px[0, :2] - 0.5
-    np.testing.assert_allclose(descriptor[:2] / descriptor[2], at[::-1] / 4, atol=1e-4)
-
-
-def test_several_scales_add_keypoints_inside_the_border(aslfeat_weights: Path) -> None:
-    image = texture(180, 300)  # on two scales
-    one = extractor(aslfeat_weights, max_keypoints=100_000).extract(image)
-    several = extractor(aslfeat_weights, max_keypoints=100_000, multi_scale=True).extract(image)
-    assert len(several.scores) > len(one.scores) > 20
-    # those of the whole image are among them, unchanged
-    known = {tuple(row) for row in several.keypoints_px.tolist()}
-    assert {tuple(row) for row in one.keypoints_px.tolist()} <= known
-    xy = one.keypoints_px[:, :2]
-    assert xy.min() > 4.5 and (xy < (300 - 4.5, 180 - 4.5)).all() and one.scores.min() > 0.5
-
-
 @pytest.mark.parametrize("image", ["even", "odd"])
 def test_keypoints_are_tensorflows(image: str, tmp_path: Path) -> None:
     outputs = np.load(TENSORFLOW / "reference.npz")
@@ -139,12 +112,6 @@ def test_keypoints_of_small_scales_lie_where_they_are_in_the_image(
     np.testing.assert_allclose(found.keypoints_px[:, :2], [[700.5, 300.5]] * 3, atol=0.1)
 
 
-@pytest.mark.parametrize("size", [(8, 30), (11, 11), (11, 200), (13, 12)])
-def test_the_smallest_images(aslfeat_weights: Path, size: tuple[int, int]) -> None:
-    features = extractor(aslfeat_weights, threshold=0.0).extract(random_image(*size))
-    assert features.keypoints_px.shape == (len(features.scores), 3)
-
-
 def tensorflows_variables() -> dict[str, np.ndarray]:
     with np.load(TENSORFLOW / "variables.npz") as written:
         return dict(written)
@@ -176,33 +143,6 @@ def test_what_does_not_fit_is_named() -> None:
         assert part in str(caught.value)
 
 
-# size, stride: size of the result, and the rows that the middle of the kernel stands on
-# (tf.nn.conv2d's documentation of SAME: ceil(size / stride); of an odd sum of margins the larger
-# one is at the end)
-SAME = [
-    (8, 1, 8, [0, 1, 2, 3, 4, 5, 6, 7]),
-    (7, 1, 7, [0, 1, 2, 3, 4, 5, 6]),
-    (8, 2, 4, [1, 3, 5, 7]),
-    (7, 2, 4, [0, 2, 4, 6]),
-    (2, 2, 1, [1]),
-    (1, 2, 1, [0]),
-]
-
-
-@pytest.mark.parametrize(("size", "stride", "expected", "middles"), SAME)
-def test_padding_is_tensorflows_same(
-    size: int, stride: int, expected: int, middles: list[int]
-) -> None:
-    image = torch.arange(1.0, size + 1).repeat(5, 1)
-    identity = torch.zeros(1, 1, 3, 3)
-    identity[0, 0, 1, 1] = 1
-    across = conv_same(image[None, None], identity, None, stride)[0, 0]
-    assert across.shape == (-(-5 // stride), expected)
-    assert across[0].tolist() == [m + 1 for m in middles]
-    down = conv_same(image.T[None, None], identity, None, stride)[0, 0]
-    assert down[:, 0].tolist() == [m + 1 for m in middles]
-
-
 @pytest.mark.parametrize("image", ["even", "odd"])
 @pytest.mark.parametrize(
     ("dtype", "tolerance"), [(torch.float64, 1e-6), (torch.float32, 1e-5)], ids=["64", "32"]
@@ -220,19 +160,6 @@ def test_maps_are_tensorflows(image: str, dtype: torch.dtype, tolerance: float) 
     torch.testing.assert_close(maps.features, features, rtol=0, atol=10 * tolerance)
 
 
-@pytest.mark.parametrize("dilation", [1, 2, 3])
-def test_the_border_is_reflected(dilation: int) -> None:
-    # a linear ramp: its mean over the neighbourhood is itself inside; at the reflected border
-    # the outer third lies `dilation` to the inside instead of the outside
-    ramp = torch.arange(10.0, dtype=torch.float64).repeat(12, 1)[None]
-    found = peakiness(ramp, dilation, torch.tensor(1.0).double())
-    inside = found[:, dilation:-dilation]
-    torch.testing.assert_close(inside, torch.full_like(inside, math.log(2) ** 2))
-    for column, outwards in ((0, -1), (-1, 1)):
-        softplus = math.log1p(math.exp(outwards * 2 * dilation / 3))
-        assert float(found[5, column]) == pytest.approx(softplus * math.log(2))
-
-
 def test_strips_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     features = torch.randn(6, 20, 11, generator=torch.Generator().manual_seed(1))
     whole = peakiness(features, 3, torch.tensor(1.0))
@@ -240,31 +167,8 @@ def test_strips_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.testing.assert_close(peakiness(features, 3, torch.tensor(1.0)), whole, rtol=0, atol=1e-6)
 
 
-def test_resizing_has_no_half_pixels() -> None:
-    # a linear function of the small map's pixels, read at i * (small / large)
-    rows, columns = torch.meshgrid(torch.arange(5.0), torch.arange(4.0), indexing="ij")
-    found = resize_as_tensorflow_1(3 * rows - 2 * columns, (19, 13))
-    r = (torch.arange(19.0) * (5 / 19)).clamp(max=4)[:, None]
-    c = (torch.arange(13.0) * (4 / 13)).clamp(max=3)
-    torch.testing.assert_close(found, 3 * r - 2 * c)
-
-
 ROWS, COLUMNS = torch.meshgrid(*[torch.arange(41.0, dtype=torch.float64) - 20] * 2, indexing="ij")
 CENTRE = torch.tensor([[20, 20]])
-
-
-# the differences reach over three pixels; along a diagonal they see the ridge of a wide one only
-@pytest.mark.parametrize(
-    ("angle_deg", "sigma_px"), [(0.0, 2.0), (90.0, 2.0), (45.0, 12.0), (135.0, 12.0)]
-)
-def test_a_straight_edge_has_no_keypoint(angle_deg: float, sigma_px: float) -> None:
-    angle = math.radians(angle_deg)
-    across = COLUMNS * math.cos(angle) + ROWS * math.sin(angle)
-    scores = torch.exp(-(across**2) / (2 * sigma_px**2))
-    y, x = torch.nonzero(scores[5:-5, 5:-5] > scores.max() - 1e-9).unbind(1)
-    crest = torch.stack([x, y], dim=1) + 5
-    assert len(crest) == 31
-    assert not on_no_edge(scores, crest, 10.0).any()
 
 
 @pytest.mark.parametrize(

@@ -198,24 +198,6 @@ def test_vectors_are_the_networks_of_what_it_sees(name: str, make: Make) -> None
     np.testing.assert_allclose(many, expected.numpy(), atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("name", "size"),
-    [
-        *(("megaloc", size) for size in [(322, 322), (480, 3), (1, 1), (15, 14), (700, 501)]),
-    ],
-)
-def test_images_of_any_size_have_vectors(make: Make, name: str, size: tuple[int, int]) -> None:
-    assert np.linalg.norm(make(name).describe(random_image(*size))) == pytest.approx(1, abs=1e-6)
-
-
-@pytest.mark.parametrize("name", ["openibl", "megaloc"])
-def test_half_precision_describes_nearly_the_same(name: str, make: Make) -> None:
-    image = texture(64, 80, sigma_px=6.0)
-    full, half = make(name).describe(image), make(name, half_precision=True).describe(image)
-    assert half.dtype == np.float32 and np.linalg.norm(half) == pytest.approx(1, abs=1e-6)
-    assert full @ half > 0.99 and (full != half).any()
-
-
 def test_it_travels_and_names_its_weights(name: str, make: Make) -> None:
     plugin, image = make(name), texture(64, 80)
     packed = pickle.dumps(plugin)
@@ -254,35 +236,6 @@ def test_names_tell_what_vectors_must_have_in_common(
     make: Make, name: str, options: dict[str, object], expected: str
 ) -> None:
     assert make(name, **options).name == expected
-
-
-@pytest.mark.parametrize(
-    ("name", "weights", "file", "expected"),
-    [
-        ("netvlad", "netvlad-tokyotm", "netvlad-tokyotm.safetensors", "netvlad-tokyotm"),
-        ("openibl", "openibl", "vgg16_netvlad.pth", "openibl"),
-        ("apgem", "apgem-resnet101", "apgem-resnet101.safetensors", "apgem-resnet101"),
-        ("delg", "delg-r50-gld", "delg-r50-gld.safetensors", "delg-r50-gld"),
-        ("megaloc", "megaloc", "MegaLoc/model.safetensors", "megaloc"),
-    ],
-)
-def test_published_files_are_found_in_the_folder_of_weights(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    name: str,
-    weights: str,
-    file: str,
-    expected: str,
-) -> None:
-    monkeypatch.setenv("MEGLOC_WEIGHTS", str(tmp_path))
-    (tmp_path / file).parent.mkdir(exist_ok=True)
-    (tmp_path / file).touch()
-    options = {"weights": weights, **({"whitening": ""} if name == "apgem" else {})}
-    plugin = KINDS[name](KINDS[name].Options.model_validate(options))
-    assert plugin.name == expected and list(plugin.weights()) == [Path(file).name]
-    if name == "megaloc":
-        with pytest.raises(DataError, match="is not the published .* of megaloc"):
-            plugin.describe(random_image(20, 20))
 
 
 def means_of_four(image: Image) -> NDArray[np.float64]:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from importlib.metadata import entry_points
 from typing import Any
 
 import cv2
 import numpy as np
-import pytest
 from images import Image
 from numpy.typing import NDArray
 
@@ -81,28 +78,6 @@ def test_all_our_extractors_have_the_option() -> None:
     assert len(ours) > 5
     for extractor in ours:
         assert issubclass(extractor.load().Options, BoundedOptions), extractor.name
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("megapixels", [12, 48])
-def test_memory_does_not_grow_with_the_image(megapixels: int) -> None:
-    """RootSIFT took 2.9 GB at 12 megapixels, 5.6 GB at 24 and was killed at 48 and 108."""
-    script = f"""if True:
-        import resource
-        import cv2, numpy as np
-        from megloc_kapture.features.image_bound import extract_bounded
-        from megloc_kapture.features.rootsift import RootSift
-        height = int(({megapixels}e6 * 3 / 4) ** 0.5)
-        small = np.random.default_rng(0).integers(0, 255, (height // 8, height // 6, 3), np.uint8)
-        image = cv2.resize(small, (height * 4 // 3, height))
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        assert len(extract_bounded(RootSift(), [(image, None)])[0].keypoints_px) == 5000
-        print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
-    """
-    done = subprocess.run(
-        [sys.executable, "-c", script], check=True, capture_output=True, text=True
-    )
-    assert int(done.stdout) < 2.2e6  # kB
 
 
 def test_a_keypoint_stands_in_the_pixel_that_holds_it() -> None:

@@ -86,13 +86,6 @@ def test_scales_and_the_thresholds_of_both_maps(weights: str, cropped: Image) ->
         assert {*map(tuple, fewer.keypoints_px)} < {*map(tuple, whole.keypoints_px)}
 
 
-def test_other_weights_make_another_type(shared_data: Path, weights: str) -> None:
-    assert extractor(weights).name == "r2d2_WASF_N16"
-    other = shared_data / "weights" / "r2d2" / "r2d2_WASF_N8_big.pt"
-    assert extractor(str(other)).name == "r2d2_WASF_N8_big"
-    assert R2D2.name == "r2d2"
-
-
 def test_a_pyramid_has_a_level() -> None:
     with pytest.raises(ValidationError, match=r"max_size is at least 1\.2 times min_size"):
         R2D2Options(min_size=1000, max_size=1024)
@@ -136,17 +129,6 @@ def test_the_maps_are_those_of_the_layers_written_down(size: tuple[int, int]) ->
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
 
 
-def test_a_pixel_sees_its_surroundings_evenly() -> None:
-    # the kernels of 2 by 2 have no middle: a shift of theirs would move every keypoint
-    network = load_r2d2(random_tensors("r2d2_WASF_N16", 3), "r").double()
-    image = torch.rand(1, 3, 121, 121, dtype=torch.float64).requires_grad_()
-    network(image).repeatability[0, 0, 60, 60].backward()
-    assert image.grad is not None
-    seen = torch.nonzero(image.grad.abs().amax(dim=(0, 1)))
-    radius = (60 - seen.amin(dim=0)).tolist()
-    assert radius == (seen.amax(dim=0) - 60).tolist() and radius[0] == radius[1] < 60
-
-
 def sizes(height: int, width: int, smallest: int, largest: int) -> list[tuple[int, int]]:
     levels = pyramid_levels(torch.zeros(1, 1, height, width), min_size=smallest, max_size=largest)
     return [(level.shape[-1], level.shape[-2]) for level in levels]
@@ -161,12 +143,6 @@ def test_four_levels_an_octave_between_two_sizes() -> None:
     assert sizes(60, 80, 256, 1024) == [(80, 60)]
     # a strip ends before it vanishes
     assert sizes(1, 400, 1, 1024)[-1][1] == 1
-
-
-@pytest.mark.parametrize(("side", "count"), [(1024, 9), (1025, 9), (256, 1)])
-def test_the_last_level_may_be_rounded_down(side: int, count: int) -> None:
-    found = sizes(16, side, 256, 1024)
-    assert len(found) == count and 255 <= found[-1][0] <= 257
 
 
 def test_a_ramp_stays_in_its_place() -> None:

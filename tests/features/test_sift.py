@@ -115,33 +115,6 @@ def test_the_options_of_sift_reach_colmap() -> None:
     assert some.mean() > everything.scores.mean()
 
 
-@pytest.mark.parametrize("kind", [RootSift, ColmapSift])
-def test_a_mask_looks_at_the_pixel_the_keypoint_lies_in(kind: Any) -> None:
-    centre = np.array([[100.5, 80.5]])  # the centre of pixel (100, 80)
-    image = blobs(centre, 3.0)
-    mask = np.zeros(image.shape[:2], dtype=bool)
-    mask[80, 100] = True
-    found = kind().extract(image, mask).keypoints_px
-    assert len(found) >= 1
-    np.testing.assert_allclose(found, np.repeat(centre, len(found), axis=0), atol=0.5)
-    assert len(kind().extract(image, ~mask).scores) < len(kind().extract(image).scores)
-
-
-@pytest.mark.parametrize("max_keypoints", [3, 20, 5000])
-@pytest.mark.parametrize("sigma_px", [2.0, 6.0])
-def test_a_mask_that_permits_everything_changes_nothing(
-    max_keypoints: int, sigma_px: float
-) -> None:
-    # with sigma 6 no keypoint of the doubled octave is left, which changes OpenCV's pyramid
-    image = blobs(grid_of_centres(seed=3), sigma_px)
-    extractor = RootSift(RootSiftOptions(max_keypoints=max_keypoints))
-    everything = np.ones(image.shape[:2], dtype=bool)
-    assert_same(extractor.extract(image), extractor.extract(image, everything))
-    # COLMAP keeps whole levels, then too
-    coarse = ColmapSift(ColmapSiftOptions(max_keypoints=max_keypoints))
-    assert_same(coarse.extract(image), coarse.extract(image, everything))
-
-
 def test_threads_do_not_disturb_each_other() -> None:
     images = [texture(110, 140, seed) for seed in range(4)]
     extractor = ColmapSift()

@@ -27,7 +27,6 @@ from megloc_kapture.features.superpoint import (
     superpoint_from,
     superpoint_with_descriptor,
 )
-from megloc_kapture.nets.score_maps import pixel_scores
 
 CPU = torch.device("cpu")
 
@@ -35,32 +34,6 @@ CPU = torch.device("cpu")
 def extractor(weights: Path, **options: object) -> SuperPoint:
     given = {"weights": str(weights), "device": "cpu", **options}
     return SuperPoint(SuperPointOptions.model_validate(given))
-
-
-def bright_cell_detector() -> SuperPointNet:
-    """Fires at row 5, column 2 of a cell of 8 x 8 pixels that has a bright pixel anywhere."""
-    net = SuperPointNet()
-    with torch.no_grad():
-        for parameter in net.parameters():
-            parameter.zero_()
-        for name, layer in net.named_children():
-            if name not in ("convPb", "convDb"):
-                layer.get_parameter("weight")[0, 0, 1, 1] = 1.0  # passes its input on
-        net.convPb.weight[8 * 5 + 2, 0] = 30.0
-        net.convPb.bias[64] = 10.0
-        net.convDb.bias[0] = 1.0
-    return net
-
-
-def test_a_keypoint_stands_at_the_middle_of_its_pixel(tmp_path: Path) -> None:
-    path = tmp_path / "superpoint_v1.pth"
-    torch.save(bright_cell_detector().state_dict(), path)
-    image = np.zeros((48, 64, 3), np.uint8)
-    image[19, 45] = 255  # cell (2, 5), whose keypoint is pixel (x 42, y 21)
-    found = extractor(path).extract(image)
-    np.testing.assert_array_equal(found.keypoints_px[:, :2], [[42.5, 21.5]])
-    assert found.keypoints_px[0, 2] == found.scores[0] > 0.99
-    assert found.keypoints_px.dtype == found.scores.dtype == found.descriptors.dtype == np.float32
 
 
 def test_ties_borders_and_the_threshold(superpoint_weights: Path) -> None:
@@ -193,17 +166,6 @@ def test_maps_of_any_size_are_transformers(size: tuple[int, int]) -> None:
     torch.testing.assert_close(descriptors, expected, rtol=0, atol=1e-6)
 
 
-def test_a_hot_channel_is_its_pixel_of_the_cell() -> None:
-    for channel in range(0, 65, 7):
-        logits = torch.zeros(1, 65, 3, 4)
-        logits[0, channel, 1, 2] = 50.0
-        scores = pixel_scores(logits)[0]
-        hot = torch.nonzero(scores > 0.9).tolist()
-        assert hot == ([[8 + channel // 8, 16 + channel % 8]] if channel < 64 else [])
-        assert scores[8:16, 16:24].sum() == pytest.approx(float(channel < 64), abs=1e-6)
-        assert scores[0, 0] == pytest.approx(1 / 65)
-
-
 def cells_at(
     xy: torch.Tensor, height: int, width: int, sampling: DescriptorSampling
 ) -> torch.Tensor:
@@ -219,28 +181,6 @@ def test_exact_sampling_reads_a_linear_map() -> None:
     xy = torch.stack([x, torch.full_like(x, 20)], dim=1)
     found = cells_at(xy, 6, 10, "exact")
     torch.testing.assert_close(found, (xy - 3.5) / 8, rtol=0, atol=1e-5)
-
-
-def test_official_sampling_drifts_by_its_formula() -> None:
-    height, width = 75, 100
-    x = torch.tensor([4, 100, 400, 799])
-    y = torch.tensor([4, 75, 300, 599])
-    found = cells_at(torch.stack([x, y], dim=1), height, width, "official")
-    expected = torch.stack(
-        [
-            (x - 3.5) * (width - 1) / (8 * width - 4.5),
-            (y - 3.5) * (height - 1) / (8 * height - 4.5),
-        ],
-        dim=1,
-    )
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
-    drift_px = 8 * (found[-1, 0] - (799 - 3.5) / 8)
-    assert drift_px == pytest.approx(-3.5, abs=0.05)
-
-
-def test_no_keypoints_no_descriptors() -> None:
-    empty = torch.zeros((0, 2), dtype=torch.int64)
-    assert sample_descriptors(torch.ones(256, 3, 4), empty, "official").shape == (0, 256)
 
 
 def parts(weights: Tensors, *prefixes: str) -> Tensors:

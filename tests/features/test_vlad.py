@@ -161,16 +161,6 @@ def test_training_depends_on_the_seed_only() -> None:
     np.testing.assert_array_equal(first[0], several[0])
 
 
-def test_a_large_training_set_starts_from_a_sample() -> None:
-    rng = np.random.default_rng(9)
-    truth = np.array([[0.0, 0.0], [50.0, 0.0], [0.0, 50.0]])
-    data = (truth[rng.integers(0, 3, 30_000)] + rng.normal(size=(30_000, 2))).astype(np.float32)
-    centres = train_vocabulary(data, VladOptions(num_clusters=3)).centres[0]
-    distance = np.linalg.norm(centres[:, None] - truth, axis=2)
-    assert sorted(distance.argmin(axis=1).tolist()) == [0, 1, 2]
-    assert distance.min(axis=1).max() < 0.1
-
-
 @given(st.lists(st.integers(0, 300), max_size=20), st.integers(1, 500), st.integers(0, 2**32 - 1))
 def test_sampled_rows_are_a_share_of_every_image(counts: list[int], total: int, seed: int) -> None:
     rows = sample_rows(counts, total, seed)

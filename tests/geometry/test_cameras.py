@@ -6,8 +6,6 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import (
@@ -178,24 +176,6 @@ def test_the_field_of_view_model_at_its_expansions(omega: float) -> None:
     # COLMAP's expansions do not meet its formula where they end: no differences across that
     radius = np.linalg.norm(at[:, :2] / at[:, 2:], axis=1)
     assert_colmaps(given, at[np.abs(radius - 0.01) > 1e-3])
-
-
-@given(
-    st.sampled_from(sorted(DISTORTION)),
-    st.lists(st.floats(-0.1, 0.1), min_size=8, max_size=8),
-    st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(0.01, 1000)),
-)
-def test_any_camera_and_point(
-    model: str, numbers: list[float], where: tuple[float, float, float]
-) -> None:
-    rest = tuple(numbers[: len(DISTORTION[model])])
-    given = camera(model, tuple(map(abs, rest)) if model == "FOV" else rest)
-    point = np.array([[where[0] * where[2], where[1] * where[2], where[2]]])
-    pixels, jacobian = project_with_jacobian(given, point)
-    np.testing.assert_allclose(pixels, colmap(given, point), rtol=1e-9, atol=1e-9)
-    # a point farther along its own ray is seen at the same pixel
-    along = jacobian[0] @ point[0]
-    np.testing.assert_allclose(along, 0.0, atol=1e-9 * np.abs(jacobian).max() * where[2])
 
 
 def test_nothing_is_seen_behind_the_camera() -> None:

@@ -125,7 +125,7 @@ def test_an_image_warped_to_its_own_view_is_itself(
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.model)
-@pytest.mark.parametrize("other", [CAMERAS[0], CAMERAS[4], CAMERAS[5]], ids=lambda c: c.model)
+@pytest.mark.parametrize("other", [CAMERAS[0], CAMERAS[4]], ids=lambda c: c.model)
 def test_a_plane_looks_as_it_does_from_there(camera: Camera, other: Camera) -> None:
     there = turned(3.0, -6.0, (0.3, -0.1, 0.2))
     view = warp_to_view([on_plane(other, STILL, WALL)], camera, there)

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -77,16 +75,6 @@ def test_half_of_the_matches_may_be_wrong(cameras: dict[str, Camera], model: str
     assert pose.num_inliers == pose.inliers.sum() and pose.num_matches == 200
 
 
-@given(st.integers(0, 2**32 - 1))
-@settings(max_examples=20)
-def test_any_pose_is_found(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    truth = random_pose(rng)
-    pose = located(absolute_pose(*scene(PINHOLE, truth, rng, count=40), PINHOLE))
-    distance, angle_deg = movement(pose.cam_from_world, truth)
-    assert distance < 1e-7 and np.radians(angle_deg) < 1e-8
-
-
 def test_points_in_a_plane() -> None:
     rng = np.random.default_rng(2)
     truth = random_pose(rng)
@@ -96,19 +84,6 @@ def test_points_in_a_plane() -> None:
     pose = located(absolute_pose(project(PINHOLE, truth, world), world, PINHOLE))
     distance, angle_deg = movement(pose.cam_from_world, truth)
     assert distance < 1e-8 and np.radians(angle_deg) < 1e-9
-
-
-def test_a_world_far_from_its_origin_loses_no_accuracy() -> None:
-    rng = np.random.default_rng(3)
-    pixels, world = scene(PINHOLE, random_pose(rng), rng)
-    pixels += 0.3 * rng.normal(size=pixels.shape)
-    far_from_near = RigidTransform((1.0, 0, 0, 0), (4.2e6, 1.7e5, 4.78e6))  # as ECEF
-    first = located(absolute_pose(pixels, world, PINHOLE))
-    second = located(absolute_pose(pixels, far_from_near.apply(world), PINHOLE))
-    distance, angle_deg = movement(second.cam_from_world @ far_from_near, first.cam_from_world)
-    assert distance < 1e-6 and np.radians(angle_deg) < 1e-8
-    np.testing.assert_allclose(second.covariance, first.covariance, rtol=1e-4, atol=1e-14)
-    assert first.num_inliers == second.num_inliers
 
 
 @pytest.mark.parametrize("length", [4.0, 0.0], ids=["line", "copies of one point"])

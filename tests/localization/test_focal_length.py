@@ -55,7 +55,7 @@ def misfit(
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.8, 0.95, 1.05, 1.2, 1.5])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(1))
 def test_a_wrong_focal_length_is_estimated(factor: float, seed: int) -> None:
     found = misfit(factor, seed=seed)
     assert found is not None
@@ -75,7 +75,7 @@ def test_a_wrong_focal_length_is_estimated(factor: float, seed: int) -> None:
     )
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("noise_px", [0.3, 3.0])
 def test_a_right_one_is_left_alone(seed: int, noise_px: float) -> None:
     assert misfit(1.0, seed=seed, noise_px=noise_px) is None
@@ -121,7 +121,7 @@ def solved(camera: Camera, pixels: Floats, points: Floats) -> Pose | Failure:
 @pytest.mark.parametrize(
     ("given_px", "deviation"), [(1400 * k, 0.1) for k in (0.7, 0.97, 1, 1.2)] + [(1920, 0.7)]
 )
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(1))
 def test_an_uncertain_camera_is_estimated(given_px: float, deviation: float, seed: int) -> None:
     """By a camera of 1400 px, off its middle and a little bent, that is said to be another."""
     rng = np.random.default_rng(seed)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.localization.ranking import DistinctiveInliers, InlierCount
-from megloc_kapture.plugin_loading import load_plugin
-from megloc_kapture.plugins import POSE_RANKERS, HypothesisView, PoseHypothesis, PoseRanker
+from megloc_kapture.plugins import HypothesisView, PoseHypothesis
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
@@ -47,13 +45,6 @@ def hypothesis(*views: HypothesisView) -> PoseHypothesis:
 def everywhere(count: int) -> NDArray[np.float64]:
     at = (np.arange(count) + 0.5) / count
     return np.stack([640 * at, 480 * ((at * 7) % 1)], axis=1)
-
-
-@pytest.mark.parametrize("name", ["inliers", "distinctive"])
-def test_they_are_registered(name: str) -> None:
-    ranker = load_plugin(POSE_RANKERS, name)
-    assert isinstance(ranker, PoseRanker)
-    assert ranker.score([], NoScene()).shape == (0,)
 
 
 def test_inliers_are_counted_over_all_views() -> None:
@@ -113,12 +104,3 @@ def test_two_clusters_of_one_place_do_not_count_against_each_other() -> None:
     other = standing(7.0, walls)
     scores = ranker(radius=0.0, power=1.0).score([*twice, other], NoScene())
     np.testing.assert_allclose(scores, [40 / 2 + 20, 40 / 2 + 20, 40 / 3])
-
-
-@pytest.mark.parametrize("power", [1.0, 4.0])
-def test_the_order_of_hypotheses_does_not_matter(power: float) -> None:
-    hypotheses = [standing(7.0 * at, room(30 + at)[at:]) for at in range(4)]
-    forward = ranker(power=power).score(hypotheses, NoScene())
-    np.testing.assert_allclose(
-        forward, ranker(power=power).score(hypotheses[::-1], NoScene())[::-1]
-    )

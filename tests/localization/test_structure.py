@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from megloc_kapture.errors import DataError
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.localization.structure import StructureDistance, _displacements_px
-from megloc_kapture.plugins import ImageDistance
 from megloc_kapture.values import Camera, RigidTransform
 
 Image = NDArray[np.uint8]
@@ -62,24 +61,6 @@ def test_it_is_the_mean_over_windows() -> None:
     assert 0.3 < expected < 1.7
     found = structure(window=0.05).distance(picture(0), picture(1), valid)
     assert found == pytest.approx(expected, rel=1e-3)
-
-
-def test_it_is_a_distance() -> None:
-    a, b = picture(0), picture(1)
-    assert isinstance(structure(), ImageDistance)
-    assert structure().distance(a, a, FULL) == pytest.approx(0.0, abs=1e-5)
-    assert structure().distance(a, b, FULL) == pytest.approx(structure().distance(b, a, FULL))
-    moved = [structure().distance(a, np.roll(a, shift, axis=1), FULL) for shift in range(4)]
-    assert (np.diff(moved) > 0).all()
-    inverted = (255 - a).astype(np.uint8)
-    assert structure().distance(a, inverted, FULL) > 1.5
-
-
-def test_light_and_shade_do_not_count() -> None:
-    a, b = picture(3, 80, 160), picture(4, 80, 160)
-    shade = np.linspace(0.6, 1.2, 80)[None, :, None]
-    darker = (a * shade + 10).clip(0, 255).astype(np.uint8)
-    assert structure().distance(a, darker, FULL) < 0.1 * structure().distance(a, b, FULL)
 
 
 def test_invalid_pixels_do_not_count() -> None:

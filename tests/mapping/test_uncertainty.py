@@ -134,20 +134,6 @@ CENTERS = np.array([[-1.0, 0.1, -6.0], [0.3, -0.4, -5.0], [1.2, 0.2, -6.5], [0.1
 FISHEYE = Camera("OPENCV_FISHEYE", 640, 480, MODELS["OPENCV_FISHEYE"])
 
 
-def test_a_pinhole_by_hand() -> None:
-    """Two cameras at right angles, f / z = 100: sums of 100^2 along the axes each resolves."""
-    camera = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
-    front = RigidTransform.from_matrix(np.eye(3), np.array([0.0, 0.0, 5.0]))
-    turned = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
-    side = RigidTransform.from_matrix(turned, np.array([0.0, 0.0, 5.0]))
-    two = np.array([0, 1])
-    found = point_covariances(np.zeros((1, 3)), 0 * two, two, [camera] * 2, [front, side])
-    # x and z are resolved by one camera each, y by both
-    np.testing.assert_allclose(found[0], [1e-4, 0, 0, 0.5e-4, 0, 1e-4], atol=1e-16)
-    deviations = point_deviations(found)
-    np.testing.assert_allclose(deviations, [[0.01 / np.sqrt(2), 0.01, 0.01]], rtol=1e-12)
-
-
 def test_what_the_images_do_not_determine_is_unknown() -> None:
     poses = looking_at_origin(CENTERS)
     points = np.zeros((5, 3))
@@ -209,16 +195,6 @@ def test_one_centre_determines_nothing_however_many_images_and_however_far() -> 
         points = center + rng.uniform((-1, -1, 2), (1, 1, 9), (50, 3))
         found = point_covariances(points, point_ids, image_ids, [FISHEYE] * 500, poses)
         assert np.isnan(found).all()
-
-
-@given(st.integers(0, 2**32 - 1), st.floats(-2, 3))
-def test_deviations_are_roots_of_eigenvalues(seed: int, spread: float) -> None:
-    rng = np.random.default_rng(seed)
-    axes = Rotation.random(random_state=seed).as_matrix()
-    values = np.sort(10.0 ** rng.uniform(spread, 3, 3))
-    matrix = axes @ np.diag(values) @ axes.T
-    six = matrix[np.triu_indices(3)][None]
-    np.testing.assert_allclose(point_deviations(six)[0], np.sqrt(values), rtol=1e-6)
 
 
 CAMERAS = (

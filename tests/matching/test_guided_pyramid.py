@@ -285,33 +285,7 @@ def test_variants_that_agree_with_the_richest_remain(rich: str) -> None:
     assert judgement.agree([]) == []
 
 
-SIZES = st.tuples(st.integers(1, 900), st.integers(1, 900))
-VARIANTS = st.builds(ImageVariant, st.floats(0.05, 4.0), st.sampled_from((0, 90, 180, 270)))
 SCALES = (0.25, 1 / 3, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0)
-
-
-def px_in_variant(variant: ImageVariant, px: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Pixels (N, 2) of an image of this size, in its variant."""
-    scaled = variant.scaled_size(width, height)
-    x, y = px.T * (np.array(scaled)[:, None] / np.array([[width], [height]]))
-    turned = {
-        0: (x, y),
-        90: (y, scaled[0] - x),
-        180: (scaled[0] - x, scaled[1] - y),
-        270: (scaled[1] - y, x),
-    }
-    return np.stack(turned[variant.rotation_deg], axis=1)
-
-
-@given(size=SIZES, variant=VARIANTS, seed=st.integers(0, 100))
-def test_there_and_back_is_where_it_was(
-    size: tuple[int, int], variant: ImageVariant, seed: int
-) -> None:
-    px = np.random.default_rng(seed).uniform(0, 1, (20, 2)) * size
-    there = px_in_variant(variant, px, *size)
-    np.testing.assert_allclose(variant.px_in_original(there, *size), px, atol=1e-9)
-    back = variant.px_in_original(px, *size)
-    np.testing.assert_allclose(px_in_variant(variant, back, *size), px, atol=1e-9)
 
 
 @pytest.mark.parametrize("rotation", (0, 90, 180, 270))

@@ -122,7 +122,7 @@ def smallest_correction_px(
     return float(np.linalg.norm(found.fun))
 
 
-@pytest.mark.parametrize("camera_b", [PINHOLE, *DISTORTED, *WIDE], ids=lambda c: c.model)
+@pytest.mark.parametrize("camera_b", [PINHOLE, DISTORTED[1], WIDE[0]], ids=lambda c: c.model)
 @pytest.mark.parametrize("camera_a", WIDE, ids=lambda c: c.model)
 def test_the_error_is_that_of_optimal_triangulation_to_first_order(
     camera_a: Camera, camera_b: Camera
@@ -234,10 +234,9 @@ def test_what_a_fisheye_sees_sideways_or_behind_is_refused() -> None:
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, *DISTORTED], ids=lambda c: c.model)
-@pytest.mark.parametrize("seed", [0, 1])
-def test_two_views_keep_the_inliers_among_as_many_outliers(camera: Camera, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    _, in_a, in_b = scene(camera, PINHOLE, count=300, seed=seed)
+def test_two_views_keep_the_inliers_among_as_many_outliers(camera: Camera) -> None:
+    rng = np.random.default_rng(0)
+    _, in_a, in_b = scene(camera, PINHOLE, count=300)
     few = verify_two_view(in_a[:14], camera, in_b[:14], PINHOLE)
     assert few.shape == (14,) and not few.any()
     assert verify_two_view(in_a[:0], camera, in_b[:0], PINHOLE).shape == (0,)
@@ -297,7 +296,7 @@ def of_one_scene(number: int, share: float, seed: int) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize("number", [40, 150, 600, 2000])
 def test_random_matches_agree_by_chance(number: int) -> None:
-    for seed in range(5):
+    for seed in range(2):
         found = verified(*of_one_scene(number, 0.0, seed))
         assert agree_by_chance(*found, OPTIONS), len(found[0])
 
@@ -310,7 +309,7 @@ def test_true_ones_do_not(number: int, share: float) -> None:
     assert agree_by_chance(first[:5], CAMERA, second[:5], CAMERA, 5, OPTIONS)  # a bare sample
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_wrong_matches_along_a_shelf(seed: int) -> None:
     """Keypoints in one band: most wrong matches are near the line of a camera that moved along
     it, more than of an image full of keypoints, and still they say nothing."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -49,32 +48,6 @@ def test_vectors_are_tensorflows(net: DelgNet, form: Form) -> None:
     # the comparison tells scales apart
     assert np.abs(joined - units[1]).max() > 1e-4
     assert np.linalg.norm(found) == pytest.approx(1)
-
-
-class Watched(torch.nn.Module):
-    """A network that keeps what it is shown."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.seen: list[torch.Tensor] = []
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        self.seen.append(x)
-        return torch.ones(len(x), 2048)
-
-
-def test_preprocessing_by_hand() -> None:
-    watched: Any = Watched()
-    pixels = torch.tensor([[0.0, 128, 255, 64, 32, 16]]).expand(1, 3, 5, 6)
-    describe(watched, pixels, (1.0, 2.0))
-    first, second = watched.seen
-    assert first[0, 0, 0].tolist() == [-1, 0, 127 / 128, -0.5, -0.75, -0.875]
-    # half-pixel centres: new places stand a quarter beside the old ones
-    assert second.shape == (1, 3, 10, 12)
-    assert second[0, 0, 0, :4].tolist() == pytest.approx([-1, -0.75, -0.25, 127 / 128 / 4])
-    # 6.5 and 7.5, each rounded to the even one, as TensorFlow does
-    describe(watched, torch.zeros(1, 3, 13, 15), (0.5,))
-    assert watched.seen[-1].shape == (1, 3, 6, 8)
 
 
 def test_too_small_an_image() -> None:

@@ -15,7 +15,6 @@ from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.nets.global_descriptors import (
     ApGemNet,
     NetVladLayer,
-    Order,
     apgem_from,
     netvlad,
     openibl,
@@ -26,15 +25,6 @@ from megloc_kapture.nets.trunks import ResNet
 CLUSTERS, OUTPUT = 3, 10
 MEAN = (123.0, 116.5, 104.25)
 AVERAGE_IMAGE = "average_image"
-
-
-def random_layer(order: Order, seed: int = 0, *, clusters: int = 4, size: int = 5) -> NetVladLayer:
-    torch.manual_seed(seed)
-    layer = NetVladLayer(clusters, size, order=order)
-    # sharp enough that the clusters differ
-    torch.nn.init.normal_(layer.conv.weight, std=4)
-    torch.nn.init.normal_(layer.centroids)
-    return layer.requires_grad_(False)
 
 
 def by_the_paper(layer: NetVladLayer, features: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -50,15 +40,6 @@ def by_the_paper(layer: NetVladLayer, features: NDArray[np.float64]) -> NDArray[
     for k in range(len(centres)):
         sums[:, k] /= np.sqrt((sums[:, k] ** 2).sum())
     return sums / np.sqrt((sums**2).sum())
-
-
-def test_the_layer_is_the_papers_equation() -> None:
-    features = torch.randn(2, 5, 3, 4, generator=torch.Generator().manual_seed(0)) * 30
-    dk, kd = random_layer("dk"), random_layer("kd")
-    for row in range(2):
-        expected = by_the_paper(dk, features[row].double().numpy())
-        for layer, vector in ((dk, expected.ravel()), (kd, expected.T.ravel())):
-            np.testing.assert_allclose(layer(features)[row].numpy(), vector, atol=2e-6)
 
 
 @pytest.fixture(scope="module")

@@ -83,19 +83,6 @@ def test_without_what_is_transient_it_is_nerf_a() -> None:
     torch.testing.assert_close(nerf_w_loss(with_none, seen), expected)
 
 
-def test_gradients_are_those_of_differences() -> None:
-    samples = random_samples((3, 7), torch.float64)
-    t = torch.sort(torch.rand(3, 7, dtype=torch.float64) + 1, dim=1).values
-    deltas = torch.full_like(t, 0.2)
-    seen = torch.rand(3, 3, dtype=torch.float64)
-    values = [value.clone().requires_grad_() for value in vars(samples).values()]
-
-    def loss(*parts: torch.Tensor) -> torch.Tensor:
-        return nerf_w_loss(composite(t, deltas, Samples(*parts)), seen)
-
-    assert torch.autograd.gradcheck(loss, values)
-
-
 def test_samples_lie_where_they_should() -> None:
     rays = rays_of(50)
     generator = torch.Generator().manual_seed(1)

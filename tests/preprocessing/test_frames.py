@@ -208,18 +208,6 @@ def test_every_model_as_colmap_undistorts_it(
     assert difference.mean() < 0.6
 
 
-@pytest.mark.parametrize("options", [UNDISTORT, SMALL])
-def test_points_project_to_where_they_are_carried(distorted: Camera, options: FrameOptions) -> None:
-    """The pose stays: a 3D point's pixel in one image is carried to its pixel in the other."""
-    plan = plan_frame(distorted, options)
-    points = points_seen(distorted, seed=1, count=300) * [0.8, 0.8, 1]
-    before, after = (px_from_cam(c, points) for c in (plan.original, plan.processed))
-    carried = carry_points(plan.original, plan.processed, before)
-    inside = np.isfinite(carried).all(axis=1)
-    assert inside.mean() > 0.8
-    np.testing.assert_allclose(carried[inside], after[inside], rtol=0, atol=1e-6)
-
-
 @pytest.mark.parametrize("options", [UNDISTORT, SMALL, FrameOptions(max_size_px=200)])
 def test_keypoints_come_back_exactly(camera: Camera, options: FrameOptions) -> None:
     plan = plan_frame(camera, options)
@@ -309,14 +297,3 @@ def test_shrunken_detail_is_averaged_not_picked(painted: Callable[..., Any]) -> 
     assert plan.shrink > 4
     assert np.abs(found - 127.5).max() < 45
     assert found.std() < 12
-
-
-@pytest.mark.parametrize("options", [UNDISTORT, FrameOptions(undistort=True, max_size_px=180)])
-def test_a_blob_of_an_undistorted_image_is_where_the_pixel_map_says(
-    distorted: Camera, painted: Callable[..., Any], options: FrameOptions
-) -> None:
-    centre = np.array([[262.4, 170.3]])
-    plan = plan_frame(distorted, options)
-    found = centroid(processed_image(blob(painted, centre, 4.0), plan))
-    expected = carry_points(plan.original, plan.processed, centre)
-    np.testing.assert_allclose(found, expected, atol=0.08)

@@ -89,16 +89,6 @@ def test_nearest_and_spacing() -> None:
     assert surface.spacing() == pytest.approx(np.median(last))
 
 
-def test_a_corner_is_found_again() -> None:
-    surface = corner_surface(3)
-    points = downsample(corner(np.random.default_rng(4), 6000)[0], 0.1)
-    turn = Rotation.from_rotvec(np.radians([2.0, -1.5, 1.0])).as_matrix()
-    start = RigidTransform.from_matrix(turn, np.array([0.03, -0.02, 0.04]))
-    found = fit_to_surface(surface, points, start, 0.3)
-    assert np.linalg.norm(found.translation) < 2e-3
-    assert np.degrees(Rotation.from_matrix(found.rotation_matrix()).magnitude()) < 0.1
-
-
 def directions(rng: np.random.Generator, count: int) -> np.ndarray:
     vectors = rng.standard_normal((count, 3))
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -285,16 +275,6 @@ def test_pixels_beside_a_step_go_and_those_beside_a_hole_stay() -> None:
     for wrong in ({"max_depth_m": 0.0}, {"max_jump": 0.0}):
         with pytest.raises(ValidationError):
             DepthCloudOptions.model_validate(wrong)
-
-
-def test_a_slanted_plane_is_no_edge() -> None:
-    """80 degrees from the sensor's axis, at the resolution of a real sensor."""
-    camera = Camera("PINHOLE", 640, 480, (585.0, 585.0, 320.0, 240.0))
-    x = (np.arange(640) + 0.5 - 320) / 585
-    depth = np.tile((1.0 / (1.0 + np.tan(np.radians(80)) * (x + 0.1))), (480, 1))
-    view = DepthView(camera, depth.astype(np.float32), IDENTITY)
-    in_range = (depth > 0) & (depth <= 1.5)
-    assert len(depth_cloud(view, DepthCloudOptions(max_depth_m=1.5))) == in_range.sum()
 
 
 def test_the_mask_is_the_images() -> None:

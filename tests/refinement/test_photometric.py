@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -35,8 +34,7 @@ from megloc_kapture.values import Camera, RigidTransform
 
 Array = NDArray[np.float64]
 Problems = Callable[..., tuple[LevelProblem, RigidTransform]]
-MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE", "FOV")
-MODELS += ("THIN_PRISM_FISHEYE",)
+MODELS = ("PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE")
 
 
 def start_from(pose: RigidTransform, seed: int, m: float, deg: float) -> RigidTransform:
@@ -76,56 +74,6 @@ def test_derivatives_equal_differences(problem: Problems, model: str) -> None:
         size = np.abs(rows[clear, :, 1 + i]).max()
         difference = (above - below)[clear] / 2e-6 - rows[clear, :, 1 + i]
         assert np.abs(difference).max() < 1e-6 * size
-
-
-def objective(
-    aligned: LevelProblem,
-    pose: RigidTransform,
-    step: torch.Tensor,
-    gains: torch.Tensor,
-    biases: torch.Tensor,
-    squared_scale: float,
-) -> torch.Tensor:
-    """The sum of Geman and McClure's losses for SIMPLE_RADIAL, written plainly."""
-    height, width = aligned.level.valid.shape
-    chosen, level, (f, cx, cy, k) = aligned.chosen, aligned.level, aligned.camera.params
-    x, y, z = step[:3]
-    zero = torch.zeros((), dtype=torch.float64)
-    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    turn = torch.linalg.matrix_exp(skew)
-    in_camera = torch.from_numpy(pose.apply(chosen.points)) @ turn.T + step[3:]
-    uv = in_camera[:, :2] / in_camera[:, 2:]
-    uv = uv * (1 + k * (uv**2).sum(1, keepdim=True))
-    centre = torch.tensor([cx, cy], dtype=torch.float64)
-    xy = (f * uv + centre) * level.scale_x - 0.5
-    corner = xy.detach().floor().long()
-    inside = ((corner >= 0) & (corner < torch.tensor([width - 1, height - 1]))).all(1)
-    xy, corner = xy[inside], corner[inside]
-    (a, b), (j, i) = (xy - corner).T[..., None], corner.T
-    image = torch.from_numpy(level.values.astype(np.float64))
-    query = (1 - a) * (1 - b) * image[i, j] + a * (1 - b) * image[i, j + 1]
-    query = query + (1 - a) * b * image[i + 1, j] + a * b * image[i + 1, j + 1]
-    group = torch.from_numpy(chosen.groups)[inside]
-    residuals = gains[group] * query + biases[group] - torch.from_numpy(chosen.values)[inside]
-    squared = (residuals**2).mean(1)
-    return (0.5 * squared_scale * squared / (squared_scale + squared)).sum()
-
-
-@pytest.mark.parametrize("channels", [1, 3])
-def test_gradient_equals_autograd(problem: Problems, channels: int) -> None:
-    aligned, truth = problem("SIMPLE_RADIAL", channels=channels, wrong=0.2)
-    pose = start_from(truth, 5, 0.05, 0.5)
-    rng = np.random.default_rng(2)
-    at = Alignment(pose, rng.uniform(0.5, 1.5, (2, channels)), rng.normal(size=(2, channels)), 1.0)
-    system = aligned.system_at(at, 0.49)
-    step = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    gains, biases = (torch.tensor(each, requires_grad=True) for each in (at.gains, at.biases))
-    cost = objective(aligned, pose, step, gains, biases, 0.49)
-    cost.backward()
-    assert system.mean_cost * system.count == pytest.approx(cost.item(), rel=1e-12)
-    np.testing.assert_allclose(system.pose_gradient, step.grad.numpy(), rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(system.own_gradient[..., 0], gains.grad.numpy(), rtol=1e-6)
-    np.testing.assert_allclose(system.own_gradient[..., 1], biases.grad.numpy(), rtol=1e-6)
 
 
 def test_a_lens_that_folds_back_does_not_show_what_is_outside() -> None:
@@ -237,7 +185,7 @@ def test_costs_and_significance_are_those_of_a_plain_loop(problem: Problems) -> 
 
 def test_a_pose_tuned_to_noise_is_not_significant(problem: Problems) -> None:
     found = []
-    for seed in range(20):
+    for seed in range(8):
         aligned, truth = problem(count=3000, noise=0.3, seed=seed)
         tuned = minimise(aligned, aligned.nuisance_at(truth), last_step_px=1e-3)
         comparison = compare_poses(aligned, truth, tuned.cam_from_world)
@@ -263,7 +211,7 @@ def test_correlation_is_that_of_numpy_about_each_references_mean(problem: Proble
 
 def test_covariance_is_that_of_the_errors(problem: Problems) -> None:
     errors, claimed = [], []
-    for seed in range(40):
+    for seed in range(16):
         aligned, truth = problem(count=3000, noise=0.3, seed=seed)
         found = minimise(aligned, aligned.nuisance_at(truth), last_step_px=1e-3)
         claim = covariance(aligned, found)

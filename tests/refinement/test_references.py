@@ -41,7 +41,7 @@ HERE = RigidTransform.identity()
 Map = Mapping[str, RenderingReference]
 Verdict = Callable[[Map], Consistency]
 
-CAMERA = Camera("PINHOLE", 240, 180, (195.0, 197.0, 120.0, 90.0))
+CAMERA = Camera("PINHOLE", 160, 120, (130.0, 131.3, 80.0, 60.0))
 PX_PER_M = 60
 SLOW = pytest.mark.slow
 # two threads on small images wait for each other most of the time

@@ -1,4 +1,4 @@
-"""Labels against definitions written out, on a rendered world whose depth is exact."""
+"""Labels of keypoints against explicit definitions, on walls of exact depth."""
 
 from __future__ import annotations
 
@@ -8,9 +8,6 @@ import cv2
 import numpy as np
 import pytest
 from corner import CAMERA, depth_m, pose_at
-from megloc_twins.options import SyntheticWorldOptions
-from megloc_twins.render import PlaceRenderer
-from megloc_twins.synthetic_kapture import build_world
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import bearing_rays, project
@@ -34,33 +31,6 @@ DISTORTED = Camera("OPENCV", 400, 300, (300.0, 302.0, 198.0, 151.0, -0.12, 0.03,
 
 def corner_view(pose: RigidTransform) -> PosedView:
     return PosedView(CAMERA, pose, DepthView(CAMERA, depth_m(pose), IDENTITY))
-
-
-@pytest.fixture(scope="module")
-def twin() -> tuple[PosedView, PosedView]:
-    """Two images of a rendered square, with cars and people that moved; the second is distorted."""
-    options = SyntheticWorldOptions(
-        seed=11, num_places=1, stations_per_place=3, day_queries=2, night_queries=0, width=240,
-        height=180, supersampling=1,
-    )  # fmt: skip
-    world = build_world(options)
-    renderer = PlaceRenderer(world.places[0], seed=11, supersampling=1)
-
-    def view(frame):  # type: ignore[no-untyped-def]
-        depth = renderer.render(frame, depth=True).depth_m
-        return PosedView(
-            frame.camera, frame.cam_from_world, DepthView(frame.camera, depth, IDENTITY)
-        )
-
-    views = {frame.name: view(frame) for frame in world.frames()}
-    query = next(name for name in views if name.startswith("query"))
-    other = max(
-        (name for name in views if name.startswith("db")),
-        key=lambda name: overlap(views[query], views[name]),
-    )
-    assert overlap(views[query], views[other]) > 0.2
-    assert views[query].camera.model == "SIMPLE_RADIAL" != views[other].camera.model
-    return views[other], views[query]
 
 
 def brute_force(
@@ -90,18 +60,17 @@ def brute_force(
 def keypoints(a: PosedView, b: PosedView) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Random ones, and in b some that are those of a, more or less."""
     rng = np.random.default_rng(0)
-    px_a = rng.uniform(0, (a.camera.width, a.camera.height), (300, 2))
+    px_a = rng.uniform(0, (a.camera.width, a.camera.height), (150, 2))
     moved, _, visible = reproject(px_a, a, b)
     near = moved[visible] + rng.normal(0, 2.0, (visible.sum(), 2))
-    far = rng.uniform(0, (b.camera.width, b.camera.height), (150, 2))
+    far = rng.uniform(0, (b.camera.width, b.camera.height), (75, 2))
     inside = ((near > 1) & (near < (b.camera.width - 1, b.camera.height - 1))).all(axis=1)
     return px_a, np.concatenate([near[inside], far])
 
 
-def test_labels_are_those_of_brute_force_on_an_exact_twin(
-    twin: tuple[PosedView, PosedView],
-) -> None:
-    a, b = twin
+def test_labels_equal_brute_force() -> None:
+    a, pose = corner_view(pose_at((-1.0, 0, 0), -4, 0)), pose_at((0.4, 0.1, 0.3), 4, 1)
+    b = PosedView(DISTORTED, pose, DepthView(CAMERA, depth_m(pose), IDENTITY))
     px_a, px_b = keypoints(a, b)
     found = labels_of_views(px_a, px_b, a, b)
     for px, other_px, view, other, partner in (
@@ -110,10 +79,10 @@ def test_labels_are_those_of_brute_force_on_an_exact_twin(
     ):
         expected = np.array(brute_force(px, other_px, view, other))
         told = expected != WITHOUT_DEPTH
-        assert told.sum() > 150
+        assert told.sum() > 75
         np.testing.assert_array_equal(partner[told], expected[told])
-        assert (expected >= 0).sum() > 40
-        assert min((expected == UNMATCHED).sum(), (expected == IGNORED).sum()) > 5
+        assert (expected >= 0).sum() > 20
+        assert min((expected == UNMATCHED).sum(), (expected == IGNORED).sum()) > 2
     matches = found.matches()
     np.testing.assert_array_equal(found.partner_b[matches[:, 1]], matches[:, 0])
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from megloc_kapture.features.rootsift import RootSift
 from megloc_kapture.features.superpoint import SuperPoint, SuperPointOptions
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.nets.superglue import ImageKeypoints, SuperGlueNet, log_optimal_transport
+from megloc_kapture.nets.superglue import ImageKeypoints, SuperGlueNet
 from megloc_kapture.training.labels import IGNORED, UNMATCHED, Labels
 from megloc_kapture.training.networks import (
     FrozenFeatures,
@@ -219,35 +218,6 @@ def test_it_is_the_likelihood_of_the_labels() -> None:
     lost = Labels(np.array([UNMATCHED, IGNORED, IGNORED]), np.full(2, IGNORED))
     transport_loss(log - 2, lost).backward()
     assert log.grad is not None and log.grad.nonzero().tolist() == [[0, 2]]
-
-
-@pytest.mark.parametrize("scale", [1.0, 40.0])  # the larger one rescales potentials on its way
-def test_gradients_through_the_transport(scale: float) -> None:
-    generator = torch.Generator().manual_seed(1)
-    scores = scale * torch.randn(5, 4, generator=generator, dtype=torch.float64)
-    dustbin = torch.tensor(0.3, dtype=torch.float64)
-
-    def loss(scores: torch.Tensor, dustbin: torch.Tensor) -> torch.Tensor:
-        return transport_loss(log_optimal_transport([scores], dustbin, 12)[0], LABELS)
-
-    inputs = (scores.requires_grad_(), dustbin.requires_grad_())
-    assert torch.autograd.gradcheck(loss, inputs, eps=1e-6, atol=1e-6)
-
-
-def test_gradients_through_superglue_reach_its_inputs() -> None:
-    torch.manual_seed(2)
-    net = SuperGlueNet(encoder_sizes=(8, 8), num_layers=2).double()
-    a, b = (random_side(count, 8, count, torch.float64) for count in (5, 4))
-
-    def loss(first: torch.Tensor, second: torch.Tensor, bin_score: torch.Tensor) -> torch.Tensor:
-        net.bin_score.data = bin_score.data
-        pair = replace(a, descriptors=first), replace(b, descriptors=second)
-        depths = net.assignments([pair], 10, [1, 2])
-        return sum(transport_loss(depth[0], LABELS) for depth in depths)  # type: ignore[return-value]
-
-    inputs = (a.descriptors.requires_grad_(), b.descriptors.requires_grad_(), net.bin_score.data)
-    # along a random direction of each
-    assert torch.autograd.gradcheck(loss, inputs, eps=1e-6, atol=1e-5, fast_mode=True)
 
 
 def test_matches_are_judged_by_labels_of_both_images() -> None:

@@ -135,7 +135,7 @@ def bilinear(image: NDArray[np.uint8], px: NDArray[np.float64]) -> NDArray[np.fl
     return np.stack([map_coordinates(channel, at, order=1) for channel in channels], axis=1)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_view_shows_what_its_homography_says(seed: int) -> None:
     image = smooth_image()
     rng = np.random.default_rng(seed)

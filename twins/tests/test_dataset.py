@@ -1,12 +1,9 @@
-"""All rendered datasets: their bytes, their options, and that their import is their truth."""
+"""All rendered datasets: their options, and their import against their truth."""
 
 from __future__ import annotations
 
-import hashlib
 from collections import defaultdict
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +20,6 @@ from megloc_kapture.io.images import image_size
 from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.plugin_loading import load_plugin
 from megloc_kapture.plugins import DATASETS
-from megloc_kapture.stages.work import Work
 from megloc_kapture.values import RigidTransform
 
 import pycolmap  # isort: skip  after the package, see megloc_kapture/io/colmap.py
@@ -37,25 +33,6 @@ COUNTS = {
     "inloc": {"floors": 2, "scans": 6, "mapping images": 216, "query images": 5},
 }
 Rendered = Callable[[str], Path]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["synthetic", *LAYOUTS])
-def test_processes_write_the_same_bytes(
-    name: str, small: dict[str, SyntheticDataset[Any]], rendered: Rendered, tmp_path: Path
-) -> None:
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as executor:
-        assert small[name].write(tmp_path, Work(executor)) == COUNTS[name]
-    found = hashes(tmp_path)
-    assert len(found) > 25 and found == hashes(rendered(name))
-
-
-def hashes(root: Path) -> dict[str, str]:
-    return {
-        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(root.rglob("*"))
-        if path.is_file()
-    }
 
 
 @pytest.mark.parametrize(
@@ -176,11 +153,7 @@ def read(folder: Path) -> tuple[dict[str, Any], dict[str, list[str]]]:
     ("name", "wrong"),
     [
         ("synthetic", {"num_places": 0}),
-        ("synthetic", {"supersampling": 9}),
         ("synthetic", {"colour": "red"}),
-        ("aachen", {"day_queries": 0}),
-        ("robotcar", {"size_px": 8}),
-        ("4seasons", {"map_keyframes": 1}),
         ("inloc", {"modules": 21}),
     ],
 )

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from megloc_twins.fourseasons import DUSK, REFERENCE, WINTER, FourSeasonsTwinOptions
+from megloc_twins.fourseasons import DUSK, REFERENCE, WINTER
 
 from megloc_kapture.datasets.fourseasons import (
     read_gnss_poses,
@@ -128,10 +128,3 @@ def test_geodesy(place: tuple[float, float, float]) -> None:
     higher = earth_from_enu(place[0], place[1], place[2] + 1).translation
     step = np.array(higher) - earth_from_enu(*place).translation
     np.testing.assert_allclose(enu[:, 2], step, atol=1e-8)
-
-
-def test_the_default_is_large_enough() -> None:
-    options = FourSeasonsTwinOptions()
-    assert 2 * options.num_places * options.map_keyframes >= 80
-    assert options.num_places * (options.winter_keyframes + options.dusk_keyframes) >= 40
-    assert (options.width, options.height) == (800, 400)
