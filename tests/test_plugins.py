@@ -65,7 +65,7 @@ ENTRY_POINTS = f"""
 
 
 def install(folder: Path, distribution: str, modules: dict[str, str], entry_points: str) -> None:
-    """What pip leaves behind: modules, and a folder of metadata beside them."""
+    """Write modules and a folder of metadata, as pip does."""
     for name, text in modules.items():
         (folder / f"{name}.py").write_text(textwrap.dedent(text))
     metadata = folder / f"{distribution}-1.0.dist-info"

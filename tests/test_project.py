@@ -49,8 +49,8 @@ def test_nothing_is_there_that_breaks_others() -> None:
 
 
 def test_the_twins_need_what_the_package_has() -> None:
-    own, *others = (Requirement(text) for text in TWINS["dependencies"])
-    assert own.name == PROJECT["name"] and own.specifier.contains(PROJECT["version"])
+    package, *others = (Requirement(text) for text in TWINS["dependencies"])
+    assert package.name == PROJECT["name"] and package.specifier.contains(PROJECT["version"])
     assert TWINS["version"] == PROJECT["version"]
     assert {str(other) for other in others} <= set(PROJECT["dependencies"])
     for key in ("requires-python", "license", "authors"):

@@ -89,8 +89,8 @@ def assert_equal_figures(
     estimated: Poses, truth: Poses, bins: list[tuple[float, float]], oracle: Figures
 ) -> None:
     statistics, results = oracle(estimated, truth, bins)
-    found = evaluate_poses(estimated, truth, thresholds=thresholds_from_pairs(bins))
-    row = found.row()
+    result = evaluate_poses(estimated, truth, thresholds=thresholds_from_pairs(bins))
+    row = result.row()
     assert row.num_queries == statistics.number_of_images
     assert row.num_localized == statistics.number_of_localized_positions
     counts = [count for _, _, count in statistics.filled_bins]
@@ -107,10 +107,10 @@ def assert_equal_figures(
         *(statistics.median_localized_positions, statistics.median_localized_rotations),
     )
     assert ours == pytest.approx(theirs, abs=1e-9)
-    assert list(found.errors.names) == [name for name, _, _ in results]
+    assert list(result.errors.names) == [name for name, _, _ in results]
     theirs_by_query = np.nan_to_num([errors for _, *errors in results], nan=np.inf)
-    np.testing.assert_allclose(found.errors.position_m, theirs_by_query[:, 0], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(found.errors.angle_deg, theirs_by_query[:, 1], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(result.errors.position_m, theirs_by_query[:, 0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(result.errors.angle_deg, theirs_by_query[:, 1], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("num_missing", [0, 5, 21, 40])
@@ -190,8 +190,8 @@ def test_folders_written_by_kapture_are_evaluated(
 ) -> None:
     truth = tmp_path / "query_gt"
     kapture.io.csv.kapture_to_dir(str(truth), kapture_of(world.truth, list(world.truth)))
-    found = evaluate(localized, truth)
+    result = evaluate(localized, truth)
     expected = evaluate_poses(world.estimated, world.truth).errors.position_m
-    assert found.row().num_queries == 40
-    np.testing.assert_allclose(found.errors.position_m, expected, rtol=0, atol=1e-9)
-    assert found.thresholds[1] == Threshold(position_m=0.25, angle_deg=2.0)
+    assert result.row().num_queries == 40
+    np.testing.assert_allclose(result.errors.position_m, expected, rtol=0, atol=1e-9)
+    assert result.thresholds[1] == Threshold(position_m=0.25, angle_deg=2.0)

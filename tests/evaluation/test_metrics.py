@@ -117,7 +117,7 @@ def test_rows_by_condition_pool_and_all() -> None:
     conditions = ["noon", "noon", "noon", "dawn", "night", ""]
     pools = {"day": ("dawn", "noon"), "wet": ("rain",)}
     members = row_members(conditions, Protocol(conditions=("noon", "rain"), pools=pools))
-    rows = [recall_row(n, errors, [QUARTER], members=own) for n, own in members.items()]
+    rows = [recall_row(n, errors, [QUARTER], members=rows_of) for n, rows_of in members.items()]
     assert [row.name for row in rows] == ["noon", "dawn", "night", "", "day", "all"]
     recall = {row.name: row.recall[0].recall for row in rows}
     # pooled: 3 of 4 queries, not the mean 0.5 of the two recalls

@@ -47,9 +47,9 @@ def test_keypoints_are_kornias(cropped: Image, shared_data: Path, variant: str) 
     planes = torch.from_numpy(image.transpose(2, 0, 1).astype(np.float32) / 255)
     with torch.inference_mode():
         theirs = net.eval()(planes[None])[0]
-    own = extractor(weights=variant, max_keypoints=20_000)
-    ours = own.extract(image)
-    assert own.name == variant and own.descriptor_size == ours.descriptors.shape[1]
+    plugin = extractor(weights=variant, max_keypoints=20_000)
+    ours = plugin.extract(image)
+    assert plugin.name == variant and plugin.descriptor_size == ours.descriptors.shape[1]
     assert theirs.n > 50
     expected = theirs.keypoints.numpy() + 0.5  # kornia's pixel centres are integers
     distance = np.linalg.norm(expected[:, None] - ours.keypoints_px[None, :, :2], axis=2)
@@ -79,10 +79,10 @@ def test_a_peak_of_the_score_map_lies_at_its_pixels_centre(monkeypatch: pytest.M
             return torch.ones(len(xy), 128)
 
     monkeypatch.setattr(aliked.Aliked, "network", lambda *_: (Net(), torch.device("cpu")))
-    found = extractor().extract(np.zeros((40, 50, 3), np.uint8))
+    result = extractor().extract(np.zeros((40, 50, 3), np.uint8))
     # the one at x = 1 is within two pixels of the border, the last one is too weak
     np.testing.assert_allclose(
-        found.keypoints_px, [[20.5, 10.5, 0.9], [35.5, 30.5, 0.6]], atol=1e-5
+        result.keypoints_px, [[20.5, 10.5, 0.9], [35.5, 30.5, 0.6]], atol=1e-5
     )
 
 

@@ -63,19 +63,19 @@ def blobs(centres: list[tuple[float, float]], heights: list[float]) -> torch.Ten
 def test_the_centre_of_a_blob(on_maps: OnMaps) -> None:
     # a blob on a pixel's centre lies a half further in COLMAP's coordinates
     centres = [(20.0, 30.0), (50.3, 20.0), (60.25, 45.6)]
-    found = on_maps(blobs(centres, [2.0, 1.5, 1.0]))
-    assert len(found.scores) == 3
+    result = on_maps(blobs(centres, [2.0, 1.5, 1.0]))
+    assert len(result.scores) == 3
     expected = np.array(centres) + 0.5
-    assert np.abs(found.keypoints_px[:, :2] - expected).max() < 0.05
-    np.testing.assert_allclose(found.keypoints_px[0, :2], [20.5, 30.5], atol=1e-4)
-    np.testing.assert_allclose(found.scores[0], 2.0, atol=1e-3)
+    assert np.abs(result.keypoints_px[:, :2] - expected).max() < 0.05
+    np.testing.assert_allclose(result.keypoints_px[0, :2], [20.5, 30.5], atol=1e-4)
+    np.testing.assert_allclose(result.scores[0], 2.0, atol=1e-3)
 
 
 def test_weak_peaks_and_peaks_at_the_border_are_left_out(on_maps: OnMaps) -> None:
     centres = [(4.0, 30.0), (5.0, 45.0), (75.0, 20.0), (74.0, 40.0), (40.0, 30.0)]
     scores = blobs(centres, [2.0, 1.5, 2.0, 1.2, 0.4])
-    found = on_maps(scores)
-    np.testing.assert_allclose(found.keypoints_px[:, :2], [[5.5, 45.5], [74.5, 40.5]], atol=0.01)
+    result = on_maps(scores)
+    np.testing.assert_allclose(result.keypoints_px[:, :2], [[5.5, 45.5], [74.5, 40.5]], atol=0.01)
 
 
 @pytest.mark.parametrize("image", ["even", "odd"])
@@ -83,22 +83,22 @@ def test_keypoints_are_tensorflows(image: str, tmp_path: Path) -> None:
     outputs = np.load(TENSORFLOW / "reference.npz")
     gray = outputs[f"{image}/image"]
     save_file(converted(), tmp_path / "aslfeat.safetensors")
-    found = extractor(tmp_path / "aslfeat.safetensors").extract(np.repeat(gray[..., None], 3, 2))
-    assert len(found.scores) > 40
+    result = extractor(tmp_path / "aslfeat.safetensors").extract(np.repeat(gray[..., None], 3, 2))
+    assert len(result.scores) > 40
     # the published network puts the first pixel's centre at (0, 0)
     np.testing.assert_allclose(
-        found.keypoints_px[:, :2] - 0.5, outputs[f"{image}/keypoints"], rtol=0, atol=1e-4
+        result.keypoints_px[:, :2] - 0.5, outputs[f"{image}/keypoints"], rtol=0, atol=1e-4
     )
-    np.testing.assert_allclose(found.scores, outputs[f"{image}/scores"], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(result.scores, outputs[f"{image}/scores"], rtol=0, atol=1e-5)
     np.testing.assert_allclose(
-        found.descriptors, outputs[f"{image}/descriptors"], rtol=0, atol=1e-5
+        result.descriptors, outputs[f"{image}/descriptors"], rtol=0, atol=1e-5
     )
 
 
 def test_keypoints_of_small_scales_lie_where_they_are_in_the_image(
     monkeypatch: pytest.MonkeyPatch, aslfeat_weights: Path
 ) -> None:
-    # the network marks the brightest pixel of what it is given: a spot is found on every scale
+    # the network marks the brightest pixel of its input: the spot is detected on every scale
     def net(gray: torch.Tensor) -> list[AslFeatMaps]:
         features = torch.ones(128, -(-gray.shape[2] // 4), -(-gray.shape[3] // 4))
         return [AslFeatMaps(gray[0, 0] / 255, features)]
@@ -107,9 +107,9 @@ def test_keypoints_of_small_scales_lie_where_they_are_in_the_image(
     y, x = np.mgrid[:500, :1000] + 0.5
     spot = 250 * np.exp(-((x - 700.5) ** 2 + (y - 300.5) ** 2) / (2 * 5.0**2))
     image = np.repeat(spot.round().astype(np.uint8)[..., None], 3, axis=2)
-    found = extractor(aslfeat_weights, multi_scale=True, threshold=0.4).extract(image)
-    assert len(found.scores) == 3
-    np.testing.assert_allclose(found.keypoints_px[:, :2], [[700.5, 300.5]] * 3, atol=0.1)
+    result = extractor(aslfeat_weights, multi_scale=True, threshold=0.4).extract(image)
+    assert len(result.scores) == 3
+    np.testing.assert_allclose(result.keypoints_px[:, :2], [[700.5, 300.5]] * 3, atol=0.1)
 
 
 def tensorflows_variables() -> dict[str, np.ndarray]:
@@ -121,7 +121,7 @@ def converted() -> dict[str, torch.Tensor]:
     return aslfeat_state(tensorflows_variables())
 
 
-def test_what_an_optimiser_keeps_is_left_out() -> None:
+def test_optimiser_state_is_left_out() -> None:
     variables = tensorflows_variables()
     slots = {
         "conv0/kernel/Momentum": variables["conv0/kernel"],
@@ -130,7 +130,7 @@ def test_what_an_optimiser_keeps_is_left_out() -> None:
     assert aslfeat_state(variables | slots).keys() == converted().keys()
 
 
-def test_what_does_not_fit_is_named() -> None:
+def test_mismatched_weights_are_named() -> None:
     state = converted()
     for scale in (0.0, -1.0, math.inf):
         with pytest.raises(DataError, match="tower/conv1/instance_max"):

@@ -51,9 +51,9 @@ def assert_same(a: LocalFeatures, b: LocalFeatures) -> None:
 @pytest.mark.parametrize(("kind", "most_px"), [(RootSift, 0.1), (ColmapSift, 0.15)])
 def test_keypoints_are_where_colmap_puts_them(kind: Any, most_px: float, sigma_px: float) -> None:
     centres = grid_of_centres(seed=int(10 * sigma_px))
-    found = kind().extract(blobs(centres, sigma_px)).keypoints_px
-    distance = np.linalg.norm(found[:, None] - centres, axis=2)
-    offset = found[distance.argmin(axis=0)] - centres
+    result = kind().extract(blobs(centres, sigma_px)).keypoints_px
+    distance = np.linalg.norm(result[:, None] - centres, axis=2)
+    offset = result[distance.argmin(axis=0)] - centres
     assert np.abs(offset).max() < most_px
     # a forgotten half pixel is ten times this, OpenCV's quarter pixel five times
     assert np.abs(offset.mean(axis=0)).max() < 0.05

@@ -38,20 +38,20 @@ def extractor(weights: Path, **options: object) -> SuperPoint:
 
 def test_ties_borders_and_the_threshold(superpoint_weights: Path) -> None:
     image = texture(120, 163, sigma_px=1.5)
-    found = extractor(superpoint_weights).extract(image)
-    assert len(found.scores) > 60
-    keys = [(-s, y, x) for x, y, s in found.keypoints_px.tolist()]
+    result = extractor(superpoint_weights).extract(image)
+    assert len(result.scores) > 60
+    keys = [(-s, y, x) for x, y, s in result.keypoints_px.tolist()]
     assert keys == sorted(keys)
-    assert found.keypoints_px[:, :2].min() >= 4.5
-    assert found.keypoints_px[:, 0].max() <= 160 - 4.5  # of what is a multiple of 8
-    assert found.keypoints_px[:, 1].max() <= 120 - 4.5
-    strong = extractor(superpoint_weights, threshold=float(found.scores[30])).extract(image)
-    np.testing.assert_array_equal(strong.keypoints_px, found.keypoints_px[:30])
+    assert result.keypoints_px[:, :2].min() >= 4.5
+    assert result.keypoints_px[:, 0].max() <= 160 - 4.5  # the part of a multiple of 8
+    assert result.keypoints_px[:, 1].max() <= 120 - 4.5
+    strong = extractor(superpoint_weights, threshold=float(result.scores[30])).extract(image)
+    np.testing.assert_array_equal(strong.keypoints_px, result.keypoints_px[:30])
 
 
-def test_the_whole_is_transformers_on_the_same_gray_image(superpoint_weights: Path) -> None:
+def test_keypoints_equal_transformers(superpoint_weights: Path) -> None:
     image = texture(96, 128, sigma_px=1.5)
-    found = extractor(superpoint_weights, remove_borders=0, max_keypoints=100).extract(image)
+    result = extractor(superpoint_weights, remove_borders=0, max_keypoints=100).extract(image)
     state = torch.load(superpoint_weights, weights_only=True)
     config = SuperPointConfig(border_removal_distance=0, max_keypoints=100, nms_radius=4)
     model = SuperPointForKeypointDetection(config).eval()
@@ -61,9 +61,9 @@ def test_the_whole_is_transformers_on_the_same_gray_image(superpoint_weights: Pa
     with torch.inference_mode():
         expected = model(gray.expand(1, 3, -1, -1))
     xy = expected.keypoints[0] * torch.tensor([128, 96]) + 0.5
-    np.testing.assert_allclose(found.keypoints_px[:, :2], xy.numpy(), atol=1e-3)
-    np.testing.assert_allclose(found.scores, expected.scores[0].numpy(), atol=1e-6)
-    np.testing.assert_allclose(found.descriptors, expected.descriptors[0].numpy(), atol=1e-5)
+    np.testing.assert_allclose(result.keypoints_px[:, :2], xy.numpy(), atol=1e-3)
+    np.testing.assert_allclose(result.scores, expected.scores[0].numpy(), atol=1e-6)
+    np.testing.assert_allclose(result.descriptors, expected.descriptors[0].numpy(), atol=1e-5)
 
 
 def test_gray_is_luma_rounded_to_eight_bits() -> None:
@@ -98,12 +98,12 @@ def test_a_second_checkpoint_gives_the_descriptors_and_another_type(
         for path in (superpoint_weights, tuned)
     }
     assert list(alone.weights()) == ["superpoint_v1.pth"]
-    found, frozen = plugin.extract(image), alone.extract(image)
-    np.testing.assert_array_equal(found.keypoints_px, frozen.keypoints_px)
+    result, frozen = plugin.extract(image), alone.extract(image)
+    np.testing.assert_array_equal(result.keypoints_px, frozen.keypoints_px)
     whole = tmp_path / "other.pth"
     torch.save({**torch.load(superpoint_weights, weights_only=True), **state}, whole)
     assert extractor(whole).name == "superpoint-other"
-    assert np.abs(found.descriptors - frozen.descriptors).max() > 0.1
+    assert np.abs(result.descriptors - frozen.descriptors).max() > 0.1
 
 
 def test_the_batch_norm_variant_is_known_by_its_keys(
@@ -179,8 +179,8 @@ def cells_at(
 def test_exact_sampling_reads_a_linear_map() -> None:
     x = torch.arange(4, 80 - 4)
     xy = torch.stack([x, torch.full_like(x, 20)], dim=1)
-    found = cells_at(xy, 6, 10, "exact")
-    torch.testing.assert_close(found, (xy - 3.5) / 8, rtol=0, atol=1e-5)
+    result = cells_at(xy, 6, 10, "exact")
+    torch.testing.assert_close(result, (xy - 3.5) / 8, rtol=0, atol=1e-5)
 
 
 def parts(weights: Tensors, *prefixes: str) -> Tensors:
@@ -189,7 +189,7 @@ def parts(weights: Tensors, *prefixes: str) -> Tensors:
 
 @torch.inference_mode()
 @pytest.mark.parametrize("kept", [(*BACKBONE, "convD"), ("conv",)])
-def test_a_descriptor_network_of_its_own(kept: tuple[str, ...]) -> None:
+def test_a_separate_descriptor_network(kept: tuple[str, ...]) -> None:
     frozen, tuned = random_tensors("superpoint", 3), random_tensors("superpoint", 4)
     net = superpoint_with_descriptor(
         frozen, parts(tuned, *kept), detector_where="a.pth", descriptor_where="b.pth"

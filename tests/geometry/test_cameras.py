@@ -57,7 +57,7 @@ def test_unprojection_undoes_projection(model: str) -> None:
 
 
 @pytest.mark.parametrize("model", DISTORTION)
-def test_focal_length_and_principal_point_are_those_of_the_model(model: str) -> None:
+def test_focal_length_and_principal_point(model: str) -> None:
     # on the optical axis every model is a pinhole: the point there and its derivative
     tiny = 1e-5
     axis = np.array([[0.0, 0, 1], [tiny, 0, 1], [0, tiny, 1]])
@@ -132,12 +132,12 @@ def colmap(given: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
 def various_points() -> NDArray[np.float64]:
     """In front of a camera: over its view, near its axis, and on it."""
     rng = np.random.default_rng(0)
-    found = rng.uniform((-1.2, -1.0, 1.0), (1.2, 1.0, 1.5), (400, 3)) * rng.uniform(
+    result = rng.uniform((-1.2, -1.0, 1.0), (1.2, 1.0, 1.5), (400, 3)) * rng.uniform(
         0.1, 50, (400, 1)
     )
-    found[:100, :2] *= 10.0 ** rng.uniform(-9, -1, (100, 1))
-    found[100:102, :2] = 0.0
-    return found
+    result[:100, :2] *= 10.0 ** rng.uniform(-9, -1, (100, 1))
+    result[100:102, :2] = 0.0
+    return result
 
 
 def differences(given: Camera, at: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -35,13 +35,13 @@ def test_absolute_pose_estimation_as_kapture_localization_calls_it() -> None:
     pixels[:10] += 100.0
     with shims(pycolmap):
         # lists of arrays and a plain dictionary, as its tools pass them
-        found = pycolmap.absolute_pose_estimation(
+        result = pycolmap.absolute_pose_estimation(
             list(pixels), list(points), camera, estimation_options={"ransac": {"max_error": 8.0}}
         )
         none = pycolmap.absolute_pose_estimation([], [], camera)
-    assert found["num_inliers"] == 50
-    assert found["inliers"] == [False] * 10 + [True] * 50
-    np.testing.assert_allclose(found["cam_from_world"].translation, [0.1, -0.2, 0.3], atol=1e-6)
+    assert result["num_inliers"] == 50
+    assert result["inliers"] == [False] * 10 + [True] * 50
+    np.testing.assert_allclose(result["cam_from_world"].translation, [0.1, -0.2, 0.3], atol=1e-6)
     assert none is None
 
 

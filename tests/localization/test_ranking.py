@@ -50,10 +50,10 @@ def everywhere(count: int) -> NDArray[np.float64]:
 def test_inliers_are_counted_over_all_views() -> None:
     good, bad = np.array([1.0, 2.0, 20.0]), np.array([np.inf, 11.0, 3.0])
     three = everywhere(3)
-    found = InlierCount().score(
+    result = InlierCount().score(
         [hypothesis(view(three, good)), hypothesis(view(three, good), view(three, bad))], NoScene()
     )
-    assert found.tolist() == [2.0, 3.0]
+    assert result.tolist() == [2.0, 3.0]
 
 
 def room(count: int, seed: int = 0) -> NDArray[np.float64]:
@@ -74,7 +74,7 @@ def ranker(**options: float) -> DistinctiveInliers:
     return DistinctiveInliers(DistinctiveInliers.Options(**options))
 
 
-def test_what_only_one_room_has_beats_more_inliers_that_every_room_has() -> None:
+def test_distinctive_inliers_beat_more_common_ones() -> None:
     walls, poster = room(100), room(10, seed=1)
     right = standing(0.0, np.concatenate([walls[:70], poster]))
     wrong = [standing(7.0 * number, walls) for number in (1, 2, 3)]

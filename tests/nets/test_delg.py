@@ -41,13 +41,13 @@ def test_vectors_are_tensorflows(net: DelgNet, form: Form) -> None:
     pixels = torch.from_numpy(image).permute(2, 0, 1)[None].float()
     with torch.inference_mode():
         np.testing.assert_allclose(net((pixels - 128) / 128)[0].numpy(), expected[1], atol=2e-5)
-        found = describe(net, pixels, SCALES)[0].numpy()
+        result = describe(net, pixels, SCALES)[0].numpy()
     units = expected / np.linalg.norm(expected, axis=1, keepdims=True)
     joined = units.sum(axis=0) / np.linalg.norm(units.sum(axis=0))
-    np.testing.assert_allclose(found, joined, atol=1e-6)
+    np.testing.assert_allclose(result, joined, atol=1e-6)
     # the comparison tells scales apart
     assert np.abs(joined - units[1]).max() > 1e-4
-    assert np.linalg.norm(found) == pytest.approx(1)
+    assert np.linalg.norm(result) == pytest.approx(1)
 
 
 def test_too_small_an_image() -> None:

@@ -1,4 +1,4 @@
-"""LPIPS: the published formula written out in loops, keys, and what a distance must do."""
+"""LPIPS: the published formula written out in loops, keys, and properties of a distance."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def functional_trunk(
             layers.append(
                 ("pool2",) if pools else ("conv", number, 1, 1) if convolves else ("relu",)
             )
-    found = []
+    result = []
     for number, (what, *how) in enumerate(layers):
         if what == "conv":
             x = conv(f"features.{how[0]}", x, how[1], how[2])
@@ -89,8 +89,8 @@ def functional_trunk(
             halves = [conv(f"{at}.expand1x1", x), conv(f"{at}.expand3x3", x, border=1)]
             x = torch.cat(halves, dim=1).clamp(min=0)
         if number in TAPS[kind]:
-            found.append(x)
-    return found
+            result.append(x)
+    return result
 
 
 def by_formula(
@@ -103,8 +103,8 @@ def by_formula(
         rgb = 2 * image.numpy().astype(np.float64) - 1
         x = (rgb - shift[:, None, None]) / scale[:, None, None]
         with torch.inference_mode():
-            found = functional_trunk(kind, state, torch.from_numpy(x).float())
-        return [each[0].numpy().astype(np.float64) for each in found]
+            result = functional_trunk(kind, state, torch.from_numpy(x).float())
+        return [each[0].numpy().astype(np.float64) for each in result]
 
     total = 0.0
     for layer, (one, other) in enumerate(zip(tapped(a), tapped(b), strict=True)):

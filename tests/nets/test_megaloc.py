@@ -36,15 +36,15 @@ def test_parts_follow_each_other() -> None:
     image = torch.rand(2, 3, 42, 56)
     mean, deviation = torch.tensor([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]])
     with torch.inference_mode():
-        found = network(image)
+        result = network(image)
         normalised = (image - mean[:, None, None]) / deviation[:, None, None]
         aggregated = network.aggregator["agg"](*network.backbone(normalised))
         linear = network.aggregator["linear"]
         expected = aggregated @ linear.weight.T + linear.bias
         expected = expected / expected.pow(2).sum(1, keepdim=True).sqrt()
-    torch.testing.assert_close(found, expected)
-    torch.testing.assert_close(found.norm(dim=1), torch.ones(2))
-    assert (found[0] - found[1]).abs().max() > 1e-4
+    torch.testing.assert_close(result, expected)
+    torch.testing.assert_close(result.norm(dim=1), torch.ones(2))
+    assert (result[0] - result[1]).abs().max() > 1e-4
 
 
 @pytest.mark.parametrize("older", [False, True])
@@ -67,8 +67,8 @@ def test_both_published_layouts_are_read(older: bool, monkeypatch: pytest.Monkey
 @pytest.mark.parametrize("size", [(57, 43), (20, 31), (28, 28), (1, 1), (101, 9)])
 def test_images_are_scaled_as_pil_scales(size: tuple[int, int]) -> None:
     image = torch.rand(1, 3, *size, generator=torch.Generator().manual_seed(0))
-    found = squared(image, 28)[0]
-    for channel, plane in zip(found, image[0], strict=True):
+    result = squared(image, 28)[0]
+    for channel, plane in zip(result, image[0], strict=True):
         expected = Image.fromarray(plane.numpy()).resize((28, 28), Image.Resampling.BILINEAR)
         np.testing.assert_allclose(channel.numpy(), np.asarray(expected), atol=1e-5)
 
@@ -127,8 +127,8 @@ def unit(x: NDArray[np.float64]) -> NDArray[np.float64]:
 def test_the_vector_is_the_papers() -> None:
     net = randomised()
     patches, whole = random_input()
-    found = net(patches, whole).detach().numpy()
-    assert found.dtype == np.float32 and found.shape == (2, TOKEN + SIZE * CLUSTERS)
+    result = net(patches, whole).detach().numpy()
+    assert result.dtype == np.float32 and result.shape == (2, TOKEN + SIZE * CLUSTERS)
     for image in range(2):
         rows = patches[image].flatten(1).T.double().numpy()
         scores = np.array([perceptron(net.score, row) for row in rows]).T
@@ -141,7 +141,7 @@ def test_the_vector_is_the_papers() -> None:
             summed[:, k] = unit(summed[:, k])
         token = unit(perceptron(net.token_features, whole[image].double().numpy()))
         expected = unit(np.concatenate([token, summed.ravel()]))
-        np.testing.assert_allclose(found[image], expected, atol=2e-6)
+        np.testing.assert_allclose(result[image], expected, atol=2e-6)
 
 
 def test_no_patch_gives_more_than_it_has_and_huge_scores_stay_numbers() -> None:
@@ -220,7 +220,7 @@ def test_at_other_sizes_only_the_positions_differ_from_transformers(
     net = small_trunk(2)
     theirs = as_transformers(net)
     image = torch.randn(1, 3, *size, generator=torch.Generator().manual_seed(3))
-    found = tokens_of(net, image)
+    result = tokens_of(net, image)
     with torch.inference_mode():
         by_its_own_rule = theirs(image).last_hidden_state
         monkeypatch.setattr(
@@ -229,9 +229,9 @@ def test_at_other_sizes_only_the_positions_differ_from_transformers(
             lambda _, height, width: net.positions(height // 14, width // 14),
         )
         expected = theirs(image).last_hidden_state
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(result, expected, rtol=1e-4, atol=1e-5)
     # its rule is near the official one, and not it
-    distance = (found - by_its_own_rule).abs().max()
+    distance = (result - by_its_own_rule).abs().max()
     assert 1e-3 < distance < 1.0
 
 
@@ -261,12 +261,14 @@ def test_positions_are_read_bicubically_with_dinov2s_offset(rows: int, columns: 
     expected = np.einsum(
         "ri,cj,ijk->rck", weights(rows, DINO_GRID), weights(columns, DINO_GRID), maps
     )
-    found = net.positions(rows, columns).detach().numpy()[0]
-    np.testing.assert_allclose(found[0], learnt[0], atol=1e-7)
-    np.testing.assert_allclose(found[1:].reshape(rows, columns, DINO_CHANNELS), expected, atol=1e-5)
+    result = net.positions(rows, columns).detach().numpy()[0]
+    np.testing.assert_allclose(result[0], learnt[0], atol=1e-7)
+    np.testing.assert_allclose(
+        result[1:].reshape(rows, columns, DINO_CHANNELS), expected, atol=1e-5
+    )
 
 
-def test_what_fills_no_patch_is_left_out() -> None:
+def test_incomplete_patches_are_left_out() -> None:
     net = small_trunk()
     image = torch.randn(1, 3, 75, 95, generator=torch.Generator().manual_seed(5))
     torch.testing.assert_close(tokens_of(net, image), tokens_of(net, image[:, :, :70, :84]))

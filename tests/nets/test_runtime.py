@@ -15,7 +15,7 @@ from megloc_kapture.nets.runtime import load_strictly, sized_tensor, without_tf3
 CPU = torch.device("cpu")
 
 
-def test_a_checkpoint_goes_in_whole_or_not_at_all() -> None:
+def test_checkpoints_load_completely_or_not_at_all() -> None:
     net, other = nn.Linear(3, 2), nn.Linear(3, 2)
     whole = dict(other.state_dict())
     assert load_strictly(net, whole, "w.pth") is net
@@ -38,16 +38,16 @@ def test_a_checkpoint_goes_in_whole_or_not_at_all() -> None:
 @pytest.mark.parametrize("most", [9, 100, None])
 def test_an_image_that_is_small_enough_stays(most: int | None) -> None:
     image = np.random.default_rng(0).integers(0, 256, (6, 9, 3), dtype=np.uint8)
-    found = sized_tensor(image, most, CPU)
-    assert found.shape == (1, 3, 6, 9) and found.dtype == torch.float32
-    np.testing.assert_allclose(found[0].numpy() * 255, image.transpose(2, 0, 1), atol=1e-4)
+    result = sized_tensor(image, most, CPU)
+    assert result.shape == (1, 3, 6, 9) and result.dtype == torch.float32
+    np.testing.assert_allclose(result[0].numpy() * 255, image.transpose(2, 0, 1), atol=1e-4)
 
 
 def test_half_the_size_is_the_mean_of_four() -> None:
     image = np.random.default_rng(0).integers(0, 256, (8, 12, 3), dtype=np.uint8)
-    found = sized_tensor(image, 6, CPU)[0].permute(1, 2, 0).numpy() * 255
+    result = sized_tensor(image, 6, CPU)[0].permute(1, 2, 0).numpy() * 255
     expected = image.reshape(4, 2, 6, 2, 3).astype(float).mean(axis=(1, 3))
-    np.testing.assert_allclose(found, expected, atol=1e-3)
+    np.testing.assert_allclose(result, expected, atol=1e-3)
     assert np.abs(expected - expected.round()).max() > 0.2  # fractions are kept
 
 

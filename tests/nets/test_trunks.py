@@ -42,16 +42,16 @@ def test_the_stages_are_transformers_stages() -> None:
     theirs.load_state_dict(renamed, strict=True)
     image = torch.randn(2, 3, 65, 98)
     with torch.inference_mode():
-        found = ours(image)
+        result = ours(image)
         expected = theirs(image, output_hidden_states=True).hidden_states[1:]
-    assert [f.shape[1] for f in found] == [256, 512, 1024, 2048]
-    for one, other in zip(found, expected, strict=True):
+    assert [f.shape[1] for f in result] == [256, 512, 1024, 2048]
+    for one, other in zip(result, expected, strict=True):
         assert one.shape == other.shape
         assert other.std() > 0.1  # the comparison says something
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5 * float(other.abs().max()))
 
 
-def test_dilations_keep_what_strides_would_give() -> None:
+def test_dilated_features_contain_the_strided_ones() -> None:
     # every place that the strided trunk has, the dilated one has too, with the same features
     strided = randomised(ResNet(50))
     dilated = ResNet(50, dilated=True).eval()
@@ -75,8 +75,8 @@ def test_the_generalized_mean_is_its_definition(power: float) -> None:
         places = features[image, channel].ravel()
         expected[image, channel] = (sum(x**power for x in places) / len(places)) ** (1 / power)
     for given in (power, torch.tensor([power], dtype=torch.float64)):
-        found = generalized_mean(torch.from_numpy(features), given)
-        np.testing.assert_allclose(found.numpy(), expected, rtol=1e-12)
+        result = generalized_mean(torch.from_numpy(features), given)
+        np.testing.assert_allclose(result.numpy(), expected, rtol=1e-12)
 
 
 def test_the_generalized_mean_of_numbers_at_the_ends_of_their_range() -> None:

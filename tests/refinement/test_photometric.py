@@ -76,7 +76,7 @@ def test_derivatives_equal_differences(problem: Problems, model: str) -> None:
         assert np.abs(difference).max() < 1e-6 * size
 
 
-def test_a_lens_that_folds_back_does_not_show_what_is_outside() -> None:
+def test_points_beyond_the_fold_of_a_lens_are_not_visible() -> None:
     # r (1 - 0.3 r^2) turns at r = 1.05 and is back in the middle at r = 1.83
     camera = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.3))
     chosen = ChosenPoints(
@@ -111,12 +111,12 @@ def test_a_step_solves_the_whole_system(problem: Problems) -> None:
     assert step is not None
     pose_step, gains, biases = step
     np.testing.assert_allclose(pose_step, expected[:6], rtol=1e-5)
-    own = np.stack([gains, biases], axis=-1).ravel()
-    np.testing.assert_allclose(own, expected[6:], rtol=1e-5, atol=1e-8)
+    gains_and_biases = np.stack([gains, biases], axis=-1).ravel()
+    np.testing.assert_allclose(gains_and_biases, expected[6:], rtol=1e-5, atol=1e-8)
 
 
-def error_vector(found: RigidTransform, truth: RigidTransform) -> Array:
-    true_from_found = truth @ found.inverse()
+def error_vector(result: RigidTransform, truth: RigidTransform) -> Array:
+    true_from_found = truth @ result.inverse()
     vector = Rotation.from_matrix(true_from_found.rotation_matrix()).as_rotvec()
     return np.concatenate([vector, true_from_found.translation])
 
@@ -127,10 +127,10 @@ def test_the_true_pose_is_found_with_gains_and_biases_among_outliers(
 ) -> None:
     aligned, truth = problem("OPENCV", channels=channels, count=1500, wrong=0.3)
     start = perturbed(truth, np.array([1e-3, -1e-3, 1e-3, 0.006, -0.005, 0.006]))
-    found = minimise(aligned, aligned.nuisance_at(start), last_step_px=1e-4)
-    assert np.abs(error_vector(found.cam_from_world, truth)).max() < 1e-4
-    np.testing.assert_allclose(found.gains, [[0.7] * channels, [1.3] * channels], atol=1e-3)
-    np.testing.assert_allclose(found.biases, [[0.2] * channels, [-0.4] * channels], atol=1e-3)
+    result = minimise(aligned, aligned.nuisance_at(start), last_step_px=1e-4)
+    assert np.abs(error_vector(result.cam_from_world, truth)).max() < 1e-4
+    np.testing.assert_allclose(result.gains, [[0.7] * channels, [1.3] * channels], atol=1e-3)
+    np.testing.assert_allclose(result.biases, [[0.2] * channels, [-0.4] * channels], atol=1e-3)
 
 
 def test_points_behind_something_else_are_left_out(problem: Problems) -> None:
@@ -154,7 +154,7 @@ def test_points_behind_something_else_are_left_out(problem: Problems) -> None:
 AWAY = np.array([0.06, -0.06, 0.01, 0.02, -0.01, 0.02])
 
 
-def test_costs_and_significance_are_those_of_a_plain_loop(problem: Problems) -> None:
+def test_costs_and_significance_equal_a_plain_loop(problem: Problems) -> None:
     aligned, truth = problem(count=3000, noise=0.3, wrong=0.1)
     old = perturbed(truth, AWAY)
     comparison = compare_poses(aligned, old, truth)
@@ -184,15 +184,15 @@ def test_costs_and_significance_are_those_of_a_plain_loop(problem: Problems) -> 
 
 
 def test_a_pose_tuned_to_noise_is_not_significant(problem: Problems) -> None:
-    found = []
+    result = []
     for seed in range(8):
         aligned, truth = problem(count=3000, noise=0.3, seed=seed)
         tuned = minimise(aligned, aligned.nuisance_at(truth), last_step_px=1e-3)
         comparison = compare_poses(aligned, truth, tuned.cam_from_world)
         assert comparison.after.cost < comparison.before.cost
-        found.append(comparison.significance)
+        result.append(comparison.significance)
     # six parameters tuned to noise gain half of chi-squared / sqrt(chi-squared): about 1.2
-    assert 0.6 < np.mean(found) < 1.8
+    assert 0.6 < np.mean(result) < 1.8
 
 
 def test_correlation_is_that_of_numpy_about_each_references_mean(problem: Problems) -> None:
@@ -213,10 +213,10 @@ def test_covariance_is_that_of_the_errors(problem: Problems) -> None:
     errors, claimed = [], []
     for seed in range(16):
         aligned, truth = problem(count=3000, noise=0.3, seed=seed)
-        found = minimise(aligned, aligned.nuisance_at(truth), last_step_px=1e-3)
-        claim = covariance(aligned, found)
+        result = minimise(aligned, aligned.nuisance_at(truth), last_step_px=1e-3)
+        claim = covariance(aligned, result)
         np.testing.assert_allclose(claim, claim.T)
-        vector = error_vector(found.cam_from_world, truth)
+        vector = error_vector(result.cam_from_world, truth)
         errors.append(vector @ np.linalg.solve(claim, vector) / 6)
         claimed.append(np.sqrt(np.diagonal(claim)))
     # one where it is right; a few dozen cells estimate a covariance itself only roughly
@@ -236,14 +236,14 @@ def test_even_steps_change_the_image_alike(problem: Problems) -> None:
     aligned, truth = problem(noise=0.2)
     at = aligned.nuisance_at(truth)
     system = aligned.system_at(at, at.squared_scale)
-    found, reduced = whitened_directions(aligned, system), system.reduced()
-    assert found is not None and reduced is not None
-    steps, change = found
+    result, reduced = whitened_directions(aligned, system), system.reduced()
+    assert result is not None and reduced is not None
+    steps, change = result
     np.testing.assert_allclose(steps.T @ reduced[0] @ steps, change * np.eye(6), atol=1e-8 * change)
     # the image says least of the first: it is the longest
     lengths = np.linalg.norm(steps * aligned.px_per_step()[:, None], axis=0)
     assert (np.diff(lengths) < 0).all()
-    # alignments beside one come by their cost
+    # alignments near the given one are sorted by cost
     starts = perturbed_starts(aligned, at)
     costs = [aligned.system_at(each, at.squared_scale).mean_cost for each in starts]
     assert len(starts) == 24 and costs == sorted(costs)
@@ -257,6 +257,6 @@ def test_squared_distance_is_that_of_the_step_between_the_poses() -> None:
     covariance = root @ root.T
     step = 1e-4 * rng.normal(size=6)
     expected = step @ np.linalg.solve(covariance, step)
-    found = squared_distance(perturbed(new, step), new, covariance)
-    assert found == pytest.approx(expected, rel=1e-6)
+    result = squared_distance(perturbed(new, step), new, covariance)
+    assert result == pytest.approx(expected, rel=1e-6)
     assert squared_distance(new, new, covariance) == pytest.approx(0.0, abs=1e-20)

@@ -43,18 +43,18 @@ def brute_force(
     distance = np.full((len(px_a), len(px_b)), np.inf)
     for i, j in itertools.product(np.flatnonzero(visible_a), np.flatnonzero(visible_b)):
         distance[i, j] = max(np.hypot(*(a_in_b[i] - px_b[j])), np.hypot(*(b_in_a[j] - px_a[i])))
-    found = []
+    result = []
     for i, known in enumerate(known_a):
         j = int(distance[i].argmin())
         mutual = int(distance[:, j].argmin()) == i
         away = np.nan_to_num(np.hypot(*(a_in_b[i] - px_b).T), nan=np.inf).min()
         if not known:
-            found.append(WITHOUT_DEPTH)
+            result.append(WITHOUT_DEPTH)
         elif mutual and distance[i, j] < options.positive_px:
-            found.append(j)
+            result.append(j)
         else:
-            found.append(UNMATCHED if away > options.negative_px else IGNORED)
-    return found
+            result.append(UNMATCHED if away > options.negative_px else IGNORED)
+    return result
 
 
 def keypoints(a: PosedView, b: PosedView) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -72,29 +72,29 @@ def test_labels_equal_brute_force() -> None:
     a, pose = corner_view(pose_at((-1.0, 0, 0), -4, 0)), pose_at((0.4, 0.1, 0.3), 4, 1)
     b = PosedView(DISTORTED, pose, DepthView(CAMERA, depth_m(pose), IDENTITY))
     px_a, px_b = keypoints(a, b)
-    found = labels_of_views(px_a, px_b, a, b)
+    result = labels_of_views(px_a, px_b, a, b)
     for px, other_px, view, other, partner in (
-        (px_a, px_b, a, b, found.partner_a),
-        (px_b, px_a, b, a, found.partner_b),
+        (px_a, px_b, a, b, result.partner_a),
+        (px_b, px_a, b, a, result.partner_b),
     ):
         expected = np.array(brute_force(px, other_px, view, other))
-        told = expected != WITHOUT_DEPTH
-        assert told.sum() > 75
-        np.testing.assert_array_equal(partner[told], expected[told])
+        has_label = expected != WITHOUT_DEPTH
+        assert has_label.sum() > 75
+        np.testing.assert_array_equal(partner[has_label], expected[has_label])
         assert (expected >= 0).sum() > 20
         assert min((expected == UNMATCHED).sum(), (expected == IGNORED).sum()) > 2
-    matches = found.matches()
-    np.testing.assert_array_equal(found.partner_b[matches[:, 1]], matches[:, 0])
+    matches = result.matches()
+    np.testing.assert_array_equal(result.partner_b[matches[:, 1]], matches[:, 0])
 
 
-def test_what_is_hidden_is_no_partner() -> None:
+def test_hidden_keypoints_have_no_partner() -> None:
     a, b = corner_view(pose_at((-1.5, 0, 0), -4, 0)), corner_view(pose_at((1.0, 0, 0), 3, 0))
     px_a = np.random.default_rng(1).uniform((50, 50), (350, 250), (200, 2))
     there, known, visible = reproject(px_a, a, b)
     assert known.all() and visible.sum() > 80
     exact = labels_of_views(px_a, there[visible], a, b)
     assert (exact.partner_a[visible] == np.arange(visible.sum())).all()
-    # something stands before the second camera
+    # an object in front of the second camera
     blocked = np.where(np.arange(400) < 200, 1.0, b.depth.depth_m).astype(np.float32)
     hidden = PosedView(b.camera, b.cam_from_world, DepthView(CAMERA, blocked, IDENTITY))
     behind = there[visible, 0] < 198
@@ -120,7 +120,7 @@ def test_without_depth_the_epipolar_line_tells() -> None:
     assert (labels_of_views(px_a, px_b, *same).partner_a == IGNORED).all()
 
 
-def test_depth_beside_the_camera_and_distortion() -> None:
+def test_a_separate_depth_camera_and_distortion() -> None:
     pose_a, pose_b = pose_at((-0.6, 0, 0), -2, 0), pose_at((0.3, 0.1, 0.2), 1, 1)
     image_from_depth = RigidTransform((1.0, 0.0, 0.0, 0.0), (0.05, -0.02, 0.01))
     views = []
@@ -161,7 +161,7 @@ def test_overlap_is_of_the_view_that_shows_more() -> None:
     near, far = corner_view(pose_at((-2, 0, 2.5), 0, 0)), corner_view(pose_at((-2, 0, 0), 0, 0))
     assert overlap(near, near) == 1.0
     assert overlap(near, far) == overlap(far, near)
-    # all of the near one stands in the far one, of which it shows (3.5 / 6)^2
+    # the far view contains all of the near one, which shows (3.5 / 6)^2 of it
     assert overlap(near, far) == pytest.approx((3.5 / 6) ** 2, abs=0.04)
     away = corner_view(pose_at((-2, 0, 0), 120, 0))
     assert overlap(far, away) == 0.0

@@ -48,11 +48,11 @@ def test_the_import_is_the_truth(
     write_official(dataset, tmp_path)
     assert not KaptureFolder(tmp_path / "query").read().trajectories
     for part, truth_part in (("mapping", "mapping"), ("query_gt", "query")):
-        found, cameras = read(tmp_path / part)
+        result, cameras = read(tmp_path / part)
         truth, true_cameras = read(root / "ground_truth" / truth_part)
-        assert found.keys() == truth.keys()
-        assert len(found) == COUNTS[name][f"{part.removesuffix('_gt')} images"]
-        for image, pose in found.items():
+        assert result.keys() == truth.keys()
+        assert len(result) == COUNTS[name][f"{part.removesuffix('_gt')} images"]
+        for image, pose in result.items():
             assert np.linalg.norm(pose.center()) < 5000
             assert_same(dataset.world.pose_in_official(pose), truth[image])
             model, width, height, *params = cameras[image]
@@ -132,10 +132,10 @@ def test_points_of_the_reference_model_reproject(
     assert sum(map(len, seen.values())) > 500
 
 
-def assert_same(found: RigidTransform, expected: RigidTransform) -> None:
+def assert_same(result: RigidTransform, expected: RigidTransform) -> None:
     """To 1e-6 m and 1e-6 deg, by scipy."""
-    assert np.linalg.norm(found.center() - expected.center()) < 1e-6
-    rotations = [Rotation.from_quat(p.quat_wxyz, scalar_first=True) for p in (found, expected)]
+    assert np.linalg.norm(result.center() - expected.center()) < 1e-6
+    rotations = [Rotation.from_quat(p.quat_wxyz, scalar_first=True) for p in (result, expected)]
     assert np.degrees((rotations[0] * rotations[1].inv()).magnitude()) < 1e-6
 
 

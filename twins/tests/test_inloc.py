@@ -123,11 +123,11 @@ def sizes_of(surfaces: Surfaces) -> np.ndarray:
 def areas(parts: Parts, recipes: Recipes) -> Counter[tuple[object, ...]]:
     """Area in square metres of each surface, by what and where it is."""
     surfaces, _ = parts.surfaces()
-    found: Counter[tuple[object, ...]] = Counter()
+    result: Counter[tuple[object, ...]] = Counter()
     where = np.hstack([surfaces.origin, surfaces.edge_u, surfaces.edge_v, surfaces.uv]).round(6)
     for texture, shape, size in zip(surfaces.texture, where, sizes_of(surfaces), strict=True):
-        found[recipes.items[texture], *shape] += float(size)
-    return found
+        result[recipes.items[texture], *shape] += float(size)
+    return result
 
 
 @pytest.mark.parametrize("kind", [*ROOM_KINDS, "corridor"])
@@ -151,14 +151,16 @@ def test_what_a_scanner_measures(floors: list[Floor]) -> None:
     bright[:10] = 5
     missing = []
     for zone, (yaw, pitch) in product(floor.zones, ((0, 0), (120, -30), (240, 30))):
-        own = cam_from_scan(yaw, pitch)
-        pose = own @ zone.scan_from_place
-        points = scanned_points(floor, camera, pose, own, bright, np.random.default_rng(0))
+        cam_from_scanner = cam_from_scan(yaw, pitch)
+        pose = cam_from_scanner @ zone.scan_from_place
+        points = scanned_points(
+            floor, camera, pose, cam_from_scanner, bright, np.random.default_rng(0)
+        )
         seen = visible_surfaces(floor.place.surfaces, pose, sample_grid(camera, 1))
         known = np.isfinite(points).all(axis=2)
         assert not known[:10].any()  # too dark
         assert not known[floor.glass[np.maximum(seen.surface, 0)]].any()
-        off = own.apply(points[known])[:, 2] - depth_map(seen)[known]
+        off = cam_from_scanner.apply(points[known])[:, 2] - depth_map(seen)[known]
         assert np.abs(off).max() < 0.006 and 1e-4 < np.std(off) < 2e-3
         np.testing.assert_array_equal(points[known], points[known].astype(np.float32))
         missing.append(1 - known[10:].mean())

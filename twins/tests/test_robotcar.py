@@ -39,10 +39,10 @@ def poses_by_image(data: kapture.Kapture) -> dict[str, kapture.PoseTransform]:
 
 
 def assert_equal_poses(
-    found: dict[str, kapture.PoseTransform], expected: dict[str, kapture.PoseTransform]
+    result: dict[str, kapture.PoseTransform], expected: dict[str, kapture.PoseTransform]
 ) -> None:
-    assert found.keys() == expected.keys()
-    for name, pose in found.items():
+    assert result.keys() == expected.keys()
+    for name, pose in result.items():
         distance_m, angle = world_pose_transform_distance(pose, expected[name])
         assert distance_m < MAX_M, name
         # kapture's own angle is an arccos, which cannot resolve a microdegree
@@ -87,8 +87,8 @@ def theirs(
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     # it writes no folder for a location without queries
-    found = sorted(path for path in out.glob("0*/*") if (path / "sensors").is_dir())
-    parts = {f"{path.parent.name}/{path.name}": kapture_from_dir(str(path)) for path in found}
+    result = sorted(path for path in out.glob("0*/*") if (path / "sensors").is_dir())
+    parts = {f"{path.parent.name}/{path.name}": kapture_from_dir(str(path)) for path in result}
     assert len(parts) >= 3
     return request.param, parts
 

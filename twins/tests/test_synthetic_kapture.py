@@ -23,10 +23,10 @@ from megloc_kapture.values import RigidTransform
 LAYOUT = "synthetic"
 
 
-def assert_same(found: RigidTransform, expected: RigidTransform) -> None:
-    rotations = found.rotation_matrix(), expected.rotation_matrix()
+def assert_same(result: RigidTransform, expected: RigidTransform) -> None:
+    rotations = result.rotation_matrix(), expected.rotation_matrix()
     np.testing.assert_allclose(*rotations, atol=1e-12)
-    np.testing.assert_allclose(found.translation, expected.translation, atol=1e-9)
+    np.testing.assert_allclose(result.translation, expected.translation, atol=1e-9)
 
 
 def test_queries_have_their_own_cameras_and_moving_objects(world: SyntheticWorld) -> None:

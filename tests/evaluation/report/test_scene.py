@@ -44,8 +44,8 @@ CAMERAS = (
 
 def data_of(page: str) -> dict[str, Any]:
     """The data of a view, arrays decoded."""
-    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
-    data: dict[str, Any] = json.loads(found[1])
+    result = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
+    data: dict[str, Any] = json.loads(result[1])
     for name in ("points", "inliers"):
         data[name] = decoded(data[name], "<f4").reshape(-1, 3)
     for name in ("cameraFrusta", "frusta", "trueFrusta"):
@@ -123,7 +123,9 @@ def evaluation_of(world: Any) -> Evaluation:
 @pytest.mark.parametrize(
     ("camera", "offset"), [*((camera, 0.0) for camera in CAMERAS), (CAMERAS[0], 4.2e6)]
 )
-def test_the_page_has_what_kapture_reads(make_map: Any, camera: Camera, offset: float) -> None:
+def test_the_page_has_the_data_that_kapture_reads(
+    make_map: Any, camera: Camera, offset: float
+) -> None:
     rng = np.random.default_rng(0)
     points = np.column_stack(
         [rng.normal((offset, 0, 0), 5, (500, 3)), rng.integers(0, 256, (500, 3))]
@@ -230,7 +232,7 @@ def test_coordinate_frames_are_kept_apart(world: Any, make_map: Any) -> None:
     assert scene_of("nothing", StoredInliers(ResultContext())) is None
 
 
-def test_points_without_colours_have_those_of_the_images(make_map: Any) -> None:
+def test_points_without_colours_take_them_from_the_images(make_map: Any) -> None:
     names = ["m/0.jpg", "m/1.jpg"]
     root = make_map(names, points=np.zeros((4, 6)))
     (root / "reconstruction" / "observations.txt").write_text(
