@@ -59,8 +59,8 @@ def test_a_folder_is_localized_when_it_is_asked_for(
     last = results[names[-1]]
     assert last and results[names[-1]] is last
     for name in names:
-        found = results[name]
-        assert found and np.less(errors(scene, name, found.cam_from_world), (0.05, 0.5)).all()
+        result = results[name]
+        assert result and np.less(errors(scene, name, result.cam_from_world), (0.05, 0.5)).all()
     with pytest.raises(KeyError):
         _ = results["nowhere.jpg"]
     table = results.to_pandas()
@@ -78,13 +78,13 @@ def test_a_folder_is_localized_when_it_is_asked_for(
 def test_results_are_evaluated_as_they_are(
     results: megloc.Results, scene: Path, tmp_path: Path
 ) -> None:
-    found = megloc.evaluate(results, truth=scene / "query_gt")
-    assert "recall (%)" in str(found) and found.row().recall[0].recall == 1.0
+    result = megloc.evaluate(results, truth=scene / "query_gt")
+    assert "recall (%)" in str(result) and result.row().recall[0].recall == 1.0
     results.save(tmp_path / "saved")
     again = megloc.evaluate(tmp_path / "saved", truth=scene / "query_gt")
     assert list(again.to_pandas().index) == list(results)
     columns = ["position_error_m", "angle_error_deg"]
-    difference = found.to_pandas()[columns] - again.to_pandas()[columns]
+    difference = result.to_pandas()[columns] - again.to_pandas()[columns]
     assert np.abs(difference.to_numpy()).max() < 1e-9
 
 
@@ -113,9 +113,9 @@ def test_photographs_need_no_camera(built: megloc.Map, scene: Path, photos: Path
     listed = built.localize(paths)
     whole = built.localize(photos)
     assert list(listed) == list(whole) == [path.name for path in paths]
-    found = [one, pillow, array, *whole.values()]
+    result = [one, pillow, array, *whole.values()]
     names = [paths[0].name] * 3 + list(whole)
-    for name, pose in zip(names, found, strict=True):
+    for name, pose in zip(names, result, strict=True):
         assert np.less(errors(scene, name, pose.cam_from_world), (0.05, 0.5)).all()
         assert isinstance(pose, megloc.Pose) and pose.camera is not None
         assert pose.camera.params[0] == pytest.approx(300, rel=0.015)
@@ -135,17 +135,17 @@ def test_a_pose_says_what_it_rests_on(built: megloc.Map, scene: Path) -> None:
     folder = KaptureFolder(scene / "query")
     name = folder.read().image_names()[0]
     camera = folder.read().camera_of(name)
-    found, read = (
+    result, read = (
         built.localize(image, camera)
         for image in (folder.image_path(name), read_image_rgb(folder.image_path(name)))
     )
-    for pose in (found, read):
+    for pose in (result, read):
         assert pose and np.less(errors(scene, name, pose.cam_from_world), (0.05, 0.5)).all()
         assert pose.covariance is not None and pose.covariance.shape == (6, 6)
-    assert found.camera is None and found.name == folder.image_path(name).name
-    assert reprojection_px(found, camera) <= 12
-    assert len(found.inlier_points_px) == len(found.inlier_points_world) == found.num_inliers
-    assert {"extraction", "retrieval", "matching", "estimation"} <= found.seconds.keys()
+    assert result.camera is None and result.name == folder.image_path(name).name
+    assert reprojection_px(result, camera) <= 12
+    assert len(result.inlier_points_px) == len(result.inlier_points_world) == result.num_inliers
+    assert {"extraction", "retrieval", "matching", "estimation"} <= result.seconds.keys()
     # in pixels of the image as it was given, whatever was made of it
     options = {**SMALL, "preprocessing.max_size_px": 320}
     smaller = megloc.open_map(built.kapture_map.folder.root, set=options)
@@ -192,8 +192,8 @@ def test_features_matches_and_a_pose_by_arrays(built: megloc.Map, scene: Path) -
     camera = megloc.Camera.pinhole(640, 480, 500)
     points = rng.uniform((-2, -2, 4), (2, 2, 8), (60, 3))
     points_px = 500 * points[:, :2] / points[:, 2:] + (320, 240)
-    found = megloc.solve_pose(points_px, points, camera)
-    assert found and np.allclose(found.cam_from_world.translation, 0, atol=1e-6)
+    result = megloc.solve_pose(points_px, points, camera)
+    assert result and np.allclose(result.cam_from_world.translation, 0, atol=1e-6)
     failed = megloc.solve_pose(rng.uniform(0, 480, (60, 2)), points, camera)
     assert not failed and failed.reason
 

@@ -32,14 +32,14 @@ def outer(x):
 
 
 def call(folder: Path) -> int:
-    found = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-c", "from outer_loops import outer; print(outer(1))"],
         cwd=folder,
         capture_output=True,
         text=True,
         check=True,
     )
-    return int(found.stdout)
+    return int(result.stdout)
 
 
 def test_a_change_of_a_called_loop_is_seen(tmp_path: Path) -> None:

@@ -51,20 +51,20 @@ EXAMPLES = [example for page in PAGES for example in blocks(page, "python")]
 
 
 def test_python_examples_name_what_there_is_with_its_arguments() -> None:
-    """What a type checker says of the names that are imported."""
+    """Check imported names and the arguments of calls, as a type checker does."""
     assert len(EXAMPLES) >= 2
     for example in EXAMPLES:
-        found: dict[str, Any] = {}
+        result: dict[str, Any] = {}
         for node in ast.walk(ast.parse(example)):
             if isinstance(node, ast.Import | ast.ImportFrom):
-                exec(ast.unparse(node), found)  # raises where a name is not there
+                exec(ast.unparse(node), result)  # raises where a name is not there
 
-        def named(node: ast.expr, found: dict[str, Any] = found) -> Any:
-            """What an expression stands for, None of what is not imported."""
+        def named(node: ast.expr, result: dict[str, Any] = result) -> Any:
+            """Return the object of an expression; None if it is not imported."""
             if isinstance(node, ast.Attribute):
                 owner = named(node.value)
                 return None if owner is None else getattr(owner, node.attr)
-            return found.get(node.id) if isinstance(node, ast.Name) else None
+            return result.get(node.id) if isinstance(node, ast.Name) else None
 
         for node in ast.walk(ast.parse(example)):
             called = named(node.func) if isinstance(node, ast.Call) else None
@@ -91,8 +91,8 @@ def test_every_page_is_reached_from_readme() -> None:
         page = to_read.pop()
         if page not in reached and page.suffix == ".md":
             reached.add(page)
-            found = re.findall(r"\]\(([^)#\s]+\.md)", page.read_text())
-            to_read += [(page.parent / one).resolve() for one in found if "://" not in one]
+            result = re.findall(r"\]\(([^)#\s]+\.md)", page.read_text())
+            to_read += [(page.parent / one).resolve() for one in result if "://" not in one]
     assert set(PAGES) <= reached
 
 
@@ -166,8 +166,10 @@ def test_every_option_stands_in_the_table_with_its_default() -> None:
     rows = re.findall(r"^\| `(\w+)`, `(\w+)` \| `(.*?)` \|", of_plugins, flags=re.M)
     assert len(rows) > 5
     for plugin, option, default in rows:
-        found = [one for one in entry_points(name=plugin) if one.group.startswith("megloc_kapture")]
-        model = VladOptions if plugin == "vlad" else found[0].load().Options
+        result = [
+            one for one in entry_points(name=plugin) if one.group.startswith("megloc_kapture")
+        ]
+        model = VladOptions if plugin == "vlad" else result[0].load().Options
         assert shown(model.model_fields[option].default) == default, (plugin, option)
 
 

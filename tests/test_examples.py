@@ -22,21 +22,21 @@ def run(code: list[str | Path], place: Path) -> str:
 
 @pytest.mark.slow
 def test_map_and_evaluate_then_photographs(scene: Path, tmp_path: Path) -> None:
-    told = run([EXAMPLES / "map_and_evaluate.py", scene], tmp_path)
-    assert told.count(".jpg: ") == 4 and "100.0 / 100.0 / 100.0 / 100.0" in told
+    output = run([EXAMPLES / "map_and_evaluate.py", scene], tmp_path)
+    assert output.count(".jpg: ") == 4 and "100.0 / 100.0 / 100.0 / 100.0" in output
     assert (tmp_path / "example_report.html").is_file()
     assert (tmp_path / "example_scene.ply").stat().st_size > 1000
     photographs = sorted((scene / "query/sensors/records_data").glob("*.jpg"))
-    told = run(
+    output = run(
         [EXAMPLES / "localize_photographs.py", tmp_path / "example_run/map", *photographs], tmp_path
     )
-    assert told.count("confidence") == 4, told
+    assert output.count("confidence") == 4, output
 
 
 @pytest.mark.slow
 def test_compare_presets(scene: Path, tmp_path: Path) -> None:
-    told = run([EXAMPLES / "compare_presets.py", scene], tmp_path)
-    assert "8 candidates" in told and "1 candidate" in told
+    output = run([EXAMPLES / "compare_presets.py", scene], tmp_path)
+    assert "8 candidates" in output and "1 candidate" in output
 
 
 @pytest.mark.slow
@@ -46,5 +46,5 @@ def test_the_notebook(scene: Path, tmp_path: Path) -> None:
     code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
     (tmp_path / "my_scene").symlink_to(scene)
     (tmp_path / "notebook.py").write_text(code)
-    told = run([tmp_path / "notebook.py"], tmp_path)
-    assert "100.0 / 100.0 / 100.0 / 100.0" in told and (tmp_path / "report.html").is_file()
+    output = run([tmp_path / "notebook.py"], tmp_path)
+    assert "100.0 / 100.0 / 100.0 / 100.0" in output and (tmp_path / "report.html").is_file()

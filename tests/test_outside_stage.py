@@ -62,10 +62,10 @@ def expected_counts(workspace: Workspace) -> list[str]:
 
 def test_it_is_part_of_the_plan_with_manifest_and_progress(scene: Path, tmp_path: Path) -> None:
     workspace = Workspace(tmp_path / "workspace")
-    told: list[tuple[int, str]] = []
+    progress: list[tuple[int, str]] = []
 
     def track(items: Iterable[Any], total: int, label: str) -> Iterator[Any]:
-        told.append((total, label))
+        progress.append((total, label))
         return iter(items)
 
     stages = planned(scene, {"count_keypoints": {}})
@@ -73,7 +73,7 @@ def test_it_is_part_of_the_plan_with_manifest_and_progress(scene: Path, tmp_path
     assert names.index("count_keypoints") == names.index("local_features") + 1
     run_plan(stages, workspace, Work(track=track), last="count_keypoints")
     images = KaptureFolder(scene / "mapping").read().image_names()
-    assert (len(images), "counting") in told
+    assert (len(images), "counting") in progress
     assert workspace.path("counts.csv").read_text().splitlines() == expected_counts(workspace)
     manifest = json.loads(workspace.manifest_path("count_keypoints").read_text())
     assert manifest["options"] == {"least": 0} and manifest["counts"] == {"images": len(images)}

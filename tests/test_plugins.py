@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 
 from megloc_kapture.errors import PluginError
-from megloc_kapture.features.rootsift import RootSift
-from megloc_kapture.matching.nearest_neighbours import NearestNeighbours
 from megloc_kapture.plugin_loading import checked_array, load_plugin, plugin_names
 from megloc_kapture.plugins import LOCAL_FEATURES, MATCHERS
 from megloc_kapture.values import LocalFeatures
@@ -67,7 +65,7 @@ ENTRY_POINTS = f"""
 
 
 def install(folder: Path, distribution: str, modules: dict[str, str], entry_points: str) -> None:
-    """What pip leaves behind: modules, and a folder of metadata beside them."""
+    """Write modules and a folder of metadata, as pip does."""
     for name, text in modules.items():
         (folder / f"{name}.py").write_text(textwrap.dedent(text))
     metadata = folder / f"{distribution}-1.0.dist-info"
@@ -90,13 +88,6 @@ def outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for module in ("outside_plugin", "outside_plugin_broken"):
         monkeypatch.delitem(sys.modules, module, raising=False)
     return tmp_path
-
-
-def test_our_own_are_registered_in_the_same_way() -> None:
-    assert isinstance(load_plugin(LOCAL_FEATURES, "rootsift"), RootSift)
-    assert isinstance(load_plugin(MATCHERS, "nn"), NearestNeighbours)
-    limited = load_plugin(LOCAL_FEATURES, "rootsift", {"max_keypoints": 7})
-    assert limited.options.max_keypoints == 7
 
 
 def test_a_plugin_of_another_package_is_found_and_works(outside: Path) -> None:

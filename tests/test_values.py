@@ -1,4 +1,4 @@
-"""The value types against scipy, and what they refuse."""
+"""The value types against scipy, and rejected values."""
 
 from __future__ import annotations
 
@@ -51,9 +51,9 @@ def test_transforms_are_their_matrices(seed: int) -> None:
     expected = (np.column_stack([points, np.ones(7)]) @ homogeneous(a).T)[:, :3]
     np.testing.assert_allclose(a.apply(points), expected, atol=1e-12)
     np.testing.assert_allclose(a.apply(a.center()[None]), np.zeros((1, 3)), atol=1e-12)
-    found = RigidTransform.from_matrix(a.rotation_matrix(), np.zeros(3)).quat_wxyz
+    result = RigidTransform.from_matrix(a.rotation_matrix(), np.zeros(3)).quat_wxyz
     sign = 1 if a.quat_wxyz[0] > 0 else -1
-    np.testing.assert_allclose(np.array(found) * sign, a.quat_wxyz, atol=1e-14)
+    np.testing.assert_allclose(np.array(result) * sign, a.quat_wxyz, atol=1e-14)
 
 
 # rotations by (nearly) 180 degrees about every axis: where the trace formula loses all digits

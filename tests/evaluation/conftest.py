@@ -61,9 +61,9 @@ def make_world(num_queries: int = 40, seed: int = 0) -> World:
         world.truth[name] = upright_camera(on_ring(along) + rng.normal(size=3), along)
         world.conditions[name] = condition
         if i % 10 == 8:
-            told = {"reason": "6 inliers, 12 needed", "num_inliers": 6}
+            fields = {"reason": "6 inliers, 12 needed", "num_inliers": 6}
         elif i % 10 == 4:
-            told = {"reason": "no matches", "fallback": "retrieval"}
+            fields = {"reason": "no matches", "fallback": "retrieval"}
             world.estimated[name] = world.mapped[f"map/{i % 60:03d}.jpg"]
         else:
             error = 10 ** rng.normal(-1.5, 0.7)
@@ -71,9 +71,9 @@ def make_world(num_queries: int = 40, seed: int = 0) -> World:
             shift *= error / np.linalg.norm(shift)
             world.estimated[name] = displaced(world.truth[name], shift, 5 * error)
             inliers = int(rng.integers(12, 250))
-            told = {"num_matches": 300, "num_inliers": inliers}
+            fields = {"num_matches": 300, "num_inliers": inliers}
         counts = {"num_matches": 0, "num_inliers": 0}
-        world.statuses[name] = LocalizationResult(name=name, **counts | told)
+        world.statuses[name] = LocalizationResult(name=name, **counts | fields)
     return world
 
 
@@ -135,8 +135,7 @@ class Page(HTMLParser):
         self.feed(html)
         self.close()
         assert self.open == []
-        # every reference stays on the page: to an id of the page, or data inside it; or leads to
-        # the view beside it
+        # every reference is an id of the page, data inside it, or the 3D view in the same folder
         assert len(self.ids) == len(set(self.ids))
         for reference in self.references:
             ours = reference.startswith("data:") or reference == "view.html"

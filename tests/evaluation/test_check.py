@@ -16,7 +16,6 @@ from megloc_kapture.evaluation.check import (
     Finding,
     Reference,
     check_submission,
-    read_reference,
 )
 from megloc_kapture.io.dataset_tables import (
     Protocol,
@@ -24,7 +23,6 @@ from megloc_kapture.io.dataset_tables import (
     SimilarityTransform,
     World,
 )
-from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.values import RigidTransform
 
 OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -129,20 +127,6 @@ def test_the_five_conventions(check: Check, scene: Callable[..., Poses]) -> None
         assert (error.severity, error.kind) == ("error", "convention") and words in error.message
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["fountain_p11", "herzjesu_p25", "herzjesu_wide", "redkitchen_rgbd"]
-)
-def test_the_conventions_on_real_scenes(shared_data: Path, check: Check, name: str) -> None:
-    folder = shared_data / "scenes" / name
-    poses = KaptureFolder(folder / "query_gt").read().poses()
-    reference = read_reference(folder)
-    assert not check(lines_of(poses), reference).findings
-    for mistake, words in CONVENTIONS.items():
-        # where cameras hardly turn several conventions are named
-        assert words in only(check(lines_of(poses, mistake), reference)).message
-
-
 def test_a_recentred_map(check: Check) -> None:
     reference, poses = made(street)
     world = World(
@@ -183,9 +167,9 @@ GOOD = "a.jpg 0.6 0.8 0 0 1.5 -0.2 3\n"
 )
 def test_wrong_rows(check: Check, line: str, kind: str, words: str) -> None:
     report = check([GOOD, "\n", f"{line}\n"])
-    found = report.findings[0]
-    assert (found.severity, found.kind, found.line) == ("error", kind, 3)
-    assert words in found.message and report.poses == 1
+    result = report.findings[0]
+    assert (result.severity, result.kind, result.line) == ("error", kind, 3)
+    assert words in result.message and report.poses == 1
 
 
 ROBOTCAR = {f"rear/{i}.jpg": f"dawn/rear/{i}.jpg" for i in range(100, 106)}
@@ -232,11 +216,11 @@ def test_endings_and_cameras_of_robotcar(check: Check) -> None:
 
 def test_unknown_missing_and_double_names(check: Check) -> None:
     names = ["IMG_0.jpg", "else.jpg", "IMG_1.jpg", "query/day/IMG_1.jpg"]
-    found = {finding.kind: finding for finding in named(check, names, AACHEN)}
-    assert found.keys() == {"unknown", "name", "duplicate", "missing"}
-    assert (found["unknown"].line, found["unknown"].names) == (2, ("else.jpg",))
-    assert found["duplicate"].line == 4 and "(line 3)" in found["duplicate"].message
-    missing = found["missing"]
+    result = {finding.kind: finding for finding in named(check, names, AACHEN)}
+    assert result.keys() == {"unknown", "name", "duplicate", "missing"}
+    assert (result["unknown"].line, result["unknown"].names) == (2, ("else.jpg",))
+    assert result["duplicate"].line == 4 and "(line 3)" in result["duplicate"].message
+    missing = result["missing"]
     assert missing.severity == "warning" and missing.message.startswith("3 queries of 5 without")
     assert missing.names == ("IMG_2.jpg", "IMG_3.jpg", "IMG_4.jpg")
 
@@ -275,19 +259,19 @@ def test_mlad_files(check: Check) -> None:
     reference, poses = drive()
     lines = mlad_lines(poses)
 
-    def found(lines: Sequence[str], name: str = "a_to_b.txt") -> list[tuple[str, str]]:
+    def result(lines: Sequence[str], name: str = "a_to_b.txt") -> list[tuple[str, str]]:
         return kinds(check(lines, reference, "4seasons", name))
 
-    assert found(lines) == []
-    assert found(lines, "mine.txt") == [("error", "file-name")]
-    assert found(lines[1:]) == [("error", "missing")]
-    assert found([*lines, "1 2 3 0 0 0 0 0 1\n"]) == [("error", "unknown")]
+    assert result(lines) == []
+    assert result(lines, "mine.txt") == [("error", "file-name")]
+    assert result(lines[1:]) == [("error", "missing")]
+    assert result([*lines, "1 2 3 0 0 0 0 0 1\n"]) == [("error", "unknown")]
     swapped = [" ".join([b, a, rest]) for a, b, rest in (line.split(" ", 2) for line in lines)]
-    assert found(swapped) == [("error", "swapped")]
-    assert ("error", "pose") in found(["x 205 1.5 -0.2 3 0 0 0 1\n"])
+    assert result(swapped) == [("error", "swapped")]
+    assert ("error", "pose") in result(["x 205 1.5 -0.2 3 0 0 0 1\n"])
     dummies = [f"{key} 0 0 0 0 0 0 1\n" for key in poses]
-    assert found([*dummies[:4], *lines[4:]]) == [("note", "dummies")]
-    assert found(dummies)[-1] == ("note", "too-few")
+    assert result([*dummies[:4], *lines[4:]]) == [("note", "dummies")]
+    assert result(dummies)[-1] == ("note", "too-few")
 
 
 def test_a_folder_of_mlad_files(tmp_path: Path) -> None:

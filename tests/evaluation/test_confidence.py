@@ -21,11 +21,11 @@ def at(x_m: float) -> RigidTransform:
 
 def test_confidences_that_are_true_have_no_calibration_error() -> None:
     rng = np.random.default_rng(0)
-    said = rng.uniform(0, 1, 200_000)
-    right = rng.uniform(0, 1, 200_000) < said
-    assert calibration_error(reliability(said, right)) < 0.01
+    claimed = rng.uniform(0, 1, 200_000)
+    right = rng.uniform(0, 1, 200_000) < claimed
+    assert calibration_error(reliability(claimed, right)) < 0.01
     # and those that say half of it have an error of a quarter
-    assert calibration_error(reliability(said / 2, right)) == pytest.approx(0.25, abs=0.01)
+    assert calibration_error(reliability(claimed / 2, right)) == pytest.approx(0.25, abs=0.01)
 
 
 def test_risk_by_hand() -> None:
@@ -47,7 +47,7 @@ def status(image: str, confidence: float | None, localized: bool = True) -> Loca
 
 def test_of_a_result() -> None:
     truth = {name: at(0.0) for name in "abcd"}
-    found = {"a": at(0.1), "b": at(100.0), "c": at(0.2), "stray": at(0.0)}
+    result = {"a": at(0.1), "b": at(100.0), "c": at(0.2), "stray": at(0.0)}
     statuses = {
         "a": status("a", 0.9),
         "b": status("b", 0.6),
@@ -56,7 +56,7 @@ def test_of_a_result() -> None:
         "stray": status("stray", 0.7),
         "refused": status("refused", 0.1, localized=False),
     }
-    evaluation = evaluate_poses(found, truth, statuses=statuses, nowhere=["stray", "refused"])
+    evaluation = evaluate_poses(result, truth, statuses=statuses, nowhere=["stray", "refused"])
     known = evaluation.confidence
     assert (known.num_queries, known.num_poses, known.num_wrong) == (6, 4, 2)
     assert (known.num_nowhere, known.num_nowhere_refused) == (2, 1)
@@ -65,7 +65,7 @@ def test_of_a_result() -> None:
     assert known.coverage == pytest.approx((1 / 6, 2 / 6, 3 / 6, 4 / 6))
     assert known.area == pytest.approx(5 / 24) and known.area_by_inliers == pytest.approx(1 / 2)
     assert known.wrong_low < 0.5 < known.wrong_high
-    # they stand in no row of recall, and are not images without truth
+    # no row of recall counts them, and they are not images without truth
     assert evaluation.row().num_queries == 4 and evaluation.without_truth == ()
     text = " ".join(report_text(evaluation).split())
     assert "2 queries show nothing of the map: 1 refused, 1 given a pose" in text
@@ -85,23 +85,23 @@ def test_recall_also_counts_doubtful_poses_as_misses() -> None:
         name: status(name, confidence)
         for name, confidence in zip("abc", (0.9, 0.6, 0.59), strict=True)
     }
-    found = evaluate_poses(
+    result = evaluate_poses(
         {name: truth[name] for name in "abc"},
         truth,
         statuses=statuses,
         conditions=dict(zip("abcd", ("day", "night", "night", "night"), strict=True)),
     )
-    assert [row.recall[-1].num_within for row in found.rows] == [1, 2, 3]
-    above = found.rows_above(0.6)
-    assert [row.name for row in above] == [row.name for row in found.rows]
+    assert [row.recall[-1].num_within for row in result.rows] == [1, 2, 3]
+    above = result.rows_above(0.6)
+    assert [row.name for row in above] == [row.name for row in result.rows]
     assert [row.recall[-1].num_within for row in above] == [1, 1, 2]
     assert [row.num_missing for row in above] == [0, 2, 2]
-    assert "misses" in report_text(found)
+    assert "misses" in report_text(result)
     # without confidences there is nothing to add
     assert evaluate_poses(truth, truth).rows_above(0.6) == ()
 
 
-def test_confidences_beside_a_pose_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_confidences_of_a_pose_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     poses = tmp_path / "poses.txt"
     poses.write_text("a 1 0 0 0 0 0 0\nb 1 0 0 0 50 0 0\n")
     truth = {"a": at(0.0), "b": at(0.0)}

@@ -26,6 +26,6 @@ def test_thresholds_of_the_challenges() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "Aachen", "synthetic-kapture", "synthetic-cmu", "cmu"])
-def test_unknown_names_are_refused_with_the_known_ones(name: str) -> None:
+def test_unknown_names_are_refused(name: str) -> None:
     with pytest.raises(OptionError, match="known: aachen, robotcar, 4seasons, inloc"):
         protocol_of(name)

@@ -1,4 +1,4 @@
-"""What can be known without truth: shares, inliers, agreement with retrieval, of two results."""
+"""Figures without true poses: shares, inliers, agreement with retrieval and of two results."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ CONDITIONS = {"d/1.jpg": "day", "d/2.jpg": "day", "n/1.jpg": "night", "n/2.jpg":
 
 @pytest.fixture
 def first() -> Result:
-    """One query at its first candidate, one beside another, a guess, and one without a pose."""
+    """One query at its first candidate, one near another, a guess, and one without a pose."""
     guess = {"reason": "dark", "fallback": "retrieval"}
     rows = (
         status("d/1.jpg", 100, "m/0.jpg", "m/8.jpg"),
@@ -71,28 +71,28 @@ def second() -> Result:
 
 
 @pytest.fixture
-def found(first: Result, second: Result) -> WithoutTruth:
+def result(first: Result, second: Result) -> WithoutTruth:
     groups = {image: ImageGroup(condition=name) for image, name in CONDITIONS.items()}
     benchmark = Benchmark(protocol=Protocol(truth="Nobody tells."), groups=groups)
     return evaluate_without_truth([first, second], benchmark, thresholds=THRESHOLDS)
 
 
-def test_counts_and_inliers(found: WithoutTruth) -> None:
-    day, night, whole = found.evaluations[0].rows
+def test_counts_and_inliers(result: WithoutTruth) -> None:
+    day, night, whole = result.evaluations[0].rows
     assert (day.name, night.name, whole.name) == ("day", "night", "all")
     counts = (whole.num_queries, whole.num_localized, whole.num_fallback, whole.num_missing)
     assert counts == (4, 2, 1, 1)
-    quartiles = inliers_quartiles(found.evaluations[0], "all")
+    quartiles = inliers_quartiles(result.evaluations[0], "all")
     assert quartiles == tuple(np.quantile([100, 20], (0.25, 0.5, 0.75)))
-    assert inliers_quartiles(found.evaluations[0], "night") is None
-    other = found.evaluations[1].rows[-1]
+    assert inliers_quartiles(result.evaluations[0], "night") is None
+    other = result.evaluations[1].rows[-1]
     assert (other.num_localized, other.num_missing) == (3, 1)
-    assert inliers_quartiles(found.evaluations[1], "all") is None
-    assert [q.reason for q in found.evaluations[0].queries] == ["", "", "dark", "no matches"]
+    assert inliers_quartiles(result.evaluations[1], "all") is None
+    assert [q.reason for q in result.evaluations[0].queries] == ["", "", "dark", "no matches"]
 
 
-def test_agreement_of_two_results(found: WithoutTruth, first: Result) -> None:
-    day, night, whole = found.agreement
+def test_agreement_of_two_results(result: WithoutTruth, first: Result) -> None:
+    day, night, whole = result.agreement
     assert (whole.num_both, whole.num_only_first, whole.num_only_second) == (2, 1, 1)
     # 0.1 m apart; and 5 degrees apart
     assert [at.num_within for at in whole.within] == [1, 2]
@@ -102,7 +102,7 @@ def test_agreement_of_two_results(found: WithoutTruth, first: Result) -> None:
     assert (day.num_both, night.num_both) == (2, 0)
     assert np.isinf(night.median_m)
     assert whole.median_m == pytest.approx(0.05)
-    np.testing.assert_allclose(found.apart[0].position_m, [0.1, 0.0, np.inf, np.inf], atol=1e-12)
+    np.testing.assert_allclose(result.apart[0].position_m, [0.1, 0.0, np.inf, np.inf], atol=1e-12)
     # a result agrees with itself
     twin = Result("twin", first.poses, first.images, first.statuses)
     (row,) = evaluate_without_truth([first, twin], thresholds=THRESHOLDS).agreement
@@ -112,14 +112,14 @@ def test_agreement_of_two_results(found: WithoutTruth, first: Result) -> None:
 def test_one_pose_file_alone_and_no_pose_at_all(
     second: Result, page_of: Callable[[str], Any]
 ) -> None:
-    found = evaluate_without_truth([second])
-    text = report_text(found)
+    result = evaluate_without_truth([second])
+    text = report_text(result)
     assert "No true poses were given." in text
     assert "agree (%)" not in text
-    assert "both have a pose" not in page_of(render_report(found)).text
-    found = evaluate_without_truth([Result("x", {}, ("a.jpg",))])
-    assert found.evaluations[0].rows[0].num_missing == 1
-    assert "From above" not in page_of(render_report(found)).text
+    assert "both have a pose" not in page_of(render_report(result)).text
+    result = evaluate_without_truth([Result("x", {}, ("a.jpg",))])
+    assert result.evaluations[0].rows[0].num_missing == 1
+    assert "From above" not in page_of(render_report(result)).text
 
 
 def test_nothing_to_say_is_refused(first: Result) -> None:
@@ -141,10 +141,10 @@ def test_from_a_workspace(first: Result, tmp_path: Path, kaptures: Callable[...,
     write_groups(tables, {name: ImageGroup(condition=c) for name, c in CONDITIONS.items()})
     write_names(tables, {name: name.replace("/", "_") for name in CONDITIONS})
     rules = benchmark_of(tables)
-    found = results_without_truth([workspace / "localized"], rules)
-    assert "visuallocalization.net keeps them" in found.statement
+    result = results_without_truth([workspace / "localized"], rules)
+    assert "visuallocalization.net keeps them" in result.statement
     # the challenge's list says which queries count
-    assert [row.num_queries for row in found.evaluations[0].rows] == [2, 2, 4]
+    assert [row.num_queries for row in result.evaluations[0].rows] == [2, 2, 4]
     # without a list, all queries of the workspace do that are scored
     everything = results_without_truth(
         [workspace / "localized"], Benchmark(protocol=rules.protocol, groups=rules.groups)

@@ -1,4 +1,4 @@
-"""Images, and weights of local features: random ones in files, published ones where there are."""
+"""Images, and weights of local features: random ones, and published ones where available."""
 
 from __future__ import annotations
 

@@ -45,15 +45,15 @@ def test_xfeat_is_kornias_half_a_pixel_on(weights: str, photograph: Image) -> No
     theirs.net.load_state_dict(read_weights(find_weights(weights)))
     tensor = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
     expected = {key: value.numpy() for key, value in theirs.detectAndCompute(tensor)[0].items()}
-    found = xfeat(weights).extract(image)
+    result = xfeat(weights).extract(image)
     # theirs has the first pixel's centre at (0, 0)
-    ours = np.lexsort(found.keypoints_px[:, :2].T)
+    ours = np.lexsort(result.keypoints_px[:, :2].T)
     order = np.lexsort(expected["keypoints"].T)
-    np.testing.assert_array_equal(found.keypoints_px[ours, :2] - 0.5, expected["keypoints"][order])
-    np.testing.assert_allclose(found.descriptors[ours], expected["descriptors"][order], atol=1e-4)
-    # of the same network as descriptors of their own, they are the same
+    np.testing.assert_array_equal(result.keypoints_px[ours, :2] - 0.5, expected["keypoints"][order])
+    np.testing.assert_allclose(result.descriptors[ours], expected["descriptors"][order], atol=1e-4)
+    # the same weights as separate descriptor weights give the same descriptors
     again = xfeat(weights, descriptor_weights=weights).extract(image)
-    np.testing.assert_allclose(again.descriptors, found.descriptors, atol=1e-4)
+    np.testing.assert_allclose(again.descriptors, result.descriptors, atol=1e-4)
 
 
 @pytest.mark.parametrize(("x", "y"), [(200, 300), (600, 200), (900, 600)])
@@ -66,9 +66,9 @@ def test_keypoints_of_an_image_that_is_resized_are_where_they_are(
     a = xfeat(weights).extract(small).keypoints_px[:, :2]
     b = xfeat(weights).extract(np.asarray(large, np.uint8)).keypoints_px[:, :2] * 64 / 94
     distance = np.linalg.norm(a[:, None] - b, axis=2)
-    found = distance.min(axis=1) < 1.5
-    assert found.sum() > 20
-    offset = (b[distance.argmin(axis=1)] - a)[found]
+    result = distance.min(axis=1) < 1.5
+    assert result.sum() > 20
+    offset = (b[distance.argmin(axis=1)] - a)[result]
     # without the half pixel of the resizing, (1 - 64 / 94) / 2 = 0.16, a median would be off too
     assert np.abs(np.median(offset, axis=0)).max() < 1e-3
     assert np.abs(offset.mean(axis=0)).max() < 0.12
@@ -82,11 +82,11 @@ def test_disk_of_a_local_file(tmp_path: Path, photograph: Image) -> None:
     image = np.ascontiguousarray(photograph[:90, :120])
     mask = np.ones(image.shape[:2], bool)
     mask[:, :60] = False
-    found = Disk(DiskOptions.model_validate(options)).extract(image, mask)
-    assert found.keypoints_px.shape == (10, 3) and found.descriptors.shape == (10, 128)
-    assert found.keypoints_px[:, 0].min() > 60 and found.num_masked > 0
+    result = Disk(DiskOptions.model_validate(options)).extract(image, mask)
+    assert result.keypoints_px.shape == (10, 3) and result.descriptors.shape == (10, 128)
+    assert result.keypoints_px[:, 0].min() > 60 and result.num_masked > 0
     tensor = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
     with torch.inference_mode():
         theirs = network(tensor, pad_if_not_divisible=True)[0]
     known = {tuple(xy) for xy in (theirs.keypoints.numpy() + 0.5).tolist()}
-    assert {tuple(xy) for xy in found.keypoints_px[:, :2].tolist()} <= known
+    assert {tuple(xy) for xy in result.keypoints_px[:, :2].tolist()} <= known

@@ -51,9 +51,9 @@ def assert_same(a: LocalFeatures, b: LocalFeatures) -> None:
 @pytest.mark.parametrize(("kind", "most_px"), [(RootSift, 0.1), (ColmapSift, 0.15)])
 def test_keypoints_are_where_colmap_puts_them(kind: Any, most_px: float, sigma_px: float) -> None:
     centres = grid_of_centres(seed=int(10 * sigma_px))
-    found = kind().extract(blobs(centres, sigma_px)).keypoints_px
-    distance = np.linalg.norm(found[:, None] - centres, axis=2)
-    offset = found[distance.argmin(axis=0)] - centres
+    result = kind().extract(blobs(centres, sigma_px)).keypoints_px
+    distance = np.linalg.norm(result[:, None] - centres, axis=2)
+    offset = result[distance.argmin(axis=0)] - centres
     assert np.abs(offset).max() < most_px
     # a forgotten half pixel is ten times this, OpenCV's quarter pixel five times
     assert np.abs(offset.mean(axis=0)).max() < 0.05
@@ -113,33 +113,6 @@ def test_the_options_of_sift_reach_colmap() -> None:
     some = extracted(max_keypoints=50)
     assert 50 <= len(some) < 0.5 * len(everything.scores)
     assert some.mean() > everything.scores.mean()
-
-
-@pytest.mark.parametrize("kind", [RootSift, ColmapSift])
-def test_a_mask_looks_at_the_pixel_the_keypoint_lies_in(kind: Any) -> None:
-    centre = np.array([[100.5, 80.5]])  # the centre of pixel (100, 80)
-    image = blobs(centre, 3.0)
-    mask = np.zeros(image.shape[:2], dtype=bool)
-    mask[80, 100] = True
-    found = kind().extract(image, mask).keypoints_px
-    assert len(found) >= 1
-    np.testing.assert_allclose(found, np.repeat(centre, len(found), axis=0), atol=0.5)
-    assert len(kind().extract(image, ~mask).scores) < len(kind().extract(image).scores)
-
-
-@pytest.mark.parametrize("max_keypoints", [3, 20, 5000])
-@pytest.mark.parametrize("sigma_px", [2.0, 6.0])
-def test_a_mask_that_permits_everything_changes_nothing(
-    max_keypoints: int, sigma_px: float
-) -> None:
-    # with sigma 6 no keypoint of the doubled octave is left, which changes OpenCV's pyramid
-    image = blobs(grid_of_centres(seed=3), sigma_px)
-    extractor = RootSift(RootSiftOptions(max_keypoints=max_keypoints))
-    everything = np.ones(image.shape[:2], dtype=bool)
-    assert_same(extractor.extract(image), extractor.extract(image, everything))
-    # COLMAP keeps whole levels, then too
-    coarse = ColmapSift(ColmapSiftOptions(max_keypoints=max_keypoints))
-    assert_same(coarse.extract(image), coarse.extract(image, everything))
 
 
 def test_threads_do_not_disturb_each_other() -> None:

@@ -27,7 +27,6 @@ from megloc_kapture.features.superpoint import (
     superpoint_from,
     superpoint_with_descriptor,
 )
-from megloc_kapture.nets.score_maps import pixel_scores
 
 CPU = torch.device("cpu")
 
@@ -37,48 +36,22 @@ def extractor(weights: Path, **options: object) -> SuperPoint:
     return SuperPoint(SuperPointOptions.model_validate(given))
 
 
-def bright_cell_detector() -> SuperPointNet:
-    """Fires at row 5, column 2 of a cell of 8 x 8 pixels that has a bright pixel anywhere."""
-    net = SuperPointNet()
-    with torch.no_grad():
-        for parameter in net.parameters():
-            parameter.zero_()
-        for name, layer in net.named_children():
-            if name not in ("convPb", "convDb"):
-                layer.get_parameter("weight")[0, 0, 1, 1] = 1.0  # passes its input on
-        net.convPb.weight[8 * 5 + 2, 0] = 30.0
-        net.convPb.bias[64] = 10.0
-        net.convDb.bias[0] = 1.0
-    return net
-
-
-def test_a_keypoint_stands_at_the_middle_of_its_pixel(tmp_path: Path) -> None:
-    path = tmp_path / "superpoint_v1.pth"
-    torch.save(bright_cell_detector().state_dict(), path)
-    image = np.zeros((48, 64, 3), np.uint8)
-    image[19, 45] = 255  # cell (2, 5), whose keypoint is pixel (x 42, y 21)
-    found = extractor(path).extract(image)
-    np.testing.assert_array_equal(found.keypoints_px[:, :2], [[42.5, 21.5]])
-    assert found.keypoints_px[0, 2] == found.scores[0] > 0.99
-    assert found.keypoints_px.dtype == found.scores.dtype == found.descriptors.dtype == np.float32
-
-
 def test_ties_borders_and_the_threshold(superpoint_weights: Path) -> None:
     image = texture(120, 163, sigma_px=1.5)
-    found = extractor(superpoint_weights).extract(image)
-    assert len(found.scores) > 60
-    keys = [(-s, y, x) for x, y, s in found.keypoints_px.tolist()]
+    result = extractor(superpoint_weights).extract(image)
+    assert len(result.scores) > 60
+    keys = [(-s, y, x) for x, y, s in result.keypoints_px.tolist()]
     assert keys == sorted(keys)
-    assert found.keypoints_px[:, :2].min() >= 4.5
-    assert found.keypoints_px[:, 0].max() <= 160 - 4.5  # of what is a multiple of 8
-    assert found.keypoints_px[:, 1].max() <= 120 - 4.5
-    strong = extractor(superpoint_weights, threshold=float(found.scores[30])).extract(image)
-    np.testing.assert_array_equal(strong.keypoints_px, found.keypoints_px[:30])
+    assert result.keypoints_px[:, :2].min() >= 4.5
+    assert result.keypoints_px[:, 0].max() <= 160 - 4.5  # the part of a multiple of 8
+    assert result.keypoints_px[:, 1].max() <= 120 - 4.5
+    strong = extractor(superpoint_weights, threshold=float(result.scores[30])).extract(image)
+    np.testing.assert_array_equal(strong.keypoints_px, result.keypoints_px[:30])
 
 
-def test_the_whole_is_transformers_on_the_same_gray_image(superpoint_weights: Path) -> None:
+def test_keypoints_equal_transformers(superpoint_weights: Path) -> None:
     image = texture(96, 128, sigma_px=1.5)
-    found = extractor(superpoint_weights, remove_borders=0, max_keypoints=100).extract(image)
+    result = extractor(superpoint_weights, remove_borders=0, max_keypoints=100).extract(image)
     state = torch.load(superpoint_weights, weights_only=True)
     config = SuperPointConfig(border_removal_distance=0, max_keypoints=100, nms_radius=4)
     model = SuperPointForKeypointDetection(config).eval()
@@ -88,9 +61,9 @@ def test_the_whole_is_transformers_on_the_same_gray_image(superpoint_weights: Pa
     with torch.inference_mode():
         expected = model(gray.expand(1, 3, -1, -1))
     xy = expected.keypoints[0] * torch.tensor([128, 96]) + 0.5
-    np.testing.assert_allclose(found.keypoints_px[:, :2], xy.numpy(), atol=1e-3)
-    np.testing.assert_allclose(found.scores, expected.scores[0].numpy(), atol=1e-6)
-    np.testing.assert_allclose(found.descriptors, expected.descriptors[0].numpy(), atol=1e-5)
+    np.testing.assert_allclose(result.keypoints_px[:, :2], xy.numpy(), atol=1e-3)
+    np.testing.assert_allclose(result.scores, expected.scores[0].numpy(), atol=1e-6)
+    np.testing.assert_allclose(result.descriptors, expected.descriptors[0].numpy(), atol=1e-5)
 
 
 def test_gray_is_luma_rounded_to_eight_bits() -> None:
@@ -125,12 +98,12 @@ def test_a_second_checkpoint_gives_the_descriptors_and_another_type(
         for path in (superpoint_weights, tuned)
     }
     assert list(alone.weights()) == ["superpoint_v1.pth"]
-    found, frozen = plugin.extract(image), alone.extract(image)
-    np.testing.assert_array_equal(found.keypoints_px, frozen.keypoints_px)
+    result, frozen = plugin.extract(image), alone.extract(image)
+    np.testing.assert_array_equal(result.keypoints_px, frozen.keypoints_px)
     whole = tmp_path / "other.pth"
     torch.save({**torch.load(superpoint_weights, weights_only=True), **state}, whole)
     assert extractor(whole).name == "superpoint-other"
-    assert np.abs(found.descriptors - frozen.descriptors).max() > 0.1
+    assert np.abs(result.descriptors - frozen.descriptors).max() > 0.1
 
 
 def test_the_batch_norm_variant_is_known_by_its_keys(
@@ -193,17 +166,6 @@ def test_maps_of_any_size_are_transformers(size: tuple[int, int]) -> None:
     torch.testing.assert_close(descriptors, expected, rtol=0, atol=1e-6)
 
 
-def test_a_hot_channel_is_its_pixel_of_the_cell() -> None:
-    for channel in range(0, 65, 7):
-        logits = torch.zeros(1, 65, 3, 4)
-        logits[0, channel, 1, 2] = 50.0
-        scores = pixel_scores(logits)[0]
-        hot = torch.nonzero(scores > 0.9).tolist()
-        assert hot == ([[8 + channel // 8, 16 + channel % 8]] if channel < 64 else [])
-        assert scores[8:16, 16:24].sum() == pytest.approx(float(channel < 64), abs=1e-6)
-        assert scores[0, 0] == pytest.approx(1 / 65)
-
-
 def cells_at(
     xy: torch.Tensor, height: int, width: int, sampling: DescriptorSampling
 ) -> torch.Tensor:
@@ -217,30 +179,8 @@ def cells_at(
 def test_exact_sampling_reads_a_linear_map() -> None:
     x = torch.arange(4, 80 - 4)
     xy = torch.stack([x, torch.full_like(x, 20)], dim=1)
-    found = cells_at(xy, 6, 10, "exact")
-    torch.testing.assert_close(found, (xy - 3.5) / 8, rtol=0, atol=1e-5)
-
-
-def test_official_sampling_drifts_by_its_formula() -> None:
-    height, width = 75, 100
-    x = torch.tensor([4, 100, 400, 799])
-    y = torch.tensor([4, 75, 300, 599])
-    found = cells_at(torch.stack([x, y], dim=1), height, width, "official")
-    expected = torch.stack(
-        [
-            (x - 3.5) * (width - 1) / (8 * width - 4.5),
-            (y - 3.5) * (height - 1) / (8 * height - 4.5),
-        ],
-        dim=1,
-    )
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
-    drift_px = 8 * (found[-1, 0] - (799 - 3.5) / 8)
-    assert drift_px == pytest.approx(-3.5, abs=0.05)
-
-
-def test_no_keypoints_no_descriptors() -> None:
-    empty = torch.zeros((0, 2), dtype=torch.int64)
-    assert sample_descriptors(torch.ones(256, 3, 4), empty, "official").shape == (0, 256)
+    result = cells_at(xy, 6, 10, "exact")
+    torch.testing.assert_close(result, (xy - 3.5) / 8, rtol=0, atol=1e-5)
 
 
 def parts(weights: Tensors, *prefixes: str) -> Tensors:
@@ -249,7 +189,7 @@ def parts(weights: Tensors, *prefixes: str) -> Tensors:
 
 @torch.inference_mode()
 @pytest.mark.parametrize("kept", [(*BACKBONE, "convD"), ("conv",)])
-def test_a_descriptor_network_of_its_own(kept: tuple[str, ...]) -> None:
+def test_a_separate_descriptor_network(kept: tuple[str, ...]) -> None:
     frozen, tuned = random_tensors("superpoint", 3), random_tensors("superpoint", 4)
     net = superpoint_with_descriptor(
         frozen, parts(tuned, *kept), detector_where="a.pth", descriptor_where="b.pth"

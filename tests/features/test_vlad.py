@@ -95,7 +95,7 @@ def test_more_descriptors_than_one_chunk(monkeypatch: pytest.MonkeyPatch) -> Non
         np.testing.assert_allclose(parts, whole, atol=1e-6)
 
 
-def test_what_leaves_no_residual_is_the_zero_vector() -> None:
+def test_no_residuals_give_the_zero_vector() -> None:
     centres = np.eye(3, 8, dtype=np.float32)
     vocabulary = Vocabulary(centres[None])
     for assignment in ("hard", "soft"):
@@ -161,16 +161,6 @@ def test_training_depends_on_the_seed_only() -> None:
     np.testing.assert_array_equal(first[0], several[0])
 
 
-def test_a_large_training_set_starts_from_a_sample() -> None:
-    rng = np.random.default_rng(9)
-    truth = np.array([[0.0, 0.0], [50.0, 0.0], [0.0, 50.0]])
-    data = (truth[rng.integers(0, 3, 30_000)] + rng.normal(size=(30_000, 2))).astype(np.float32)
-    centres = train_vocabulary(data, VladOptions(num_clusters=3)).centres[0]
-    distance = np.linalg.norm(centres[:, None] - truth, axis=2)
-    assert sorted(distance.argmin(axis=1).tolist()) == [0, 1, 2]
-    assert distance.min(axis=1).max() < 0.1
-
-
 @given(st.lists(st.integers(0, 300), max_size=20), st.integers(1, 500), st.integers(0, 2**32 - 1))
 def test_sampled_rows_are_a_share_of_every_image(counts: list[int], total: int, seed: int) -> None:
     rows = sample_rows(counts, total, seed)
@@ -185,7 +175,7 @@ def test_sampled_rows_are_a_share_of_every_image(counts: list[int], total: int, 
     )
 
 
-def test_vocabularies_stand_side_by_side_with_equal_weight() -> None:
+def test_vocabularies_are_concatenated_with_equal_weight() -> None:
     rng = np.random.default_rng(11)
     data = unit_rows(rng, 300, 8)
     options = VladOptions(num_clusters=4, vocabularies=3)
@@ -202,11 +192,11 @@ def test_vocabularies_stand_side_by_side_with_equal_weight() -> None:
 def images_of(rng: np.random.Generator, count: int) -> dict[str, NDArray[np.float32]]:
     """Images of a few kinds of descriptors each, and one without any."""
     kinds = unit_rows(rng, 12, 8)
-    found = {}
+    result = {}
     for number in range(count):
         some = kinds[rng.integers(0, 12, 30)] + 0.2 * rng.normal(size=(30, 8))
-        found[f"{number:03d}"] = some.astype(np.float32)
-    return {**found, "empty": np.zeros((0, 8), np.float32)}
+        result[f"{number:03d}"] = some.astype(np.float32)
+    return {**result, "empty": np.zeros((0, 8), np.float32)}
 
 
 WHITENED = VladOptions(num_clusters=4, vocabularies=2, dimensions=10)
@@ -216,7 +206,7 @@ def train(images: dict[str, NDArray[np.float32]], options: VladOptions) -> Vocab
     return train_vlad(sorted(images), lambda name: len(images[name]), images.__getitem__, options)
 
 
-def test_training_whole_is_training_vocabularies_and_then_whitening() -> None:
+def test_training_learns_vocabularies_then_whitening() -> None:
     images = images_of(np.random.default_rng(13), 30)
     vocabulary = train(images, WHITENED)
     named = sorted(set(images) - {"empty"})
@@ -302,9 +292,9 @@ def test_the_projection_is_the_eigenvectors_over_powers_of_the_deviations(
 def test_vectors_are_of_unit_length_and_nothing_stays_nothing() -> None:
     data = vectors_of(np.random.default_rng(6), 20, 10)
     whitening = learn_whitening(data.copy(), 4)
-    found = whitening.apply(data[0])
-    assert found.dtype == np.float32 and found.shape == (4,)
-    np.testing.assert_allclose(np.linalg.norm(found), 1.0, atol=1e-6)
+    result = whitening.apply(data[0])
+    assert result.dtype == np.float32 and result.shape == (4,)
+    np.testing.assert_allclose(np.linalg.norm(result), 1.0, atol=1e-6)
     nothing = whitening.apply(np.zeros(10, np.float32))
     assert nothing.shape == (4,) and not nothing.any()
     assert not whitening.apply(whitening.mean).any()

@@ -64,7 +64,7 @@ def on_plane(
     image_from_depth: RigidTransform = STILL,
     mask: NDArray[np.bool_] | None = None,
 ) -> WarpSource:
-    """What a camera with a depth sensor beside it makes of a painted plane."""
+    """Return the image of a painted plane, with depth of a sensor next to the camera."""
     depth_camera = depth_camera or camera
     depth_from_world = image_from_depth.inverse() @ cam_from_world
     depth = plane_depth(depth_camera, depth_from_world, plane)
@@ -125,8 +125,8 @@ def test_an_image_warped_to_its_own_view_is_itself(
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.model)
-@pytest.mark.parametrize("other", [CAMERAS[0], CAMERAS[4], CAMERAS[5]], ids=lambda c: c.model)
-def test_a_plane_looks_as_it_does_from_there(camera: Camera, other: Camera) -> None:
+@pytest.mark.parametrize("other", [CAMERAS[0], CAMERAS[4]], ids=lambda c: c.model)
+def test_a_warped_plane_equals_the_true_view(camera: Camera, other: Camera) -> None:
     there = turned(3.0, -6.0, (0.3, -0.1, 0.2))
     view = warp_to_view([on_plane(other, STILL, WALL)], camera, there)
     depth = plane_depth(camera, there, WALL)
@@ -143,7 +143,7 @@ def test_a_plane_looks_as_it_does_from_there(camera: Camera, other: Camera) -> N
     np.testing.assert_allclose(view.depth_m.ravel()[valid], depth[valid], rtol=2e-4)
 
 
-def test_a_depth_camera_of_its_own_beside_the_camera() -> None:
+def test_depth_of_a_separate_camera() -> None:
     small = Camera("PINHOLE", 50, 40, (38.0, 40.0, 26.0, 19.0))
     beside = turned(1.0, -2.0, (0.08, 0.01, -0.02))
     there = turned(-2.0, 5.0, (-0.2, 0.1, 0.1))
@@ -245,7 +245,7 @@ def test_several_references_fill_each_others_holes() -> None:
     aside, other = turned(0.0, 0.0, (-0.6, 0.0, 0.0)), turned(0.0, 0.0, (-1.0, 0.2, 0.0))
     sources = [board_source(STILL), board_source(other)]
     one = warp_to_view(sources[:1], CAMERAS[1], aside)
-    check_board(one, aside, [STILL])  # what a board hides is masked, and what it covers too
+    check_board(one, aside, [STILL])  # pixels hidden or covered by the board are masked
     assert (one.image[~one.valid] == 0).all() and (one.source[~one.valid] == -1).all()
     both = warp_to_view(sources, CAMERAS[1], aside)
     assert both.valid.sum() > one.valid.sum() + 100
@@ -286,7 +286,7 @@ def test_masked_pixels_and_missing_depth_are_not_shown() -> None:
         assert np.isfinite(view.depth_m).all()
 
 
-def test_the_colour_camera_may_not_see_what_the_depth_camera_sees() -> None:
+def test_points_that_only_the_depth_camera_sees_are_hidden() -> None:
     # the sensor far to the side sees the wall behind the board, the camera does not
     camera, beside = CAMERAS[1], turned(0.0, 0.0, (0.6, 0.0, 0.0))
     depth, _ = board(camera, beside.inverse())
@@ -299,6 +299,6 @@ def test_the_colour_camera_may_not_see_what_the_depth_camera_sees() -> None:
     check_board(view, there, [STILL])
 
 
-def test_of_nothing_there_is_an_empty_view() -> None:
+def test_no_sources_give_an_empty_view() -> None:
     view = warp_to_view([], CAMERAS[0], STILL)
     assert not view.valid.any() and (view.depth_m == 0).all() and (view.source == -1).all()

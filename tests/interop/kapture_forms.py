@@ -65,33 +65,33 @@ def without_images(folder: Path, gone: str) -> None:
     kapture_to_dir(str(folder), data)
 
 
-def assert_same_images(found: KaptureData, expected: KaptureData, *, atol: float = 0.0) -> None:
+def assert_same_images(result: KaptureData, expected: KaptureData, *, atol: float = 0.0) -> None:
     """The same images in the same order, with the same cameras and poses.
 
     Ids of sensors are each form's own.
     """
-    assert list(found.records_camera.values()) == list(expected.records_camera.values())
+    assert list(result.records_camera.values()) == list(expected.records_camera.values())
     for name in expected.records_camera.values():
-        assert found.camera_of(name) == expected.camera_of(name)
-        pose, own = expected.cam_from_world(name), found.cam_from_world(name)
-        assert (own is None) == (pose is None), name
-        if own is not None and pose is not None:
-            np.testing.assert_allclose(own.matrix(), pose.matrix(), rtol=0, atol=atol)
+        assert result.camera_of(name) == expected.camera_of(name)
+        pose, actual_pose = expected.cam_from_world(name), result.cam_from_world(name)
+        assert (actual_pose is None) == (pose is None), name
+        if actual_pose is not None and pose is not None:
+            np.testing.assert_allclose(actual_pose.matrix(), pose.matrix(), rtol=0, atol=atol)
 
 
 def assert_same_dataset(
-    found: OfficialDataset, expected: OfficialDataset, *, atol: float = 0.0
+    result: OfficialDataset, expected: OfficialDataset, *, atol: float = 0.0
 ) -> None:
     """The same images and tables, the order of names and lines of the summary included."""
-    assert_same_images(found.mapping, expected.mapping, atol=atol)
-    assert_same_images(found.query, expected.query, atol=atol)
-    assert (found.query_gt is None) == (expected.query_gt is None)
-    if found.query_gt is not None and expected.query_gt is not None:
-        assert_same_images(found.query_gt, expected.query_gt, atol=atol)
+    assert_same_images(result.mapping, expected.mapping, atol=atol)
+    assert_same_images(result.query, expected.query, atol=atol)
+    assert (result.query_gt is None) == (expected.query_gt is None)
+    if result.query_gt is not None and expected.query_gt is not None:
+        assert_same_images(result.query_gt, expected.query_gt, atol=atol)
     for table in ("groups", "priors", "protocol", "world", "names"):
-        assert getattr(found, table) == getattr(expected, table), table
-    assert list(found.names) == list(expected.names)
-    assert list(map(str, found.summary)) == list(map(str, expected.summary))
+        assert getattr(result, table) == getattr(expected, table), table
+    assert list(result.names) == list(expected.names)
+    assert list(map(str, result.summary)) == list(map(str, expected.summary))
 
 
 def assert_linked(dataset: OfficialDataset, output: Path, images: Path) -> None:

@@ -63,12 +63,12 @@ def merged(place: Path, mapping: Path, query: Path, *, skip: Sequence[str] = ())
 def pose_errors(result: Path, truth: Path) -> dict[str, tuple[float, float]]:
     """(metres, degrees) of each image of ``truth`` that ``result`` has a pose for.
 
-    Poses are read and compared by kapture alone, images are told apart by name.
+    Poses are read and compared by kapture alone, images are identified by name.
     """
-    found, expected = _poses(result), _poses(truth)
+    actual, expected = _poses(result), _poses(truth)
     return {
-        name: world_pose_transform_distance(found[name], expected[name])
-        for name in sorted(found.keys() & expected.keys())
+        name: world_pose_transform_distance(actual[name], expected[name])
+        for name in sorted(actual.keys() & expected.keys())
     }
 
 

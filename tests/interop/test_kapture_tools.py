@@ -29,10 +29,10 @@ def test_its_ltvl_export_is_our_pose_file(fountain_workspace: Path, tmp_path: Pa
     localized = fountain_workspace / "localized"
     kapture_tool("kapture_export_LTVL2020", "-i", localized, "-o", exported, "--full_file_name")
     ours = next((fountain_workspace / "submissions").glob("*.txt"))
-    expected, found = read_pose_file(exported), read_pose_file(ours)
+    expected, result = read_pose_file(exported), read_pose_file(ours)
     assert len(expected) == 4
-    assert found.keys() == expected.keys()
-    for name, pose in found.items():
+    assert result.keys() == expected.keys()
+    for name, pose in result.items():
         np.testing.assert_allclose(pose, expected[name], rtol=0, atol=1e-9)
 
 

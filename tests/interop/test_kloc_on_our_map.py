@@ -30,10 +30,10 @@ def assert_all_localized(result: Path, truth: Path) -> None:
 
 @dataclass(frozen=True)
 class Theirs:
-    """What kapture-localization made of a workspace's features.
+    """kapture-localization's results from a workspace's features.
 
     ``together`` is a kapture of links with map and query images, their matches, and our points;
-    the matches lie in features folders (orphan layout) of their own.
+    the matches are in separate features folders (orphan layout).
     """
 
     workspace: Path
@@ -119,6 +119,6 @@ def test_our_stages_run_on_its_pairs_and_matches(
     pairs = read_pairs(theirs.query_pairs)
     places = [theirs.workspace, theirs.query_matches]
     query = KaptureFolder(fountain / "query", features_dirs=places)
-    found = localize_from_matches(KaptureFolder(our_map), query, query, pairs, [LOCAL], options)
-    write_localized(result, query, found)
+    actual = localize_from_matches(KaptureFolder(our_map), query, query, pairs, [LOCAL], options)
+    write_localized(result, query, actual)
     assert_all_localized(result, fountain / "query_gt")

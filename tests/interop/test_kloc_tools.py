@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from contextlib import suppress
-from types import ModuleType
 
-import kloc_tools
 import numpy as np
 import pycolmap
 import pytest
@@ -29,14 +25,6 @@ def test_shims_add_names_and_take_them_away(error: bool) -> None:
     assert not hasattr(pycolmap, "absolute_pose_estimation")
 
 
-def test_shims_leave_an_old_pycolmap_alone() -> None:
-    old = ModuleType("old_pycolmap")
-    old.absolute_pose_estimation = original = object()
-    with shims(old):
-        assert old.absolute_pose_estimation is original
-    assert old.absolute_pose_estimation is original
-
-
 def test_absolute_pose_estimation_as_kapture_localization_calls_it() -> None:
     rng = np.random.default_rng(0)
     camera = pycolmap.Camera(
@@ -47,13 +35,13 @@ def test_absolute_pose_estimation_as_kapture_localization_calls_it() -> None:
     pixels[:10] += 100.0
     with shims(pycolmap):
         # lists of arrays and a plain dictionary, as its tools pass them
-        found = pycolmap.absolute_pose_estimation(
+        result = pycolmap.absolute_pose_estimation(
             list(pixels), list(points), camera, estimation_options={"ransac": {"max_error": 8.0}}
         )
         none = pycolmap.absolute_pose_estimation([], [], camera)
-    assert found["num_inliers"] == 50
-    assert found["inliers"] == [False] * 10 + [True] * 50
-    np.testing.assert_allclose(found["cam_from_world"].translation, [0.1, -0.2, 0.3], atol=1e-6)
+    assert result["num_inliers"] == 50
+    assert result["inliers"] == [False] * 10 + [True] * 50
+    np.testing.assert_allclose(result["cam_from_world"].translation, [0.1, -0.2, 0.3], atol=1e-6)
     assert none is None
 
 
@@ -64,23 +52,3 @@ def test_tools_are_found_where_pip_put_them() -> None:
     assert scripts["kapture_pycolmap_localize"].suffix == ".py"
     with pytest.raises(OptionError, match="no tool 'kapture_nothing'.*kapture_compute_matches"):
         run_tool("kapture_nothing", [], pycolmap)
-
-
-@needs_kapture_localization
-def test_tool_sees_its_own_command_line_and_ours_is_restored(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    argv, path = list(sys.argv), list(sys.path)
-    with pytest.raises(SystemExit) as stopped:
-        run_tool("kapture_compute_matches.py", ["--help"], pycolmap)
-    assert stopped.value.code == 0
-    assert "--pairsfile-path" in capsys.readouterr().out
-    assert (sys.argv, sys.path) == (argv, path)
-
-
-@needs_kapture_localization
-@pytest.mark.parametrize("arguments", [[], ["kapture_nothing"]])
-def test_command_refuses_in_one_line(arguments: list[str]) -> None:
-    command = [sys.executable, kloc_tools.__file__, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)

@@ -80,7 +80,7 @@ def view(
     name: str = "q",
 ) -> QueryView:
     """Of the right place; of an image so many keypoints match, or these."""
-    rows = {n: range(own) if isinstance(own, int) else own for n, own in shares.items()}
+    rows = {n: range(share) if isinstance(share, int) else share for n, share in shares.items()}
     xyz = points()
     seen = project(CAMERA, cam_from_rig @ TRUTH, xyz[:PER_PLACE]).astype(np.float32)
     return QueryView(name, CAMERA, (TypedMatches(index(xyz), seen, matches(rows)),), cam_from_rig)
@@ -161,7 +161,7 @@ def test_a_failure_is_that_of_the_cluster_that_came_nearest() -> None:
     assert [cluster.num_matches for cluster in result.clusters] == [9, 5]
 
 
-def test_without_points_there_is_nothing_to_localize_in() -> None:
+def test_without_points_localization_fails() -> None:
     empty = np.zeros(0, np.int64)
     bare = MapIndex.build(np.zeros((0, 3)), (), empty, empty, empty)
     typed = TypedMatches(bare, np.zeros((1, 2), np.float32), matches({"right/1": [0]}))
@@ -214,7 +214,7 @@ def test_a_covariance_moves_with_the_camera() -> None:
     np.testing.assert_allclose(measured / scale, moved / scale, atol=0.05)
 
 
-def test_rankings_are_taken_in_turn() -> None:
+def test_rankings_are_interleaved() -> None:
     assert interleave([["a", "b", "c"], ["b", "d"], []]) == ["a", "b", "d", "c"]
     assert interleave([]) == []
 
@@ -300,8 +300,8 @@ def test_candidates_are_divided_as_asked_and_frames_never_mixed(
     monkeypatch.setattr(module, "_MIN_SHARED_POINTS", 2)
     chosen = ClusterOptions.model_validate(options)
     indices = [small_index()] * types
-    found = cluster_candidates(NAMES, tuple(frames), chosen, centers=CENTERS, indices=indices)
-    assert found == expected
+    actual = cluster_candidates(NAMES, tuple(frames), chosen, centers=CENTERS, indices=indices)
+    assert actual == expected
 
 
 def test_poses_need_a_scale() -> None:

@@ -61,27 +61,27 @@ def terms(right: int, wrong: int, **settings: float) -> dict[str, float]:
     return evidence_of(problem, pose, sources, ERROR_PX)
 
 
-def test_terms_of_known_worth() -> None:
-    found = terms(80, 40)
-    assert set(found) == set(TERMS)
-    assert all(math.isfinite(value) for value in found.values())
-    found = terms(200, 0, noise_px=1.0)
+def test_terms_have_known_values() -> None:
+    result = terms(80, 40)
+    assert set(result) == set(TERMS)
+    assert all(math.isfinite(value) for value in result.values())
+    result = terms(200, 0, noise_px=1.0)
     # the median length of a normal vector of deviation 1 in two dimensions
-    assert found["residual"] == pytest.approx(math.log(1.177 / ERROR_PX), abs=0.15)
-    assert found["misfit"] == 0.0
-    assert found["agreement"] == pytest.approx(math.log(200.0))
+    assert result["residual"] == pytest.approx(math.log(1.177 / ERROR_PX), abs=0.15)
+    assert result["misfit"] == 0.0
+    assert result["agreement"] == pytest.approx(math.log(200.0))
     # every point of the map is seen, and every one of them matched
-    assert found["matched_share"] == pytest.approx(0.0, abs=0.02)
+    assert result["matched_share"] == pytest.approx(0.0, abs=0.02)
     # the map image stood 0.37 away, the points 6
-    assert 0.03 < found["viewing_angle"] * 90 < 6
-    assert found["distance_ratio"] < 0.2
-    assert found["support"] == pytest.approx(math.log(2.0))
+    assert 0.03 < result["viewing_angle"] * 90 < 6
+    assert result["distance_ratio"] < 0.2
+    assert result["support"] == pytest.approx(math.log(2.0))
 
 
 def test_surprise_against_the_binomial_distribution() -> None:
     """The number of false alarms bounds what chance does, and grows with what agrees."""
-    found = [terms(count, 200 - count)["surprise"] for count in (10, 20, 40, 80)]
-    assert found == sorted(found) and found[0] < found[-1]
+    result = [terms(count, 200 - count)["surprise"] for count in (10, 20, 40, 80)]
+    assert result == sorted(result) and result[0] < result[-1]
     problem, pose, sources = scene(40, 160, noise_px=2.0)
     surprise = 10 ** evidence_of(problem, pose, sources, ERROR_PX)["surprise"] - 1
     share = np.pi * ERROR_PX**2 / (640 * 480)
@@ -107,16 +107,16 @@ def test_the_number_of_views_does_not_matter() -> None:
 
 def test_more_wrong_matches_never_speak_for_a_pose() -> None:
     for model in calibrations().values():
-        found = [model.probability(terms(50, wrong)) for wrong in (0, 40, 160, 640)]
-        assert found == sorted(found, reverse=True)
+        result = [model.probability(terms(50, wrong)) for wrong in (0, 40, 160, 640)]
+        assert result == sorted(result, reverse=True)
 
 
 def test_right_and_chance() -> None:
     """A pose that half of the matches hold is trusted; the best pose of chance matches is not."""
     problem, pose, sources = scene(100, 60)
-    found = with_confidence(problem, pose, sources, ERROR_PX, 0.5)
-    assert isinstance(found, Pose) and found.confidence is not None and found.confidence > 0.9
-    assert found.evidence == evidence_of(problem, pose, sources, ERROR_PX)
+    result = with_confidence(problem, pose, sources, ERROR_PX, 0.5)
+    assert isinstance(result, Pose) and result.confidence is not None and result.confidence > 0.9
+    assert result.evidence == evidence_of(problem, pose, sources, ERROR_PX)
     problem, pose, sources = scene(4, 600, noise_px=0.1)
     refused = with_confidence(problem, pose, sources, ERROR_PX, 0.5)
     assert isinstance(refused, Failure) and refused.num_inliers == pose.num_inliers
@@ -140,7 +140,7 @@ def test_a_focal_length_that_does_not_fit_lowers_the_confidence() -> None:
     assert refused.reason.endswith("matches agree, and remark")
 
 
-def test_what_surrounds_keypoints_excuses_their_errors() -> None:
+def test_displaced_surroundings_excuse_keypoint_errors() -> None:
     problem, pose, sources = scene(200, 0, noise_px=3.0)
     exact = replace(sources, noise=np.tile([0.3 / 500, 0.3], (200, 1)))
 
@@ -164,7 +164,7 @@ def test_what_surrounds_keypoints_excuses_their_errors() -> None:
     evidence_of(problem, pose, replace(sources, displacements_rad=never), ERROR_PX)
 
 
-def test_points_that_are_not_well_known_excuse_errors() -> None:
+def test_uncertain_points_excuse_errors() -> None:
     """Depth that little parallax determined shows in a query from elsewhere, as noise of the map's
     own images never did."""
     rng = np.random.default_rng(0)
@@ -175,14 +175,15 @@ def test_points_that_are_not_well_known_excuse_errors() -> None:
     moved = view.points_world + rng.normal(0, deviation, (400, 1)) * np.array([1.0, 0.0, 0.0])
     known = np.tile([(deviation / 0.3) ** 2, 0.0, 0.0, 0.0, 0.0, 0.0], (400, 1))
     exact = replace(view, points_world=moved)
-    told = replace(exact, point_covariances=known)
+    uncertain = replace(exact, point_covariances=known)
     without, within = (
-        evidence_of(PoseProblem.of([each]), pose, sources, 50.0)["misfit"] for each in (exact, told)
+        evidence_of(PoseProblem.of([each]), pose, sources, 50.0)["misfit"]
+        for each in (exact, uncertain)
     )
     assert without > 3.0 and within == 0.0
     # a pose that is off by more than that is still contradicted
     off = replace(pose, cam_from_world=RigidTransform((1.0, 0.0, 0.0, 0.0), (0.1, -0.1, 0.3)))
-    assert evidence_of(PoseProblem.of([told]), off, sources, 50.0)["misfit"] > 1.0
+    assert evidence_of(PoseProblem.of([uncertain]), off, sources, 50.0)["misfit"] > 1.0
 
 
 def test_keypoints_of_a_small_image_are_as_good_in_pixels() -> None:
@@ -229,8 +230,8 @@ def test_a_map_of_few_points_is_not_trusted() -> None:
     assert isinstance(trusted, Pose) and trusted.evidence.keys() == set(TERMS)
 
 
-def test_what_is_not_known() -> None:
+def test_unknown_noise_and_points() -> None:
     problem, pose, sources = scene(50, 10)
     unknown = replace(sources, noise=np.full((60, 2), np.nan), seen=[np.zeros((0, 3))])
-    found = evidence_of(problem, pose, unknown, ERROR_PX)
-    assert found["misfit"] == 0.0 and found["matched_share"] == 0.0
+    result = evidence_of(problem, pose, unknown, ERROR_PX)
+    assert result["misfit"] == 0.0 and result["matched_share"] == 0.0

@@ -75,7 +75,7 @@ def test_it_is_the_networks_distance(files: tuple[Path, Path]) -> None:
     assert half == pytest.approx(plugin.distance(a, b, FULL), rel=0.1)
 
 
-def test_where_nothing_can_be_told_it_is_infinite(files: tuple[Path, Path]) -> None:
+def test_the_distance_without_valid_pixels_is_infinite(files: tuple[Path, Path]) -> None:
     assert distance(files).distance(*pictures(), ~FULL) == np.inf
     assert distance(files).distance(*pictures(height=40), FULL[:40]) == np.inf
 

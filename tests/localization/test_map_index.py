@@ -93,14 +93,14 @@ def resolve(matches: list[tuple[int, int, float, int]]) -> Correspondences:
     )
 
 
-def triples(found: Correspondences) -> list[tuple[int, int, int]]:
-    columns = (found.keypoint_ids, found.point_ids, found.support)
+def triples(result: Correspondences) -> list[tuple[int, int, int]]:
+    columns = (result.keypoint_ids, result.point_ids, result.support)
     assert all(column.dtype == np.int64 for column in columns)
     return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
 def greedy(matches: list[tuple[int, int, float, int]]) -> list[tuple[int, int, int]]:
-    """What most images say, then the most similar, each keypoint and each point once."""
+    """Matches of most images, then the most similar, each keypoint and each point once."""
     support = Counter((k, p) for k, p, _, _ in matches)
     best: dict[tuple[int, int], float] = {}
     for k, p, similarity, _ in matches:
@@ -117,7 +117,7 @@ def greedy(matches: list[tuple[int, int, float, int]]) -> list[tuple[int, int, i
 
 
 @given(st.one_of(rows, wide), st.randoms(use_true_random=False))
-def test_equal_to_a_greedy_loop_whatever_the_order(
+def test_matches_equal_a_greedy_loop(
     matches: list[tuple[int, int, float, int]], random: Any
 ) -> None:
     expected = greedy(matches)

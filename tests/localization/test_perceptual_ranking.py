@@ -64,7 +64,7 @@ class Scene:
     unknown: dict[str, slice] = field(default_factory=dict)
     mask: NDArray[np.bool_] | None = None
     asked: list[str] = field(default_factory=list)
-    # where a numbered image stands before the wall: beside the middle, and ahead
+    # position of a numbered image in front of the wall: to the side, and ahead
     stands: Callable[[int], tuple[float, float]] = lambda number: ((-0.4, 0.5)[number], -0.2)
 
     def place(self, name: str) -> tuple[int, RigidTransform]:
@@ -153,7 +153,7 @@ def test_scores_follow_the_hypotheses(scene: Scene) -> None:
     np.testing.assert_allclose(ranker().score(HYPOTHESES[::-1], scene)[::-1], forward, atol=1e-6)
     few = ranker(finalists=2).score(HYPOTHESES, scene)
     assert np.argmax(few) == 2
-    # those that are no finalists follow, in the order of their own distances
+    # the others follow the finalists, ordered by their distances
     by_alone = ranker(finalists=1).score(HYPOTHESES, scene)
     np.testing.assert_array_equal(np.argsort(-few)[2:], np.argsort(-by_alone)[2:])
 
@@ -175,8 +175,8 @@ def test_pictures_are_compared_where_both_rooms_show_something(scene: Scene) -> 
     assert abs(together[0] - together[1]) < 0.3 * (alone[0] - alone[1])
 
 
-def test_rooms_that_show_nothing_in_common_are_told_by_their_own_distances(scene: Scene) -> None:
-    # of the wrong room the poster is known, of the right one the wall beside it
+def test_rooms_without_common_pixels_compare_their_distances(scene: Scene) -> None:
+    # of the wrong room the poster is known, of the right one the wall next to it
     for room, unknown in ((0, slice(90)), (RIGHT, slice(70, None))):
         scene.unknown |= {f"{room}_{number}.jpg": unknown for number in (0, 1)}
     for order in (1, -1):
@@ -187,7 +187,7 @@ def test_rooms_that_show_nothing_in_common_are_told_by_their_own_distances(scene
             assert scores.sum() == pytest.approx(0.0)
 
 
-def test_what_cannot_be_told(scene: Scene) -> None:
+def test_poses_without_depth_or_pixels(scene: Scene) -> None:
     # hopeless clusters are not looked at
     scores = ranker(min_inlier_share=0.5).score(HYPOTHESES, scene)
     assert np.argmin(scores) == 2  # 120 of 300
@@ -220,7 +220,7 @@ def test_masked_parts_of_the_query_do_not_count(scene: Scene) -> None:
     assert plain[2] > 0
 
 
-def test_an_aligned_view_is_what_the_query_would_see(scene: Scene) -> None:
+def test_an_aligned_view_equals_the_query(scene: Scene) -> None:
     view = aligned_view(CAMERA, standing(RIGHT), ["2_0.jpg", "2_1.jpg"], scene)
     assert view.valid.mean() > 0.95
     difference = np.abs(view.image.astype(int) - scene.query)[view.valid]
@@ -255,7 +255,7 @@ def test_repeated_photographs_wait_until_the_others_are_taken() -> None:
     assert room.asked == ["2_3.jpg", "2_9.jpg"]
     of_film = aligned_view(CAMERA, standing(RIGHT), film, room, two)
     assert view.valid.mean() > of_film.valid.mean() + 0.1
-    # with room for all, and where there is nothing else, they are taken as they come
+    # with room for all, and without alternatives, all are taken in order
     room.asked = []
     aligned_view(CAMERA, standing(RIGHT), [*film, "2_9.jpg"], room)
     assert room.asked == ["2_3.jpg", "2_9.jpg", "2_2.jpg", "2_1.jpg", "2_0.jpg"]

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.localization.ranking import DistinctiveInliers, InlierCount
-from megloc_kapture.plugin_loading import load_plugin
-from megloc_kapture.plugins import POSE_RANKERS, HypothesisView, PoseHypothesis, PoseRanker
+from megloc_kapture.plugins import HypothesisView, PoseHypothesis
 from megloc_kapture.values import Camera, RigidTransform
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
@@ -49,20 +47,13 @@ def everywhere(count: int) -> NDArray[np.float64]:
     return np.stack([640 * at, 480 * ((at * 7) % 1)], axis=1)
 
 
-@pytest.mark.parametrize("name", ["inliers", "distinctive"])
-def test_they_are_registered(name: str) -> None:
-    ranker = load_plugin(POSE_RANKERS, name)
-    assert isinstance(ranker, PoseRanker)
-    assert ranker.score([], NoScene()).shape == (0,)
-
-
 def test_inliers_are_counted_over_all_views() -> None:
     good, bad = np.array([1.0, 2.0, 20.0]), np.array([np.inf, 11.0, 3.0])
     three = everywhere(3)
-    found = InlierCount().score(
+    result = InlierCount().score(
         [hypothesis(view(three, good)), hypothesis(view(three, good), view(three, bad))], NoScene()
     )
-    assert found.tolist() == [2.0, 3.0]
+    assert result.tolist() == [2.0, 3.0]
 
 
 def room(count: int, seed: int = 0) -> NDArray[np.float64]:
@@ -83,7 +74,7 @@ def ranker(**options: float) -> DistinctiveInliers:
     return DistinctiveInliers(DistinctiveInliers.Options(**options))
 
 
-def test_what_only_one_room_has_beats_more_inliers_that_every_room_has() -> None:
+def test_distinctive_inliers_beat_more_common_ones() -> None:
     walls, poster = room(100), room(10, seed=1)
     right = standing(0.0, np.concatenate([walls[:70], poster]))
     wrong = [standing(7.0 * number, walls) for number in (1, 2, 3)]
@@ -113,12 +104,3 @@ def test_two_clusters_of_one_place_do_not_count_against_each_other() -> None:
     other = standing(7.0, walls)
     scores = ranker(radius=0.0, power=1.0).score([*twice, other], NoScene())
     np.testing.assert_allclose(scores, [40 / 2 + 20, 40 / 2 + 20, 40 / 3])
-
-
-@pytest.mark.parametrize("power", [1.0, 4.0])
-def test_the_order_of_hypotheses_does_not_matter(power: float) -> None:
-    hypotheses = [standing(7.0 * at, room(30 + at)[at:]) for at in range(4)]
-    forward = ranker(power=power).score(hypotheses, NoScene())
-    np.testing.assert_allclose(
-        forward, ranker(power=power).score(hypotheses[::-1], NoScene())[::-1]
-    )

@@ -61,7 +61,7 @@ def test_points_lie_on_the_plane_and_on_their_rays(image_from_depth: RigidTransf
         model=IMAGE.model, width=IMAGE.width, height=IMAGE.height, params=IMAGE.params
     )
     np.testing.assert_allclose(camera.img_from_cam(points), keypoints, atol=1e-3)
-    # what the depth camera does not see has none
+    # keypoints outside the depth camera's view have no depth
     wide = Camera("PINHOLE", 640, 480, (300.0, 300.0, 320.0, 240.0))
     keypoints = np.array([[5.0, 240.0], [320.0, 240.0]])
     _, valid = lift_keypoints(keypoints, plane_depth(DEPTH), wide, DEPTH, image_from_depth)
@@ -92,7 +92,7 @@ def test_an_edge_has_no_depth(monkeypatch: pytest.MonkeyPatch) -> None:
     assert lift_keypoints(keypoints, depth, camera, camera, IDENTITY)[1].all()
 
 
-def test_missing_depth_falls_back_to_the_nearest_that_is_there() -> None:
+def test_missing_depth_falls_back_to_the_nearest_pixel() -> None:
     depth = np.full((4, 4), 3.0, np.float32)
     depth[1, 2], depth[2, 1], depth[2, 2] = 0.0, np.nan, -1.0
     depth[1, 1] = 2.9
@@ -138,8 +138,8 @@ def test_near_an_edge_either_surface_may_be_meant(monkeypatch: pytest.MonkeyPatc
     near = np.column_stack([(np.arange(28, 36) + 0.5 - 32.0) / 60.0, np.zeros(8), np.ones(8)])
     wrong = {1.0: [True] * 2 + [False] * 6, 2.0: [False] * 6 + [True] * 2}
     for metres, expected in (wrong | {2.5: [True] * 8}).items():  # behind both there is nothing
-        found, checked = contradicted_by_depth(near * metres, depth, SMALL, IDENTITY, EXACT)
-        assert checked.all() and found.tolist() == expected
+        result, checked = contradicted_by_depth(near * metres, depth, SMALL, IDENTITY, EXACT)
+        assert checked.all() and result.tolist() == expected
 
 
 @pytest.mark.parametrize("missing", [0.0, -1.0, np.nan, np.inf])
@@ -148,7 +148,7 @@ def test_missing_depth_says_nothing(missing: float, monkeypatch: pytest.MonkeyPa
     depth[20:28, 28:36] = missing
     wrong = np.array([[0.0, 0.0, 5.0]])
     monkeypatch.setattr(module, "_WINDOW_PX", 1)
-    for point in (wrong, wrong + [0.3, 0.0, 0.0]):  # in the hole, and one pixel beside it
+    for point in (wrong, wrong + [0.3, 0.0, 0.0]):  # in the hole, and one pixel next to it
         for judged in contradicted_by_depth(point, depth, SMALL, IDENTITY, EXACT):
             assert not judged.any()
     far_from_it = wrong + [1.0, 0.0, 0.0]

@@ -122,8 +122,7 @@ def test_mistakes_are_named(name: str) -> None:
     assert re.search(expected, fault), fault
 
 
-@pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize("noise_px", [0.0, 1.0, 4.0])
+@pytest.mark.parametrize(("seed", "noise_px"), [(0, 0.0), (1, 1.0), (2, 4.0)])
 def test_good_maps_have_no_fault(seed: int, noise_px: float) -> None:
     assert map_fault(*good_map(seed, noise_px)) is None
 

@@ -32,17 +32,17 @@ from megloc_kapture.values import Camera, RigidTransform
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
 def test_exhaustive_pairs(count: int) -> None:
-    found = exhaustive_pairs(count)
-    assert found.dtype == np.int64 and found.shape[1] == 2
-    assert [tuple(pair) for pair in found.tolist()] == list(combinations(range(count), 2))
+    result = exhaustive_pairs(count)
+    assert result.dtype == np.int64 and result.shape[1] == 2
+    assert [tuple(pair) for pair in result.tolist()] == list(combinations(range(count), 2))
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), max_size=30))
 def test_unique_pairs(given_pairs: list[tuple[int, int]]) -> None:
-    found = unique_pairs(np.array(given_pairs, dtype=np.int64).reshape(-1, 2))
+    result = unique_pairs(np.array(given_pairs, dtype=np.int64).reshape(-1, 2))
     expected = sorted({(min(p), max(p)) for p in given_pairs if p[0] != p[1]})
-    assert found.dtype == np.int64 and found.shape == (len(expected), 2)
-    assert [tuple(p) for p in found.tolist()] == expected
+    assert result.dtype == np.int64 and result.shape == (len(expected), 2)
+    assert [tuple(p) for p in result.tolist()] == expected
 
 
 def camera_at(center: NDArray[np.float64], rotation: Rotation) -> RigidTransform:
@@ -66,7 +66,7 @@ def by_all_distances(
     centers = [camera.center() for camera in cameras]
     # the optical axis in the world: where the camera frame's z axis points
     axes = [c.inverse().apply(np.array([[0.0, 0, 1]]))[0] - c.center() for c in cameras]
-    found = set()
+    result = set()
     for i in range(len(cameras)):
         candidates = []
         for j in range(len(cameras)):
@@ -75,8 +75,8 @@ def by_all_distances(
             if i != j and angle <= options.max_angle_deg:
                 candidates.append((distance, j))
         for _, j in sorted(candidates)[: options.num_neighbours]:
-            found.add((min(i, j), max(i, j)))
-    return [list(pair) for pair in sorted(found)]
+            result.add((min(i, j), max(i, j)))
+    return [list(pair) for pair in sorted(result)]
 
 
 @given(
@@ -98,9 +98,9 @@ def test_equal_to_all_pairs(
     options = PairsByPosesOptions(num_neighbours=num_neighbours, max_angle_deg=max_angle_deg)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "_BLOCK_ELEMENTS", block)
-        found = pairs_by_poses(cameras, options)
-    assert found.dtype == np.int64 and found.shape[1] == 2
-    assert found.tolist() == by_all_distances(cameras, options)
+        result = pairs_by_poses(cameras, options)
+    assert result.dtype == np.int64 and result.shape[1] == 2
+    assert result.tolist() == by_all_distances(cameras, options)
 
 
 def test_an_angle_of_180_degrees_is_no_bound() -> None:
@@ -116,11 +116,11 @@ def test_an_angle_of_180_degrees_is_no_bound() -> None:
     assert min(cosines) < -1.0
 
 
-def test_many_may_stand_at_one_place() -> None:
+def test_many_cameras_at_one_place() -> None:
     cameras = 120 * [camera_at(np.zeros(3), Rotation.identity())]
-    found = pairs_by_poses(cameras, PairsByPosesOptions(num_neighbours=3))
-    assert (found[:, 0] < found[:, 1]).all() and len(found) <= 120 * 3
-    assert np.bincount(found.ravel(), minlength=120).min() >= 3
+    result = pairs_by_poses(cameras, PairsByPosesOptions(num_neighbours=3))
+    assert (result[:, 0] < result[:, 1]).all() and len(result) <= 120 * 3
+    assert np.bincount(result.ravel(), minlength=120).min() >= 3
 
 
 def test_an_image_searches_so_far_and_no_further(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,14 +152,14 @@ def by_sets(
     seen: list[set[int]] = [set() for _ in range(num_images)]
     for point, image in observations:
         seen[image].add(point)
-    found = set()
+    result = set()
     for image in range(num_images):
         shared = [(-len(seen[image] & seen[other]), other) for other in range(num_images)]
         shared.remove((-len(seen[image]), image))
         for count, other in sorted(shared)[:top_k]:
             if -count >= min_shared:
-                found.add((min(image, other), max(image, other)))
-    return [list(pair) for pair in sorted(found)]
+                result.add((min(image, other), max(image, other)))
+    return [list(pair) for pair in sorted(result)]
 
 
 @given(
@@ -183,9 +183,9 @@ def test_pairs_by_covisibility_equal_the_sets(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "_IMAGES_AT_ONCE", chunk)
         patch.setattr(module, "_MIN_SHARED_POINTS", min_shared_points)
-        found = pairs_by_covisibility(num_images, arrays[:, 0], arrays[:, 1], options)
-    assert found.dtype == np.int64 and found.shape[1] == 2
-    assert found.tolist() == by_sets(num_images, observations, top_k, min_shared_points)
+        result = pairs_by_covisibility(num_images, arrays[:, 0], arrays[:, 1], options)
+    assert result.dtype == np.int64 and result.shape[1] == 2
+    assert result.tolist() == by_sets(num_images, observations, top_k, min_shared_points)
 
 
 def test_a_point_that_every_image_sees_is_not_squared(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,11 +193,11 @@ def test_a_point_that_every_image_sees_is_not_squared(monkeypatch: pytest.Monkey
     monkeypatch.setattr(module, "_MIN_SHARED_POINTS", 2)
     options = PairsByCovisibilityOptions(top_k=3)
     images = np.tile(np.arange(20_000), 2)
-    found = pairs_by_covisibility(20_000, np.repeat([0, 1], 20_000), images, options)
+    result = pairs_by_covisibility(20_000, np.repeat([0, 1], 20_000), images, options)
     # everybody shares as much: the first within reach
-    assert (np.bincount(found.ravel(), minlength=20_000) >= 3).all()
-    assert len(found) <= 20_000 * 3
-    assert np.diff(found, axis=1).max() == module._TRACK_WINDOW
+    assert (np.bincount(result.ravel(), minlength=20_000) >= 3).all()
+    assert len(result) <= 20_000 * 3
+    assert np.diff(result, axis=1).max() == module._TRACK_WINDOW
 
 
 def test_in_a_long_track_an_image_counts_those_near_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,24 +206,24 @@ def test_in_a_long_track_an_image_counts_those_near_it(monkeypatch: pytest.Monke
     options = PairsByCovisibilityOptions(top_k=100)
     # near in the track, not in the numbers of the images
     images = 10 * np.arange(9)
-    found = pairs_by_covisibility(100, np.zeros(9, dtype=int), images, options)
+    result = pairs_by_covisibility(100, np.zeros(9, dtype=int), images, options)
     expected = [[10 * a, 10 * b] for a in range(9) for b in range(a + 1, min(a + 4, 9))]
-    assert found.tolist() == expected
+    assert result.tolist() == expected
 
 
 def by_loops(
     cameras: list[str], timestamps: list[int], options: PairsBySequenceOptions
 ) -> list[list[int]]:
-    found = set()
+    result = set()
     for camera in set(cameras):
-        own = [image for image in range(len(cameras)) if cameras[image] == camera]
-        own.sort(key=lambda image: timestamps[image])
-        for place, image in enumerate(own):
+        of_camera = [image for image in range(len(cameras)) if cameras[image] == camera]
+        of_camera.sort(key=lambda image: timestamps[image])
+        for place, image in enumerate(of_camera):
             for step in range(1, options.window + 1):
-                if options.loop or place + step < len(own):
-                    other = own[(place + step) % len(own)]
-                    found.add((min(image, other), max(image, other)))
-    return [list(pair) for pair in sorted(found) if pair[0] != pair[1]]
+                if options.loop or place + step < len(of_camera):
+                    other = of_camera[(place + step) % len(of_camera)]
+                    result.add((min(image, other), max(image, other)))
+    return [list(pair) for pair in sorted(result) if pair[0] != pair[1]]
 
 
 @given(
@@ -240,9 +240,9 @@ def by_loops(
 def test_equal_to_a_walk(records: list[tuple[str, int]], window: int, loop: bool) -> None:
     cameras, timestamps = [camera for camera, _ in records], [time for _, time in records]
     options = PairsBySequenceOptions(window=window, loop=loop)
-    found = pairs_by_sequence(cameras, timestamps, options)
-    assert found.shape[1] == 2
-    assert found.tolist() == by_loops(cameras, timestamps, options)
+    result = pairs_by_sequence(cameras, timestamps, options)
+    assert result.shape[1] == 2
+    assert result.tolist() == by_loops(cameras, timestamps, options)
 
 
 CAMERAS = [
@@ -272,7 +272,7 @@ def test_views_with_a_place_in_the_middle_of_both_overlap(seed: int) -> None:
 def test_views_back_to_back_do_not_overlap(camera: Camera, apart_m: float) -> None:
     here = RigidTransform.identity()
     turn = Rotation.from_euler("y", 180, degrees=True).as_matrix()
-    # the other one stands behind, and looks away
+    # the other camera is behind, and looks away
     there = RigidTransform.from_matrix(turn, -turn @ [0.0, 0.0, -apart_m])
     assert not views_can_overlap(camera, here, camera, there)
     assert not views_can_overlap(camera, there, camera, here)

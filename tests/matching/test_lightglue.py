@@ -144,7 +144,7 @@ def assert_refused(tensors: dict[str, torch.Tensor], folder: Path, message: str)
 
 
 @pytest.mark.parametrize("setting", range(len(published.CONFIDENCES)))
-def test_matches_are_those_of_the_published_code(setting: int, tmp_path: Path) -> None:
+def test_matches_equal_the_published_code(setting: int, tmp_path: Path) -> None:
     """Also where it stops early and drops keypoints."""
     torch.save(published.tensors(), tmp_path / "random.pth")
     depth, width = published.CONFIDENCES[setting]
@@ -168,7 +168,7 @@ def test_the_authors_thresholds_are_the_default() -> None:
     assert thresholds == (0.95, 0.99, 0.1)
 
 
-def test_matches_are_those_of_transformers(tmp_path: Path) -> None:
+def test_matches_equal_transformers(tmp_path: Path) -> None:
     network = transformers_network()
     torch.save(official_of(network), tmp_path / "superpoint_lightglue.pth")
     a = random_image(190, 256, seed=1)  # both images have as many: theirs is one tensor
@@ -195,7 +195,7 @@ def test_matches_are_kornias(checkpoint: Path, size: int) -> None:
     a = random_image(150, size, seed=1)
     b = noisy(a, seed=2)
     with torch.inference_mode():
-        found = random_network(size)(
+        result = random_network(size)(
             {
                 name: {
                     # the networks know the first pixel's centre as (0, 0)
@@ -208,21 +208,21 @@ def test_matches_are_kornias(checkpoint: Path, size: int) -> None:
         )
     matches, scores = matcher(checkpoint).match(a, b)
     assert len(matches) > 50
-    np.testing.assert_array_equal(matches, found["matches"][0].numpy())
-    np.testing.assert_allclose(scores, found["scores"][0].numpy(), atol=1e-4)
+    np.testing.assert_array_equal(matches, result["matches"][0].numpy())
+    np.testing.assert_allclose(scores, result["scores"][0].numpy(), atol=1e-4)
 
 
 def test_unused_tensors_of_disks_file_are_ignored(tmp_path: Path) -> None:
     tensors = official(random_network(128))
     image = random_image(60, 128, seed=1)
-    found = []
+    result = []
     for name, more in (("plain", {}), ("disk", {"log_assignment.0.r": torch.zeros(1)})):
         torch.save(tensors | more, tmp_path / f"{name}.pth")
-        found.append(matcher(tmp_path / f"{name}.pth").match(image, image)[0])
-    np.testing.assert_array_equal(*found)
+        result.append(matcher(tmp_path / f"{name}.pth").match(image, image)[0])
+    np.testing.assert_array_equal(*result)
 
 
-def test_a_file_may_lack_what_is_not_used(checkpoint: Path, size: int, tmp_path: Path) -> None:
+def test_a_file_may_lack_unused_tensors(checkpoint: Path, size: int, tmp_path: Path) -> None:
     kept = {
         key: value
         for key, value in official(random_network(size)).items()
@@ -244,7 +244,7 @@ def test_a_file_may_lack_what_is_not_used(checkpoint: Path, size: int, tmp_path:
         ("self_attn.1.Wqkv.bias", 9, r"transformers\.1\.self_attn\.Wqkv\.bias is \(9,\), not \(7"),
     ],
 )
-def test_what_does_not_fit_is_named(
+def test_mismatched_weights_are_named(
     size: int, tmp_path: Path, key: str, kept: int, message: str
 ) -> None:
     tensors = official(random_network(size))

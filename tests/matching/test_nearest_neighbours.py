@@ -81,9 +81,9 @@ def test_equal_to_loops_over_all_pairs(
         expected = by_loops(a, b, options)
         assert len(matches) == len(expected)
         # two float32 products may tie in float32 only: compare by value
-        found = np.einsum("nd,nd->n", a[matches[:, 0]], b[matches[:, 1]])
+        result = np.einsum("nd,nd->n", a[matches[:, 0]], b[matches[:, 1]])
         truth = [float(a[i].astype(np.float64) @ b[j].astype(np.float64)) for i, j in expected]
-        np.testing.assert_allclose(found, truth, atol=1e-5)
+        np.testing.assert_allclose(result, truth, atol=1e-5)
     products = a.astype(np.float64) @ b.astype(np.float64).T
     for (i, j), score in zip(matches.tolist(), scores.tolist(), strict=True):
         others = [other for other in range(len(b)) if other != j]
@@ -141,6 +141,6 @@ def test_the_plugin_passes_its_options_on() -> None:
     rng, xy = np.random.default_rng(5), np.zeros((30, 2), np.float32)
     a, b = (ImageFeatures(xy[:n], rng.normal(size=(n, 4)), 640, 480) for n in (30, 20))
     options = NearestNeighbourOptions(mutual=False)
-    found = NearestNeighbours(options).match(a, b)[0]
-    np.testing.assert_array_equal(found, match_nearest(a.descriptors, b.descriptors, options)[0])
-    assert len(found) == 30 > len(NearestNeighbours().match(a, b)[0])
+    result = NearestNeighbours(options).match(a, b)[0]
+    np.testing.assert_array_equal(result, match_nearest(a.descriptors, b.descriptors, options)[0])
+    assert len(result) == 30 > len(NearestNeighbours().match(a, b)[0])

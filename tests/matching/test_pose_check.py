@@ -23,7 +23,7 @@ Matrix = NDArray[np.float64]
 def poses_around(number: int) -> list[Matrix]:
     """``cam_from_world`` of cameras on an arc around points near the origin, far from the world's
     axes."""
-    found = []
+    result = []
     for at in range(number):
         angle = 0.9 * at / number - 0.4
         rotation = Rotation.from_euler("yxz", [-angle, 0.1 * (at % 3), 0.05 * (at % 2)]).as_matrix()
@@ -32,8 +32,8 @@ def poses_around(number: int) -> list[Matrix]:
         pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
         world = np.eye(4)
         world[:3, :3], world[:3, 3] = Rotation.from_rotvec([0.3, 0.9, -0.5]).as_matrix(), (5, -9, 3)
-        found.append(pose @ world)
-    return found
+        result.append(pose @ world)
+    return result
 
 
 def evidence(right: list[Matrix], given: list[RigidTransform]) -> list[PairEvidence]:

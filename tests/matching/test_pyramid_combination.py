@@ -42,21 +42,21 @@ def test_against_looking_at_all_of_them(
         if expected < 0:
             behind = nearest(keypoint, kept[len(base) :])
             expected = behind if behind < 0 else behind + len(base)
-        (found,) = union.find(keypoint[None]).tolist()
-        assert found == expected
-        if found < 0:
+        (result,) = union.find(keypoint[None]).tolist()
+        assert result == expected
+        if result < 0:
             assert union.append(keypoint) == len(kept)
             kept = np.concatenate([kept, keypoint[None]])
     assert len(union) == len(kept)
     np.testing.assert_array_equal(union.added(), kept[len(base) :])
     assert union.find(np.zeros((0, 3), np.float32)).shape == (0,)
-    # opened again with what was added, it finds the same
+    # a union with the added keypoints finds the same
     again = KeypointUnion(array(base), union.added())
     np.testing.assert_array_equal(again.find(array(more)), union.find(array(more)))
 
 
 @given(base=POSITIONS, more=POSITIONS, taken_back=st.integers(0, 25))
-def test_what_is_taken_back_was_never_there(
+def test_truncated_keypoints_are_gone(
     base: list[tuple[float, float]], more: list[tuple[float, float]], taken_back: int
 ) -> None:
     union = KeypointUnion(array(base))
@@ -90,7 +90,7 @@ def grid(count: int) -> np.ndarray:
 BASE = (np.array([[0, 0], [1, 1]]), np.array([0.9, 0.8]))
 
 
-def test_all_is_what_was_there_and_what_is_new() -> None:
+def test_mode_all_adds_new_matches() -> None:
     keypoints = KeypointUnion(grid(5))
     tried = [
         # at keypoint 2; new; new, but the other one has a match; at keypoint 1, which has one
@@ -142,7 +142,7 @@ def test_max_keeps_the_images_as_they_are_where_no_variant_has_more() -> None:
     seed=st.integers(0, 10_000),
     sizes=st.lists(st.tuples(st.integers(0, 1), st.integers(0, 12)), max_size=5),
 )
-def test_whatever_is_tried(
+def test_combination_keeps_its_invariants(
     mode: Literal["all", "max"], seed: int, sizes: list[tuple[Literal[0, 1], int]]
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -160,15 +160,15 @@ def test_whatever_is_tried(
         for side, size in sizes
     ]
     combined = combine(base, tried, mode, unions)
-    found = combined.matches
-    assert len(found) == len(combined.scores) >= 4
+    result = combined.matches
+    assert len(result) == len(combined.scores) >= 4
     for side in (0, 1):
-        assert len(set(found[:, side].tolist())) == len(found)  # a keypoint has one match
+        assert len(set(result[:, side].tolist())) == len(result)  # a keypoint has one match
         union, added = unions[side], combined.added[side]
         length = (8, 9)[side]
         assert len(union) == length + len(added)
-        # every added keypoint is used, and stands where its match says
-        assert set(range(length, len(union))) <= set(found[:, side].tolist())
+        # every added keypoint is used, at the position of its match
+        assert set(range(length, len(union))) <= set(result[:, side].tolist())
         for keypoint, (number, match) in zip(union.added(), added.tolist(), strict=True):
             assert tried[number][0] == side
             np.testing.assert_array_equal(keypoint, tried[number][1].keypoints_px[match])
@@ -176,7 +176,7 @@ def test_whatever_is_tried(
         gaps = np.linalg.norm(all_px[:, None] - all_px[None], axis=2)
         assert (gaps[length:] + 9 * np.eye(len(union))[length:] > 1.0).all()
     if mode == "all" or combined.best is None:
-        assert found[:4].tolist() == base[0].tolist()
+        assert result[:4].tolist() == base[0].tolist()
     if mode == "max":
         most = max([len(each) for _, each in tried], default=0)
         assert combined.best is None or len(tried[combined.best][1]) == most > 4

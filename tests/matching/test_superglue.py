@@ -1,4 +1,4 @@
-"""The SuperGlue plugin with random weights: what it feeds the network, and what it refuses."""
+"""The SuperGlue plugin with random weights: its input to the network, and rejected features."""
 
 from __future__ import annotations
 
@@ -103,9 +103,9 @@ def test_many_are_each_alone(weights: Path) -> None:
     others = [seen_again(a, 60, 1), image(0, 2), seen_again(a, 90, 3), image(1, 4)]
     plugin = matcher(weights)
     alone = [plugin.match(a, other) for other in others]
-    for (matches, scores), found in zip(alone, plugin.match_many(a, others), strict=True):
-        np.testing.assert_array_equal(found[0], matches)
-        np.testing.assert_allclose(found[1], scores, atol=1e-5)
+    for (matches, scores), result in zip(alone, plugin.match_many(a, others), strict=True):
+        np.testing.assert_array_equal(result[0], matches)
+        np.testing.assert_allclose(result[1], scores, atol=1e-5)
     assert len(alone[0][0]) > 15 and len(alone[2][0]) > 15
     assert plugin.match_many(a, []) == []
     nothing = ImageFeatures(np.zeros((0, 3), np.float32), np.zeros((0, 0)), 640, 480)
@@ -115,7 +115,7 @@ def test_many_are_each_alone(weights: Path) -> None:
         assert scores.shape == (0,) and scores.dtype == np.float32
 
 
-def test_what_it_cannot_use_is_named(weights: Path) -> None:
+def test_unusable_features_are_named(weights: Path) -> None:
     good = image(9, 0)
     plugin = matcher(weights)
     bare = ImageFeatures(good.keypoints_px[:, :2], good.descriptors, 640, 480)

@@ -26,14 +26,14 @@ def _normals(number: int) -> np.ndarray:
     y, x = np.mgrid[: CAMERA.height, : CAMERA.width] + 0.5
     rays = bearing_rays(CAMERA, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(*exact.shape, 3)
     world = POSES[number].inverse().apply((rays * exact[..., None]).reshape(-1, 3))
-    found = np.zeros((exact.size, 3))
+    result = np.zeros((exact.size, 3))
     for origin, along, _, _ in WALLS:
         normal = np.cross(along, [0.0, 1.0, 0.0])
         on_wall = np.abs((world - origin) @ normal) < 1e-4
-        found[on_wall] = rotation @ normal
-    found = found.reshape(rays.shape)
-    found[(found * rays).sum(-1) > 0] *= -1
-    return found
+        result[on_wall] = rotation @ normal
+    result = result.reshape(rays.shape)
+    result[(result * rays).sum(-1) > 0] *= -1
+    return result
 
 
 def write_map(path: Path, array: np.ndarray) -> None:
@@ -89,7 +89,7 @@ def test_colmap_fuses_our_maps_to_the_two_walls(tmp_path: Path) -> None:
     assert np.percentile(distances, 99) < 0.012
 
 
-def test_maps_are_those_of_colmap(tmp_path: Path) -> None:
+def test_maps_equal_colmap(tmp_path: Path) -> None:
     exact = depth_m(POSES[0])
     ours, theirs = tmp_path / "ours.bin", tmp_path / "theirs.bin"
     write_map(ours, exact)
@@ -109,7 +109,7 @@ def test_maps_are_those_of_colmap(tmp_path: Path) -> None:
     assert "ours.bin" in str(refused.value)
 
 
-def test_planes_are_those_of_depth_and_normals() -> None:
+def test_planes_equal_depth_and_normals() -> None:
     exact, normals = depth_m(POSES[0]), _normals(0)
     known = exact > 0
     planes = planes_of(CAMERA, np.where(known, exact, 1), normals)
@@ -124,6 +124,6 @@ def test_planes_are_those_of_depth_and_normals() -> None:
 
 
 @pytest.mark.skipif(has_cuda(), reason="this pycolmap has CUDA")
-def test_without_cuda_it_is_refused_with_what_to_do() -> None:
+def test_without_cuda_stereo_is_refused_with_the_remedy() -> None:
     with pytest.raises(PluginError, match="no CUDA.*pycolmap-cuda12.*sweep"):
         ColmapStereo()

@@ -14,7 +14,7 @@ _DIRECTIONS = [(y, x) for y, x in product((-1, 0, 1), repeat=2) if (y, x) != (0,
 
 
 @pytest.mark.parametrize("direction", _DIRECTIONS)
-def test_path_costs_are_those_of_all_label_sequences(direction: tuple[int, int]) -> None:
+def test_path_costs_equal_the_minimum_over_label_sequences(direction: tuple[int, int]) -> None:
     rng = np.random.default_rng(5)
     cost = rng.integers(0, 60, (4, 5, 3)).astype(np.uint8)
     grey = rng.uniform(0, 100, (4, 5)).astype(np.float32)
@@ -54,9 +54,9 @@ def test_a_parabola_gives_its_lowest_point() -> None:
     truth = np.array([[2.3, 5.0, 6.75]])
     labels = np.arange(9)
     total = (100 * (labels - truth[..., None]) ** 2).round().astype(np.uint16)
-    found = np.empty(truth.shape)
-    best_labels(total, found)
-    np.testing.assert_allclose(found, truth, atol=0.01)
+    result = np.empty(truth.shape)
+    best_labels(total, result)
+    np.testing.assert_allclose(result, truth, atol=0.01)
 
 
 def test_cost_is_that_of_the_two_best_correlations() -> None:
@@ -113,7 +113,7 @@ def test_part_of_a_window_scores_as_its_pixels_correlate() -> None:
         for one, mean in zip((ours, theirs), means, strict=True)
     ]
     straight = (np.array([0.0, 0, 0]), source, np.eye(3), np.zeros(3))
-    found = _plane_score(values, weights, 3, 1, 0, *straight)
-    assert found == pytest.approx(above / (spreads[0] * spreads[1]), abs=1e-4)
+    result = _plane_score(values, weights, 3, 1, 0, *straight)
+    assert result == pytest.approx(above / (spreads[0] * spreads[1]), abs=1e-4)
     # a source that shows less than half of it says nothing
     assert _part_score(values, weights, 3, source, 36.5, 28.5, 1.0, 0.0, 0.0, 1.0) == -2

@@ -37,12 +37,12 @@ def test_a_plane_is_carried_to_where_its_points_project() -> None:
     infinity, baseline = relative_projection(reference, source)
     pixels = np.column_stack([px - 0.5, np.ones(len(px))])
     path = pixels @ infinity.T + inverse[:, None] * baseline
-    found = path[:, :2] / path[:, 2:] + 0.5
-    np.testing.assert_allclose(found, project(CAMERA, source.cam_from_world, world), atol=1e-8)
+    result = path[:, :2] / path[:, 2:] + 0.5
+    np.testing.assert_allclose(result, project(CAMERA, source.cam_from_world, world), atol=1e-8)
     # as a homography: the plane's inverse depth is linear in the pixel
     covector = np.linalg.lstsq(pixels, inverse, rcond=None)[0]
     bent = pixels @ (infinity + np.outer(baseline, covector)).T
-    np.testing.assert_allclose(bent[:, :2] / bent[:, 2:] + 0.5, found, atol=1e-8)
+    np.testing.assert_allclose(bent[:, :2] / bent[:, 2:] + 0.5, result, atol=1e-8)
 
 
 @pytest.mark.parametrize("size", [400, 200])
@@ -56,7 +56,7 @@ def test_distortion_is_undone(size: int) -> None:
     assert np.abs(shown - expected).max() < 1.6  # grey levels; a pixel is half a level
 
 
-def test_a_mask_and_what_the_lens_does_not_show_are_left_out() -> None:
+def test_masked_pixels_and_pixels_outside_the_lens_are_left_out() -> None:
     mask = np.ones((300, 400), bool)
     mask[100:120, 50:80] = False
     view = stereo_view(_ramps(CAMERA), CAMERA, pose_at((0, 0, 0), 0, 0), mask, 200)
@@ -67,7 +67,7 @@ def test_a_mask_and_what_the_lens_does_not_show_are_left_out() -> None:
 
 def test_sources_share_points_under_an_angle() -> None:
     xyz = np.random.default_rng(2).uniform([-1, -1, 9], [1, 1, 11], (60, 3))
-    # 0 asks; 1 stands beside it, 2 at 11 degrees, 3 at 60 degrees, 4 sees nothing of it
+    # 0 is the reference; 1 is next to it, 2 at 11 degrees, 3 at 60 degrees, 4 sees nothing of it
     centers = np.array([[0, 0, 0], [0.05, 0, 0], [2, 0, 0], [17, 0, 0], [2, 0.1, 0]], float)
     seen = [np.arange(40), np.arange(40), np.arange(20), np.arange(40), np.arange(40, 60)]
     ids = np.concatenate(seen)
@@ -100,11 +100,11 @@ def test_a_pixel_of_error_moves_depth_as_the_baseline_says() -> None:
     depth[:10] = 0
     estimate = DepthEstimate(depth, 0.01 * depth, np.zeros((*depth.shape, 3), np.float32))
     focal = CAMERA.params[0]
-    found = with_pose_errors(reference, [near], estimate, (2.0, 8.0), 0.5)
+    result = with_pose_errors(reference, [near], estimate, (2.0, 8.0), 0.5)
     # z = f b / d in a rectified pair, so that dz = z^2 / (f b) dd
     expected = np.hypot(0.01 * depth, 0.5 * depth.astype(float) ** 2 / (focal * 0.5))
-    np.testing.assert_allclose(found.sigma_m, expected, rtol=0.02)
-    assert not found.sigma_m[:10].any()
+    np.testing.assert_allclose(result.sigma_m, expected, rtol=0.02)
+    assert not result.sigma_m[:10].any()
     both = with_pose_errors(reference, [near, far], estimate, (2.0, 8.0), 0.5)
     steps = np.array([1 / 0.5, 1 / 1.0]) / focal
     mixed = 0.5 * np.sqrt(np.mean(steps**2)) * depth.astype(float) ** 2

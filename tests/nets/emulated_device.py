@@ -74,8 +74,8 @@ _GUARDED: dict[Any, Any] = {
 
 
 def _nonzero(x: torch.Tensor, as_tuple: bool) -> Any:
-    found = torch.ops.aten.nonzero(x)
-    return found.unbind(1) if as_tuple else found
+    actual = torch.ops.aten.nonzero(x)
+    return actual.unbind(1) if as_tuple else actual
 
 
 class _Mode(TorchDispatchMode):
@@ -111,12 +111,12 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
 def _check(name: str, *values: Any) -> None:
     """Allow tensors of one device only, but for single numbers on the CPU."""
     leaves = tree_leaves(values)
-    found = {leaf.device for leaf in leaves if isinstance(leaf, DeviceTensor)}
+    actual = {leaf.device for leaf in leaves if isinstance(leaf, DeviceTensor)}
     arrays = (leaf for leaf in leaves if isinstance(leaf, torch.Tensor | np.ndarray))
     if any(leaf.ndim for leaf in arrays if not isinstance(leaf, DeviceTensor)):
-        found.add(CPU)
-    if len(found) > 1:
-        raise RuntimeError(f"{name}: tensors on {' and '.join(sorted(map(str, found)))}")
+        actual.add(CPU)
+    if len(actual) > 1:
+        raise RuntimeError(f"{name}: tensors on {' and '.join(sorted(map(str, actual)))}")
 
 
 def _computed(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:

@@ -41,7 +41,6 @@ EXTRACTORS: dict[str, tuple[Any, dict[str, Any]]] = {
     "disk": (Disk, {}),
 }
 GLOBAL: dict[str, tuple[Any, dict[str, Any]]] = {
-    "netvlad-pitts30k": (global_networks.NetVlad, {}),
     "openibl": (global_networks.OpenIbl, {"max_size_px": 128}),
     "apgem-resnet101-lm18": (global_networks.ApGem, {}),
     "delg-r101-gldv2clean": (global_networks.Delg, {"scales": [1.0]}),
@@ -102,10 +101,10 @@ def test_local_features(name: str, weights: Callable[..., None], image: NDArray[
     mask = np.ones((HEIGHT, WIDTH), bool)
     mask[:, :20] = False
     images, masks = [image, image[::-1].copy()], [mask, None]
-    cpu, found = on_both(
+    cpu, result = on_both(
         kind, options | {"max_keypoints": 200}, lambda p: p.extract_many(images, masks)
     )
-    for one, other in zip(cpu, found, strict=True):
+    for one, other in zip(cpu, result, strict=True):
         assert len(one.scores) > 20
         apart = np.linalg.norm(one.keypoints_px[:, None, :2] - other.keypoints_px[:, :2], axis=2)
         near = apart.min(axis=1) < 1.0
@@ -120,8 +119,8 @@ def test_local_features(name: str, weights: Callable[..., None], image: NDArray[
 def test_global_features(name: str, weights: Callable[..., None], image: NDArray[np.uint8]) -> None:
     weights(name)
     kind, options = GLOBAL[name]
-    cpu, found = on_both(kind, options, lambda p: p.describe_many([image, image[::-1].copy()]))
-    cosine = (cpu * found).sum(axis=1)
+    cpu, result = on_both(kind, options, lambda p: p.describe_many([image, image[::-1].copy()]))
+    cosine = (cpu * result).sum(axis=1)
     assert cosine.min() > 0.95
 
 
@@ -141,26 +140,26 @@ def test_matches(name: str, weights: Callable[..., None]) -> None:
     order = rng.permutation(60)[:40]
     b = ImageFeatures(a.keypoints_px[order], a.descriptors[order], WIDTH, HEIGHT)
     options = {"sinkhorn_iterations": 5} if name == "superglue_outdoor" else {}
-    cpu, found = on_both(MATCHERS[name], options, lambda p: p.match_many(a, [b, less, none]))
-    pairs = [set(map(tuple, matches.tolist())) for matches, _ in (cpu[0], found[0])]
+    cpu, result = on_both(MATCHERS[name], options, lambda p: p.match_many(a, [b, less, none]))
+    pairs = [set(map(tuple, matches.tolist())) for matches, _ in (cpu[0], result[0])]
     assert len(pairs[0]) > 20
     assert len(pairs[0] & pairs[1]) >= 0.9 * len(pairs[0] | pairs[1])
-    assert len(found[2][0]) == 0
+    assert len(result[2][0]) == 0
 
 
 @SLOW
 def test_labels(weights: Callable[..., None], image: NDArray[np.uint8]) -> None:
     """In full precision only: activations of random weights exceed float16."""
     weights("deeplabv3plus-resnet101")
-    cpu, found = on_both(DeepLab, {}, lambda p: p.segment(image), half=False)
-    assert (cpu == found).mean() > 0.999
+    cpu, result = on_both(DeepLab, {}, lambda p: p.segment(image), half=False)
+    assert (cpu == result).mean() > 0.999
 
 
 def test_image_distance(weights: Callable[..., None], image: NDArray[np.uint8]) -> None:
     weights("lpips-trunk-alex", "lpips-alex")
     valid = np.ones((HEIGHT, WIDTH), bool)
     valid[:, :30] = False
-    cpu, found = on_both(
+    cpu, result = on_both(
         lpips.LpipsDistance, {}, lambda p: p.distance(image, image[::-1].copy(), valid)
     )
-    assert cpu > 0 and found == pytest.approx(cpu, rel=0.02)
+    assert cpu > 0 and result == pytest.approx(cpu, rel=0.02)

@@ -15,7 +15,6 @@ from megloc_kapture.errors import DataError, OptionError
 from megloc_kapture.nets.global_descriptors import (
     ApGemNet,
     NetVladLayer,
-    Order,
     apgem_from,
     netvlad,
     openibl,
@@ -28,17 +27,8 @@ MEAN = (123.0, 116.5, 104.25)
 AVERAGE_IMAGE = "average_image"
 
 
-def random_layer(order: Order, seed: int = 0, *, clusters: int = 4, size: int = 5) -> NetVladLayer:
-    torch.manual_seed(seed)
-    layer = NetVladLayer(clusters, size, order=order)
-    # sharp enough that the clusters differ
-    torch.nn.init.normal_(layer.conv.weight, std=4)
-    torch.nn.init.normal_(layer.centroids)
-    return layer.requires_grad_(False)
-
-
 def by_the_paper(layer: NetVladLayer, features: NDArray[np.float64]) -> NDArray[np.float64]:
-    """V(j, k) of equation 4, each number a sum of its own, of features (D, h, w)."""
+    """V(j, k) of equation 4, each number by a separate sum, of features (D, h, w)."""
     weights = layer.conv.weight.detach()[:, :, 0, 0].double().numpy()
     centres = layer.centroids.detach().double().numpy()
     unit = [x / np.sqrt((x**2).sum()) for x in features.reshape(len(features), -1).T]
@@ -50,15 +40,6 @@ def by_the_paper(layer: NetVladLayer, features: NDArray[np.float64]) -> NDArray[
     for k in range(len(centres)):
         sums[:, k] /= np.sqrt((sums[:, k] ** 2).sum())
     return sums / np.sqrt((sums**2).sum())
-
-
-def test_the_layer_is_the_papers_equation() -> None:
-    features = torch.randn(2, 5, 3, 4, generator=torch.Generator().manual_seed(0)) * 30
-    dk, kd = random_layer("dk"), random_layer("kd")
-    for row in range(2):
-        expected = by_the_paper(dk, features[row].double().numpy())
-        for layer, vector in ((dk, expected.ravel()), (kd, expected.T.ravel())):
-            np.testing.assert_allclose(layer(features)[row].numpy(), vector, atol=2e-6)
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +75,7 @@ def test_the_whole_network_restated(weights: Tensors, image: torch.Tensor, offic
         mean = 255 * torch.tensor((0.48501960784313836, 0.4579568627450961, 0.4076039215686255))
     assert not net.training
     with torch.inference_mode():
-        found = net(image)
+        result = net(image)
     x = image.double() * 255 - mean.double()[:, None, None]
     for number in range(29):
         if f"base_model.base.{number}.weight" in weights:
@@ -111,8 +92,8 @@ def test_the_whole_network_restated(weights: Tensors, image: torch.Tensor, offic
         whitening = weights["pca_layer.weight"].double().numpy()[:, :, 0, 0]
         expected = whitening @ vector + weights["pca_layer.bias"].double().numpy()
         expected /= np.linalg.norm(expected)
-        np.testing.assert_allclose(found[row].numpy(), expected, atol=1e-5)
-    np.testing.assert_allclose(found.norm(dim=1).numpy(), 1, atol=1e-6)
+        np.testing.assert_allclose(result[row].numpy(), expected, atol=1e-5)
+    np.testing.assert_allclose(result.norm(dim=1).numpy(), 1, atol=1e-6)
 
 
 def test_weights_of_netvlad_that_do_not_fit(weights: Tensors) -> None:
@@ -161,18 +142,18 @@ def test_apgem_is_its_steps_one_by_one(apgem_tensors: Tensors) -> None:
     for normalised in (False, True):
         settings["model_options.norm_features"] = torch.tensor(normalised)
         with torch.inference_mode():
-            found = apgem_from(tensors | settings, "w.pt").describe(image).numpy()
+            result = apgem_from(tensors | settings, "w.pt").describe(image).numpy()
         if normalised:
             pooled /= np.linalg.norm(pooled, axis=1, keepdims=True)
         vectors = pooled @ tensors["fc.weight"].numpy().T + tensors["fc.bias"].numpy()
         expected = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-        assert found.shape == (2, 2048) and found.dtype == np.float32
-        np.testing.assert_allclose(found, expected, atol=1e-6)
+        assert result.shape == (2, 2048) and result.dtype == np.float32
+        np.testing.assert_allclose(result, expected, atol=1e-6)
 
 
 def test_checkpoints_of_apgem(apgem_tensors: Tensors) -> None:
     net = apgem_from(apgem_tensors, "w.pt")
-    # without statistics of its own they are ImageNet's
+    # the default statistics are ImageNet's
     assert net.mean.flatten().tolist() == pytest.approx([0.485, 0.456, 0.406])
     assert net.deviation.flatten().tolist() == pytest.approx([0.229, 0.224, 0.225])
     assert not net.training and not net.normalised_features
@@ -197,14 +178,14 @@ def pca(name: str = "Landmarks_clean", *, whiten: bool = True, size: int = 2048)
 def test_whitening_is_the_authors_formula(whiten: bool, power: float) -> None:
     parts = pca(whiten=whiten)
     vectors = torch.nn.functional.normalize(torch.randn(3, 2048))
-    found = whitening_from(parts, "Landmarks_clean", "w.pt", power=power)(vectors)
+    result = whitening_from(parts, "Landmarks_clean", "w.pt", power=power)(vectors)
     mean, components, variance, _ = (value.double().numpy() for value in parts.values())
     expected = (vectors.numpy() - mean) @ components.T
     if whiten:
         expected /= variance**power
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
-    assert found.shape == (3, 40) and found.dtype == torch.float32
-    np.testing.assert_allclose(found.numpy(), expected, atol=1e-6)
+    assert result.shape == (3, 40) and result.dtype == torch.float32
+    np.testing.assert_allclose(result.numpy(), expected, atol=1e-6)
 
 
 PCA = "Landmarks_clean"
@@ -225,8 +206,6 @@ PCA = "Landmarks_clean"
     ],
     ids=["other name", "none", "other size", "no variance", "incomplete"],
 )
-def test_whitenings_that_are_not_there_or_not_whole(
-    parts: Tensors, name: str, message: str
-) -> None:
+def test_missing_or_incomplete_whitenings(parts: Tensors, name: str, message: str) -> None:
     with pytest.raises(OptionError if "no whitening" in message else DataError, match=message):
         whitening_from(parts, name, "w.pt", power=0.25)

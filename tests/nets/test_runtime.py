@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,12 +10,12 @@ import torch
 from torch import nn
 
 from megloc_kapture.errors import DataError
-from megloc_kapture.nets.runtime import load_strictly, sized_tensor
+from megloc_kapture.nets.runtime import load_strictly, sized_tensor, without_tf32
 
 CPU = torch.device("cpu")
 
 
-def test_a_checkpoint_goes_in_whole_or_not_at_all() -> None:
+def test_checkpoints_load_completely_or_not_at_all() -> None:
     net, other = nn.Linear(3, 2), nn.Linear(3, 2)
     whole = dict(other.state_dict())
     assert load_strictly(net, whole, "w.pth") is net
@@ -39,16 +38,16 @@ def test_a_checkpoint_goes_in_whole_or_not_at_all() -> None:
 @pytest.mark.parametrize("most", [9, 100, None])
 def test_an_image_that_is_small_enough_stays(most: int | None) -> None:
     image = np.random.default_rng(0).integers(0, 256, (6, 9, 3), dtype=np.uint8)
-    found = sized_tensor(image, most, CPU)
-    assert found.shape == (1, 3, 6, 9) and found.dtype == torch.float32
-    np.testing.assert_allclose(found[0].numpy() * 255, image.transpose(2, 0, 1), atol=1e-4)
+    result = sized_tensor(image, most, CPU)
+    assert result.shape == (1, 3, 6, 9) and result.dtype == torch.float32
+    np.testing.assert_allclose(result[0].numpy() * 255, image.transpose(2, 0, 1), atol=1e-4)
 
 
 def test_half_the_size_is_the_mean_of_four() -> None:
     image = np.random.default_rng(0).integers(0, 256, (8, 12, 3), dtype=np.uint8)
-    found = sized_tensor(image, 6, CPU)[0].permute(1, 2, 0).numpy() * 255
+    result = sized_tensor(image, 6, CPU)[0].permute(1, 2, 0).numpy() * 255
     expected = image.reshape(4, 2, 6, 2, 3).astype(float).mean(axis=(1, 3))
-    np.testing.assert_allclose(found, expected, atol=1e-3)
+    np.testing.assert_allclose(result, expected, atol=1e-3)
     assert np.abs(expected - expected.round()).max() > 0.2  # fractions are kept
 
 
@@ -62,24 +61,17 @@ def test_sizes(height: int, width: int, most: int, size: tuple[int, int]) -> Non
     assert sized_tensor(image, most, CPU).shape == (1, 3, *size)
 
 
-@pytest.mark.parametrize("newer", [False, True])
-def test_tf32_is_off_only_during_inference(newer: bool) -> None:
-    """torch refuses to read its older settings once the newer ones were written."""
-    if newer and not hasattr(torch.backends.cuda.matmul, "fp32_precision"):
-        pytest.skip("this torch has the older settings only")
-    code = (
-        "import torch\n"
-        "from megloc_kapture.nets.runtime import without_tf32\n"
-        "products = torch.backends.cuda.matmul\n"
+def test_tf32_is_off_only_during_inference() -> None:
+    newer = hasattr(torch.backends.cuda.matmul, "fp32_precision")  # torch 2.9
+    name, enabled, exact = (
+        ("fp32_precision", "tf32", "ieee") if newer else ("allow_tf32", True, False)
     )
-    code += (
-        "torch.backends.fp32_precision = 'tf32'\nread = lambda: products.fp32_precision == 'tf32'\n"
-        if newer
-        else "products.allow_tf32 = True\nread = lambda: products.allow_tf32\n"
-    )
-    code += (
-        "with without_tf32(torch.device('cuda')):\n"
-        "    assert getattr(products, 'fp32_precision', 'ieee') == 'ieee'\n"
-        "assert read()\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    setting: Any = torch.backends.cuda.matmul
+    before = getattr(setting, name)
+    setattr(setting, name, enabled)
+    try:
+        with without_tf32(torch.device("cuda")):
+            assert getattr(setting, name) == exact
+        assert getattr(setting, name) == enabled
+    finally:
+        setattr(setting, name, before)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from published import randomised
-from torch.nn import functional as F
 from transformers import (
     ResNetConfig,
     ResNetModel,
@@ -17,60 +16,8 @@ from transformers import (
 
 from megloc_kapture.nets.trunks import (
     ResNet,
-    Vgg16Features,
     generalized_mean,
 )
-
-# configuration D of the paper's table 1; P: pooling. torchvision counts convolution, ReLU, pooling
-CONFIGURATION: tuple[int | str, ...] = (
-    *(64, 64, "P", 128, 128, "P"),
-    *(256, 256, 256, "P", 512, 512, 512, "P", 512, 512, 512, "P"),
-)
-
-
-@pytest.fixture(scope="module")
-def image() -> torch.Tensor:
-    return torch.randn(2, 3, 33, 34, generator=torch.Generator().manual_seed(1))  # odd sides
-
-
-def restated(state: dict[str, torch.Tensor], image: torch.Tensor) -> list[torch.Tensor]:
-    """All activations, float64; pooling as the maximum of a window's four."""
-    activations: list[torch.Tensor] = []
-    x = image.double()
-    for word in CONFIGURATION:
-        if word == "P":
-            height, width = x.shape[-2] // 2, x.shape[-1] // 2
-            even = x[..., : 2 * height, : 2 * width]
-            x = even.reshape(*x.shape[:2], height, 2, width, 2).amax((3, 5))
-            activations.append(x)
-            continue
-        number = len(activations)
-        weight, bias = (state[f"{number}.{kind}"].double() for kind in ("weight", "bias"))
-        assert len(weight) == word
-        x = F.conv2d(F.pad(x, (1, 1, 1, 1)), weight) + bias[:, None, None]
-        activations.append(x)
-        x = x.clamp(min=0)
-        activations.append(x)
-    return activations
-
-
-@pytest.mark.parametrize("last", [3, 28, 30])
-def test_an_activation_is_the_restated_one(image: torch.Tensor, last: int) -> None:
-    torch.manual_seed(0)
-    state = Vgg16Features(last=30).state_dict()
-    for name, value in state.items():
-        # activations stay near 1, biases count
-        value.normal_(0, 0.3 if name.endswith("bias") else (2 / value[0].numel()) ** 0.5)
-    # float32 differs between processors by as much as the bound
-    trunk, before = Vgg16Features(last=last).double(), image.double()
-    assert set(trunk.state_dict()) == {key for key in state if int(key.split(".")[0]) <= last}
-    trunk.load_state_dict({key: state[key] for key in trunk.state_dict()})
-    given = before.clone()
-    found, expected = trunk(given), restated(state, image)[last]
-    assert expected.std() > 0.05
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-5 * float(expected.std()))
-    assert torch.equal(given, before)
-    assert (found < 0).any() == (last == 28)
 
 
 def resnet_names(key: str) -> str:
@@ -95,16 +42,16 @@ def test_the_stages_are_transformers_stages() -> None:
     theirs.load_state_dict(renamed, strict=True)
     image = torch.randn(2, 3, 65, 98)
     with torch.inference_mode():
-        found = ours(image)
+        result = ours(image)
         expected = theirs(image, output_hidden_states=True).hidden_states[1:]
-    assert [f.shape[1] for f in found] == [256, 512, 1024, 2048]
-    for one, other in zip(found, expected, strict=True):
+    assert [f.shape[1] for f in result] == [256, 512, 1024, 2048]
+    for one, other in zip(result, expected, strict=True):
         assert one.shape == other.shape
         assert other.std() > 0.1  # the comparison says something
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5 * float(other.abs().max()))
 
 
-def test_dilations_keep_what_strides_would_give() -> None:
+def test_dilated_features_contain_the_strided_ones() -> None:
     # every place that the strided trunk has, the dilated one has too, with the same features
     strided = randomised(ResNet(50))
     dilated = ResNet(50, dilated=True).eval()
@@ -128,8 +75,8 @@ def test_the_generalized_mean_is_its_definition(power: float) -> None:
         places = features[image, channel].ravel()
         expected[image, channel] = (sum(x**power for x in places) / len(places)) ** (1 / power)
     for given in (power, torch.tensor([power], dtype=torch.float64)):
-        found = generalized_mean(torch.from_numpy(features), given)
-        np.testing.assert_allclose(found.numpy(), expected, rtol=1e-12)
+        result = generalized_mean(torch.from_numpy(features), given)
+        np.testing.assert_allclose(result.numpy(), expected, rtol=1e-12)
 
 
 def test_the_generalized_mean_of_numbers_at_the_ends_of_their_range() -> None:

@@ -43,7 +43,7 @@ def test_the_bottom_share_is_ignored(share: float, height: int, used: int) -> No
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_polygon_is_what_another_library_says(seed: int) -> None:
+def test_polygons_equal_matplotlib(seed: int) -> None:
     rng = np.random.default_rng(seed)
     angles = np.sort(rng.uniform(0, 2 * np.pi, 7))
     radius = rng.uniform(0.1, 0.5, 7)
@@ -53,8 +53,8 @@ def test_a_polygon_is_what_another_library_says(seed: int) -> None:
     inside = Outline(corners * [width, height]).contains_points(
         np.stack([x.ravel(), y.ravel()], axis=1)
     )
-    found = outside_polygon(corners, width, height)
-    np.testing.assert_array_equal(~found.ravel(), inside)
+    result = outside_polygon(corners, width, height)
+    np.testing.assert_array_equal(~result.ravel(), inside)
     assert 0 < inside.mean() < 1
 
 
@@ -82,7 +82,7 @@ def test_it_is_for_a_sensor_or_a_pattern_of_images() -> None:
         ({"camera": "", "bottom_share": 0.2}, "at least 1 character"),
     ],
 )
-def test_what_is_no_fixed_mask(values: dict[str, object], message: str) -> None:
+def test_invalid_fixed_masks(values: dict[str, object], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         FixedMask.model_validate({"camera": "c", **values})
 
@@ -95,9 +95,9 @@ def test_pixels_within_the_margin_of_an_ignored_one_go(mask: np.ndarray, margin_
     for row, column in np.argwhere(~mask):
         # the library's distances are float32
         expected &= np.float32(np.hypot(y - row, x - column)) > np.float32(margin_px)
-    found = with_margin(mask, margin_px)
-    assert found.dtype == np.bool_
-    np.testing.assert_array_equal(found, expected if margin_px > 0 else mask)
+    result = with_margin(mask, margin_px)
+    assert result.dtype == np.bool_
+    np.testing.assert_array_equal(result, expected if margin_px > 0 else mask)
     assert with_margin(np.ones_like(mask), margin_px).all()
 
 
@@ -138,7 +138,7 @@ def test_the_bonnet_is_found(drive: Drive) -> None:
     assert (~region_of(lit).mask(192, 192))[~truth].mean() > 0.97
 
 
-def test_a_camera_beside_it_sees_none(drive: Drive) -> None:
+def test_another_camera_of_the_car_has_no_static_region(drive: Drive) -> None:
     region = region_of([image for image, _ in drive["right"]])
     assert not region and "no static region" in region.reason
     assert region.mask(30, 20).all()
@@ -146,7 +146,7 @@ def test_a_camera_beside_it_sees_none(drive: Drive) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("every", [1, 4])
-def test_a_hand_held_camera_sees_none(shared_data: Path, every: int) -> None:
+def test_a_hand_held_camera_has_no_static_region(shared_data: Path, every: int) -> None:
     folder = shared_data / "scenes" / "redkitchen_rgbd" / "mapping" / "sensors" / "records_data"
     paths = sorted(folder.rglob("*.jpg"))[: 30 * every : every]
     assert len(paths) == 30
@@ -155,7 +155,7 @@ def test_a_hand_held_camera_sees_none(shared_data: Path, every: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["herzjesu_p25", "fountain_p11"])
-def test_photographs_of_one_facade_have_none(shared_data: Path, scene: str) -> None:
+def test_photographs_of_one_facade_have_no_static_region(shared_data: Path, scene: str) -> None:
     folder = shared_data / "scenes" / scene
     paths = sorted(folder.glob("*/sensors/records_data/**/*.jpg"))[:14]
     assert len(paths) >= MIN_IMAGES
@@ -185,7 +185,7 @@ def road(image: Image, seed: int) -> None:
 
 
 @pytest.mark.parametrize("draw", [spot, road])
-def test_what_is_no_bonnet(draw: Callable[[Image, int], None]) -> None:
+def test_scenes_without_a_bonnet(draw: Callable[[Image, int], None]) -> None:
     images = [noise(seed) for seed in range(16)]
     for seed, image in enumerate(images):
         draw(image, seed)
@@ -202,7 +202,7 @@ def test_a_plain_bonnet_without_texture_is_found_by_its_edge() -> None:
     assert (~mask)[~plain].mean() < 0.08
 
 
-def test_a_camera_that_stands_still_is_said_so() -> None:
+def test_a_still_camera_is_reported() -> None:
     region = region_of([noise(0)] * MIN_IMAGES)
     assert not region and "hardly moves" in region.reason
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from poses import random_pose
 
 from megloc_kapture.geometry.cameras import bearing_rays
 from megloc_kapture.plugins import DepthView
@@ -30,10 +30,6 @@ PARAMS = {
 }
 CAMERAS = {model: Camera(model, 640, 480, params) for model, params in PARAMS.items()}
 WIDTH, HEIGHT = 160, 120
-
-
-def random_pose(rng: np.random.Generator) -> RigidTransform:
-    return RigidTransform.from_matrix(Rotation.random(rng=rng).as_matrix(), 5 * rng.normal(size=3))
 
 
 def texture(rng: np.random.Generator, channels: int, deviation_px: float = 1.5) -> Array:

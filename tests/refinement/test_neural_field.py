@@ -59,15 +59,15 @@ def coarse_planes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
 def views(
     count: int, camera: Camera = SMALL, *, seed: int = 1, depth: bool = True, moving: bool = False
 ) -> list[FieldView]:
-    found = []
+    result = []
     for number, pose in enumerate(room.poses(count, seed)):
         mover = number if moving and number % 5 < 3 else None
         seen = room.render(pose, camera=camera, light=number % 2, moving=mover)
         # of the room alone, as stereo or a scan made at another time has it
         alone = room.render(pose, camera=camera).depth_m
         known = DepthView(camera, alone, IDENTITY) if depth else None
-        found.append(FieldView(f"{number:03}.png", seen.image, camera, pose, None, known))
-    return found
+        result.append(FieldView(f"{number:03}.png", seen.image, camera, pose, None, known))
+    return result
 
 
 def depth_error(field: NeuralField, tests: list[FieldView]) -> float:
@@ -76,8 +76,8 @@ def depth_error(field: NeuralField, tests: list[FieldView]) -> float:
     for view in tests:
         assert view.depth is not None
         known = view.depth.depth_m
-        found = field.render(view.camera, view.cam_from_world).depth_m
-        errors.append(np.abs(found - known) / known)
+        result = field.render(view.camera, view.cam_from_world).depth_m
+        errors.append(np.abs(result - known) / known)
     return float(np.median(errors))
 
 
@@ -200,14 +200,14 @@ def test_depth_of_another_camera_is_brought_to_the_image() -> None:
             FieldView(view.name, view.image, view.camera, view.cam_from_world, None, depth)
         )
     for view, other in zip(plain, moved, strict=True):
-        own, brought = pixels_of(view, 32)[3], pixels_of(other, 32)[3]
-        assert own is not None and brought is not None
-        both = (own > 0) & (brought > 0)
+        direct, brought = pixels_of(view, 32)[3], pixels_of(other, 32)[3]
+        assert direct is not None and brought is not None
+        both = (direct > 0) & (brought > 0)
         assert both.mean() > 0.75
-        assert np.median(np.abs(brought[both] / own[both] - 1)) < 0.01
+        assert np.median(np.abs(brought[both] / direct[both] - 1)) < 0.01
 
 
-def test_what_cannot_be_trained_is_refused() -> None:
+def test_invalid_training_is_refused() -> None:
     few = views(1)
     with pytest.raises(DataError, match="1 images with poses and pixels are too few"):
         train_field(few, QUICK)
@@ -226,7 +226,7 @@ def test_what_cannot_be_trained_is_refused() -> None:
 
 
 @pytest.mark.slow
-def test_two_lights_and_what_moves_need_their_embeddings() -> None:
+def test_two_lights_and_moving_objects_need_embeddings() -> None:
     clean = views(10, room.CAMERA, seed=2)
     trained = views(40, room.CAMERA, moving=True)
     psnr_db, errors = [], []

@@ -49,7 +49,7 @@ def test_levels_halve_and_know_their_scale(appearance: Appearance) -> None:
 
 
 @pytest.mark.parametrize("appearance", APPEARANCES)
-def test_what_a_mask_hides_enters_no_value(appearance: Appearance) -> None:
+def test_masked_pixels_enter_no_value(appearance: Appearance) -> None:
     mask = np.ones((150, 200), bool)
     mask[30:90, 50:120] = False
     images = [picture(), picture()]
@@ -68,12 +68,12 @@ def test_what_a_mask_hides_enters_no_value(appearance: Appearance) -> None:
         np.testing.assert_allclose(a.values, b.values, atol=1e-6)
 
 
-def test_colours_are_normalised_each_as_brightness_is_whatever_the_exposure() -> None:
+def test_each_colour_is_normalised_like_brightness() -> None:
     image = picture()
-    found = build_pyramid(image, levels=2, appearance="colours")
+    result = build_pyramid(image, levels=2, appearance="colours")
     for channel in range(3):
         grey = build_pyramid(np.repeat(image[..., channel : channel + 1], 3, axis=2), levels=2)
-        for a, b in zip(found, grey, strict=True):
+        for a, b in zip(result, grey, strict=True):
             np.testing.assert_allclose(a.values[..., channel], b.values[..., 0], atol=1e-5)
     # grey, so that brightness is not rounded
     grey = np.repeat(image[..., :1], 3, axis=2)
@@ -93,7 +93,7 @@ def test_gradient_energy_is_that_of_central_differences() -> None:
     assert not energy[0].any() and not energy[:, -1].any() and not energy[70, 99:102].any()
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_mismatched_sizes_are_refused() -> None:
     with pytest.raises(DataError, match="mask"):
         build_pyramid(picture(), np.ones((10, 10), bool))
     with pytest.raises(DataError, match="depth map"):

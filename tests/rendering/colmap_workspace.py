@@ -23,7 +23,7 @@ def write_workspace(
 ) -> Any:
     """Write ``images/``, ``database.db`` and ``sparse/0`` of a scene's map, all of one camera.
 
-    COLMAP extracts, matches and triangulates, with the true camera and poses: its model stands in
+    COLMAP extracts, matches and triangulates, with the true camera and poses: its model is in
     the scene's world.
 
     Parameters
@@ -93,15 +93,15 @@ def _write_features(
     camera_id = database.write_camera(camera)
     features, ids = {}, {}
     for name in names:
-        found = extractor.extract(read_image_rgb(root / "images" / name))
+        result = extractor.extract(read_image_rgb(root / "images" / name))
         features[name] = ImageFeatures(
-            found.keypoints_px, found.descriptors, known.width, known.height
+            result.keypoints_px, result.descriptors, known.width, known.height
         )
         ids[name] = database.write_image(pycolmap.Image(name=name, camera_id=camera_id))
-        affine = np.zeros((len(found.keypoints_px), 6), np.float32)
-        affine[:, :2], affine[:, 2], affine[:, 5] = found.keypoints_px[:, :2], 1, 1
+        affine = np.zeros((len(result.keypoints_px), 6), np.float32)
+        affine[:, :2], affine[:, 2], affine[:, 5] = result.keypoints_px[:, :2], 1, 1
         database.write_keypoints(ids[name], affine)
-        rows = np.ascontiguousarray(found.descriptors).view(np.uint8)
+        rows = np.ascontiguousarray(result.descriptors).view(np.uint8)
         database.write_descriptors(ids[name], pycolmap.FeatureDescriptors(kind, rows))
     pairs = list(itertools.combinations(names, 2))
     matcher = load_plugin(MATCHERS, "nn", {})

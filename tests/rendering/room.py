@@ -28,7 +28,7 @@ _TEXTURE_PX = 256
 
 @dataclass(frozen=True, eq=False)
 class RoomImage:
-    """uint8 (H, W, 3), the depth float32 (H, W) that a sensor beside it measures, and
+    """uint8 (H, W, 3), the depth float32 (H, W) of a sensor next to the camera, and
     where something moves."""
 
     image: NDArray[np.uint8]
@@ -71,12 +71,12 @@ def render(
     light: int = 0,
     moving: int | None = None,
 ) -> RoomImage:
-    """What a camera in the room sees; exact but for bilinear textures and rounding to 8 bit.
+    """Render the view of a camera; exact except for bilinear textures and rounding to 8 bit.
 
     Parameters
     ----------
     light : which of the two shines.
-    moving : seed of a sphere that stands in the way; None: none does.
+    moving : seed of a sphere in the way; None: no sphere.
     """
     fx, fy, cx, cy = camera.params
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
@@ -133,10 +133,10 @@ def render(
 def poses(count: int, seed: int) -> list[RigidTransform]:
     """Cameras about the middle of the room that look every way."""
     rng = np.random.default_rng(seed)
-    found = []
+    result = []
     for number in range(count):
         centre = rng.uniform([-0.7, -0.5, -0.6], [0.6, 0.3, 0.6])
         yaw = 360.0 * (number * 0.381966) + rng.uniform(-10, 10)
         rotation = Rotation.from_euler("xy", [rng.uniform(-15, 15), yaw], degrees=True).as_matrix()
-        found.append(RigidTransform.from_matrix(rotation, -rotation @ centre))
-    return found
+        result.append(RigidTransform.from_matrix(rotation, -rotation @ centre))
+    return result

@@ -91,7 +91,7 @@ def test_float32_stays_float32_and_early_is_the_mean_of_cosines() -> None:
     np.testing.assert_allclose(fused, joined[0] @ joined[1].T, atol=1e-6)
 
 
-def test_what_cannot_be_fused_is_refused() -> None:
+def test_invalid_weights_are_refused() -> None:
     same = [np.zeros((2, 4), np.float32)] * 2
     for weights in ([1.0], [1.0, 0.0], [1.0, -1.0], [1.0, np.nan]):
         with pytest.raises(OptionError, match="weights"):
@@ -123,10 +123,10 @@ def test_reciprocal_ranks_add_up(lists: list[NDArray[np.int64]], top_k: int) -> 
                 if image >= 0:
                     points[image] += weight / sum(weights) / (60 + rank + 1)
         best = sorted(points, key=lambda image: (-round(points[image], 12), image))[:top_k]
-        found = [image for image in indices[row].tolist() if image >= 0]
-        assert len(found) == len(best)
+        result = [image for image in indices[row].tolist() if image >= 0]
+        assert len(result) == len(best)
         # of equal sums the order may hang on rounding: points are compared, not images
-        np.testing.assert_allclose([points[i] for i in found], [points[i] for i in best])
+        np.testing.assert_allclose([points[i] for i in result], [points[i] for i in best])
         np.testing.assert_allclose(scores[row, : len(best)], [points[i] for i in best], rtol=1e-6)
 
 
@@ -139,7 +139,7 @@ def ids(*values: int) -> np.ndarray:
     return np.array(values, dtype=np.int64)
 
 
-def test_a_neighbour_of_the_best_makes_way_for_what_adds_more() -> None:
+def test_coverage_prefers_images_that_add_more_points() -> None:
     images = [ids(0, 1, 2, 3), ids(0, 1, 2), ids(7, 8), ids()]
     assert greedy_coverage(images, 2) == ([0, 2], [4, 2])
     # what adds nothing comes in order of its matches, and of its place

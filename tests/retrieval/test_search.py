@@ -51,7 +51,7 @@ def problems(draw: st.DrawFn) -> tuple[NDArray[np.float64], NDArray[np.float64],
 
 @given(problems())
 @settings(deadline=None)
-def test_equal_to_a_full_stable_sort_whatever_the_blocks(
+def test_search_equals_a_full_stable_sort(
     problem: tuple[NDArray[np.float64], NDArray[np.float64], int, int],
 ) -> None:
     queries, database, top_k, block = problem
@@ -103,20 +103,20 @@ class Blocks:
         return rows
 
 
-def test_a_source_is_read_once_in_blocks_and_gives_what_the_array_gives() -> None:
+def test_a_source_is_read_once_in_blocks() -> None:
     rng = np.random.default_rng(2)
     queries, database = rng.integers(-3, 4, (9, 4)) * 1.0, rng.integers(-3, 4, (50, 4)) * 1.0
     source = Blocks(database)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(search, "_MOST_ROWS", 16)
-        found = rank_by_similarity(queries, source, 7)
+        result = rank_by_similarity(queries, source, 7)
     assert source.reads == [(0, 16), (16, 32), (32, 48), (48, 50)]
-    for ours, expected in zip(found, full_sort(queries, database, 7), strict=True):
+    for ours, expected in zip(result, full_sort(queries, database, 7), strict=True):
         np.testing.assert_array_equal(ours, expected)
 
 
 @pytest.mark.parametrize("method", ["ghm", "mean", "early", "reciprocal_rank"])
-def test_fused_ranking_is_that_of_the_whole_matrices(method: str) -> None:
+def test_fused_ranking_equals_whole_matrices(method: str) -> None:
     rng = np.random.default_rng(4)
     queries = [rng.normal(size=(7, d)) / 4 for d in (5, 9, 3)]
     database = [rng.normal(size=(60, d)) / 4 for d in (5, 9, 3)]
@@ -132,7 +132,7 @@ def test_fused_ranking_is_that_of_the_whole_matrices(method: str) -> None:
         if options.fuses_ranks():
             ranks = [np.argsort(np.argsort(-m[0], kind="stable")) for m in matrices]
             shares = np.array(weights) / sum(weights)
-            fused = sum(share / (61 + own) for share, own in zip(shares, ranks, strict=True))
+            fused = sum(share / (61 + rank) for share, rank in zip(shares, ranks, strict=True))
         else:
             fused = fuse(matrices, options, weights)[0]
         # of equal scores rounding may change the order

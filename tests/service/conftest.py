@@ -29,7 +29,7 @@ def served_map(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def localizer(served_map: Path) -> Localizer:
-    """What answers are compared with."""
+    """The localizer whose poses the answers must have."""
     return Localizer(KaptureMap.open(served_map), options=OPTIONS)
 
 
@@ -44,5 +44,5 @@ def photos(scene: Path) -> list[Photo]:
 @pytest.fixture
 def client(localizer: Localizer) -> Iterator[TestClient]:
     """A client of a service without token."""
-    with client_of(localizer, threads=2) as found:
-        yield found
+    with client_of(localizer, threads=2) as result:
+        yield result

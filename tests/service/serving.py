@@ -1,4 +1,4 @@
-"""What the tests of the service share: photographs with their cameras, clients."""
+"""Photographs with their cameras, and clients, for the tests of the service."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Photo:
         return json.dumps({name: getattr(self.camera, name) for name in names} | changed)
 
     def form(self, camera: str | None = None) -> dict[str, Any]:
-        """What httpx sends as a form."""
+        """Return the form for httpx."""
         return {
             "files": {"image": ("photo.jpg", self.content, "image/jpeg")},
             "data": {"camera": self.camera_json() if camera is None else camera},

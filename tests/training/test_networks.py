@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from megloc_kapture.features.rootsift import RootSift
 from megloc_kapture.features.superpoint import SuperPoint, SuperPointOptions
 from megloc_kapture.geometry.cameras import project
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.nets.superglue import ImageKeypoints, SuperGlueNet, log_optimal_transport
+from megloc_kapture.nets.superglue import ImageKeypoints, SuperGlueNet
 from megloc_kapture.training.labels import IGNORED, UNMATCHED, Labels
 from megloc_kapture.training.networks import (
     FrozenFeatures,
@@ -49,9 +48,9 @@ LABELS = Labels(
 
 def random_side(count: int, size: int, seed: int, dtype: torch.dtype = torch.float32):  # type: ignore[no-untyped-def]
     draw = torch.Generator().manual_seed(seed)
-    own = nn.functional.normalize(torch.randn(count, size, generator=draw), dim=1)
+    unit = nn.functional.normalize(torch.randn(count, size, generator=draw), dim=1)
     at, scores = torch.rand(count, 2, generator=draw), torch.rand(count, generator=draw)
-    return ImageKeypoints(at.to(dtype), scores.to(dtype), own.to(dtype))
+    return ImageKeypoints(at.to(dtype), scores.to(dtype), unit.to(dtype))
 
 
 def extractors(files: dict[str, str]) -> list[SuperPoint | XFeat]:
@@ -65,30 +64,30 @@ def test_a_describer_begins_as_its_extractor(files: dict[str, str]) -> None:
     # no multiple of 32: XFeat resizes it
     image = texture(116, 150)
     for extractor in extractors(files):
-        found = extractor.extract(image)
-        assert len(found.scores) > 30
-        xy_px = torch.from_numpy(found.keypoints_px[:, :2].copy())
+        result = extractor.extract(image)
+        assert len(result.scores) > 30
+        xy_px = torch.from_numpy(result.keypoints_px[:, :2].copy())
         described = describer_of(extractor).train()(image, xy_px)
         assert described.requires_grad
-        np.testing.assert_allclose(described.detach().numpy(), found.descriptors, atol=2e-5)
+        np.testing.assert_allclose(described.detach().numpy(), result.descriptors, atol=2e-5)
 
 
 def test_a_new_superglue_matches_as_its_descriptors_do() -> None:
     pair = random_side(7, 64, 0), random_side(5, 64, 1)
     net = SuperGlueNet(encoder_sizes(64), 4).train()
-    (own,) = ProductHead()([pair], 20)
-    assert not torch.allclose(net([pair], 20)[0], own, atol=0.1)
+    (products,) = ProductHead()([pair], 20)
+    assert not torch.allclose(net([pair], 20)[0], products, atol=0.1)
     begin_at_products(net)
-    (found,) = net([pair], 20)
-    torch.testing.assert_close(found, own, atol=1e-4, rtol=1e-4)
+    (result,) = net([pair], 20)
+    torch.testing.assert_close(result, products, atol=1e-4, rtol=1e-4)
     # all of it can learn
-    found[0, 0].backward()
+    result[0, 0].backward()
     for layer in net.gnn.layers:
         assert layer.mlp[-1].weight.grad.abs().sum() > 0
     assert net.kenc.encoder[-1].weight.grad.abs().sum() > 0
 
 
-def test_what_is_trained_is_read_as_descriptor_weights(
+def test_trained_weights_are_read_as_descriptor_weights(
     files: dict[str, str], tmp_path: Path
 ) -> None:
     image = texture(64, 96)
@@ -145,8 +144,8 @@ def test_frozen_features_are_the_best_and_kept(files: dict[str, str]) -> None:
     assert labelled == [(20, 20)]
     a, b = first.features
     assert (a.width, a.height, b.width, b.height) == (128, 96, 96, 80)
-    found = extractor.extract(images[0])
-    np.testing.assert_array_equal(a.keypoints_px, found.keypoints_px[:20])
+    result = extractor.extract(images[0])
+    np.testing.assert_array_equal(a.keypoints_px, result.keypoints_px[:20])
     again = frozen.prepare(TrainingPair(images, ("b", "c"), label))
     assert again.features[0] is b and again.features[1] is not b
     assert frozen.prepare(TrainingPair(images, None, label)).features[0] is not a
@@ -193,7 +192,7 @@ def test_a_pair_without_keypoints_costs_nothing(files: dict[str, str]) -> None:
     assert loss.item() == 0 and len(model.match(pair)[0]) == 0
 
 
-def test_what_cannot_be_trained_is_refused(files: dict[str, str], tmp_path: Path) -> None:
+def test_invalid_training_is_refused(files: dict[str, str], tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="superpoint and xfeat can be trained, not those of root"):
         describer_of(RootSift())
     assert encoder_sizes(256) == (32, 64, 128, 256, 256)
@@ -221,41 +220,12 @@ def test_it_is_the_likelihood_of_the_labels() -> None:
     assert log.grad is not None and log.grad.nonzero().tolist() == [[0, 2]]
 
 
-@pytest.mark.parametrize("scale", [1.0, 40.0])  # the larger one rescales potentials on its way
-def test_gradients_through_the_transport(scale: float) -> None:
-    generator = torch.Generator().manual_seed(1)
-    scores = scale * torch.randn(5, 4, generator=generator, dtype=torch.float64)
-    dustbin = torch.tensor(0.3, dtype=torch.float64)
-
-    def loss(scores: torch.Tensor, dustbin: torch.Tensor) -> torch.Tensor:
-        return transport_loss(log_optimal_transport([scores], dustbin, 12)[0], LABELS)
-
-    inputs = (scores.requires_grad_(), dustbin.requires_grad_())
-    assert torch.autograd.gradcheck(loss, inputs, eps=1e-6, atol=1e-6)
-
-
-def test_gradients_through_superglue_reach_its_inputs() -> None:
-    torch.manual_seed(2)
-    net = SuperGlueNet(encoder_sizes=(8, 8), num_layers=2).double()
-    a, b = (random_side(count, 8, count, torch.float64) for count in (5, 4))
-
-    def loss(first: torch.Tensor, second: torch.Tensor, bin_score: torch.Tensor) -> torch.Tensor:
-        net.bin_score.data = bin_score.data
-        pair = replace(a, descriptors=first), replace(b, descriptors=second)
-        depths = net.assignments([pair], 10, [1, 2])
-        return sum(transport_loss(depth[0], LABELS) for depth in depths)  # type: ignore[return-value]
-
-    inputs = (a.descriptors.requires_grad_(), b.descriptors.requires_grad_(), net.bin_score.data)
-    # along a random direction of each
-    assert torch.autograd.gradcheck(loss, inputs, eps=1e-6, atol=1e-5, fast_mode=True)
-
-
 def test_matches_are_judged_by_labels_of_both_images() -> None:
     labels = Labels(np.array([1, UNMATCHED, IGNORED, IGNORED]), np.array([IGNORED, 0, UNMATCHED]))
     matches = np.array([[0, 1], [1, 0], [2, 0], [3, 2]])
-    right, told = judged(matches, labels)
+    right, has_label = judged(matches, labels)
     assert right.tolist() == [True, False, False, False]
-    assert told.tolist() == [True, True, False, True]
+    assert has_label.tolist() == [True, True, False, True]
 
 
 def test_auc_is_the_area() -> None:

@@ -50,7 +50,7 @@ def test_overlaps_are_measured_once(walk: Path, tmp_path: Path) -> None:
     source = PosedPairs(KaptureFolder(walk), SMALL, measured=path)
     pairs = read_pairs(path)
     assert len(pairs) == 10 and 0.5 < max(pair.score for pair in pairs) < 1
-    # what stands there is taken: all but one pair overlap too much
+    # the file's overlaps are used: all but one pair overlap too much
     write_pairs(path, [replace(p, score=0.99) for p in pairs[1:]] + [replace(pairs[0], score=0.2)])
     again = PosedPairs(KaptureFolder(walk), SMALL, measured=path)
     assert again.counts()["pairs"] == 1 < source.counts()["pairs"]
@@ -88,7 +88,7 @@ def test_a_pair_is_its_images_reduced_and_its_geometry(walk: Path) -> None:
     }
 
 
-def test_what_cannot_be_trained_on_is_said(walk: Path, tmp_path: Path) -> None:
+def test_invalid_training_data_is_refused(walk: Path, tmp_path: Path) -> None:
     write_kapture(tmp_path / "flat", POSES, with_poses=True)
     with pytest.raises(DataError, match=r"flat: no two images have a pose and a depth map"):
         PosedPairs(KaptureFolder(tmp_path / "flat"), SMALL)
@@ -135,8 +135,8 @@ def bilinear(image: NDArray[np.uint8], px: NDArray[np.float64]) -> NDArray[np.fl
     return np.stack([map_coordinates(channel, at, order=1) for channel in channels], axis=1)
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_a_view_shows_what_its_homography_says(seed: int) -> None:
+@pytest.mark.parametrize("seed", range(3))
+def test_a_view_follows_its_homography(seed: int) -> None:
     image = smooth_image()
     rng = np.random.default_rng(seed)
     view, view_from_image = random_view(image, (160, 120), rng, HomographyOptions())

@@ -210,7 +210,7 @@ def test_a_split_superpoint_is_trained_and_read(
     assert len(matcher.match(side, side)[0]) <= 60
 
 
-def test_what_cannot_be_trained_is_refused(
+def test_invalid_training_is_refused(
     files: dict[str, str], walk: Path, photographs: Path, tmp_path: Path
 ) -> None:
     data = TrainingData([KaptureFolder(walk)])

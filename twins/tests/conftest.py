@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from functools import lru_cache
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 from megloc_twins import render
 from megloc_twins.aachen import AachenTwin, AachenTwinOptions
@@ -14,7 +16,9 @@ from megloc_twins.fourseasons import FourSeasonsTwin, FourSeasonsTwinOptions
 from megloc_twins.inloc import InLocTwin, InLocTwinOptions
 from megloc_twins.options import SyntheticDataset, SyntheticWorldOptions
 from megloc_twins.robotcar import RobotCarTwin, RobotCarTwinOptions
+from megloc_twins.surfaces import Atlas, build_atlas
 from megloc_twins.synthetic_kapture import SyntheticKapture, SyntheticWorld, build_world
+from megloc_twins.textures import TextureRecipe
 
 SIZE = {"width": 160, "height": 120, "supersampling": 1}
 PLACES = {"num_places": 2, "day_queries": 2, "night_queries": 2}
@@ -39,13 +43,19 @@ SMALL: dict[str, SyntheticDataset[Any]] = {
 }
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _painted_once() -> Iterator[None]:
-    """The outdoor places of a seed look alike in all datasets, and painting them is what takes
-    time."""
+def _plain_atlas(recipes: Iterable[TextureRecipe]) -> Atlas:
+    """Smooth random colours: layouts and poses do not depend on the textures, which take long."""
+    textures = []
+    for recipe in recipes:
+        coarse = np.random.default_rng(recipe.seed).integers(60, 200, (3, 3, 3), np.uint8)
+        textures.append(cv2.resize(coarse, (recipe.width, recipe.height)))
+    return build_atlas(textures)
+
+
+def _write_plain(dataset: SyntheticDataset[Any], root: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(render, "painted", lru_cache(maxsize=4)(render.painted))
-        yield
+        patch.setattr(render, "painted", _plain_atlas)
+        dataset.write(root)
 
 
 @pytest.fixture(scope="session")
@@ -63,7 +73,7 @@ def small() -> dict[str, SyntheticDataset[Any]]:
 @pytest.fixture(scope="session")
 def rendered(written_once: Callable[..., Path]) -> Callable[[str], Path]:
     """Folder of the small dataset in a layout; not to be written into."""
-    return lambda name: written_once(f"rendered_{name}", SMALL[name].write)
+    return lambda name: written_once(f"rendered_{name}", partial(_write_plain, SMALL[name]))
 
 
 @pytest.fixture(scope="module")

@@ -48,11 +48,11 @@ def test_versions(imported: Path) -> None:
     num_added = sum(name.startswith("query/night/nexus5x_additional_night/") for name in query)
     in_sequences = sum(name.startswith("sequences/") for name in mapping)
     in_database = sum(name.startswith("db/") for name in mapping)
-    found = (in_database, in_sequences, len(mapping), len(sensors), len(query), num_added)
+    result = (in_database, in_sequences, len(mapping), len(sensors), len(query), num_added)
     # each sequence has one camera
     newer = (NUM_DATABASE, NUM_SEQUENCE, NUM_DATABASE + NUM_SEQUENCE, NUM_DATABASE + 2, 8, 2)
     older = (NUM_DATABASE, 0, NUM_DATABASE, NUM_DATABASE, 6, 0)
-    assert found == (older if imported.name == "1.0" else newer)
+    assert result == (older if imported.name == "1.0" else newer)
 
 
 def test_colmap_reads_the_added_model(root: Path) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from megloc_twins.fourseasons import DUSK, REFERENCE, WINTER, FourSeasonsTwinOptions
+from megloc_twins.fourseasons import DUSK, REFERENCE, WINTER
 
 from megloc_kapture.datasets.fourseasons import (
     read_gnss_poses,
@@ -85,11 +85,11 @@ def test_frames_between_the_recordings(root: Path) -> None:
     moments = [
         read_transformations(root / name / "Transformations.txt") for name in (REFERENCE, WINTER)
     ]
-    scales = [found.gnss_scale for found in moments]
+    scales = [result.gnss_scale for result in moments]
     assert all(scale is not None and 0.96 <= scale <= 0.97 for scale in scales)
     assert scales[0] != scales[1]
     assert moments[0].w_from_gpsw != moments[1].w_from_gpsw
-    positions = [np.array(found.e_from_gpsw.translation) for found in moments]
+    positions = [np.array(result.e_from_gpsw.translation) for result in moments]
     assert 10 < np.linalg.norm(positions[0] - positions[1]) < 1000
     latitude, longitude, _ = geodetic(positions[0])
     assert (latitude, longitude) == pytest.approx((48.2, 11.6), abs=0.1)
@@ -114,8 +114,8 @@ def test_fixes_of_the_receiver_are_where_the_car_is(root: Path) -> None:
 
 @pytest.mark.parametrize("place", [(48.2, 11.6, 540.0), (-33.9, 151.2, 12.0), (0.0, -180.0, -30.0)])
 def test_geodesy(place: tuple[float, float, float]) -> None:
-    found = geodetic(np.array(earth_from_enu(*place).translation))
-    np.testing.assert_allclose(np.abs(found), np.abs(place), atol=1e-8)
+    result = geodetic(np.array(earth_from_enu(*place).translation))
+    np.testing.assert_allclose(np.abs(result), np.abs(place), atol=1e-8)
     # WGS 84 at the equator and the pole
     np.testing.assert_allclose(
         earth_from_enu(0, 0, 0).translation, (6378137, 0, 0), rtol=0, atol=1e-6
@@ -128,10 +128,3 @@ def test_geodesy(place: tuple[float, float, float]) -> None:
     higher = earth_from_enu(place[0], place[1], place[2] + 1).translation
     step = np.array(higher) - earth_from_enu(*place).translation
     np.testing.assert_allclose(enu[:, 2], step, atol=1e-8)
-
-
-def test_the_default_is_large_enough() -> None:
-    options = FourSeasonsTwinOptions()
-    assert 2 * options.num_places * options.map_keyframes >= 80
-    assert options.num_places * (options.winter_keyframes + options.dusk_keyframes) >= 40
-    assert (options.width, options.height) == (800, 400)

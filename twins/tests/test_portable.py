@@ -1,11 +1,6 @@
-"""Equal bytes on every processor, and the arithmetic for them compared with OpenCV's."""
+"""Resampling and arithmetic compared with OpenCV and numpy."""
 
 from __future__ import annotations
-
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,122 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from megloc_twins.portable import averaged, blurred, product, resized, settled_pose
 from megloc_twins.rasterization import bilinear
-
-# what the libraries take from a processor can be withheld from them: these run as they do where
-# there is no AVX and no fused multiplication, and without Intel's own filters
-OLDER = {
-    "OPENBLAS_CORETYPE": "Nehalem",
-    "NPY_DISABLE_CPU_FEATURES": "X86_V3,X86_V4,AVX512_ICL,AVX512_SPR,AVX2,FMA3,AVX512F,AVX512_SKX",
-    "OPENCV_CPU_DISABLE": "AVX512-SKX,AVX2,AVX,FP16",
-    "OPENCV_IPP": "disabled",
-    "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-AVX512F",
-    "NUMBA_CPU_NAME": "generic",
-    "NUMBA_CPU_FEATURES": "",
-}
-
-FIELDS = """
-import hashlib
-import numpy as np
-from megloc_twins.surfaces import build_atlas
-from megloc_twins.frames import Frame, day_lighting, looking_at, night_lighting
-from megloc_twins.synthetic_kapture import SENSOR_FROM_RIG
-from megloc_twins.drawing import periodic_noise, smooth_noise
-from megloc_twins.options import stream
-from megloc_twins.rasterization import sample_colour, sample_grid, visible_surfaces
-from megloc_twins.render import cast_shadows, cloud_texture, develop, radiance
-from megloc_twins.surfaces import SurfaceBuilder
-from megloc_twins.textures import TextureRecipe
-from megloc_kapture.values import Camera
-
-def digest(name, *arrays):
-    parts = b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)
-    print(name, hashlib.sha256(parts).hexdigest())
-
-rng = stream(0, "portable")
-poses = [looking_at(rng.normal(0, 3, 3), *rng.normal(0, 1, 3)) for _ in range(50)]
-chain = poses[0]
-for pose in poses[1:]:
-    chain = chain @ pose.inverse() @ SENSOR_FROM_RIG["rig_left"]
-    digest("pose", chain.quat_wxyz, chain.translation, chain.center())
-digest("noise", smooth_noise(rng, 300, 400, cell=90), periodic_noise(rng, 256, cell=40))
-wall = (("material", "brick"), ("material_seed", 3.0))
-recipes = [TextureRecipe("wall", 300, 200, 1, wall)]
-recipes += [TextureRecipe(p, 180, 160, 1) for p in ("window", "door", "shutter", "wood", "poster")]
-textures = [recipe.paint() for recipe in recipes]
-digest("textures", *textures)
-builder = SurfaceBuilder()
-for _ in range(60):
-    at, size, yaw = rng.uniform(-8, 8, 2), rng.uniform(0.4, 2, 3), rng.uniform(0, 6)
-    sides = tuple(rng.integers(0, len(textures), 4).tolist())
-    builder.add_box(tuple(at), tuple(size), yaw, sides, 0)
-surfaces = builder.build()
-grid = sample_grid(Camera("SIMPLE_RADIAL", 320, 240, (230.0, 160.0, 120.0, -0.07)), 2)
-lamps = rng.uniform((-5, -5, 2), (5, 5, 3), (6, 3))
-day = day_lighting(rng, (1.0, 0.8), overcast=0.2)
-night = night_lighting(rng, exposure=1.0)
-atlas, clouds = build_atlas(textures), cloud_texture(0)
-for look in (day, night):
-    pose = looking_at(np.array([0.3, -7.0, 1.6]), 1.5, 0.05, 0.02)
-    seen = visible_surfaces(surfaces, pose, grid)
-    colour = sample_colour(seen, surfaces, atlas)
-    shadows = cast_shadows(surfaces, look.sun_direction) if any(look.sun) else None
-    light = radiance(
-        seen, surfaces, colour, look, cam_from_place=pose, lamps=lamps, shadows=shadows,
-        clouds=clouds,
-    )
-    digest(look.condition, seen.planes, seen.inverse_depth, colour, light)
-    frame = Frame("f", "query", "", 0, 0, "s", grid.camera, pose, look, 1, bonnet=True)
-    digest(look.condition + " developed", develop(light, frame, 2, 0))
-"""
-
-TWIN = """
-import hashlib, sys
-from pathlib import Path
-from megloc_twins.{0} import {1}Twin, {1}TwinOptions
-root = Path(sys.argv[1])
-{1}Twin({1}TwinOptions({2})).write(root)
-for path in sorted(p for p in root.rglob("*") if p.is_file()):
-    print(path.relative_to(root), hashlib.sha256(path.read_bytes()).hexdigest())
-"""
-PROGRAMS = {
-    "fields": FIELDS,
-    "aachen": TWIN.format(
-        "aachen",
-        "Aachen",
-        "num_places=1, stations_per_place=3, sequence_images=2, day_queries=1, night_queries=1,"
-        " additional_night_queries=1, width=160, height=120, points_per_image=20",
-    ),
-    "4seasons": TWIN.format(
-        "fourseasons",
-        "FourSeasons",
-        "num_places=1, map_keyframes=4, winter_keyframes=1, dusk_keyframes=1, width=200,"
-        " height=100",
-    ),
-    "inloc": TWIN.format(
-        "inloc",
-        "InLoc",
-        "modules=1, queries=2, cutout_width=64, cutout_height=48, query_width=96, query_height=72",
-    ),
-}
-
-
-def printed(program: str, folder: Path, settings: dict[str, str]) -> list[str]:
-    """Return the lines that a program prints in a new process with environment variables."""
-    folder.mkdir()
-    kept = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "compiled"), **settings}
-    command = [sys.executable, "-c", program, str(folder / "twin")]
-    done = subprocess.run(command, env=kept, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_an_older_processor_gives_the_same_bytes(name: str, tmp_path: Path) -> None:
-    program = PROGRAMS[name]
-    here = printed(program, tmp_path / "here", {})
-    assert len(here) > 10
-    assert printed(program, tmp_path / "older", OLDER) == here
 
 
 @given(

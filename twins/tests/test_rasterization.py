@@ -178,9 +178,9 @@ def test_corners_appear_where_colmap_projects_them(camera: Camera) -> None:
     expected = px_from_cam(camera, pose.apply(corners))
     start = (expected - 0.5).astype(np.float32)[:, None]
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
-    found = cv2.cornerSubPix(gray, start.copy(), (5, 5), (-1, -1), criteria)[:, 0] + 0.5
-    assert np.abs((found - expected).mean(0)).max() < 0.01
-    assert np.linalg.norm(found - expected, axis=1).max() < 0.1
+    result = cv2.cornerSubPix(gray, start.copy(), (5, 5), (-1, -1), criteria)[:, 0] + 0.5
+    assert np.abs((result - expected).mean(0)).max() < 0.01
+    assert np.linalg.norm(result - expected, axis=1).max() < 0.1
 
 
 def test_far_textures_are_averaged_not_sampled() -> None:

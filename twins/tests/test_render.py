@@ -21,7 +21,6 @@ from megloc_twins.surfaces import SurfaceBuilder, Surfaces
 from megloc_twins.synthetic_kapture import SyntheticWorld, build_world
 from megloc_twins.viewpoints import overlap
 
-from megloc_kapture.features.rootsift import RootSift
 from megloc_kapture.io.colmap import normalized_from_px, px_from_cam
 
 OPTIONS = SyntheticWorldOptions(
@@ -41,43 +40,6 @@ def painter(world: SyntheticWorld) -> PlaceRenderer:
 
 def first(world: SyntheticWorld, prefix: str) -> Frame:
     return next(frame for frame in world.frames() if frame.name.startswith(prefix))
-
-
-def test_drawing_gives_the_same_bytes_whatever_was_drawn_before(
-    world: SyntheticWorld, painter: PlaceRenderer
-) -> None:
-    frames = [first(world, p) for p in ("db/place0/front", "query/day", "query/night")]
-    images = [painter.render(frame).image for frame in frames]
-    fresh = PlaceRenderer(world.places[0], seed=OPTIONS.seed, supersampling=OPTIONS.supersampling)
-    for frame, image in reversed(list(zip(frames, images, strict=True))):
-        assert image.shape == (240, 320, 3) and image.dtype == np.uint8
-        np.testing.assert_array_equal(fresh.render(frame).image, image)
-
-
-def test_images_are_rich_in_features_by_day_and_poorer_at_night(
-    world: SyntheticWorld, painter: PlaceRenderer
-) -> None:
-    sift = RootSift()
-    strong = {}
-    for prefix in ("db/place0/left", "query/day", "query/night"):
-        image = painter.render(first(world, prefix)).image
-        features = sift.extract(image)
-        assert len(features.scores) > 200
-        strong[prefix] = int((features.scores > 0.02).sum())
-    assert strong["query/night"] < 0.5 * min(strong["db/place0/left"], strong["query/day"])
-
-
-def test_the_same_view_is_darker_and_noisier_at_night(
-    world: SyntheticWorld, painter: PlaceRenderer
-) -> None:
-    night = first(world, "query/night")
-    day = replace(night, lighting=first(world, "query/day").lighting)
-    dark, bright = painter.render(night).image, painter.render(day).image
-    assert dark.mean() < 0.5 * bright.mean()
-    red, _, blue = dark.reshape(-1, 3).mean(0)
-    assert red > 1.15 * blue  # the lamps' colour
-    again = painter.render(replace(night, noise_seed=1)).image
-    assert np.abs(again.astype(int) - dark).mean() > 2
 
 
 def test_the_bonnet_stays_in_the_image_and_is_masked(

@@ -59,12 +59,12 @@ def frames(world: SyntheticWorld) -> list[Frame]:
 @pytest.fixture(scope="module")
 def depths(world: SyntheticWorld) -> Depths:
     surfaces = [place.surfaces_in_world() for place in world.places]
-    found = {}
+    result = {}
     for frame in world.frames():
         grid = sample_grid(frame.camera, 1)
         seen = visible_surfaces(surfaces[frame.place], frame.cam_from_world, grid)
-        found[frame.name] = depth_map(seen)
-    return found
+        result[frame.name] = depth_map(seen)
+    return result
 
 
 @pytest.fixture(scope="module")

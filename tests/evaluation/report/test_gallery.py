@@ -1,4 +1,4 @@
-"""Pictures of the report: the worst queries beside what they match."""
+"""Pictures of the report: the worst queries next to their matches."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from megloc_kapture.io.kapture import FeatureConfig, FeatureWriter, MatchesWrite
 from megloc_kapture.values import Camera, LocalizationResult, RigidTransform
 
 CAMERA = Camera("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.02))
-# the query's true pose, and two map images: one beside it, one far away
+# the query's true pose, and two map images: one nearby, one far away
 QUERY, NEAR, FAR = "query/q.jpg", "map/near.jpg", "map/far.jpg"
 POSES = {
     QUERY: RigidTransform((0.998, 0.0, 0.0632, 0.0), (0.3, 0.1, 0.0)),
@@ -63,7 +63,7 @@ def run(tmp_path: Path, kaptures: Callable[..., Path]) -> Run:
     points = rng.uniform((-2, -1, 4), (2, 1, 9), (60, 3))
     query_px = project(CAMERA, POSES[QUERY], points)
     near_px = project(CAMERA, POSES[NEAR], points)
-    # far beside their epipolar lines, which run across the images
+    # far from their epipolar lines, which run across the images
     near_px[NUM_RIGHT : NUM_RIGHT + NUM_WRONG, 1] += 60.0
     config = FeatureConfig("x", np.dtype("<f4"), 2)
     with FeatureWriter(workspace, "keypoints", "x", config, orphan=True) as keypoints:
@@ -98,7 +98,7 @@ def test_projections_of_one_point_fit_and_others_do_not(run: Run) -> None:
     assert fits_poses(*matches, same).all()
 
 
-def test_the_best_match_stands_beside_the_query(run: Run, shown: QueryResult) -> None:
+def test_the_best_match_is_shown_next_to_the_query(run: Run, shown: QueryResult) -> None:
     map_poses = run.context.map_poses()
     (picture,) = worst_pictures([shown], run.context, map_poses)
     # ranked second, but with more matches
@@ -115,7 +115,7 @@ def test_the_best_match_stands_beside_the_query(run: Run, shown: QueryResult) ->
     assert f"right: {NEAR}, 0 matches" in picture.facts
 
 
-def test_what_is_missing_is_left_out(run: Run, shown: QueryResult) -> None:
+def test_missing_data_are_left_out(run: Run, shown: QueryResult) -> None:
     poses = run.context.map_poses()
     assert worst_pictures([replace(shown, image="query/other.jpg")], run.context, poses) == []
     assert worst_pictures([shown], ResultContext(), poses) == []

@@ -42,7 +42,7 @@ def test_any_axis_may_be_up_and_the_page_is_not_mirrored(world: Any, axis: int, 
     assert set(labels) == set("xyz") - {"xyz"[axis]}
 
 
-def test_a_slanted_world_is_seen_along_its_own_vertical(world: Any) -> None:
+def test_a_slanted_world_is_seen_along_its_vertical(world: Any) -> None:
     level, labels = top_view(*arrays(world.truth.values()))
     assert labels == ("x", "y")
     np.testing.assert_array_equal(np.array([[1.0, 2.0, 3.0]]) @ level.T, [[1.0, 2.0]])

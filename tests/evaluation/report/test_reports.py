@@ -63,15 +63,13 @@ def test_the_steps_of_the_paper_come_first(world: Any, page_of: Any) -> None:
     assert text.index("ASLFeat") < text.index("poses refined by ICP") < text.index("Recall")
     assert "<no> depth" in text and "<no>" not in html
     assert "steps" not in html.partition("<pre>")[2]  # not once more at the end
-    assert "Stages: " not in render_report(evaluation_of(world))
 
 
 def test_files(world: Any, tmp_path: Path, page_of: Any) -> None:
     evaluation = evaluation_of(world)
     options = {"map_poses": world.mapped, "provenance": {"preset": "classic"}}
     paths = write_report(tmp_path / "evaluation", evaluation, **options)
-    again = write_report(tmp_path / "again", evaluation, **options)
-    assert all(path.read_bytes() == again[name].read_bytes() for name, path in paths.items())
+
     page = page_of(paths["report.html"].read_text())
     assert page.references
     with pytest.raises(OutputError, match="recall"):

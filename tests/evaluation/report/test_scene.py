@@ -44,8 +44,8 @@ CAMERAS = (
 
 def data_of(page: str) -> dict[str, Any]:
     """The data of a view, arrays decoded."""
-    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
-    data: dict[str, Any] = json.loads(found[1])
+    result = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
+    data: dict[str, Any] = json.loads(result[1])
     for name in ("points", "inliers"):
         data[name] = decoded(data[name], "<f4").reshape(-1, 3)
     for name in ("cameraFrusta", "frusta", "trueFrusta"):
@@ -120,9 +120,12 @@ def evaluation_of(world: Any) -> Evaluation:
     return evaluate_poses(world.estimated, world.truth, **options)
 
 
-@pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.model)
-@pytest.mark.parametrize("offset", [0.0, 4.2e6], ids=["near zero", "ECEF"])
-def test_the_page_has_what_kapture_reads(make_map: Any, camera: Camera, offset: float) -> None:
+@pytest.mark.parametrize(
+    ("camera", "offset"), [*((camera, 0.0) for camera in CAMERAS), (CAMERAS[0], 4.2e6)]
+)
+def test_the_page_has_the_data_that_kapture_reads(
+    make_map: Any, camera: Camera, offset: float
+) -> None:
     rng = np.random.default_rng(0)
     points = np.column_stack(
         [rng.normal((offset, 0, 0), 5, (500, 3)), rng.integers(0, 256, (500, 3))]
@@ -138,28 +141,18 @@ def test_the_page_has_what_kapture_reads(make_map: Any, camera: Camera, offset: 
     np.testing.assert_allclose(data["up"], [0, 0, 1], atol=1e-9)
 
 
-@pytest.mark.slow
-def test_a_foreign_map_of_rigs(shared_data: Path) -> None:
-    root = shared_data / "foreign_maps" / "virtual_gallery" / "map"
-    scene = drawn(root)
-    data = data_of(render_view(scene))
-    check_against_kapture(data, kapture_from_dir(str(root), skip_list=[kapture.Observations]))
-    read = KaptureFolder(root).read()
-    for name, frustum in zip(data["cameras"], data["cameraFrusta"], strict=True):
-        check_corners(read.camera_of(name), read.poses()[name], frustum)
-
-
 def test_many_points_and_cameras_are_drawn_in_part(make_map: Any, monkeypatch: Any) -> None:
     rng = np.random.default_rng(0)
-    points = np.column_stack([rng.normal(0, 5, (90_000, 3)), rng.integers(0, 256, (90_000, 3))])
+    points = np.column_stack([rng.normal(0, 5, (900, 3)), rng.integers(0, 256, (900, 3))])
     monkeypatch.setattr(scenes, "MAX_CAMERAS", 10)
+    monkeypatch.setattr(scenes, "MAX_POINTS", 600)
     root = make_map([f"m/{k:03d}.jpg" for k in range(30)], CAMERAS[0], points)
     scene = drawn(root)
     assert len(scene.cameras) == 10
-    assert "60000 of the map's 90000 points" in scene.notes[0]
+    assert "600 of the map's 900 points" in scene.notes[0]
     assert "10 of the map's 30 cameras" in scene.notes[1]
     page = render_view(scene)
-    assert len(page) < 3_000_000
+
     assert render_view(drawn(root)) == page
     known = {tuple(row) for row in np.float32(points[:, :3] - scene.origin).tolist()}
     assert {tuple(row) for row in scene.points.tolist()} <= known
@@ -239,7 +232,7 @@ def test_coordinate_frames_are_kept_apart(world: Any, make_map: Any) -> None:
     assert scene_of("nothing", StoredInliers(ResultContext())) is None
 
 
-def test_points_without_colours_have_those_of_the_images(make_map: Any) -> None:
+def test_points_without_colours_take_them_from_the_images(make_map: Any) -> None:
     names = ["m/0.jpg", "m/1.jpg"]
     root = make_map(names, points=np.zeros((4, 6)))
     (root / "reconstruction" / "observations.txt").write_text(

@@ -1,0 +1,34 @@
+"""Poses for tests: random ones, disturbed ones, and how far two are apart."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from megloc_kapture.values import Failure, Pose, RigidTransform
+
+
+def random_pose(rng: np.random.Generator) -> RigidTransform:
+    return RigidTransform.from_matrix(Rotation.random(rng=rng).as_matrix(), 5 * rng.normal(size=3))
+
+
+def displaced(pose: RigidTransform, seed: int, m: float = 0.1, deg: float = 2.0) -> RigidTransform:
+    """The camera moved and rotated by this much, each in a random direction."""
+    rng = np.random.default_rng(seed)
+    axis, shift = rng.normal(size=3), rng.normal(size=3)
+    turn = Rotation.from_rotvec(np.radians(deg) * axis / np.linalg.norm(axis)).as_matrix()
+    rotation = turn @ pose.rotation_matrix()
+    center = pose.center() + m * shift / np.linalg.norm(shift)
+    return RigidTransform.from_matrix(rotation, -rotation @ center)
+
+
+def pose_errors(pose: RigidTransform, truth: RigidTransform) -> tuple[float, float]:
+    """Distance of the centres in metres, and the angle in degrees."""
+    turn = Rotation.from_matrix(pose.rotation_matrix() @ truth.rotation_matrix().T)
+    distance_m = np.linalg.norm(pose.center() - truth.center())
+    return float(distance_m), float(np.degrees(turn.magnitude()))
+
+
+def located(result: Pose | Failure) -> Pose:
+    assert isinstance(result, Pose), result
+    return result
