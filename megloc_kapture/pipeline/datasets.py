@@ -217,19 +217,19 @@ def with_model(choice: DatasetChoice) -> DatasetChoice | None:
 
 
 def has_model(choice: DatasetChoice) -> bool:
-    found = with_model(choice)
+    reference = with_model(choice)
     try:
-        if found is not None:
-            found.check()
+        if reference is not None:
+            reference.check()
     except MeglocError:  # :meth:`DatasetChoice.check` passes without the model
         return False
-    return found is not None
+    return reference is not None
 
 
 def _root_in_environment(name: str, adapter: DatasetAdapter | None) -> Path:
     folder = os.environ.get(DATA_VARIABLE)
     names: Sequence[str] = (name,) if adapter is None else (name, *adapter.card.folders)
-    tried = [Path(folder) / own for own in names] if folder else []
+    tried = [Path(folder) / part for part in names] if folder else []
     for place in tried:
         if place.is_dir():
             return place
@@ -307,7 +307,7 @@ class BenchmarkFile(PresetOptions):
     def changes(self, preset: str, *, map_depth: bool, query_depth: bool) -> list[dict[str, Any]]:
         """Return changes to a preset, in order, for data with or without depth maps."""
         layers = self, self.presets.get(preset, PresetOptions())
-        changed = [one._changes(map_depth=map_depth, query_depth=query_depth) for one in layers]
+        changed = [layer._changes(map_depth=map_depth, query_depth=query_depth) for layer in layers]
         return [EVERY_POSE, *chain.from_iterable(changed)]
 
     def import_options_of(self, preset: str) -> dict[str, Any]:
@@ -324,10 +324,10 @@ def find_benchmark(dataset: str) -> BenchmarkFile:
         for place in _PLACES:
             path = place / f"{name}.toml"
             if path.is_file():
-                found = read_benchmark(path)
+                benchmark = read_benchmark(path)
                 if name == dataset:
-                    return found
-                return found.model_copy(update={"dataset": dataset, "published": ()})
+                    return benchmark
+                return benchmark.model_copy(update={"dataset": dataset, "published": ()})
     return BenchmarkFile(dataset=dataset)
 
 
@@ -348,8 +348,8 @@ def _has_depth(root: Path) -> bool:
     from megloc_kapture.stages.scene import depth_records
 
     data = KaptureFolder(root).read()
-    found = bool(depth_records(data))
-    if data.records_depth and not found:
+    has_depth = bool(depth_records(data))
+    if data.records_depth and not has_depth:
         said = "%s: no rig joins the depth sensors to cameras of their moments; depth is not used"
         _log.warning(said, root)
-    return found
+    return has_depth

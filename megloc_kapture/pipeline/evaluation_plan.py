@@ -90,8 +90,8 @@ class Run:
     def _changed_features(self) -> dict[str, str]:
         usual, changed = self.usual or options_of_preset(self.preset), {}
         for key in ("local_features", "global_features"):
-            names = [one.name for one in getattr(self.options, key)]
-            if names != [one.name for one in getattr(usual, key)]:
+            names = [choice.name for choice in getattr(self.options, key)]
+            if names != [choice.name for choice in getattr(usual, key)]:
                 changed[key] = "+".join(names)
         return changed
 
@@ -227,30 +227,30 @@ def explained(rows: Sequence[Mapping[str, Any]]) -> str:
 def _insert(stages: list[Stage], stage: Stage) -> None:
     """Insert a plugin stage after the last stage that writes one of its inputs."""
     check_option(
-        not any(stage.name == one.name for one in stages),
+        not any(stage.name == other.name for other in stages),
         f"stages.{stage.name}: there is a stage of this name",
     )
     for path in stage.reads:
         check_option(
-            any(is_below(path, written) for one in stages for written in one.writes),
+            any(is_below(path, written) for other in stages for written in other.writes),
             f"stages.{stage.name} reads {path}, which no stage of the run writes",
         )
     places = [
         number
-        for number, one in enumerate(stages)
-        if any(is_below(path, written) for path in stage.reads for written in one.writes)
+        for number, other in enumerate(stages)
+        if any(is_below(path, written) for path in stage.reads for written in other.writes)
     ]
     stages.insert(max(places, default=len(stages) - 1) + 1, stage)
 
 
 def _with_model(run: Run) -> DatasetChoice:
-    found = with_model(run.source)
-    if found is None:
+    source = with_model(run.source)
+    if source is None:
         raise OptionError(
             f"dataset {run.dataset} comes with no model: mapping_pairs by covisibility needs its "
             'points; --set \'mapping_pairs.by=["poses", "retrieval"]\' does without them'
         )
-    return found
+    return source
 
 
 class _RunStage(Stage):
@@ -363,9 +363,11 @@ class Evaluate(_RunStage):
         output = work.out / EVALUATION
         context, label = context_of(localized), self._run.label
         if not truth.is_dir():
-            found = results_without_truth([localized], benchmark_of(tables), labels=[label])
-            found = replace(found, evaluations=(replace(found.evaluations[0], context=context),))
-            write_report(output, found, map_poses=map_poses, provenance=provenance)
+            results = results_without_truth([localized], benchmark_of(tables), labels=[label])
+            results = replace(
+                results, evaluations=(replace(results.evaluations[0], context=context),)
+            )
+            write_report(output, results, map_poses=map_poses, provenance=provenance)
             return {"queries_with_truth": 0}
         mapping = work.path(MAPPING)
         evaluation = evaluate(localized, truth, side_tables=tables, label=label, mapping=mapping)

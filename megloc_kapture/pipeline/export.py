@@ -317,7 +317,7 @@ def _posed_images(
         raise errors[0]
     stored = {key: data.sensors[key].camera() for key in scaled}
     warn_of_scaled(folder.root, [(stored[key], scaled[key]) for key in scaled])
-    found = []
+    posed = []
     for image, pose in sorted(data.poses().items()):
         timestamp, device = data.record_of(image)
         if sensor not in (None, device):
@@ -331,7 +331,7 @@ def _posed_images(
             width, height = scaled[device].width, scaled[device].height
             keypoints = keypoints * (width / camera.width, height / camera.height)
             camera = scaled_camera(camera, width, height)
-        found.append(
+        posed.append(
             PosedImage(
                 name=image,
                 path=folder.image_path(image),
@@ -345,7 +345,7 @@ def _posed_images(
                 points=points,
             )
         )
-    return found
+    return posed
 
 
 def _observed(

@@ -75,12 +75,12 @@ class MapKeypoints:
         names = [self.name, base_type(self.name)]
         if self.name in self.folder.types("keypoints"):
             names.append(self._keypoints.config.name)
-        found = next((found for name in names if (found := _extractor_named(name))), None)
+        choice = next((choice for name in names if (choice := _extractor_named(name))), None)
         has_descriptors = self.name in self.folder.types("descriptors")
-        if found is not None and found.name in _SIFT_OF.values() and has_descriptors:
+        if choice is not None and choice.name in _SIFT_OF.values() and has_descriptors:
             # other tools also say SIFT; COLMAP's and OpenMVG's descriptors are bytes
-            found = PluginChoice(name=_SIFT_OF[self._descriptors.config.dtype.kind == "u"])
-        return found
+            choice = PluginChoice(name=_SIFT_OF[self._descriptors.config.dtype.kind == "u"])
+        return choice
 
     def check(self, images: Collection[str]) -> None:
         if not self.has_descriptors(images):
@@ -139,8 +139,8 @@ class KaptureMap:
         origins = _find_origins(folder, indices)
         if pixel_origin != "auto":
             origins = {
-                name: replace(found, intrinsics=pixel_origin, reason="as asked for")
-                for name, found in origins.items()
+                name: replace(origin, intrinsics=pixel_origin, reason="as asked for")
+                for name, origin in origins.items()
             }
         keypoints = {n: MapKeypoints(folder, n, indices[n], origins[n]) for n in indices}
         return cls(folder, keypoints, restrictions_beside(folder.root))
@@ -222,9 +222,9 @@ class KaptureMap:
             sample = observed_keypoints(
                 self.folder, keypoints.index, (images[at] for at in taken if at < len(images))
             )
-            found = map_fault(sample, keypoints.index.xyz)
-            if found is not None:
-                return found if len(self.keypoints) == 1 else f"{name}: {found}"
+            reason = map_fault(sample, keypoints.index.xyz)
+            if reason is not None:
+                return reason if len(self.keypoints) == 1 else f"{name}: {reason}"
         return None
 
     @cached_property
@@ -280,21 +280,21 @@ def _is_ours(folder: KaptureFolder, local_type: str) -> bool:
     """
     refined = (folder.root / "reconstruction" / REPORT_FILE).is_file()
     name = base_type(local_type)
-    found = _extractor_named(name)
-    if found is None or name not in (found.name, found.options.get("weights")):
+    extractor = _extractor_named(name)
+    if extractor is None or name not in (extractor.name, extractor.options.get("weights")):
         return False
-    return refined or found.name not in _NETWORKS
+    return refined or extractor.name not in _NETWORKS
 
 
 def _find_origins(folder: KaptureFolder, indices: Mapping[str, MapIndex]) -> dict[str, PixelOrigin]:
     """Estimate the pixel origin of the intrinsics, by the type with the most observations, and of
     each type's keypoints.
     """
-    found = {name: _find_origin(folder, name, index) for name, index in indices.items()}
-    most = max(found, key=lambda name: (len(indices[name].point_ids), name))
-    intrinsics = found[most].intrinsics
+    origin_of = {name: _find_origin(folder, name, index) for name, index in indices.items()}
+    most = max(origin_of, key=lambda name: (len(indices[name].point_ids), name))
+    intrinsics = origin_of[most].intrinsics
     origins = {}
-    for name, origin in found.items():
+    for name, origin in origin_of.items():
         if origin.intrinsics != intrinsics:
             # only their difference is measured
             agree = origin.keypoints == origin.intrinsics

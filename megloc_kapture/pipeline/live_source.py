@@ -87,10 +87,10 @@ class LocalType:
 
     @cached_property
     def matcher(self) -> Matcher:
-        own = None if self.choice is None else self.choice.matching
-        chosen = own or self._options.matching
-        found: Matcher = load_chosen(MATCHERS, chosen, self._options.placement)
-        return found
+        own_choice = None if self.choice is None else self.choice.matching
+        chosen = own_choice or self._options.matching
+        matcher: Matcher = load_chosen(MATCHERS, chosen, self._options.placement)
+        return matcher
 
     @cached_property
     def second_matcher(self) -> Matcher | None:
@@ -98,8 +98,8 @@ class LocalType:
 
     @cached_property
     def extractor(self) -> LocalFeatureExtractor:
-        found = self.brought()
-        if found is None:
+        choice = self.brought()
+        if choice is None:
             raise DataError(
                 f"features of type {self.name!r} are missing and no extractor for them is "
                 f"installed (known: {', '.join(plugin_names(LOCAL_FEATURES))}); give them with "
@@ -108,15 +108,15 @@ class LocalType:
                 path=self._map.folder.root,
             )
         extractor: LocalFeatureExtractor = load_chosen(
-            LOCAL_FEATURES, found, self._options.placement
+            LOCAL_FEATURES, choice, self._options.placement
         )
         return extractor
 
     def brought(self) -> PluginChoice | None:
-        found = self.first.extractor()
-        if self.choice is None or (found is not None and found.name != self.choice.name):
-            return found
-        known = {} if found is None else found.options
+        stored = self.first.extractor()
+        if self.choice is None or (stored is not None and stored.name != self.choice.name):
+            return stored
+        known = {} if stored is None else stored.options
         return PluginChoice(name=self.choice.name, options={**self.choice.options, **known})
 
     def of_query(self, image: QueryImage) -> Features:
@@ -134,7 +134,7 @@ class LocalType:
     def match(
         self, query: Features, images: Sequence[str], matcher: Matcher | None = None
     ) -> list[VerifiedMatches]:
-        found = dict.fromkeys(images, _NO_MATCHES)
+        matches = dict.fromkeys(images, _NO_MATCHES)
         verify = verification_of(self._options.verify_queries())
         # limits the features in memory
         for names in batched((image for image in images if image in self.first), BATCH):
@@ -142,8 +142,8 @@ class LocalType:
             labels = [f"pair with {name}" for name in names]
             pairs = match_all(matcher or self.matcher, query, others, labels)
             for name, other, pair in zip(names, others, pairs, strict=True):
-                found[name] = verified(query, other, pair, verify)
-        return [found[image] for image in images]
+                matches[name] = verified(query, other, pair, verify)
+        return [matches[image] for image in images]
 
     def match_again(
         self, query: Features, pairs: Mapping[str, VerifiedMatches], image: QueryImage
@@ -170,7 +170,7 @@ class LocalType:
         method = PyramidMethod(
             self.extractor, self.matcher, options.verify_queries(), options.guided_pyramid
         )
-        found = retry_query(
+        retried = retry_query(
             query,
             [each for each in matches if each[0] in self.first],
             lambda name: self._map_features(self.points, name),
@@ -179,9 +179,9 @@ class LocalType:
             num_found={name: pair.num_found for name, pair in pairs.items()},
             name=image.query.name,
         )
-        skipped = next((one.skipped for one in found.tried), "")
+        skipped = next((one.skipped for one in retried.tried), "")
         remark = f"guided pyramid matching: skipped {skipped}" if skipped else ""
-        return np.concatenate([query.keypoints_px, found.added_px]), found.matches, remark
+        return np.concatenate([query.keypoints_px, retried.added_px]), retried.matches, remark
 
     @cached_property
     def pyramid_obstacle(self) -> str:
@@ -213,20 +213,22 @@ def local_types_of(kapture_map: KaptureMap, options: PipelineOptions) -> list[Lo
         named = _rank(stored, choices) < len(choices)
         if named and base_type(stored) not in by_base:
             by_base[base_type(stored)] = kapture_map.keypoints_of(stored)
-    found = []
+    types = []
     for base in sorted(by_base, key=lambda name: (_rank(name, choices), name)):
         points = by_base[base]
         first, rank = points, _rank(base, choices)
         if options.uses_pyramid() and base in kapture_map.stored_types():
             first = kapture_map.keypoints_of(base)
         choice = choices[rank] if rank < len(choices) else None
-        found.append(LocalType(kapture_map, points, first, choice, options))
-    return found
+        types.append(LocalType(kapture_map, points, first, choice, options))
+    return types
 
 
 def _rank(local_type: str, choices: Sequence[LocalFeaturesChoice]) -> int:
     plain = plain_name(base_type(local_type))
-    fitting = (rank for rank, one in enumerate(choices) if plain.startswith(plain_name(one.name)))
+    fitting = (
+        rank for rank, choice in enumerate(choices) if plain.startswith(plain_name(choice.name))
+    )
     return next(fitting, len(choices))
 
 
@@ -240,7 +242,7 @@ def extract_again(
         "them from again",
         path=kapture_map.folder.root,
     )
-    found: dict[str, NDArray[Any]] = {}
+    descriptors_of: dict[str, NDArray[Any]] = {}
     again = observed = 0
     for image in kapture_map.images:
         if image not in keypoints:
@@ -252,7 +254,7 @@ def extract_again(
         descriptors = np.zeros((len(stored), features.descriptors.shape[1]), np.float32)
         hit = rows >= 0
         descriptors[hit] = features.descriptors[rows[hit]]
-        found[image] = descriptors
+        descriptors_of[image] = descriptors
         seen, _ = keypoints.index.observed(image)
         again += int(hit[seen].sum())
         observed += len(seen)
@@ -262,7 +264,7 @@ def extract_again(
         f"{again} of {observed} observed keypoints: it was made with other options",
         path=kapture_map.folder.root,
     )
-    return found
+    return descriptors_of
 
 
 @dataclass(frozen=True)
@@ -384,27 +386,27 @@ class MapMatching:
     ) -> list[str]:
         """Return the permitted map images most similar to a query, best first."""
         compared = self._compared(image.query.global_features)
-        vectors = [self._of_query(one, image, features) for one in compared]
+        vectors = [self._of_query(kind, image, features) for kind in compared]
         rows = [_unit(np.asarray(v, np.float32).reshape(1, -1)) for v in vectors]
         members = np.array(sorted({self._positions[name] for name in permitted}), np.int64)
         # do not copy the whole map, the usual pool
         whole = len(members) == len(self._map.images)
         databases = [of_map if whole else of_map[members] for of_map in map(self._of_map, compared)]
-        names, weights = zip(*((one.name, one.weight) for one in compared), strict=True)
+        names, weights = zip(*((kind.name, kind.weight) for kind in compared), strict=True)
         retrieval = Retrieval(names, weights, self.options.fusion)
         index, _ = most_similar(rows, databases, members, retrieval, self.options.query_pairs.top_k)
         return [self._map.images[i] for i in index[0] if i >= 0]
 
     def is_at_hand(self, brought: Collection[str]) -> bool:
         """Return whether queries with these global features can be ranked immediately."""
-        return all(one.is_at_hand for one in self._compared(brought))
+        return all(kind.is_at_hand for kind in self._compared(brought))
 
     def describe_candidates(self, brought: Collection[str]) -> str:
         """Describe the choice of candidates for queries with these global features."""
         count, top_k = len(self._map.images), self.options.query_pairs.top_k
         how = ", ".join(
-            "VLAD over the map's descriptors" if one.is_vlad else f"global features {one.name}"
-            for one in self._compared(brought)
+            "VLAD over the map's descriptors" if kind.is_vlad else f"global features {kind.name}"
+            for kind in self._compared(brought)
         )
         if self.options.query_pairs.by == "exhaustive" or count <= top_k:
             ranked = f"ranked by {how}" if self.is_at_hand(brought) else "not ranked"
@@ -415,9 +417,9 @@ class MapMatching:
         shared = [name for name in self._map.global_types() if name in brought]
         with self._lock:
             if not shared:
-                usable = [one for one in self._wanted if one.stored or one.is_vlad]
+                usable = [kind for kind in self._wanted if kind.stored or kind.is_vlad]
                 return usable or self._wanted
-            weights = {one.name: one.weight for one in self._wanted}
+            weights = {kind.name: kind.weight for kind in self._wanted}
         named = [name for name in shared if name in weights] or shared
         return [_GlobalType(name, weights.get(name, 1.0), stored=True) for name in named]
 
@@ -449,8 +451,8 @@ class MapMatching:
     @cached_property
     def _stored_vocabularies(self) -> dict[str, tuple[Vocabulary, VladSettings]]:
         folder = self._map.folder
-        known = {base_type(one.name) for one in self.types}
-        found: dict[str, tuple[Vocabulary, VladSettings]] = {}
+        known = {base_type(local.name) for local in self.types}
+        vocabularies: dict[str, tuple[Vocabulary, VladSettings]] = {}
         for name in self._map.global_types():
             places = [folder.root / "reconstruction" / "global_features" / name]
             places += [
@@ -458,33 +460,33 @@ class MapMatching:
             ]
             for stored in filter(None, map(read_vocabulary, places)):
                 if stored[1].local_type in known:
-                    found.setdefault(name, stored)
-        return found
+                    vocabularies.setdefault(name, stored)
+        return vocabularies
 
     def _of_query(
-        self, one: _GlobalType, image: QueryImage, features: Sequence[Features]
+        self, kind: _GlobalType, image: QueryImage, features: Sequence[Features]
     ) -> NDArray[np.float32]:
-        if one.choice is None:
-            return np.asarray(image.query.global_features[one.name])
-        if not one.is_vlad:
-            return image.describe(one.extractor or one.choice.make(self.options.placement))
-        vocabulary, settings = self._vlad(one)
+        if kind.choice is None:
+            return np.asarray(image.query.global_features[kind.name])
+        if not kind.is_vlad:
+            return image.describe(kind.extractor or kind.choice.make(self.options.placement))
+        vocabulary, settings = self._vlad(kind)
         descriptors = features[self._position(settings.local_type)].descriptors
         return aggregate(descriptors, vocabulary, settings.options)
 
-    def _of_map(self, one: _GlobalType) -> NDArray[np.float32]:
+    def _of_map(self, kind: _GlobalType) -> NDArray[np.float32]:
         with self._lock:
-            if one.name not in self._vectors:
-                self._vectors[one.name] = self._read_or_describe(one)
-            return self._vectors[one.name]
+            if kind.name not in self._vectors:
+                self._vectors[kind.name] = self._read_or_describe(kind)
+            return self._vectors[kind.name]
 
-    def _read_or_describe(self, one: _GlobalType) -> NDArray[np.float32]:
+    def _read_or_describe(self, kind: _GlobalType) -> NDArray[np.float32]:
         images = self._map.images
-        if one.stored or one.choice is None:
-            (source,) = vectors_of([self._map.folder.global_features(one.name)], images)
+        if kind.stored or kind.choice is None:
+            (source,) = vectors_of([self._map.folder.global_features(kind.name)], images)
             return source.read(0, len(source))
-        if one.is_vlad:
-            vocabulary, settings = self._vlad(one)
+        if kind.is_vlad:
+            vocabulary, settings = self._vlad(kind)
             local = self.types[self._position(settings.local_type)]
             return np.stack(
                 [
@@ -494,10 +496,10 @@ class MapMatching:
             )
         require(
             self._map.has_images(),
-            f"the map has no global features {one.name!r}, and no images to describe",
+            f"the map has no global features {kind.name!r}, and no images to describe",
             path=self._map.folder.root,
         )
-        extractor = one.extractor or one.choice.make(self.options.placement)
+        extractor = kind.extractor or kind.choice.make(self.options.placement)
         return np.stack([self._map_image(name).describe(extractor) for name in images])
 
     def _map_image(self, name: str) -> QueryImage:
@@ -505,16 +507,16 @@ class MapMatching:
         pixels = read_image_of(folder.image_path(name), folder.read().camera_of(name))
         return self._preprocessor.of(Query(self._map.camera(name), pixels, name))
 
-    def _vlad(self, one: _GlobalType) -> tuple[Vocabulary, VladSettings]:
+    def _vlad(self, kind: _GlobalType) -> tuple[Vocabulary, VladSettings]:
         with self._lock:
-            if one.name not in self._vocabularies:
-                stored = self._stored_vocabularies.get(one.name)
-                self._vocabularies[one.name] = stored or self._trained(one)
-            return self._vocabularies[one.name]
+            if kind.name not in self._vocabularies:
+                stored = self._stored_vocabularies.get(kind.name)
+                self._vocabularies[kind.name] = stored or self._trained(kind)
+            return self._vocabularies[kind.name]
 
-    def _trained(self, one: _GlobalType) -> tuple[Vocabulary, VladSettings]:
-        assert one.choice is not None
-        vlad = one.choice.vlad_options()
+    def _trained(self, kind: _GlobalType) -> tuple[Vocabulary, VladSettings]:
+        assert kind.choice is not None
+        vlad = kind.choice.vlad_options()
         local = self.types[self._position(vlad.local_type or self.types[0].name)]
         options, images = vlad.of_vlad(), [i for i in self._map.images if i in local.first]
         vocabulary = train_vlad(
@@ -527,7 +529,7 @@ class MapMatching:
         return {name: at for at, name in enumerate(self._map.images)}
 
     def _position(self, local_type: str) -> int:
-        names = [base_type(one.name) for one in self.types]
+        names = [base_type(local.name) for local in self.types]
         if base_type(local_type) not in names:
             raise DataError(
                 f"VLAD over {local_type} needs local features of this type; queries have "

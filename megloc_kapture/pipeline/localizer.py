@@ -151,14 +151,14 @@ class Localizer:
                 ranker=self._ranker,
                 scene=scene,
             )
-            found = []
+            finished = []
             for image, source, result in zip(images, sources, results, strict=True):
                 name = image.query.name
                 if isinstance(result, Pose):
                     intrinsics = result.camera or image.camera
                     result = self.refiners.refine(name, intrinsics, result, scene)
                     result = image.in_original(result)
-                found.append(
+                finished.append(
                     replace(
                         result,
                         name=name,
@@ -166,7 +166,7 @@ class Localizer:
                         seconds={**source.clock.seconds, **result.seconds},
                     )
                 )
-            return found
+            return finished
 
     @cached_property
     def _centers(self) -> dict[str, NDArray[np.float64]]:

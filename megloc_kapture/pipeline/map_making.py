@@ -281,11 +281,11 @@ def describe_map(workspace: Path, photographs: Photographs) -> list[str]:
 
 
 def _too_few(number: int, unreadable: Mapping[str, str]) -> DataError:
-    told = f"{number} photographs are too few for a map; give {MIN_IMAGES} or more"
+    message = f"{number} photographs are too few for a map; give {MIN_IMAGES} or more"
     if unreadable:
         name, reason = min(unreadable.items())
-        told += f" ({len(unreadable)} more cannot be used, the first is {name}: {reason})"
-    return DataError(told)
+        message += f" ({len(unreadable)} more cannot be used, the first is {name}: {reason})"
+    return DataError(message)
 
 
 _STAMP = "colmap.txt"

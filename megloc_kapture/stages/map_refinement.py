@@ -327,10 +327,10 @@ def _scans(
         centres = centres[np.unique(scan_of, return_index=True)[1]]
         # index 0 is the scan itself
         nearest = range(1, min(_NEIGHBOURING_SCANS + 1, count) + 1)
-        found = cKDTree(centres).query(centres, k=nearest)[1] + len(scans)
+        neighbours = cKDTree(centres).query(centres, k=nearest)[1] + len(scans)
         scans += [
-            _Scan(own, frozenset(others) - {len(scans) + number})
-            for number, (own, others) in enumerate(zip(views, found.tolist(), strict=True))
+            _Scan(view, frozenset(others) - {len(scans) + number})
+            for number, (view, others) in enumerate(zip(views, neighbours.tolist(), strict=True))
         ]
     return scans
 
@@ -367,9 +367,9 @@ def _votes_of_other_scans(
     judge = partial(_judge, folder, options)
     votes, judged = np.zeros(len(lifted), np.int64), np.zeros(len(lifted), bool)
     results = work.map(judge, jobs, "depth of other scans", len(asked))
-    for (_, rows), (through, there) in zip(asked, results, strict=True):
-        votes[rows] += there.astype(np.int64) - through
-        judged[rows] |= there | through
+    for (_, rows), (through, agreeing) in zip(asked, results, strict=True):
+        votes[rows] += agreeing.astype(np.int64) - through
+        judged[rows] |= agreeing | through
     return votes, judged
 
 
@@ -379,7 +379,7 @@ def _judge(
     job: tuple[list[_DepthView], Floats, Floats],
 ) -> tuple[Mask, Mask]:
     views, xyz, sigmas = job
-    through, there = np.zeros((2, len(xyz)), dtype=bool)
+    through, agreeing = np.zeros((2, len(xyz)), dtype=bool)
     for record, cam_from_world in views:
         before, behind, checked = compare_with_depth(
             cam_from_world.apply(xyz),
@@ -390,8 +390,8 @@ def _judge(
             sigmas,
         )
         through |= before
-        there |= checked & ~before & ~behind
-    return through & ~there, there
+        agreeing |= checked & ~before & ~behind
+    return through & ~agreeing, agreeing
 
 
 # depth, points (N, 3) in the image's frame, deviations (N,) along the depth axis

@@ -162,8 +162,8 @@ def match_pairs(
         read, match, matcher, "match_many", None, verify
     )
     results = work.map(steps, jobs, resumed_label("matching", len(ordered), len(todo)))
-    for (image, others), found in zip(jobs, results, strict=True):
-        for other, pair in zip(others, found, strict=True):
+    for (image, others), verified_pairs in zip(jobs, results, strict=True):
+        for other, pair in zip(others, verified_pairs, strict=True):
             count = PairCount(image, other, pair.num_found, len(pair.matches))
             counts[image, other] = count
             append_match_count(output, local_type, count)
@@ -212,8 +212,8 @@ def check_given_poses(
     steps: Batched[_Job, list[PairEvidence]] = Batched(
         read, match, matcher, "match_many", None, finish
     )
-    found = work.map(steps, _sampled(pairs), "checking the given poses")
-    contradiction = pose_contradiction([pair for of_image in found for pair in of_image])
+    evidence = work.map(steps, _sampled(pairs), "checking the given poses")
+    contradiction = pose_contradiction([pair for of_image in evidence for pair in of_image])
     if contradiction is None:
         return
     message, most = contradiction
@@ -240,10 +240,10 @@ def _sampled(pairs: Sequence[ImagePair]) -> list[_Job]:
 def _evidence(
     specs: tuple[FolderSpec, FolderSpec],
     local_type: str,
-    found: tuple[_Job, Sequence[_PairMatches]],
+    matched_job: tuple[_Job, Sequence[_PairMatches]],
 ) -> list[PairEvidence]:
     """Return the pairs of an image that a two-view model explains better than chance."""
-    (image, others), matched = found
+    (image, others), matched = matched_job
     data, options = specs[0].open().read(), TwoViewOptions()
     a, *read = _read(specs, local_type, (image, others))
     evidence = []
@@ -289,9 +289,9 @@ def _verify(
     specs: tuple[FolderSpec, FolderSpec],
     local_type: str,
     verification: Verification,
-    found: tuple[_Job, Sequence[_PairMatches]],
+    matched_job: tuple[_Job, Sequence[_PairMatches]],
 ) -> list[VerifiedMatches]:
-    (image, others), matched = found
+    (image, others), matched = matched_job
     first, second = (spec.open().read() for spec in specs)
 
     def relative(other: str) -> RigidTransform | None:
@@ -316,14 +316,14 @@ def match_all(
     def match(batch: Sequence[ImageFeatures]) -> Sequence[_PairMatches]:
         return many.match_many(a, batch) if len(batch) > 1 else [matcher.match(a, batch[0])]
 
-    found = in_batches(
+    pairs = in_batches(
         matcher,
         "match_many",
         match,
         others,
         name=names.__getitem__,
     )
-    for (matches, scores), other, name in zip(found, others, names, strict=True):
+    for (matches, scores), other, name in zip(pairs, others, names, strict=True):
         who = f"matcher {type(matcher).__name__} on {name}"
         checked_array(who, matches, (None, 2), "int64", "int32", "uint64", "uint32")
         checked_array(who, scores, (len(matches),), "float32", "float64")
@@ -332,7 +332,7 @@ def match_all(
             raise PluginError(
                 f"{who}: a match is outside the {bounds[0]} and {bounds[1]} keypoints"
             )
-    return found
+    return pairs
 
 
 def verified(a: Features, b: Features, pair: _PairMatches, verify: Verify) -> VerifiedMatches:

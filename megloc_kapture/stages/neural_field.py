@@ -170,19 +170,19 @@ def views_between(data: KaptureData) -> KaptureData:
     require(
         pairs, "no two cameras have a similar viewing direction: there are no views between them"
     )
-    found = KaptureData()
+    between = KaptureData()
     for number, (a, b) in enumerate(pairs):
         first, second = poses[names[a]], poses[names[b]]
-        one, other = np.array(first.quat_wxyz), np.array(second.quat_wxyz)
-        middle = one + math.copysign(1.0, one @ other) * other
+        quat, other = np.array(first.quat_wxyz), np.array(second.quat_wxyz)
+        middle = quat + math.copysign(1.0, quat @ other) * other
         w, x, y, z = (middle / np.linalg.norm(middle)).tolist()
         turned = RigidTransform((w, x, y, z), (0.0, 0.0, 0.0))
         t_x, t_y, t_z = turned.apply(-0.5 * (first.center() + second.center())).tolist()
         sensor = f"{data.record_of(names[a])[1]}_between"
-        found.sensors[sensor] = Sensor.from_camera(data.camera_of(names[a]))
-        found.trajectories[number, sensor] = RigidTransform(turned.quat_wxyz, (t_x, t_y, t_z))
-        found.records_camera[number, sensor] = f"between/{number:06d}.png"
-    return found
+        between.sensors[sensor] = Sensor.from_camera(data.camera_of(names[a]))
+        between.trajectories[number, sensor] = RigidTransform(turned.quat_wxyz, (t_x, t_y, t_z))
+        between.records_camera[number, sensor] = f"between/{number:06d}.png"
+    return between
 
 
 @dataclass(frozen=True)
@@ -198,14 +198,14 @@ class _Renderer:
         name, camera, pose = view
         field = open_field(self.field, self.options.device)
         light = None if self.appearance is None else field.appearance_of(self.appearance)
-        found = field.render(camera, pose, appearance=light, max_side_px=self.max_side_px)
-        if np.mean(found.depth_m > 0) < self.min_shown:
+        rendered = field.render(camera, pose, appearance=light, max_side_px=self.max_side_px)
+        if np.mean(rendered.depth_m > 0) < self.min_shown:
             return None
         image, depth = (self.records / part for part in _files_of(name))
         image.parent.mkdir(parents=True, exist_ok=True)
-        write_image(image, found.image)
-        write_depth_map(depth, found.depth_m)
-        return found.camera
+        write_image(image, rendered.image)
+        write_depth_map(depth, rendered.depth_m)
+        return rendered.camera
 
 
 def _files_of(name: str) -> tuple[str, str]:
@@ -251,9 +251,9 @@ def render_along(
         timestamp, sensor = data.record_of(name)
         image, depth = _files_of(name)
         ids = sensor, f"{sensor}_depth"
-        for one, kind in zip(ids, ("camera", "depth"), strict=True):
-            written.sensors[one] = Sensor.from_camera(camera, sensor_type=kind)
-            written.trajectories[timestamp, one] = pose
+        for sensor_id, kind in zip(ids, ("camera", "depth"), strict=True):
+            written.sensors[sensor_id] = Sensor.from_camera(camera, sensor_type=kind)
+            written.trajectories[timestamp, sensor_id] = pose
         # kapture associates depth with an image by their common rig
         same = RigidTransform.identity()
         written.rigs[f"{sensor}_with_depth"] = dict.fromkeys(ids, same)
@@ -375,8 +375,8 @@ class FieldRefiner:
             image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
             if mask is not None:
                 mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_AREA) > 0
-        found = self._features.extract(image, mask)
-        return ImageFeatures(found.keypoints_px, found.descriptors, *size)
+        features = self._features.extract(image, mask)
+        return ImageFeatures(features.keypoints_px, features.descriptors, *size)
 
     def _solve(
         self, query: ImageFeatures, rendering: FieldRendering, pose: RigidTransform

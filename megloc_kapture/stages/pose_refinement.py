@@ -156,7 +156,9 @@ class MapRefiners:
             # a pose made elsewhere comes from no cluster
             only_first=bool(pose.candidates),
         )
-        return tuple(near), tuple(one.reason if one else "" for one in self._verdicts[frame])
+        return tuple(near), tuple(
+            verdict.reason if verdict else "" for verdict in self._verdicts[frame]
+        )
 
     def refine(self, image: str, camera: Camera, pose: Pose, scene: RankingScene) -> Pose:
         if not self.refiners:
@@ -171,10 +173,10 @@ def _hold_out(
     return refiner.hold_out(image, images, KaptureScene(mapping.open()))
 
 
-def _consistency_row(frame: str, method: str, found: Consistency) -> ConsistencyRow:
-    median = found.median or Displacement(*[float("nan")] * len(fields(Displacement)))
-    counts = (found.images, found.contradicting)
-    return ConsistencyRow(frame, method, *counts, **vars(median), reason=found.reason)
+def _consistency_row(frame: str, method: str, consistency: Consistency) -> ConsistencyRow:
+    median = consistency.median or Displacement(*[float("nan")] * len(fields(Displacement)))
+    counts = (consistency.images, consistency.contradicting)
+    return ConsistencyRow(frame, method, *counts, **vars(median), reason=consistency.reason)
 
 
 def refine_pose(

@@ -178,12 +178,12 @@ class ClassMasks:
     def labels(self, image: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
         """Return the label of each pixel, uint8 (H, W), of an image (H, W, 3)."""
         who = f"plugin {self.segmenter.name!r} on image {name}"
-        found = checked_array(who, self.segmenter.segment(image), image.shape[:2], "uint8")
-        if found.max() >= len(self.segmenter.classes):
+        labels = checked_array(who, self.segmenter.segment(image), image.shape[:2], "uint8")
+        if labels.max() >= len(self.segmenter.classes):
             raise PluginError(
-                f"{who}: label {found.max()}, but there are {len(self.segmenter.classes)} classes"
+                f"{who}: label {labels.max()}, but there are {len(self.segmenter.classes)} classes"
             )
-        return found
+        return labels
 
     def mask(self, labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """Return the mask bool (H, W), True = use."""
@@ -491,6 +491,6 @@ class Preprocess(PipelineStage):
             name, out = folder.root.name, work.out / PREPROCESSED / folder.root.name
             # a camera may have few queries, or only night queries
             others = [] if folder is mapping else [mapping]
-            found = preprocess_images(folder, out, options, sequences=others, work=work)
-            counts |= {f"{name}_{key}": count for key, count in found.items()}
+            counted = preprocess_images(folder, out, options, sequences=others, work=work)
+            counts |= {f"{name}_{key}": count for key, count in counted.items()}
         return counts

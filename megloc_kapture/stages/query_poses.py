@@ -118,12 +118,12 @@ def write_localized(
     """
     data = query.read() if isinstance(query, KaptureFolder) else query
     ordered = sorted(results, key=lambda result: result.name)
-    found = {result.name: result for result in ordered if isinstance(result, Pose)}
+    localized_poses = {result.name: result for result in ordered if isinstance(result, Pose)}
     guesses: Mapping[str, tuple[str, RigidTransform]] = {}
     if fallback == "retrieval":
         guesses = first_candidates or {}
     elif fallback == "rig":
-        guesses = poses_through_rig(data, found)
+        guesses = poses_through_rig(data, localized_poses)
     poses: dict[tuple[int, str], RigidTransform] = {}
     sensors, records = dict(data.sensors), dict(data.records_camera)
     written: list[LocalizationResult] = []
@@ -152,9 +152,9 @@ def write_localized(
         write_timing(timing, written)
     return {
         "queries": len(written),
-        "localized": len(found),
-        "failed": len(written) - len(found),
-        "fallbacks": len(poses) - len(found),
+        "localized": len(localized_poses),
+        "failed": len(written) - len(localized_poses),
+        "fallbacks": len(poses) - len(localized_poses),
     }
 
 
@@ -469,8 +469,8 @@ def localize_from_matches(
     measured = {name: with_noise(map_folder, index) for name, index in read.items()}
     jobs: list[_Job] = []
     for unit in units:
-        own = [candidates.get(image, ()) for image, _ in unit]
-        jobs.append((unit, own, {one: restrictions.frame(one) for one in chain(*own)}))
+        images_of = [candidates.get(image, ()) for image, _ in unit]
+        jobs.append((unit, images_of, {one: restrictions.frame(one) for one in chain(*images_of)}))
     specs = FolderSpec(map_folder), FolderSpec(query), FolderSpec(matches)
     with shared_index(measured, scratch) as indices:
         localizer = _StoredQueries(*specs, indices, options, ranker)

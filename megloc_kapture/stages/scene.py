@@ -79,14 +79,16 @@ def observed_keypoints(
     poses = data.poses()
     lifted = index.seen_once
     telling = lifted if lifted[index.point_ids].all() else ~lifted
-    found = []
+    observed = []
     for image in images:
         rows, points = index.observed(image)
-        told = telling[points]
+        chosen = telling[points]
         pixels = keypoints.read(image)[:, :2]
         camera, pose = data.camera_of(image), poses[image]
-        found.append(ObservedKeypoints(image, camera, pose, pixels, rows[told], points[told]))
-    return found
+        observed.append(
+            ObservedKeypoints(image, camera, pose, pixels, rows[chosen], points[chosen])
+        )
+    return observed
 
 
 def with_noise(folder: KaptureFolder, index: MapIndex) -> MapIndex:
@@ -187,7 +189,7 @@ def poses_through_rig(
     at_time: dict[int, list[tuple[str, str]]] = {}
     for (timestamp, sensor), image in data.records_camera.items():
         at_time.setdefault(timestamp, []).append((sensor, image))
-    found = {}
+    guesses = {}
     for image in sorted(set(data.records_camera.values()) - set(localized)):
         timestamp, sensor = data.record_of(image)
         poses = [
@@ -198,8 +200,8 @@ def poses_through_rig(
         ]
         if poses:
             _, other, pose = min(poses, key=itemgetter(0, 1))
-            found[image] = (other, pose)
-    return found
+            guesses[image] = (other, pose)
+    return guesses
 
 
 @dataclass(frozen=True)
@@ -221,7 +223,7 @@ def depth_records(data: KaptureData) -> dict[str, DepthRecord]:
     at_time: dict[int, list[tuple[str, str]]] = {}
     for (timestamp, sensor), path in sorted(data.records_depth.items()):
         at_time.setdefault(timestamp, []).append((sensor, path))
-    found = {}
+    depth_of = {}
     for (timestamp, camera), image in data.records_camera.items():
         options = [
             (image_from_depth, sensor, path)
@@ -232,8 +234,8 @@ def depth_records(data: KaptureData) -> dict[str, DepthRecord]:
             image_from_depth, sensor, path = min(
                 options, key=lambda option: (np.linalg.norm(option[0].translation), option[1])
             )
-            found[image] = DepthRecord(path, data.sensors[sensor].camera(), image_from_depth)
-    return found
+            depth_of[image] = DepthRecord(path, data.sensors[sensor].camera(), image_from_depth)
+    return depth_of
 
 
 def read_depth(folder: KaptureFolder, record: DepthRecord) -> NDArray[np.float32]:
@@ -250,16 +252,16 @@ def _carried(data: KaptureData) -> _Carried:
 
     def members(rig: str, above: frozenset[str]) -> dict[str, RigidTransform]:
         require(rig not in above, f"rig {rig!r} contains itself")
-        found = {}
+        sensors = {}
         for member, member_from_rig in data.rigs[rig].items():
             if member not in data.rigs:
-                found[member] = member_from_rig
+                sensors[member] = member_from_rig
                 continue
             for sensor, sensor_from_member in members(member, above | {rig}).items():
-                found[sensor] = sensor_from_member @ member_from_rig
-        return found
+                sensors[sensor] = sensor_from_member @ member_from_rig
+        return sensors
 
-    on_others = {member for one in data.rigs.values() for member in one}
+    on_others = {member for parts in data.rigs.values() for member in parts}
     return {rig: members(rig, frozenset()) for rig in sorted(data.rigs) if rig not in on_others}
 
 

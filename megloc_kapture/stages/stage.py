@@ -82,11 +82,11 @@ class Layout:
     posed: bool = False
 
     def paths(self, parts: Sequence[LayoutPath]) -> list[str]:
-        found: list[str] = []
+        names: list[str] = []
         for part in parts:
-            one = part if isinstance(part, str) else part(self)
-            found += [one] if isinstance(one, str) else one
-        return found
+            part_names = part if isinstance(part, str) else part(self)
+            names += [part_names] if isinstance(part_names, str) else part_names
+        return names
 
     def mapping(self) -> str:
         """Return the kapture folder after pre-processing."""
@@ -150,7 +150,7 @@ class StageWork(Work):
         return self.root / name
 
     def folder(self, name: str, *features: str) -> KaptureFolder:
-        return KaptureFolder(self.path(name), features_dirs=[self.path(one) for one in features])
+        return KaptureFolder(self.path(name), features_dirs=[self.path(part) for part in features])
 
     def folders(self, names: Sequence[str], *features: str) -> list[KaptureFolder]:
         """Open the existing ones of these kapture folders."""
@@ -204,10 +204,10 @@ class Stage(ABC):
 
     def code(self) -> dict[str, str]:
         """Return code versions of plugins and of stages of other packages."""
-        found = [*self.plugins(), *(() if is_ours(type(self)) else (self,))]
+        plugins = [*self.plugins(), *(() if is_ours(type(self)) else (self,))]
         for plugin in self.plugins():
-            found += getattr(plugin, "plugins", tuple)()
-        kinds = {type(plugin) for plugin in found}
+            plugins += getattr(plugin, "plugins", tuple)()
+        kinds = {type(plugin) for plugin in plugins}
         names = {f"{CODE_OF}{kind.__module__}.{kind.__qualname__}": kind for kind in kinds}
         # mypy does not consider classes hashable
         return {name: code_of(kind) for name, kind in names.items()}  # type: ignore[arg-type]

@@ -97,9 +97,13 @@ class FindPoses(PipelineStage):
         data, structure = mapping.read(), self._structure
         models = self._models(work, mapping, data)
         world, model, counts = _scaled(models[0], structure)
-        if own := sorted(i for i, sensor in model.sensors.items() if sensor not in data.sensors):
-            said = "%d photographs have the size of others but another camera (a zoom, a crop): %s"
-            _log.warning(said, len(own), ", ".join(own))
+        if separate := sorted(
+            i for i, sensor in model.sensors.items() if sensor not in data.sensors
+        ):
+            message = (
+                "%d photographs have the size of others but another camera (a zoom, a crop): %s"
+            )
+            _log.warning(message, len(separate), ", ".join(separate))
         tables = work.out / SIDE_TABLES
         reasons = read_unreadable(work.path(SIDE_TABLES))
         absent = set(data.image_names()) - model.poses.keys()
@@ -167,9 +171,13 @@ def write_posed(output: Path, data: KaptureData, model: Model) -> None:
         if name in model.poses:
             sensor = model.sensors[name]
             # the image got another camera
-            own = sensor if sensor in data.sensors else f"{device}_{data.record_of(sensor)[0]}"
-            records[timestamp, own] = name
-            sensors[own] = Sensor.from_camera(model.cameras[sensor], name=data.sensors[device].name)
+            own_sensor = (
+                sensor if sensor in data.sensors else f"{device}_{data.record_of(sensor)[0]}"
+            )
+            records[timestamp, own_sensor] = name
+            sensors[own_sensor] = Sensor.from_camera(
+                model.cameras[sensor], name=data.sensors[device].name
+            )
     poses = {key: model.poses[name] for key, name in records.items()}
     write_sensors(
         output, replace(data, sensors=sensors, records_camera=records, trajectories=poses)
@@ -190,14 +198,14 @@ def _scaled(model: Model, structure: StructureOptions) -> tuple[World, Model, di
     if structure.gps is None:
         return World(unit=NO_METRES), model, {}
     centers = {name: pose.center() for name, pose in model.poses.items()}
-    found = align_to_earth(centers, structure.gps)
+    alignment = align_to_earth(centers, structure.gps)
     counts = {
-        "positions_from_GPS": found.num_positions,
-        "GPS_residual_m": round(found.residual_m, 3),
-        "metres_per_unit": found.scale,
+        "positions_from_GPS": alignment.num_positions,
+        "GPS_residual_m": round(alignment.residual_m, 3),
+        "metres_per_unit": alignment.scale,
     }
-    world = World(unit=METRES, geo_origin=found.origin)
-    return world, _moved(model, found.scale, found.enu_from_map), counts
+    world = World(unit=METRES, geo_origin=alignment.origin)
+    return world, _moved(model, alignment.scale, alignment.enu_from_map), counts
 
 
 def _moved(model: Model, scale: float, turned: RigidTransform = _UNTURNED) -> Model:

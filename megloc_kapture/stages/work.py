@@ -68,10 +68,10 @@ def in_batches(
     Raise MeglocError if one item does not fit.
     """
     key = type(plugin).__qualname__, many, repr(getattr(plugin, "options", None))
-    found: list[Result] = []
-    while len(found) < len(items):
+    finished: list[Result] = []
+    while len(finished) < len(items):
         most = min(most_at_once(plugin, many), _limits.get(key, sys.maxsize))
-        batch = items[len(found) :][:most]
+        batch = items[len(finished) :][:most]
         try:
             results = run(batch)
         except RuntimeError as error:
@@ -79,7 +79,7 @@ def in_batches(
                 raise
             if len(batch) == 1:
                 raise MeglocError(
-                    f"{name(len(found))}: there is not enough memory for it alone; make images "
+                    f"{name(len(finished))}: there is not enough memory for it alone; make images "
                     "smaller (max_megapixels, preprocessing.max_size_px), keep fewer keypoints, or "
                     "compute on another device (--device)"
                 ) from error
@@ -87,8 +87,8 @@ def in_batches(
             continue
         if len(results) != len(batch):
             raise PluginError(f"{many} of {key[0]} gave {len(results)} for {len(batch)} items")
-        found += results
-    return found
+        finished += results
+    return finished
 
 
 # of plain RuntimeErrors: allocation by the CPU, by CUDA contexts, cuBLAS and cuDNN
@@ -178,13 +178,13 @@ class Batched(Generic[Item, Result]):
     finish: Callable[[tuple[Item, Any]], Result] | None = None
 
     def __call__(self, items: Sequence[Item]) -> Sequence[Result]:
-        found = self.computed([(item, self.read(item)) for item in items])
-        return found if self.finish is None else list(map(self.finish, found))
+        results = self.computed([(item, self.read(item)) for item in items])
+        return results if self.finish is None else list(map(self.finish, results))
 
     def computed(self, batch: Sequence[tuple[Item, Any]]) -> list[Any]:
         items, arrays = zip(*batch, strict=True)
-        found = self.compute(items, arrays)
-        return list(found if self.finish is None else zip(items, found, strict=True))
+        results = self.compute(items, arrays)
+        return list(results if self.finish is None else zip(items, results, strict=True))
 
 
 @dataclass(frozen=True)
@@ -250,13 +250,13 @@ class Work:
         # reading ahead and finishing overlap with computing
         with ThreadPoolExecutor(_READERS) as readers, ThreadPoolExecutor(1) as computing:
             ahead = most + _READERS
-            read = ordered_map(lambda one: (one, steps.read(one)), items, readers, window=ahead)
+            read = ordered_map(lambda item: (item, steps.read(item)), items, readers, window=ahead)
             ready = _alike(read, most, lambda pair: alike(pair[0]))
-            found = chain.from_iterable(ordered_map(steps.computed, ready, computing, window=2))
+            results = chain.from_iterable(ordered_map(steps.computed, ready, computing, window=2))
             if steps.finish is None:
-                yield from found
+                yield from results
             else:
-                yield from ordered_map(steps.finish, found, self.executor)
+                yield from ordered_map(steps.finish, results, self.executor)
 
     def unfinished(self, items: Iterable[Item], is_written: Callable[[Item], bool]) -> list[Item]:
         """Return the items that an interrupted run of the stage has not written."""
