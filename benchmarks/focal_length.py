@@ -25,7 +25,7 @@ import pandas as pd
 from megloc_kapture import KaptureMap, Localizer, Pose, Query
 from megloc_kapture.geometry.cameras import focal_px, scale_focal
 from megloc_kapture.io.kapture import KaptureFolder
-from megloc_kapture.pipeline import local_types
+from megloc_kapture.pipeline import live_source
 from megloc_kapture.pipeline.presets import options_of_preset
 from megloc_kapture.pipeline.query_folders import KaptureQueries
 from megloc_kapture.stages.matches import match_all
@@ -121,7 +121,7 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=1, help="of the queries")
     parser.add_argument("-o", "--output", type=Path, help="a row per pose")
     given = parser.parse_args()
-    with patch.object(local_types, "match_all", matched_once):
+    with patch.object(live_source, "match_all", matched_once):
         rows = [
             row
             for place in given.map
