@@ -147,7 +147,7 @@ class MapRefiners:
         ]
 
     def uses(self, pose: Pose) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return ``references`` and ``distrusted`` for :func:`refine_pose`, in a tested frame."""
+        """Return ``references`` and ``distrusted`` for :func:`apply_refiners`, frame tested."""
         frame = self._frame(pose)
         near = self._by_frame[frame].near(
             pose.cam_from_world,
@@ -164,7 +164,7 @@ class MapRefiners:
         if not self.refiners:
             return pose
         self.test([pose])
-        return refine_pose(image, camera, pose, *self.uses(pose), self.refiners, scene)
+        return apply_refiners(image, camera, pose, *self.uses(pose), self.refiners, scene)
 
 
 def _hold_out(
@@ -179,7 +179,7 @@ def _consistency_row(frame: str, method: str, consistency: Consistency) -> Consi
     return ConsistencyRow(frame, method, *counts, **vars(median), reason=consistency.reason)
 
 
-def refine_pose(
+def apply_refiners(
     image: str,
     camera: Camera,
     pose: Pose,
@@ -303,7 +303,7 @@ def _refine(
 ) -> Pose:
     image, pose, references, distrusted = job
     scene, camera = KaptureScene(mapping.open(), query.open()), query.open().read().camera_of(image)
-    return refine_pose(image, camera, pose, references, distrusted, refiners, scene)
+    return apply_refiners(image, camera, pose, references, distrusted, refiners, scene)
 
 
 class RefinePoses(PipelineStage):
