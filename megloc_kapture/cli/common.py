@@ -21,6 +21,7 @@ from megloc_kapture.io.kapture import KaptureFolder
 from megloc_kapture.io.output_folders import staged_output
 from megloc_kapture.io.text_lines import CameraList, read_cameras
 from megloc_kapture.pipeline.executors import (
+    LOG_FORMAT,
     ExecutorKind,
     available_cores,
     open_executor,
@@ -156,9 +157,7 @@ class Common:
 
     def console(self) -> Console:
         level = "debug" if self.debug else self.verbose
-        logging.basicConfig(
-            level=getattr(logging, level.upper()), format="%(levelname)s %(name)s: %(message)s"
-        )
+        logging.basicConfig(level=getattr(logging, level.upper()), format=LOG_FORMAT)
         return Console(quiet=self.quiet)
 
 

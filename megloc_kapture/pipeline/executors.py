@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import signal
@@ -18,6 +19,7 @@ from typing import Any, Literal
 from megloc_kapture.errors import MeglocError, OptionError, check_option
 
 ExecutorKind = Literal["inline", "processes", "dask"]
+LOG_FORMAT = "%(levelname)s %(name)s: %(message)s"
 
 
 def available_cores() -> int:
@@ -70,7 +72,8 @@ def enter_single_threaded() -> None:
     threadpool_limits(1)
 
 
-def _start_worker() -> None:
+def _start_worker(log_level: int) -> None:
+    logging.basicConfig(level=log_level, format=LOG_FORMAT)
     # the parent ends its workers when a terminal interrupts the process group
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
@@ -123,7 +126,7 @@ def _process_pool(count: int) -> Iterator[Executor]:
     # fork is unsafe with the threads of BLAS and OpenCV
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["megloc_kapture.stages.query_poses"])
-    pool = ProcessPoolExecutor(count, context, _start_worker)
+    pool = ProcessPoolExecutor(count, context, _start_worker, (logging.getLogger().level,))
     try:
         yield pool
     except BaseException as error:

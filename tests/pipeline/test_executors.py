@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import time
@@ -32,13 +33,21 @@ def _torch_threads() -> int:
     return torch.get_num_threads()
 
 
-def test_workers_are_other_processes_with_one_thread_each() -> None:
+def _log_level() -> int:
+    return logging.getLogger().level
+
+
+def test_workers_are_other_processes_with_one_thread_each_and_the_same_log_level(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(logging.getLogger(), "level", logging.INFO)
     with open_executor("processes", 2) as executor:
         assert executor is not None
         assert executor.submit(os.getpid).result() != os.getpid()
         counts = {pool["num_threads"] for pool in executor.submit(threadpool_info).result()}
         assert counts == {1}
         assert executor.submit(_torch_threads).result() == 1
+        assert executor.submit(_log_level).result() == logging.INFO
 
 
 def test_a_block_limits_torch_and_gives_its_threads_back() -> None:
