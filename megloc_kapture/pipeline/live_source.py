@@ -313,20 +313,21 @@ class MapMatching:
         """Return the features of a query, given or extracted, by keypoints type."""
         return [local.of_query(image) for local in self.types]
 
-    def candidates(self, image: QueryImage, features: Sequence[Features]) -> list[str]:
-        """Return the map images to match, best first; all of a small map in its own order."""
+    def candidates(self, image: QueryImage, features: Sequence[Features]) -> tuple[list[str], bool]:
+        """Return the map images to match, and whether they are ranked, best first.
+
+        Those of a small map without global features are not.
+        """
         query = image.query
         if query.candidates is not None:
-            return self._usable(query, query.candidates)
+            return self._usable(query, query.candidates), True
         permitted = self._permitted(query)
         options = self.options.query_pairs
         if options.by == "exhaustive" or not permitted:
-            return permitted
-        all_taken = len(permitted) <= options.top_k
-        in_order = self.options.localization.sure_confidence is not None
-        if all_taken and not in_order and not self.is_at_hand(query.global_features):
-            return permitted
-        return self.rank(image, features, permitted)
+            return permitted, False
+        if len(permitted) <= options.top_k and not self.is_at_hand(query.global_features):
+            return permitted, False
+        return self.rank(image, features, permitted), True
 
     def ranked(self, image: QueryImage) -> list[str]:
         """Return the most similar map images, best first, with reranking if enabled."""
@@ -558,11 +559,13 @@ class LiveSource:
         self._matching, self._cam_from_rig = matching, cam_from_rig
         self._features = matching.features(image)
         self.clock.lap("extraction")
-        self._ranked = self.candidates = matching.candidates(image, self._features)
+        self._ranked, ranked = matching.candidates(image, self._features)
+        self.candidates = self._ranked
         self.clock.lap("retrieval")
         self._matches: list[list[VerifiedMatches]] = [[] for _ in matching.types]
         options = matching.options
         self._needs_all = options.reranking.reranks() or options.matches_again()
+        self.in_turn = ranked and not self._needs_all
         if self._needs_all:
             self._view = self._match(len(self._ranked))
 

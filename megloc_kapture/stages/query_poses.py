@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -224,7 +224,7 @@ def _fault(spec: FolderSpec, name: str) -> str:
     return ""
 
 
-_FIRST_TURN = 5
+_FIRST_TURN = 8
 # below this even the right pose can be decimetres off, which more candidates improve
 # (docs/performance.md)
 _SURE_INLIERS = 30
@@ -244,11 +244,11 @@ class LocalizationOptions(Options):
         description="poses with a lower confidence are rejected; 0 (as in benchmarks) keeps all",
     )
     sure_confidence: float | None = Field(
-        default=None,
+        default=0.9,
         gt=0,
         le=1,
-        description="match candidates in turn, best first, until the pose has "
-        f"{_SURE_INLIERS} inliers and this confidence; none: match all candidates",
+        description="Localizer, megloc localize and serve match candidates in turn, best first, "
+        f"until the pose has {_SURE_INLIERS} inliers and this confidence; none: match all",
     )
     rigs: bool = Field(default=False, description="localize all cameras of a rig jointly")
     fallback: Fallback = Field(
@@ -327,6 +327,11 @@ class QuerySource(Protocol):
         """Map images, best first."""
         ...
 
+    @property
+    def in_turn(self) -> bool:
+        """True if candidates are ranked, and a view of fewer takes less time."""
+        ...
+
     def view(self, count: int) -> QueryView:
         """Return the matches with the first ``count`` candidates."""
         ...
@@ -338,6 +343,7 @@ class StoredSource:
 
     stored: QueryView
     candidates: Sequence[str]
+    in_turn: ClassVar[bool] = False
 
     def view(self, count: int) -> QueryView:
         return self.stored.among(self.candidates[:count])
@@ -355,8 +361,8 @@ def localize_query(
     """Localize a query, or the cameras of a rig; return a result per camera.
 
     ``megloc eval``, ``megloc localize``, ``Localizer`` and the HTTP service all call this function.
-    With ``sure_confidence``, candidates are taken in turn until the pose is certain. See
-    :func:`localize_unit`.
+    With ``sure_confidence``, candidates that are not matched yet are taken in turn until the pose
+    is certain (docs/performance.md). See :func:`localize_unit`.
     """
 
     def solve(count: int) -> list[Pose | Failure]:
@@ -372,6 +378,8 @@ def localize_query(
 
     num_candidates = max((len(source.candidates) for source in sources), default=0)
     sure, count = options.sure_confidence, _FIRST_TURN
+    if not all(source.in_turn for source in sources):
+        sure = None
     while sure is not None and count < num_candidates:
         results = solve(count)
         if all(

@@ -33,6 +33,7 @@ from megloc_kapture.values import RigidTransform
 from tests.pipeline.runs import evaluated
 
 TYPE = "rootsift"
+ALL_CANDIDATES = "localization.sure_confidence=none"  # as eval matches them
 FEW = ("local_features.rootsift.options.max_keypoints=300",)
 TWO_TYPES = (
     *('local_features=["rootsift","sift"]', "local_features.sift.options.first_octave=0"),
@@ -47,7 +48,7 @@ SECOND = (
 
 def both(scene: Path, root: Path, *assignments: str) -> tuple[Workspace, Localizer]:
     """A workspace with localized queries, and a localizer in its map, of the same options."""
-    options = options_of_preset(assignments=assignments)
+    options = options_of_preset(assignments=[ALL_CANDIDATES, *assignments])
     workspace = evaluated(root, scene, options, last="submission")
     return workspace, Localizer(KaptureMap.open(workspace.path("map")), options=options)
 
@@ -108,8 +109,6 @@ def with_rig(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             pytest.param((*FEW, *more), id=name, marks=pytest.mark.slow)
             for name, more in {
                 "retrieval": ["query_pairs.top_k=4"],
-                "in turn": ["localization.sure_confidence=0.5"],
-                "turns of all": ["localization.sure_confidence=1.0", "reranking.by=matches"],
                 "resized": ["preprocessing.max_size_px=240", "query_pairs.top_k=4"],
                 "matches": [*TWO_TYPES, "reranking.by=matches", "reranking.keep=3"],
                 "pyramid": [

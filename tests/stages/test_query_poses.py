@@ -99,8 +99,9 @@ def test_an_unknown_ranker_is_refused_before_the_first_query(world: Any) -> None
 class _Turns:
     """A query whose pose gets surer with more candidates, and the counts that were asked for."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, in_turn: bool) -> None:
         self.candidates = [str(number) for number in range(count)]
+        self.in_turn = in_turn
         self.asked: list[int] = []
 
     def view(self, count: int) -> QueryView:
@@ -109,21 +110,26 @@ class _Turns:
 
 
 @pytest.mark.parametrize(
-    ("count", "sure", "expected"),
+    ("count", "sure", "in_turn", "expected"),
     [
-        (50, 0.9, [5, 10, 20]),
-        (15, 0.9, [5, 10, 15]),
-        (50, 1.0, [5, 10, 20, 40, 50]),
-        (50, None, [50]),
+        (50, 0.9, True, [8, 16, 32]),
+        (25, 0.9, True, [8, 16, 25]),
+        (50, 1.0, True, [8, 16, 32, 50]),
+        (50, None, True, [50]),
+        (50, 0.9, False, [50]),
     ],
 )
 def test_candidates_are_taken_in_turn_until_the_pose_is_sure_and_well_supported(
-    count: int, sure: float | None, expected: list[int], monkeypatch: pytest.MonkeyPatch
+    count: int,
+    sure: float | None,
+    in_turn: bool,
+    expected: list[int],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    source = _Turns(count)
+    source = _Turns(count, in_turn)
 
     def solve(*_: Any, **__: Any) -> list[Pose]:
-        turns = {5: (0.99, 29), 10: (0.89, 30), 20: (0.9, 30)}
+        turns = {8: (0.99, 29), 16: (0.89, 30), 32: (0.9, 30)}
         confidence, inliers = turns.get(source.asked[-1], (0.95, 99))
         return [Pose(RigidTransform.identity(), 100, inliers, confidence=confidence)]
 
