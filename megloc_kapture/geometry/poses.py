@@ -223,9 +223,9 @@ def align_to_earth(
     weights = np.ones(len(names))
     for _ in range(_ALIGNING_ROUNDS):
         scale, rotation, translation = _similarity(local, enu, weights)
-        apart = np.linalg.norm(scale * local @ rotation.T + translation - enu, axis=1)
-        weights = 1 / (1 + (apart / max(float(np.median(apart)), 1e-9)) ** 2)
-    residual_m = float(np.median(apart))
+        residuals_m = np.linalg.norm(scale * local @ rotation.T + translation - enu, axis=1)
+        weights = 1 / (1 + (residuals_m / max(float(np.median(residuals_m)), 1e-9)) ** 2)
+    residual_m = float(np.median(residuals_m))
     spread_m = np.linalg.svd(scale * (local - np.median(local, axis=0)), compute_uv=False)[1]
     spread_m /= np.sqrt(len(names))
     if spread_m < _MIN_SPREAD * max(residual_m, _MIN_RESIDUAL_M):
@@ -276,12 +276,13 @@ def align_poses(
         return 1.0, similarity[1], b.mean(axis=0) - similarity[1] @ a.mean(axis=0)
 
     def agreeing(scale: float, rotation: Floats, translation: Floats) -> NDArray[np.bool_]:
-        apart = np.linalg.norm(scale * centers[0] @ rotation.T + translation - centers[1], axis=1)
+        aligned = scale * centers[0] @ rotation.T + translation
+        distances = np.linalg.norm(aligned - centers[1], axis=1)
         # trace of rotation^T target_from_cam cam_from_source
         cosines = (np.einsum("nij,jk,nik->n", axes[1], rotation, axes[0]) - 1) / 2
-        turned = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
-        near = apart <= _AGREEMENT_OF_SPREAD * spread
-        return near & (turned <= _AGREEMENT_DEG) & (scale > 0)
+        angles_deg = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+        near = distances <= _AGREEMENT_OF_SPREAD * spread
+        return near & (angles_deg <= _AGREEMENT_DEG) & (scale > 0)
 
     rows = np.stack(np.triu_indices(number, 1), axis=1)
     if len(rows) > _ALIGNING_PAIRS:
@@ -289,14 +290,14 @@ def align_poses(
     agrees = np.zeros(number, np.bool_)
     for pair in rows:
         if np.any(centers[0][pair[0]] != centers[0][pair[1]]):
-            more = agreeing(*fit(pair))
-            agrees = more if more.sum() > agrees.sum() else agrees
+            inliers = agreeing(*fit(pair))
+            agrees = inliers if inliers.sum() > agrees.sum() else agrees
     best = fit(np.flatnonzero(agrees) if agrees.sum() > 1 else np.arange(number))
     for _ in range(_ALIGNING_ROUNDS):
-        more = agreeing(*best)
-        if more.sum() <= agrees.sum():
+        inliers = agreeing(*best)
+        if inliers.sum() <= agrees.sum():
             break
-        agrees, best = more, fit(np.flatnonzero(more))
+        agrees, best = inliers, fit(np.flatnonzero(inliers))
     scale, rotation, translation = best
     return PoseAlignment(
         scale,

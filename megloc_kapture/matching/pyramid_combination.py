@@ -53,8 +53,8 @@ def combine(
 
     The base matches (K, 2) come first. The variants follow by number of matches, their matches by
     score; matches of used keypoints are skipped. With ``max``, the variant with most matches
-    replaces the base if it has more. The second image's keypoints may be None if none of the
-    variants belongs to it.
+    replaces the base if it has more. The second image's keypoints may be None if it has no
+    variants.
     """
     base_matches, base_scores = base
     order = sorted(range(len(tried)), key=lambda at: -len(tried[at][1]))
@@ -143,7 +143,7 @@ class KeypointUnion:
         return len(self._base) + len(self._added)
 
     def find(self, keypoints_px: Float32) -> NDArray[np.int64]:
-        """Return the rows (K,) of identical keypoints, -1 if there is none."""
+        """Return the rows (K,) of identical keypoints, -1 for new ones."""
         rows_of = np.full(len(keypoints_px), -1, dtype=np.int64)
         if self._tree is not None and len(keypoints_px):
             near = self._tree.query_ball_point(

@@ -165,8 +165,8 @@ def _window(reference, reach, y, x, tone, values, weights):
 
 
 @compiled_loop
-def _noise(y, x, turn, k):
-    state = np.uint32(y * 73856093) ^ np.uint32(x * 19349663) ^ np.uint32(turn * 83492791 + k)
+def _noise(y, x, number, k):
+    state = np.uint32(y * 73856093) ^ np.uint32(x * 19349663) ^ np.uint32(number * 83492791 + k)
     state = np.uint32((state ^ (state >> np.uint32(16))) * np.uint32(0x7FEB352D))
     state = np.uint32((state ^ (state >> np.uint32(15))) * np.uint32(0x846CA68B))
     state = np.uint32(state ^ (state >> np.uint32(16)))
@@ -175,12 +175,12 @@ def _noise(y, x, turn, k):
 
 @compiled_loop
 def refine_planes(
-    reference, sources, infinities, baselines, planes, costs, reach, tone, turn, step, limits
+    reference, sources, infinities, baselines, planes, costs, reach, tone, number, step, limits
 ):
-    """Update planes (H, W, 3) and costs (H, W) in place by pass ``turn`` of PatchMatch.
+    """Update planes (H, W, 3) and costs (H, W) in place by pass ``number`` of PatchMatch.
 
     Passes alternate in direction (Bleyer et al., BMVC 2011). The candidates of a pixel are the
-    planes of its two neighbours visited before, and three random perturbations of its own: of
+    planes of its two neighbours visited before, and three random perturbations of its plane: of
     depth, of slope, and of both by half as much. Pass 0 also computes the initial costs. ``step``
     is the change of inverse depth that moves a projection by about a pixel; ``limits`` are the
     smallest and largest inverse depth.
@@ -189,8 +189,8 @@ def refine_planes(
     count = (2 * reach + 1) ** 2
     values, weights = np.empty(count, np.float32), np.empty(count, np.float32)
     candidate = np.empty(3, np.float64)
-    direction = 1 if turn % 2 == 0 else -1
-    size = step * 0.5**turn
+    direction = 1 if number % 2 == 0 else -1
+    size = step * 0.5**number
     for i in range(height):
         y = i if direction > 0 else height - 1 - i
         for j in range(width):
@@ -199,7 +199,7 @@ def refine_planes(
             if not _window(reference, reach, y, x, tone, values, weights):
                 costs[y, x] = np.float32(2)
                 continue
-            if turn == 0:
+            if number == 0:
                 costs[y, x] = _plane_cost(
                     values, weights, reach, y, x, current, sources, infinities, baselines
                 )
@@ -215,10 +215,10 @@ def refine_planes(
                     scale = size if k < 4 else 0.5 * size
                     candidate[0], candidate[1], candidate[2] = current[0], current[1], current[2]
                     if k != 3:
-                        candidate[0] += scale * _noise(y, x, turn, 3 * k)
+                        candidate[0] += scale * _noise(y, x, number, 3 * k)
                     if k != 2:
-                        candidate[1] += scale / reach * _noise(y, x, turn, 3 * k + 1)
-                        candidate[2] += scale / reach * _noise(y, x, turn, 3 * k + 2)
+                        candidate[1] += scale / reach * _noise(y, x, number, 3 * k + 1)
+                        candidate[2] += scale / reach * _noise(y, x, number, 3 * k + 2)
                 if candidate[0] < limits[0] or candidate[0] > limits[1]:
                     continue
                 cost = _plane_cost(

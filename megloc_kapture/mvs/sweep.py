@@ -251,8 +251,8 @@ def refine(
     grey = stereo_image(reference)
     views = _compared(reference, sources)
     costs = np.full(grey.shape, 2.0, np.float32)
-    for turn in range(passes):
-        refine_planes(grey, *views, planes, costs, _REACH, _TONE, turn, step, limits)
+    for number in range(passes):
+        refine_planes(grey, *views, planes, costs, _REACH, _TONE, number, step, limits)
     deviations = matching_deviations(reference, sources, planes, CALIBRATION)
     deviations[costs > _MAX_COST] = 0.0
     return deviations

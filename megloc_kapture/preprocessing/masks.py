@@ -121,7 +121,7 @@ class UnchangingRegion:
     """Static region below a frontier across the image; if empty, it is false and has a reason.
 
     The frontier has a value per column, all of equal width: its distance from the top as a share of
-    the height, 1 where there is no region.
+    the height, 1 in columns without a region.
     """
 
     frontier: tuple[float, ...]

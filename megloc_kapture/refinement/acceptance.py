@@ -241,18 +241,18 @@ def _fit(problem: LevelProblem, rows: Float64, deviation: float) -> Fit:
 def _correlation(rows: Float64, chosen: ChosenPoints, num_groups: int) -> float:
     seen = ~np.isnan(rows[:, 0, 0])
     query, reference, groups = rows[seen][..., 7], chosen.values[seen], chosen.groups[seen]
-    together = apart_query = apart_reference = 0.0
+    product, query_square, reference_square = 0.0, 0.0, 0.0
     for group in range(num_groups):
         ours = groups == group
         if not ours.any():
             continue
         a = query[ours] - query[ours].mean(0)
         b = reference[ours] - reference[ours].mean(0)
-        together += float((a * b).sum())
-        apart_query += float((a * a).sum())
-        apart_reference += float((b * b).sum())
-    product = apart_query * apart_reference
-    return together / float(np.sqrt(product)) if product > 0 else 0.0
+        product += float((a * b).sum())
+        query_square += float((a * a).sum())
+        reference_square += float((b * b).sum())
+    squares = query_square * reference_square
+    return product / float(np.sqrt(squares)) if squares > 0 else 0.0
 
 
 def covariance(problem: LevelProblem, at: Alignment) -> Float64 | None:

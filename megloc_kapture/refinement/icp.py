@@ -390,6 +390,6 @@ class Icp:
         mask = scene.query_mask(query)
         points = depth_cloud(view, options.depth, image_camera=camera, image_mask=mask)
         if not len(points):
-            return PoseRefinement(cam_from_world, "the query's depth has only 0 points")
+            return PoseRefinement(cam_from_world, "the query's depth has no usable points")
         cloud = map_cloud(view, points, cam_from_world, references, scene, options)
         return refine_by_icp(points, cloud, cam_from_world, options)
