@@ -255,7 +255,7 @@ def _folded(weight: torch.Tensor, norm: nn.BatchNorm2d) -> tuple[torch.Tensor, t
 
 
 def aliked_from(tensors: Mapping[str, torch.Tensor], where: str) -> AlikedNet:
-    """Build the network in eval mode; the checkpoint's shapes tell the variant."""
+    """Build the network in eval mode, with its variant inferred from the checkpoint's shapes."""
     try:
         first = tensors["block1.conv1.weight"].shape[0]
         second, third, fourth = (tensors[f"conv{level}.weight"].shape[1] for level in (2, 3, 4))

@@ -41,7 +41,7 @@ from megloc_kapture.nets.score_maps import (
 from megloc_kapture.values import LocalFeatures
 
 DESCRIPTOR_SIZE = 128
-STRIDE = 4  # of the descriptor map: its cell (i, j) is centred at pixel (4 i, 4 j)
+STRIDE = 4  # cell (i, j) of the descriptor map is centred at pixel (4 i, 4 j)
 # layers that add to the score map: dilation of the neighbourhood, and weight in the sum
 _SCORED = {"conv1": (3, 1 / 6), "conv3": (2, 2 / 6), "conv6": (1, 3 / 6)}
 _DEFORMABLE = ("conv6_0", "conv6_1", "conv6")

@@ -190,7 +190,7 @@ def _apgem_with_whitening(
 
 
 class ApGem(GlobalNetwork[ApGemOptions]):
-    """AP-GeM: unit-norm float32 (2048,); the name has checkpoint, whitening and power."""
+    """AP-GeM: unit-norm float32 (2048,); checkpoint, whitening and power are in the type name."""
 
     name = method = "apgem"
     Options = ApGemOptions

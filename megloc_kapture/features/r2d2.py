@@ -150,7 +150,7 @@ class R2D2Network(nn.Module):
 
 
 def load_r2d2(tensors: Mapping[str, torch.Tensor], where: str) -> R2D2Network:
-    """Build the network of a checkpoint for inference; the shapes tell the base width."""
+    """Build the network for inference, with its width inferred from the checkpoint's shapes."""
     first = tensors.get("ops.0.weight")
     if first is None or first.ndim != 4:
         raise DataError(

@@ -144,9 +144,8 @@ class SuperPointNet(nn.Module):
         x = self._first_stage(gray)
         for first, second in ((self.conv2a, self.conv2b), (self.conv3a, self.conv3b)):
             x = second(functional.relu_(first(x)))
-            x = functional.relu_(
-                functional.max_pool2d(x, 2)
-            )  # after pooling, ReLU is four times cheaper
+            # ReLU after pooling is four times cheaper
+            x = functional.relu_(functional.max_pool2d(x, 2))
         return functional.relu_(self.conv4b(functional.relu_(self.conv4a(x))))
 
     def _first_stage(self, gray: torch.Tensor) -> torch.Tensor:

@@ -79,9 +79,9 @@ class PcaWhitening:
 def learn_whitening(vectors: Float32, dimensions: int, power: float = 1.0) -> PcaWhitening:
     """Learn whitening from vectors float32 (N, D), which are overwritten.
 
-    With few images the last components are noise, so a ``power`` below one of the standard
-    deviations divides them (Revaud et al., ICCV 2019). ``dimensions`` is reduced to the rank of the
-    centred vectors, which is less than N.
+    Components are divided by their standard deviations to the ``power``; a power below one reduces
+    the noise of the last components if images are few (Revaud et al., ICCV 2019). ``dimensions`` is
+    limited by the rank of the centred vectors, which is less than N.
     """
     mean = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)
     vectors -= mean
@@ -203,7 +203,7 @@ def _cluster(data: Float32, options: VladOptions, number: int) -> Float32:
         counts = np.bincount(labels, minlength=len(centres))
         filled = counts > 0
         centres[filled] = (sums[filled] / counts[filled, None]).astype(np.float32)
-        for k in np.flatnonzero(~filled):  # an empty cluster restarts at a random one
+        for k in np.flatnonzero(~filled):  # an empty cluster restarts at a random descriptor
             centres[k] = data[rng.integers(len(data))]
     return centres
 

@@ -31,7 +31,7 @@ class LpipsOptions(NetworkOptions):
 class LpipsDistance:
     """Plugin ``lpips``: LPIPS 0.1 (:class:`megloc_kapture.nets.lpips.Lpips`) over the valid pixels.
 
-    With other weights its name is ``lpips-like-NET``, since values are not comparable with
+    With other weights its name is ``lpips-like-NET``, since its values are not comparable with
     published ones.
     """
 

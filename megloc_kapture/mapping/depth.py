@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 # depth, so both are iterated; points that do not converge are hidden behind an edge
 _ROUNDS = 6
 _SETTLED = 0.01  # largest last change of a converged depth, relative
-# estimated depths have deviations for a keypoint noise of one over this many pixels
+# deviations of estimated depth are for a keypoint noise of 1 / _PIXELS_OF_SIGMA pixels
 _PIXELS_OF_SIGMA = 3.0
 # if the four depths around a keypoint differ by more than this share of the smallest, the keypoint
 # is on an edge and has no depth

@@ -25,7 +25,7 @@ def in_chunks(count: int, size: int, work: Callable[[int, int], object]) -> None
         for first, last in chunks:
             work(first, last)
         return
-    with ThreadPoolExecutor(get_num_threads()) as executor:  # the cores available to the process
+    with ThreadPoolExecutor(get_num_threads()) as executor:  # one per available core
         for done in [executor.submit(work, first, last) for first, last in chunks]:
             done.result()
 

@@ -79,7 +79,7 @@ def ray_slopes(camera: Camera, keypoints_px: NDArray[np.floating[Any]], rays: Fl
     a, b, c, d = (jacobian[:, row, column] for row in (0, 1) for column in (0, 1))
     determinant = a * d - b * c
     error = np.abs(px - keypoints_px).max(axis=1)
-    # where a distortion polynomial folds over, it mirrors
+    # reject mirrored pixels, where a distortion polynomial folds over
     good = (error <= _MAX_RAY_ERROR_PX) & (determinant > 0)
     slopes = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2)
     slopes /= np.where(good, determinant, np.nan)[:, None, None]
@@ -186,7 +186,7 @@ def two_view_of_variants(
     base_matches: NDArray[np.int64],
     options: TwoViewOptions,
 ) -> PairVerifier:
-    """Return a two-view verifier; variants must agree with the model with the most matches.
+    """Return a two-view verifier; variants must agree with the model of the best variant.
 
     Keypoints are (N, 2 or more) and (M, 2 or more); ``base_matches`` int64 (K, 2) are the verified
     matches of the images themselves.
@@ -256,7 +256,7 @@ def known_pose_of_variants(
 ) -> PairVerifier:
     """Return a verifier by a known pose.
 
-    ``other`` rays are (M, 3), their slopes (M, 2, 2).
+    ``other_rays`` (M, 3) and ``other_slopes`` (M, 2, 2) are those of the other image's keypoints.
     """
 
     def verify(features: VariantFeatures, matches: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -67,7 +67,7 @@ _TRUNKS: dict[Trunk, Callable[[], nn.Sequential]] = {
 # input normalisation of the published module, for RGB in [-1, 1]
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 _MIN_LENGTH = 1e-10
-SMALLEST_PX = 64  # shortest side that AlexNet's pooling layers leave large enough
+SMALLEST_PX = 64  # smallest side that leaves enough cells after AlexNet's pooling
 
 
 class _Head(nn.Module):

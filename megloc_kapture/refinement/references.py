@@ -30,8 +30,8 @@ from megloc_kapture.refinement.pyramid import (
 from megloc_kapture.values import Camera, RigidTransform
 
 _FORWARD = np.array([0.0, 0.0, 1.0])
-# held-out images: largest and smallest number of displacements (with a chance of 1 in 32, all five
-# are on the wrong side of the true median), and number of images tried
+# held-out images: largest and smallest number of displacements (five are all above the true median
+# with a chance of 1 in 32), and number of images tried
 MAX_TESTED, MIN_TESTED, MAX_TRIED = 24, 5, 96
 # smallest ratio of baseline to surface distance: an angle of about 6 deg between views
 _MIN_PARALLAX = 0.1
@@ -140,9 +140,7 @@ class Displacement:
     # claimed_m, claimed_deg: standard deviations by the claimed covariance
     claimed_m: float
     claimed_deg: float
-    squared_distance: (
-        float  # squared Mahalanobis distance by this covariance, six degrees of freedom
-    )
+    squared_distance: float  # squared Mahalanobis distance by this covariance
 
     @property
     def contradicts(self) -> bool:
